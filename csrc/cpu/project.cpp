@@ -138,15 +138,21 @@ void project_block(const GaussianInputs& in, int64_t begin, Raster& raster, floa
         const vf side = intervals[0] * f.inverse;
         low_pass *= c.fx * c.fy * side * side;
     }
+    if (in.intervals) {
+        // The determinant of the projection alone is the square of a cross product, which does not cancel for needles.
+        vf square = splat(0.0f), size = splat(0.0f);
+        for (int j = 0; j < 3; ++j) {
+            const int k = (j + 1) % 3, l = (j + 2) % 3;
+            const vf normal = f.a[k] * f.b[l] - f.a[l] * f.b[k];
+            square += normal * normal, size += f.a[j] * f.a[j] + f.b[j] * f.b[j];
+        }
+        const vf total = largest(low_pass, splat(kScreenLowPass));
+        opacity *= square_root((square + low_pass * (size + low_pass)) / (square + total * (size + total)));
+        low_pass = total;
+    }
     vf xx = low_pass, xy = splat(0.0f), yy = low_pass;
     for (int j = 0; j < 3; ++j) xx += f.a[j] * f.a[j], xy += f.a[j] * f.b[j], yy += f.b[j] * f.b[j];
-    vf determinant = xx * yy - xy * xy;
-    if (in.intervals) {
-        const vf added = largest(splat(kScreenLowPass) - low_pass, splat(0.0f)), before = determinant;
-        xx += added, yy += added;
-        determinant = xx * yy - xy * xy;
-        opacity *= square_root(smallest(splat(1.0f), largest(splat(0.0f), before / determinant)));
-    }
+    const vf determinant = xx * yy - xy * xy;
     vf x = c.fx * f.point[0] * f.inverse + c.cx, y = c.fy * f.point[1] * f.inverse + c.cy;
     if (in.screen_offsets) {
         Rows<2> offsets;

@@ -16,14 +16,14 @@ from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.data.open import open_capture
 from structgstream.data.source import FrameSource, FrameStream
 from structgstream.errors import ConfigError
-from structgstream.evaluation.capture import capture_of, part_metadata
+from structgstream.evaluation.capture import capture_of, part_metadata, stored_capture
 from structgstream.evaluation.evaluate import evaluate as evaluate_recording
 from structgstream.evaluation.optional_metrics import MetricSelection
 from structgstream.evaluation.report import Report
 from structgstream.evaluation.run_log import read_log
 from structgstream.exporters.formats import Format, PageFormat
 from structgstream.exporters.frames import write_frames
-from structgstream.exporters.request import check_degree, check_page, choose_frames, destination
+from structgstream.exporters.request import check_degree, check_low_pass, check_page, choose_frames, destination
 from structgstream.frame_report import FrameReport
 from structgstream.kernels.backend import Backend, BackendName, select_backend
 from structgstream.player.stream_file import StreamFile
@@ -197,6 +197,7 @@ def evaluate(
     Args:
         path: the stream file.
         capture: the folder of the capture that it was made from, or that capture, opened with the same arguments.
+            Scores at the size of larger stored pictures need the folder.
         cameras: names of the cameras to score; None for the held-out ones.
         metrics: ``basic`` leaves out MS-SSIM, FLIP, LPIPS and the temporal metrics.
         lpips_weights: folder or file with the weights of LPIPS; None for the default places.
@@ -212,7 +213,9 @@ def evaluate(
         BackendError: the back-end is not available.
     """
     with open_stream(path) as reader:
+        stored = None
         if isinstance(capture, Path | str):
+            stored = stored_capture(reader.header, capture, frames=len(reader.packets))
             capture = capture_of(reader.header, capture, frames=len(reader.packets))
         return evaluate_recording(
             reader,
@@ -222,6 +225,7 @@ def evaluate(
             log=read_log(Path(path)),
             metrics=metrics,
             lpips_weights=lpips_weights,
+            stored=stored,
         )
 
 
@@ -233,6 +237,7 @@ def export(
     frame: int | None = None,
     frames: tuple[int, int] | None = None,
     sh_degree: int | None = None,
+    low_pass: float = 0.0,
     backend: Backend | BackendName = "auto",
 ) -> Path:
     """Writes a stream as a page with a player, or its frames as plain 3D Gaussians for other programs.
@@ -245,6 +250,8 @@ def export(
         frame: the only frame to write.
         frames: the first and the last frame to write; None for all.
         sh_degree: degree of the spherical harmonics, 0 to 2; None for 1, and 0 in a ``.splat``, which has none.
+        low_pass: variance in squared training pixels that plain Gaussians are widened by, for viewers that draw larger
+            pictures than the training pictures or have no low-pass of their own: docs/export.md.
         backend: evaluates the MLPs.
 
     Returns:
@@ -262,13 +269,14 @@ def export(
         path, None if output is None else Path(output), format=format, frame=frame, frames=frames
     )
     if chosen == "html" or chosen == "site":
-        check_page(frame=frame, frames=frames, sh_degree=sh_degree)
+        check_page(frame=frame, frames=frames, sh_degree=sh_degree, low_pass=low_pass)
         write = write_page if chosen == "html" else write_site
         write(target, StreamFile(path))
         return target
-    degree = check_degree(sh_degree, chosen)
+    degree, low_pass = check_degree(sh_degree, chosen), check_low_pass(low_pass)
     with open_stream(path, by_index=frame is not None) as reader:
         numbers = choose_frames(reader.runs, target, frame=frame, frames=frames)
-        for _ in write_frames(reader, numbers, target, format=chosen, backend=select_backend(backend), degree=degree):
+        kind = select_backend(backend)
+        for _ in write_frames(reader, numbers, target, format=chosen, backend=kind, degree=degree, low_pass=low_pass):
             pass
     return target

@@ -35,6 +35,20 @@ class Viewport(NamedTuple):
     near: float
 
 
+REFERENCE_PIXELS = 640
+"""Longer side, in pixels, of the largest pictures for which lengths in pixels were chosen (320 x 240 to 640 x 360). In
+a larger picture the same content covers more pixels, and lengths are in proportion (:func:`enlargement`)."""
+
+
+def enlargement(width: float, height: float) -> float:
+    """How many pixels of a picture of ``width`` x ``height`` are one of a picture of the reference size, at least 1.
+
+    Lengths in pixels that stand in a configuration are multiplied by it, areas in pixels by its square. Pictures below
+    the reference size take them as they are (docs/scaling.md).
+    """
+    return max(1.0, max(width, height) / REFERENCE_PIXELS)
+
+
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera.

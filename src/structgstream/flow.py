@@ -7,6 +7,7 @@ to a bound at a size where that is cheap, and :func:`dis_refinement` makes its a
 """
 
 from collections.abc import Callable
+from math import hypot
 from typing import Any
 
 import numpy as np
@@ -61,13 +62,13 @@ def dis_search(extra: str, *, refined: bool = True, finest_level: int = 1) -> Fl
     return flow
 
 
-def dis_refinement(extra: str, *, finest_level: int, coarsest_level: int) -> FlowRefinement:
+def dis_refinement(*, finest_level: int, coarsest_level: int) -> FlowRefinement:
     """As :func:`dis_search` with ``refined=False``, but from an approximate flow and the level ``coarsest_level`` on.
 
     Raises:
         MissingExtraError: OpenCV is not installed.
     """
-    cv2 = _opencv(extra)
+    cv2 = _opencv("capture")
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     search.setFinestScale(finest_level)
     search.setCoarsestScale(coarsest_level)
@@ -81,7 +82,7 @@ def dis_refinement(extra: str, *, finest_level: int, coarsest_level: int) -> Flo
 
 
 def block_search(
-    extra: str, first: NDArray[np.uint8], second: NDArray[np.uint8], *, cell_pixels: int, reach_cells: int
+    first: NDArray[np.uint8], second: NDArray[np.uint8], *, cell_pixels: int, reach_cells: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Approximate flow ``[H, W, 2]`` from ``first`` to ``second`` and back: block matching of reduced pictures.
 
@@ -90,7 +91,6 @@ def block_search(
     Then the median over 3 x 3 cells, enlarged. The time is that of ``pi reach_cells^2`` passes over the cells.
 
     Args:
-        extra: the extra of this package that a user should install when OpenCV is missing.
         first: ``[H, W, 3]``.
         second: ``[H, W, 3]``.
         cell_pixels: size of a cell.
@@ -99,28 +99,41 @@ def block_search(
     Raises:
         MissingExtraError: OpenCV is not installed.
     """
-    cv2 = _opencv(extra)
+    cv2 = _opencv("capture")
     height, width = first.shape[:2]
     columns, rows = -(-width // cell_pixels), -(-height // cell_pixels)
-    one, other = (cv2.resize(picture, (columns, rows), interpolation=cv2.INTER_AREA) for picture in (first, second))
+    one, other = (
+        cv2.resize(picture, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.float32)
+        for picture in (first, second)
+    )
+    displacements = _displacements(reach_cells, columns, rows)
     least = [np.full((rows, columns), np.inf, np.float32) for _ in range(2)]
-    best = [np.zeros((rows, columns, 2), np.float32) for _ in range(2)]
-    for dx, dy in _displacements(reach_cells, columns, rows):
-        # The cells of both pictures that the displacement connects, and those of the second.
+    best = [np.zeros((rows, columns), np.int16) for _ in range(2)]
+    total = np.ones((1, 3), np.float32)
+    for number, (dx, dy) in enumerate(displacements):
+        # The cells of the first picture that the displacement leads to cells of the second, and these.
         here = slice(max(0, -dy), rows - max(0, dy)), slice(max(0, -dx), columns - max(0, dx))
         there = slice(max(0, dy), rows + min(0, dy)), slice(max(0, dx), columns + min(0, dx))
-        difference = cv2.transform(cv2.absdiff(one[here], other[there]).astype(np.float32), np.ones((1, 3), np.float32))
-        np.minimum(difference, BLOCK_COST_CLIP, out=difference)
-        cost = cv2.boxFilter(difference, -1, (3, 3), borderType=cv2.BORDER_REPLICATE)
-        cost += BLOCK_COST_PER_CELL * float(np.hypot(dx, dy))
-        for at, direction, sign in ((here, 0, 1), (there, 1, -1)):
+        cost = cv2.transform(cv2.absdiff(one[here], other[there]), total)
+        np.minimum(cost, BLOCK_COST_CLIP, out=cost)
+        cost = cv2.boxFilter(cost, -1, (3, 3), borderType=cv2.BORDER_REPLICATE)
+        cost += BLOCK_COST_PER_CELL * hypot(dx, dy)
+        for at, direction in ((here, 0), (there, 1)):
             better = cost < least[direction][at]
             np.copyto(least[direction][at], cost, where=better)
-            best[direction][at][better] = sign * dx, sign * dy
-    scale = np.array([width / columns, height / rows], np.float32)
-    smooth = (np.stack([cv2.medianBlur(cells[..., axis].copy(), 3) for axis in (0, 1)], -1) for cells in best)
-    forward, back = (np.asarray(cv2.resize(cells * scale, (width, height)), np.float32) for cells in smooth)
+            np.copyto(best[direction][at], number, where=better)
+    cells = np.array(displacements, np.float32) * (width / columns, height / rows)
+    forward, back = (
+        _enlarged(sign * cells[numbers], (width, height)) for sign, numbers in zip((1, -1), best, strict=True)
+    )
     return forward, back
+
+
+def _enlarged(cells: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """The median over 3 x 3 cells of a flow ``[h, w, 2]``, interpolated to a width and height."""
+    cv2 = _opencv("capture")
+    smooth = [cv2.medianBlur(np.ascontiguousarray(cells[..., axis], np.float32), 3) for axis in (0, 1)]
+    return np.asarray(cv2.resize(np.stack(smooth, -1), size), np.float32)
 
 
 def _displacements(reach: int, columns: int, rows: int) -> list[tuple[int, int]]:

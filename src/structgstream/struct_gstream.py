@@ -11,6 +11,7 @@ from structgstream.kernels.backend import Backend
 from structgstream.pipeline import FrameTask, Past, Pipeline
 from structgstream.presets import StreamConfig, to_json
 from structgstream.rate_control import with_rate_control
+from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
 from structgstream.scene_codecs import scene_codec
@@ -97,7 +98,7 @@ class StructGStream:
         if motion.residual_threshold <= 0.0 and not light.enabled:
             return FirstFrame()
         first = task()
-        scene, views, backend = on_device(state, first.backend.device), first.pictures.views, first.backend
+        scene, views, backend = self._filtered(state, first), first.pictures.views, first.backend
         floor = None
         if motion.residual_threshold > 0.0:
             floor = residual_floor(scene, views, scale=motion.picture_scale, backend=backend)
@@ -143,7 +144,12 @@ class StructGStream:
     def residual(self, state: Scene, task: FrameTask) -> float:
         """Mean absolute difference, in 0 ... 1, of the decoded ``state`` to the frame's training pictures."""
         scale, backend = self.config.online.motion.picture_scale, task.backend
-        return mean_residual(on_device(state, backend.device), task.pictures.views, scale=scale, backend=backend)
+        return mean_residual(self._filtered(state, task), task.pictures.views, scale=scale, backend=backend)
+
+    def _filtered(self, state: Scene, task: FrameTask) -> Scene:
+        """The decoded ``state`` on the task's device, drawn as online frames draw it."""
+        sampling = RigSampling.of(task.rig) if self.config.online.sampling_filter else None
+        return replace(on_device(state, task.backend.device), sampling=sampling)
 
 
 def stream_pipeline(

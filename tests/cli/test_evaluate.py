@@ -24,9 +24,22 @@ def test_evaluate_reads_the_file(stream: Path, tmp_path: Path, capsys: pytest.Ca
     assert content["stream"]["total_bytes"] == stream.stat().st_size
     assert content["stream"]["metadata"]["scale"] == 0.25
     assert content["environment"]["backend"] == QUICKEST
-    assert {entry.name for entry in folder.iterdir()} == {"report.json", "over_time.png", "contact_sheet.png"}
+    assert {entry.name for entry in folder.iterdir()} == {
+        "report.json", "index.html", "over_time.png", "contact_sheet.png", "worst"
+    }  # fmt: skip
     assert json.loads((folder / "report.json").read_text())["mean"]["psnr"] == content["mean"]["psnr"]
+    page = (folder / "index.html").read_text()
+    crops = [path.relative_to(folder) for path in (folder / "worst").iterdir()]
+    assert len(crops) >= 2
+    assert all(f"src='{path}'" in page for path in crops)
+    worst = content["stream"]["worst"]["changed"]
+    assert worst["psnr_changed"] == min(f["psnr_changed"] for f in content["frames"] if f["psnr_changed"] is not None)
+    assert worst["camera"] == "cam00"
+    assert content["stream"]["stored_size_frames"] == [2]
+    assert [frame["psnr_stored"] is None for frame in content["frames"]] == [True, True, False]
+    assert all(8 < frame["psnr_half"] < 45 for frame in content["frames"])
     table = capsys.readouterr().out
+    assert re.search(r"camera +half size +SSIM +stored size +SSIM +disoccluded % +ghosts % ", table)
     headline, beside = (f"{content['mean'][name]:.2f}" for name in ("psnr", "psnr_camera_color"))
     assert re.search(rf"mean +{headline} +{beside} ", table)
     assert "with the header shared over them" in " ".join(table.split())

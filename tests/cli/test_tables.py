@@ -17,6 +17,7 @@ FACTS: dict[str, Any] = {
     "drift_at_equal_shares_db_per_frame": 0.0009, "total_bytes": 5_000_000,
     "header_bytes": 1_000_000, "packet_bytes": 4_000_000, "frames": 4, "megabits_per_second": 240.0,
     "megabits_per_second_with_header": 300.0, "fps": 30.0, "render_fps": 12.34, "decode_and_render_fps": 5.0,
+    "worst": {"changed": None, "ghosts": None},
     "field_bytes": {"small": 10, "large": 3_000_000, "none": 0},
 }  # fmt: skip
 MACHINE = {"gpu": None, "cpu": "a [fast] one", "cores": 2, "backend": "cpu", "torch": "2.0", "peak_memory_bytes": None}
@@ -126,3 +127,22 @@ def test_facts_that_only_some_files_have() -> None:
 def test_the_quality_in_a_line() -> None:
     assert quality_text(report()) == "30.00 dB (30.50 after frame 0's colour fit)"
     assert quality_text(replace(report(), mean=scores())) == "30.00 dB"
+
+
+def test_other_sizes_and_ghosts_have_a_table_of_what_is_known() -> None:
+    known = scores(psnr_half=33.333, ssim_half=0.95, disoccluded_share=0.021, ghost_share=0.155, psnr_disoccluded=24.0)
+    cameras = {"cam[0]": known, "side": replace(known, ghost_share=None)}
+    text = shown(replace(report(cameras={"cam[0]": "held out", "side": "held out"}), cameras=cameras, mean=known))
+    words = " ".join(text.split())
+    assert "camera half size SSIM disoccluded % ghosts % dB there" in words
+    assert "cam[0] 33.33 0.9500 2.10 15.50 24.00" in words
+    assert "side 33.33 0.9500 2.10 - 24.00" in words
+    assert "stored size" not in text
+
+
+def test_the_worst_frames_are_named() -> None:
+    changed = {"frame": 3, "camera": "cam[0]", "psnr_changed": 19.876}
+    ghosts = {"frame": 2, "camera": "side", "ghost_share": 0.4, "disoccluded_share": 0.02}
+    text = shown(report(worst={"changed": changed, "ghosts": ghosts}))
+    assert "3 of cam[0]: 19.88 dB on changed pixels" in text
+    assert "frame 2 of side: 40.0 % of the disoccluded pixels, 0.80 % of all" in text

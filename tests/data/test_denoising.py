@@ -9,6 +9,7 @@ import pytest
 
 from memory_captures import MemoryCapture
 from rigs import arc_rig
+from structgstream import cameras
 from structgstream.data.denoising import MOST_FRAMES, Denoised, DenoisingConfig, denoised, mean_of_still
 from structgstream.data.prefetch import Prefetch
 from structgstream.data.source import FrameSource
@@ -228,3 +229,25 @@ def test_the_largest_sums_fit() -> None:
 def test_what_cannot_be_is_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match="Denoising takes"):
         DenoisingConfig(**wrong)  # type: ignore[arg-type]
+
+
+def test_the_surroundings_that_have_to_stand_still_are_as_wide_in_larger_pictures(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A block moves by eight of 64 pixels; the strip beside it that is not averaged is as wide in twice the size."""
+
+    def averaged(times: int) -> np.ndarray:
+        frames = [picture.repeat(times, 0).repeat(times, 1) for picture in (flat(10), flat(18))]
+        first, later = (MultiViewFrame(number, 0.0, {"cam01": picture}) for number, picture in enumerate(frames))
+        monkeypatch.setattr(cameras, "REFERENCE_PIXELS", WIDTH)
+        found = mean_of_still(first, [later], names=["cam01"], config=DenoisingConfig(frames=2, reach_pixels=6))
+        return found.images["cam01"][::times, ::times, 0] != frames[0][::times, ::times, 0]
+
+    def flat(column: int) -> np.ndarray:
+        picture = np.full((HEIGHT, WIDTH, 3), 100, np.uint8)
+        picture[18:30, column : column + 12] = 250
+        return picture + np.uint8(2 if column > 10 else 0)  # What is averaged shows it.
+
+    small, large = averaged(1), averaged(2)
+    assert 0.3 < small.mean() < 0.9
+    assert (small != large).mean() < 0.05

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 
 from filmed import noise_texture
+from structgstream import cameras
+from structgstream.data.matching import Features
 from structgstream.data.pair_matches import MatchConfig, PairMatcher
 
 SIDE, SHIFT = 256, 17
@@ -64,3 +66,23 @@ def test_a_picture_and_a_pair_are_looked_at_once(monkeypatch: pytest.MonkeyPatch
     assert sorted(extracted) == ["a", "b", "other"]
     assert again["a", "b"] is first["a", "b"]
     assert list(again) == [("a", "b"), ("a", "other")]
+
+
+def test_inliers_lie_as_near_in_larger_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keypoints that are off by the same share of a picture match, however many pixels it has."""
+    g = np.random.default_rng(3)
+
+    def count(times: int) -> int:
+        features = {}
+        for name, shift in (("a", 0.0), ("b", SHIFT)):
+            pixels = np.random.default_rng(7).uniform(20, SIDE - 20, (400, 2)) - [shift, 0.0]
+            pixels += g.normal(0.0, 0.6, pixels.shape)  # 0.6 pixels of the smaller pictures
+            descriptors = np.random.default_rng(8).random((400, 128)).astype(np.float32)
+            features[name] = Features(times * pixels, descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True))
+        images = {name: np.zeros((times * SIDE, times * SIDE, 3), np.uint8) for name in features}
+        matcher = PairMatcher(images, MatchConfig(min_inlier_share=0.0))
+        monkeypatch.setattr(matcher, "_extract", features.__getitem__)
+        return len(matcher.indices([("a", "b")])["a", "b"])
+
+    monkeypatch.setattr(cameras, "REFERENCE_PIXELS", SIDE)
+    assert count(4) > 0.9 * count(1) > 200

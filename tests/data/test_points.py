@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from planes import distance_to_surface, room_frame, room_rig
+from structgstream import cameras
 from structgstream.data.clip import bundled_clip
 from structgstream.data.matching import inside, project
 from structgstream.data.plane_sweep import DEFAULT_LEVELS, SweepConfig
@@ -185,3 +186,17 @@ def test_cameras_that_look_away_from_each_other_give_random_points() -> None:
     inverted = {name: replace(camera, viewmat=camera.viewmat.inverse()) for name, camera in CLIP.rig.cameras.items()}
     config = PointsConfig(random_points=900, sweep_levels=())
     assert initial_points(frame, CLIP.rig.mapped(inverted), config=config).random
+
+
+def test_keypoints_are_those_of_pictures_of_the_reference_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures of twice the size give the points that they give when they are reduced."""
+    clip, config = CLIP, PointsConfig(max_points=20_000, sweep_levels=(), min_points=1)
+    frame, rig = next(iter(clip.frames())), clip.rig
+    width, height = rig[rig.training[0]].width, rig[rig.training[0]].height
+    large = replace(rig, cameras={name: rig[name].resized(2 * width, 2 * height) for name in rig})
+    pictures = {name: image.repeat(2, 0).repeat(2, 1) for name, image in frame.images.items()}
+    monkeypatch.setattr(cameras, "REFERENCE_PIXELS", width)
+    expected = initial_points(frame, rig, config=config)
+    found = initial_points(MultiViewFrame(0, 0.0, pictures), large, config=config)
+    assert len(expected.positions) > 100
+    np.testing.assert_allclose(found.positions, expected.positions, atol=1e-9)

@@ -54,6 +54,16 @@ def heights(axis: Axes) -> dict[str, list[float]]:
     }
 
 
+def test_ghosts_have_a_panel_where_there_is_a_place_for_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    two = [frame(0, {"left": 30.0}), frame(1, {"left": 29.0})]
+    name = "ghosts, % of disoccluded"
+    assert name not in panels(two, monkeypatch)
+    scores = replace(two[1].cameras["left"], ghost_share=0.25, disoccluded_share=0.1, psnr_half=33.0)
+    shown = panels([two[0], replace(two[1], cameras={"left": scores}, mean=scores)], monkeypatch)
+    assert lines(shown[name]) == {"camera left": [25.0], "all": [25.0]}
+    assert lines(shown["PSNR, dB"])["half size"] == [33.0]
+
+
 def test_quality_by_camera_and_their_mean(monkeypatch: pytest.MonkeyPatch) -> None:
     two = [frame(0, {"left": 30.0, "right": 26.0}), frame(1, {"left": 29.0, "right": 25.0})]
     shown = panels(two, monkeypatch)

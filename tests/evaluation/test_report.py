@@ -164,3 +164,13 @@ def test_plots_have_a_panel_more_with_a_log(tmp_path: Path) -> None:
     heights = [pixels_of(tmp_path / f"{name}.png").shape[0] for name in ("with", "without", "scored")]
     assert heights[2] > heights[0] > heights[1] > 500
     assert heights[2] - heights[0] == pytest.approx(2 * (heights[0] - heights[1]), abs=2)
+
+
+def test_scores_of_disoccluded_pixels_are_weighed_by_their_number() -> None:
+    many = replace(GOOD, disoccluded_share=0.3, ghost_share=0.1, psnr_disoccluded=30.0)
+    few = replace(GOOD, disoccluded_share=0.1, ghost_share=0.5, psnr_disoccluded=20.0)
+    none = replace(GOOD, disoccluded_share=0.0)
+    mean = mean_scores([many, few, none])
+    assert (mean.ghost_share, mean.psnr_disoccluded) == (pytest.approx(0.2), pytest.approx(27.5))
+    assert mean.disoccluded_share == pytest.approx(0.4 / 3)
+    assert mean_scores([none, GOOD]).ghost_share is None

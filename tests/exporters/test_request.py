@@ -1,13 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where an export goes and which frames it has, for every way to say it; refusals are in ``cli/test_export.py``."""
 
+import math
 from pathlib import Path
 
 import pytest
 
 from structgstream.errors import ConfigError
 from structgstream.exporters.formats import Format, PageFormat
-from structgstream.exporters.request import check_degree, check_page, choose_frames, destination, is_one_file
+from structgstream.exporters.request import (
+    check_degree,
+    check_low_pass,
+    check_page,
+    choose_frames,
+    destination,
+    is_one_file,
+)
 
 STREAM = Path("/videos/ball.sgs")
 
@@ -64,8 +72,15 @@ def test_a_degree_is_what_the_format_can_hold() -> None:
             check_degree(degree, "spz")
 
 
+def test_a_low_pass_is_a_share_of_a_training_pixel() -> None:
+    assert [check_low_pass(variance) for variance in (0.0, 0.3, 1.0)] == [0.0, 0.3, 1.0]
+    for variance in (-0.1, 1.1, math.nan):
+        with pytest.raises(ConfigError, match="expected 0 to 1"):
+            check_low_pass(variance)
+
+
 def test_a_page_has_no_wishes() -> None:
-    check_page(frame=None, frames=None, sh_degree=None)
-    for wish in ({"frame": 0}, {"frames": (0, 0)}, {"sh_degree": 0}):
+    check_page(frame=None, frames=None, sh_degree=None, low_pass=0.0)
+    for wish in ({"frame": 0}, {"frames": (0, 0)}, {"sh_degree": 0}, {"low_pass": 0.2}):
         with pytest.raises(ConfigError, match="a page holds the whole stream"):
-            check_page(**{"frame": None, "frames": None, "sh_degree": None, **wish})
+            check_page(**{"frame": None, "frames": None, "sh_degree": None, "low_pass": 0.0, **wish})

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from backends import quickest_backend
 from clip_groups import made
+from structgstream import cameras
 from structgstream.cameras import CameraRig
 from structgstream.groups.base import GroupBase
 from structgstream.groups.border import draw_border
@@ -46,3 +47,20 @@ def test_what_neither_frame_shows_is_found_where_it_is(base: tuple[Scene, Camera
     backend = quickest_backend()
     found = visible_mixtures(displaced(scene, there), draw_border(scene, scene, rig, backend), rig, backend)
     assert found[there].float().mean() > 2.0 * found[~there].float().mean() > 0.0
+
+
+def test_what_shows_is_the_same_in_larger_pictures(
+    base: tuple[Scene, CameraRig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Coverage is measured at one size, so that specks count in large pictures as they do in small ones."""
+    scene, rig = base
+    there, backend = middle(scene), quickest_backend()
+    sides = max(max(rig[name].width, rig[name].height) for name in rig)
+    large = replace(rig, cameras={name: rig[name].resized(2 * rig[name].width, 2 * rig[name].height) for name in rig})
+    monkeypatch.setattr(cameras, "REFERENCE_PIXELS", sides)
+    found = [
+        visible_mixtures(displaced(scene, there), draw_border(scene, scene, of, backend), of, backend)
+        for of in (rig, large)
+    ]
+    other = (found[0] != found[1]).float().mean() / found[0].float().mean()
+    assert float(other) < 0.3  # 0.62 if coverage is in pixels of each size.

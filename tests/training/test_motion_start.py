@@ -46,6 +46,15 @@ def test_anchors_begin_near_where_they_have_gone() -> None:
     assert len(start.displacements) == len(partition.moving.anchors)
 
 
+def test_fast_movers_are_counted_and_how_many_of_them_flow_displaces() -> None:
+    """Fast is more than an eightieth of the width: here 1.6 pixels."""
+    _, fast = begun(moving_world(2, cameras=6, movers=60, speed=2 * SPEED, width=128, height=96))
+    assert 0.5 * len(fast.displacements) < fast.fast_count <= len(fast.displacements)
+    assert 0.8 * fast.fast_count < fast.fast_lifted_count <= min(fast.fast_count, fast.lifted_count)
+    _, slow = begun(moving_world(2, cameras=6, movers=60, speed=0.5 * SPEED, width=128, height=96))
+    assert slow.fast_count == slow.fast_lifted_count == 0
+
+
 def test_the_second_round_acts() -> None:
     once, twice = (begun(world(), rounds=rounds)[1] for rounds in (1, 2))
     assert once.corrected_count == 0

@@ -7,9 +7,11 @@ import pytest
 import torch
 
 from backends import quickest_backend
+from structgstream.cameras import CameraRig
+from structgstream.frames import MultiViewFrame
 from structgstream.training.lifting import LiftConfig
 from structgstream.training.motion import MotionConfig
-from structgstream.training.tracking import TrackConfig, Tracked, Tracker, track_frame
+from structgstream.training.tracking import TrackConfig, Tracked, Tracker, _seen, track_frame
 from worlds import World, moving_world
 
 SPEED, FRAMES = 0.06, 5
@@ -119,3 +121,27 @@ def test_a_frame_without_a_known_picture_moves_nothing() -> None:
     nothing = chosen.pictures(scenery.frames[1], [])
     found = track_frame(chosen, Tracked.at_rest(scenery.scene), nothing)
     assert torch.equal(found.scene.anchors.positions, scenery.scene.anchors.positions)
+
+
+def test_coverage_is_in_pixels_of_the_reference_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In pictures of twice the size, tracked at half of it or whole, movers cover as many pixels."""
+    scenery = world()
+    monkeypatch.setattr("structgstream.cameras.REFERENCE_PIXELS", 128)
+
+    def coverage(times: int, scale: float) -> torch.Tensor:
+        rig = CameraRig(
+            {name: scenery.rig[name].resized(128 * times, 96 * times) for name in scenery.rig}, scenery.rig.held_out
+        )
+        enlarged = World(rig, scenery.scene, [])
+        chosen = tracker(enlarged, replace(CONFIG, scale=scale))
+        frames = [
+            MultiViewFrame(n, 0.0, {name: i.repeat(times, 0).repeat(times, 1) for name, i in frame.images.items()})
+            for n, frame in enumerate(scenery.frames[:2])
+        ]
+        pictures = chosen.pictures(frames[1], chosen.pictures(frames[0], None).views)
+        seen = [_seen(chosen, scenery.scene, pictures.views[n], change) for n, change in pictures.changes.items()]
+        return torch.stack([entry.flows[:, 3] for entry in seen]).sum(0)
+
+    small = coverage(1, 1.0)
+    for found in (coverage(2, 1.0), coverage(2, 0.5)):
+        assert 0.8 < float(found.sum() / small.sum()) < 1.25  # 4 if it were in pixels of each size.

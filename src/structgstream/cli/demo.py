@@ -120,6 +120,7 @@ def _look_at(stream: Path, source: "FrameSource", backend: "Backend") -> tuple["
     write_page(folder / PLAYER, StreamFile(stream))
     return report, {
         "stream": stream,
+        "worst frames": folder / "report" / "index.html",
         "pictures": folder / "report" / "contact_sheet.png",
         "plots": folder / "report" / "over_time.png",
         "numbers": folder / "report" / "report.json",

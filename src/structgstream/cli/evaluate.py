@@ -42,7 +42,7 @@ class Evaluate:
     json: JsonPath = None
     """Write every number to this file (keys: docs/evaluation.md)."""
     report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
-    """Write report.json, plots over time and a contact sheet into this folder."""
+    """Write report.json and a page of the worst frames, plots over time and a contact sheet into this folder."""
     metrics: Literal["all", "basic"] = "all"
     """Metrics: "basic" leaves out MS-SSIM, FLIP, LPIPS and temporal ones, which take longer than rendering."""
     lpips_weights: Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")] = None
@@ -55,7 +55,7 @@ def main(arguments: list[str]) -> None:
     """Evaluates and prints a table."""
     options = parse_options(Evaluate, "evaluate", arguments=arguments)
     from structgstream.codec.reader import open_stream
-    from structgstream.evaluation.capture import capture_of
+    from structgstream.evaluation.capture import capture_of, stored_capture
     from structgstream.evaluation.report import as_json, write_json
     from structgstream.kernels.backend import select_backend
 
@@ -70,6 +70,7 @@ def main(arguments: list[str]) -> None:
         folder=options.report,
         metrics=options.metrics,
         lpips_weights=options.lpips_weights,
+        stored=stored_capture(reader.header, options.scene, frames=len(reader.packets)),
     )
     if options.json is not None:
         write_json(options.json, as_json(report))
@@ -89,24 +90,30 @@ def run_evaluation(
     folder: Path | None,
     metrics: "MetricSelection" = "all",
     lpips_weights: Path | None = None,
+    stored: "FrameSource | None" = None,
 ) -> "Report":
     """Evaluates with a progress display, and writes the report into ``folder`` (None: nowhere)."""
     from structgstream.evaluation.evaluate import Compared, evaluate
+    from structgstream.evaluation.page import write_page
     from structgstream.evaluation.pictures import contact_sheet, spread_indices
     from structgstream.evaluation.plots import write_plots
     from structgstream.evaluation.report import as_json, write_json
     from structgstream.evaluation.run_log import read_log
+    from structgstream.evaluation.worst import WorstPictures
 
     frames = len(reader.packets)
     wanted = set(spread_indices(frames, SHEET_COLUMNS)) if frames else set()
     kept: dict[str, dict] = {}
+    worst = WorstPictures()
     console = Console(stderr=True)
     with console.status("evaluating") as status:
 
         def observe(index: int, compared: Compared) -> None:
             status.update(f"evaluating frame {index + 1} of {frames}")
-            if folder is not None and index in wanted:
-                kept.setdefault(compared.camera, {})[index] = (compared.truth, compared.picture)
+            if folder is not None:
+                worst.see(index, compared)
+                if index in wanted:
+                    kept.setdefault(compared.camera, {})[index] = (compared.truth, compared.picture)
 
         report = evaluate(
             reader,
@@ -117,10 +124,12 @@ def run_evaluation(
             observer=observe,
             metrics=metrics,
             lpips_weights=lpips_weights,
+            stored=stored,
         )
     if folder is not None:
         title = f"{source.name}, {stream.name}: {quality_text(report)} over {frames} frames"
         write_json(folder / "report.json", as_json(report))
         write_plots(folder / "over_time.png", report, title=title)
         contact_sheet(folder / "contact_sheet.png", kept, title=title)
+        write_page(folder, worst.crops(), title=title, pictures=("over_time.png", "contact_sheet.png"))
     return report

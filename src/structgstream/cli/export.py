@@ -46,6 +46,9 @@ class Export:
     """First and last frame to export. Default: all."""
     sh_degree: Annotated[int | None, tyro.conf.arg(metavar="0..2", help_behavior_hint="")] = None
     """Degree of the spherical harmonics. Default: 1; .splat has none."""
+    low_pass: Annotated[float, tyro.conf.arg(metavar="0..1", help_behavior_hint="")] = 0.0
+    """Widen Gaussians by this variance, in squared training pixels, for viewers that show the scene larger than it was
+    filmed (0.2) or have no low-pass of their own (0.3). Default: 0, best at the size of the training pictures."""
     device: Device = "auto"
     """Back-end that evaluates the MLPs."""
 
@@ -53,16 +56,17 @@ class Export:
 def main(arguments: list[str]) -> None:
     """Exports and prints the path of the result."""
     options = parse_options(Export, "export", arguments=arguments)
-    from structgstream.exporters.request import check_degree, check_page, choose_frames, destination
+    from structgstream.exporters.request import check_degree, check_low_pass, check_page, choose_frames, destination
 
     frame, frames = options.frame, options.frames
     with usage_errors():
         output, format = destination(options.stream, options.output, format=options.format, frame=frame, frames=frames)
         if format == "html" or format == "site":
-            check_page(frame=frame, frames=frames, sh_degree=options.sh_degree)
+            check_page(frame=frame, frames=frames, sh_degree=options.sh_degree, low_pass=options.low_pass)
             _export_page(options.stream, output, format)
             return
         degree = check_degree(options.sh_degree, format)
+        low_pass = check_low_pass(options.low_pass)
     from structgstream.codec.reader import open_stream
     from structgstream.exporters.frames import write_frames
     from structgstream.kernels.backend import select_backend
@@ -82,7 +86,8 @@ def main(arguments: list[str]) -> None:
     )
     with bar:
         task = bar.add_task("frames", total=len(numbers))
-        for file in write_frames(reader, numbers, output, format=format, backend=backend, degree=degree):
+        files = write_frames(reader, numbers, output, format=format, backend=backend, degree=degree, low_pass=low_pass)
+        for file in files:
             written += file.bytes
             gaussians += file.gaussians
             bar.advance(task)

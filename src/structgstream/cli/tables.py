@@ -30,10 +30,20 @@ FURTHER = (  # title, key, digits
     ("truth", "truth_flicker", 2),
 )
 
+AT_OTHER_SIZES = (  # title, key, factor, digits
+    ("half size", "psnr_half", 1, 2),
+    ("SSIM", "ssim_half", 1, 4),
+    ("stored size", "psnr_stored", 1, 2),
+    ("SSIM", "ssim_stored", 1, 4),
+    ("disoccluded %", "disoccluded_share", 100, 2),
+    ("ghosts %", "ghost_share", 100, 2),
+    ("dB there", "psnr_disoccluded", 1, 2),
+)
+
 
 def report_tables(report: "Report", *, title: str) -> Group:
     """Scores by frame and by camera, and the facts of the file."""
-    parts = [_frames(report, title), _cameras(report)]
+    parts = [_frames(report, title), _cameras(report), _other_sizes(report)]
     if report.stream["metrics"] == "all":
         parts.append(_further(report))
     if report.stream["not_available"]:
@@ -105,6 +115,19 @@ def _further(report: "Report") -> Table:
     return table
 
 
+def _other_sizes(report: "Report") -> Table:
+    """The scores of ``AT_OTHER_SIZES`` by camera, and their mean, without columns in which there is nothing."""
+    columns = [column for column in AT_OTHER_SIZES if getattr(report.mean, column[1]) is not None]
+    table = compact_table()
+    for name in ("camera", *(title for title, *_ in columns)):
+        table.add_column(name, justify="left" if name == "camera" else "right")
+    for name, scores in (*report.cameras.items(), ("mean", report.mean)):
+        values = [(getattr(scores, key), factor, digits) for _, key, factor, digits in columns]
+        cells = ["-" if v is None else f"{factor * v:.{digits}f}" for v, factor, digits in values]
+        table.add_row(*literal_cells(name), *cells)
+    return table
+
+
 def _not_available(report: "Report") -> Table:
     """Which scores are missing, and why: one row for each reason."""
     reasons: dict[str, list[str]] = {}
@@ -134,6 +157,22 @@ def _facts(report: "Report") -> Table:
         f"first {s['psnr_first']:.2f}, last {s['psnr_last']:.2f}, worst {s['psnr_worst']:.2f} dB; "
         f"drift {s['drift_db_per_frame']:+.3f} dB a frame{_at_equal_shares(s['drift_at_equal_shares_db_per_frame'])}",
     )
+    if s["worst"]["changed"]:
+        found = s["worst"]["changed"]
+        table.add_row(
+            "worst frame",
+            Text(f"{found['frame']} of {found['camera']}: {found['psnr_changed']:.2f} dB on changed pixels"),
+        )
+    if s["worst"]["ghosts"]:
+        found = s["worst"]["ghosts"]
+        pixels = 100 * found["ghost_share"] * found["disoccluded_share"]
+        table.add_row(
+            "most ghosts",
+            Text(
+                f"frame {found['frame']} of {found['camera']}: {100 * found['ghost_share']:.1f} % of the disoccluded "
+                f"pixels, {pixels:.2f} % of all"
+            ),
+        )
     table.add_row(
         "size",
         f"{human_bytes(s['total_bytes'])}: header {human_bytes(s['header_bytes'])}, "

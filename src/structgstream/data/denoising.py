@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.cameras import enlargement
 from structgstream.data.images import opencv
 from structgstream.data.source import FrameStream, is_recording
 from structgstream.data.wrappers import SourceWrapper
@@ -39,7 +40,8 @@ class DenoisingConfig:
     """A pixel stands still while the smoothed difference to frame 0, in 0 ... 1, in the channel that differs most, is
     below this everywhere around it."""
     reach_pixels: int = 3
-    """Distance up to which the surroundings of a pixel have to stand still, too."""
+    """Distance up to which the surroundings of a pixel have to stand still, too, in pixels of a picture of the
+    reference size (``cameras.enlargement``)."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.frames <= MOST_FRAMES or self.reach_pixels < 0 or not self.threshold > 0:
@@ -142,7 +144,8 @@ def _unchanged(first: NDArray[np.uint8], other: NDArray[np.uint8], config: Denoi
     cv2 = opencv()
     difference = cv2.absdiff(_box_sums(first), _box_sums(other))
     around = _box_sums(cv2.max(cv2.max(difference[..., 0], difference[..., 1]), difference[..., 2]))
-    reach = 2 * config.reach_pixels + 1
+    height, width = first.shape[:2]
+    reach = 2 * round(config.reach_pixels * enlargement(width, height)) + 1
     most = cv2.dilate(around, np.ones((reach, reach), np.uint8))
     return most < config.threshold * 255.0 * SMOOTHING_PIXELS**4
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.cameras import enlargement
 from structgstream.data.arrays import Floats
 from structgstream.data.descriptor_matches import mutual_matches
 from structgstream.data.matching import Features, Pair, load_cv2, sift_features
@@ -21,7 +22,8 @@ class MatchConfig:
     Args:
         features: SIFT keypoints per picture.
         ratio: largest ratio of the best to the second-best descriptor distance.
-        inlier_pixels: largest epipolar distance of inliers of a pair's own epipolar geometry.
+        inlier_pixels: largest epipolar distance of inliers of a pair's own epipolar geometry, in pixels of a picture of
+            the reference size (``cameras.enlargement``).
         min_inliers: least number of inliers of a pair that is used.
         min_inlier_share: least share of inliers among the matches of a pair that is used.
     """
@@ -97,7 +99,9 @@ class PairMatcher:
             return empty
         cv2 = load_cv2()
         pixels1, pixels2 = first.pixels[rows], second.pixels[columns]
-        _, mask = cv2.findFundamentalMat(pixels1, pixels2, cv2.FM_RANSAC, config.inlier_pixels, 0.999, 2000)
+        height, width = np.maximum(*(self._images[name].shape[:2] for name in pair))
+        most = config.inlier_pixels * enlargement(width, height)
+        _, mask = cv2.findFundamentalMat(pixels1, pixels2, cv2.FM_RANSAC, most, 0.999, 2000)
         agree = np.zeros(len(rows), bool) if mask is None else mask.ravel().astype(bool)
         if agree.sum() < config.min_inliers or agree.mean() < config.min_inlier_share:
             return empty

@@ -14,7 +14,7 @@ ORBIT_SHARE = 0.5  # of the distance to the nearest cameras: further out, surfac
 NEIGHBOURS = 3
 ARC_HALF_ANGLE = math.radians(50.0)
 LEAST_NEAR_SHARE = 0.01
-"""A free camera's near plane is at least this share of that of the nearest camera of the rig: what is nearer is a blur."""
+"""A free camera's near plane is at least this share of its nearest camera's: what is nearer is a blur."""
 
 
 def focus_point(rig: CameraRig) -> Tensor:
@@ -100,8 +100,8 @@ def looking(camera: Camera, eye: Tensor, target: Tensor, down: Tensor, rig: Came
 def free_near(rig: CameraRig, eye: Tensor) -> float:
     """The near plane of a free camera at ``eye`` ``[3]``: nothing that the rig's cameras show is behind it.
 
-    The rig's cameras show nothing nearer to them than their own near plane, so around each there is a ball of that radius
-    that need not be drawn; it shrinks as the free camera leaves its nearest camera.
+    The rig's cameras show nothing nearer to them than their own near plane, so around each there is a ball of that
+    radius that need not be drawn; what is left of it shrinks as the free camera leaves its nearest camera.
     """
     distances = (rig.centers - eye).norm(dim=1)
     near = list(rig.cameras.values())[int(distances.argmin())].near

@@ -27,7 +27,8 @@ from structgstream.evaluation.facts import (
     training_facts,
 )
 from structgstream.evaluation.flow import Flow
-from structgstream.evaluation.masks import blackened
+from structgstream.evaluation.ghosts import Ghosts, GhostSearch
+from structgstream.evaluation.masks import blackened, both
 from structgstream.evaluation.optional_metrics import (
     OF_WHOLE_PICTURES,
     ComparedFrame,
@@ -39,6 +40,8 @@ from structgstream.evaluation.optional_metrics import (
 from structgstream.evaluation.recording import Drawable, Recording, to_device
 from structgstream.evaluation.report import FrameScores, Report, Scores, drawing_facts, mean_scores, psnr_trend
 from structgstream.evaluation.scoring import Mask, Picture, counting, score
+from structgstream.evaluation.sizes import StoredSize, half_scores, halved, stored_size
+from structgstream.evaluation.worst import worst_facts
 from structgstream.frame_report import counts
 from structgstream.kernels.backend import Backend
 from structgstream.memory import PeakMeter
@@ -47,12 +50,25 @@ from structgstream.scene.render import render, to_8bit_image
 
 @dataclass(frozen=True)
 class Compared:
-    """One camera of one frame: ground truth, rendering and scores."""
+    """One camera of one frame: ground truth, rendering and scores.
+
+    Args:
+        camera: its name.
+        truth: ``[H, W, 3]``; this and the next are black where a mask leaves pixels out.
+        picture: the rendering.
+        scores: of it.
+        first: the camera's first picture.
+        counting: ``[H, W]``, the pixels that count in both; None for all.
+        ghosts: where something was (``ghosts.py``); None if the camera's background is not known.
+    """
 
     camera: str
     truth: Picture
     picture: Picture
     scores: Scores
+    first: Picture
+    counting: Mask | None
+    ghosts: Ghosts | None
 
 
 EVALUATION = "evaluation"
@@ -72,6 +88,7 @@ def evaluate(
     metrics: MetricSelection = "all",
     flow: Flow | None = None,
     lpips_weights: Path | None = None,
+    stored: FrameSource | None = None,
 ) -> Report:
     """Scores of every frame of the file against the capture.
 
@@ -85,6 +102,7 @@ def evaluate(
         metrics: "basic" leaves out the metrics that take longer than rendering: MS-SSIM, FLIP, LPIPS, temporal ones.
         flow: exact flow to the frame before, if the capture has it; None estimates it.
         lpips_weights: folder or file with the weights of LPIPS (``lpips.py``, Note [Weights]).
+        stored: the same frames at the capture's own, larger size (``capture.stored_capture``); None for no such scores.
 
     Raises:
         CaptureError: the capture is not the stream's: a camera is missing, has another calibration or picture size, or
@@ -98,16 +116,16 @@ def evaluate(
     views = {name: recording.header.camera(name) for name in names}
     optional_metrics = None
     if metrics == "all":
-        size = len(recording.packets)
         optional_metrics = load_optional_metrics(
-            views.items(), frames=size, device=backend.device, flow=flow, lpips_weights=lpips_weights
+            views.items(), frames=len(recording.packets), device=backend.device, flow=flow, lpips_weights=lpips_weights
         )
-    comparison = _Comparison(views, backend, optional_metrics)
+    size = len(recording.packets)
+    selected = select_cameras(source, names)
+    large = None if stored is None else stored_size(stored, views, backend=backend, frames=size)
+    comparison = _Comparison(views, backend, optional_metrics, GhostSearch(selected, names, size), large)
     frames = []
     peaks = PeakMeter(backend.device)
-    for frame, (info, scene, decode_seconds) in zip(
-        select_cameras(source, names).frames(), decoded(recording, backend.device)
-    ):
+    for frame, (info, scene, decode_seconds) in zip(selected.frames(), decoded(recording, backend.device)):
         compared = []
         for name in frame.present(names):
             truth, mask = frame.images[name], frame.masks.get(name)
@@ -127,6 +145,8 @@ def evaluate(
     left_out = comparison_facts(frames, names, comparison.left_out)
     facts |= left_out
     facts |= training_facts(frame.log for frame in frames) | drawing_facts(frames)
+    facts |= {"worst": worst_facts(frames)}
+    facts |= {"stored_size_frames": sorted(large.frames) if large is not None else []}
     facts |= {"camera_colors": {name: vars(fit) for name, fit in comparison.colors.items()}}
     facts |= {"metrics": metrics, "not_available": _not_available(optional_metrics, left_out["masked_share"])}
     facts |= {"lpips_weights": dict(optional_metrics.weights) if optional_metrics else {}}
@@ -143,6 +163,8 @@ class _Comparison:
         views: cameras by name, scene units.
         backend: the compute back-end.
         optional_metrics: the metrics that take longer; None for none.
+        ghosts: finds what is still drawn where something was.
+        large: scores at the size of the stored pictures; None for none.
         first: each camera's first picture, and its mask.
         colors: each camera's colour response, fitted to frame 0.
         before: each camera's last frame and its number, for temporal metrics.
@@ -152,6 +174,9 @@ class _Comparison:
     views: Mapping[str, Camera]
     backend: Backend
     optional_metrics: OptionalMetrics | None
+    ghosts: GhostSearch
+    large: StoredSize | None
+    halves: dict[str, Camera] = field(default_factory=dict, init=False)
     first: dict[str, tuple[Picture, Mask | None]] = field(default_factory=dict)
     colors: dict[str, ChannelFit] = field(default_factory=dict)
     before: dict[str, tuple[int, ComparedFrame]] = field(default_factory=dict)
@@ -180,6 +205,15 @@ class _Comparison:
             mask=mask,
             first_mask=first_mask,
         )
+        ghosts = self.ghosts.find(camera, picture, truth, index=index, mask=mask)
+        scores = replace(scores, **self._at_other_sizes(camera, scene, truth, index=index, mask=mask))
+        if ghosts is not None:
+            scores = replace(
+                scores,
+                disoccluded_share=ghosts.disoccluded_share,
+                ghost_share=ghosts.share,
+                psnr_disoccluded=ghosts.psnr,
+            )
         self.left_out.setdefault(camera, []).append(0.0 if mask is None else 1.0 - float(mask.mean()))
         if self.optional_metrics is not None:
             number, last = self.before.get(camera, (-1, None))
@@ -194,7 +228,17 @@ class _Comparison:
             )
             self.before[camera] = index, now
             scores = replace(scores, **further)
-        return Compared(camera, truth, picture, scores)
+        return Compared(camera, truth, picture, scores, first, both(mask, first_mask), ghosts)
+
+    def _at_other_sizes(
+        self, camera: str, scene: Drawable, truth: Picture, *, index: int, mask: Mask | None
+    ) -> dict[str, float | None]:
+        if min(truth.shape[:2]) < 2:
+            return {}
+        if camera not in self.halves:
+            self.halves[camera] = halved(self.views[camera])
+        scores = half_scores(scene, self.halves[camera], truth, backend=self.backend, mask=mask)
+        return scores if self.large is None else scores | self.large.scores(camera, scene, index=index)
 
 
 def _not_available(metrics: OptionalMetrics | None, masked_share: Mapping[str, float]) -> dict[str, str]:

@@ -34,15 +34,21 @@ def changed_pixels(
     """
     if mask is not None:
         return changed_pixels(blackened(truth, mask), blackened(first, mask)) & mask
+    return dilate(differing(truth, first, THRESHOLD * 255), GROWN)
+
+
+def differing(one: NDArray[np.uint8], other: NDArray[np.uint8], levels: float) -> NDArray[np.bool_]:
+    """Where two pictures ``[H, W, 3]`` differ by more than ``levels`` of 255, absolute, averaged over channels and 3x3
+    pixels, ``[H, W]``."""
     # Sums of integers: exact, and half the memory of floats.
-    channels = np.abs(np.subtract(truth, first, dtype=np.int16))
+    channels = np.abs(np.subtract(one, other, dtype=np.int16))
     difference = channels[..., 0] + channels[..., 1] + channels[..., 2]
     padded = np.pad(difference, SMOOTHED, mode="edge")
     height, width = difference.shape
     size = 2 * SMOOTHED + 1
     across = sum((padded[:, x : x + width] for x in range(1, size)), start=padded[:, :width])
     total = sum((across[y : y + height] for y in range(1, size)), start=across[:height])
-    return dilate(total > THRESHOLD * (255 * 3 * size**2), GROWN)
+    return total > levels * (3 * size**2)
 
 
 def dilate(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:

@@ -19,7 +19,7 @@ FLICKER = (("flicker", "rendering"), ("truth_flicker", "truth"))
 
 
 def write_plots(path: Path, report: Report, *, title: str) -> None:
-    """Panels over the frame number: PSNR by camera, distances, flicker, bytes by field, counts, and seconds by stage.
+    """Panels over the frame number: PSNR by camera, distances, flicker, ghosts, bytes by field, counts, seconds.
 
     Seconds need the trainer's log; distances (FLIP, LPIPS) and flicker are shown if they were computed.
 
@@ -30,6 +30,8 @@ def write_plots(path: Path, report: Report, *, title: str) -> None:
     for panel, lines in ((_distances, DISTANCES), (_flicker, FLICKER)):
         if any(_known(report, key) for key, _ in lines):
             panels.append(panel)
+    if _known(report, "ghost_share"):
+        panels.append(_ghosts)
     panels += [_bytes, _counts]
     if any(_stages(frame) for frame in report.frames):
         panels.append(_seconds)
@@ -64,6 +66,9 @@ def _quality(axis: "Axes", report: Report) -> None:
         axis.plot(*zip(*colored), color=INK, linewidth=1.5, linestyle="--", label="mean, frame 0's colour fit")
     if changed := _known(report, "psnr_changed"):
         axis.plot(*zip(*changed), color=INK, linewidth=1, linestyle=":", label="changed pixels")
+    for key, style, label in (("psnr_half", "-.", "half size"), ("psnr_stored", ":", "stored size")):
+        if points := _known(report, key):
+            axis.plot(*zip(*points), color=OTHER, linewidth=1.5, linestyle=style, marker=".", markersize=3, label=label)
     axis.set_ylabel("PSNR, dB", fontsize=9)
 
 
@@ -75,6 +80,18 @@ def _distances(axis: "Axes", report: Report) -> None:
 def _flicker(axis: "Axes", report: Report) -> None:
     _lines(axis, report, FLICKER)
     axis.set_ylabel("flicker, levels", fontsize=9)
+
+
+def _ghosts(axis: "Axes", report: Report) -> None:
+    for colour, name in zip(cycle(COLORS), report.cameras):
+        pairs = [(frame.index, frame.cameras[name].ghost_share) for frame in report.frames if name in frame.cameras]
+        points = [(index, 100 * share) for index, share in pairs if share is not None]
+        if points:
+            axis.plot(*zip(*points), color=colour, linewidth=1, alpha=0.75, label=f"camera {name}")
+    points = [(index, 100 * share) for index, share in _known(report, "ghost_share")]
+    axis.plot(*zip(*points), color=INK, linewidth=2, label="all")
+    axis.set_ylim(bottom=0)
+    axis.set_ylabel("ghosts, % of disoccluded", fontsize=9)
 
 
 def _lines(axis: "Axes", report: Report, keys: Sequence[tuple[str, str]]) -> None:

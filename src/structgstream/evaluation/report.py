@@ -37,6 +37,14 @@ class Scores:
         t_lpips: the same by LPIPS with AlexNet.
         flicker: mean absolute change of the rendering where the truth did not change, in levels of 1/255.
         truth_flicker: that of the truth: the camera's noise.
+        psnr_half: dB of a rendering at half size (``sizes.py``); None for pictures of one row or column.
+        ssim_half: SSIM of it.
+        psnr_stored: dB of a rendering at the size of the stored pictures, where those are larger than the stream's;
+            None elsewhere, and in the frames that are not scored so.
+        ssim_stored: SSIM of it.
+        disoccluded_share: share of the pixels where something was and the truth is as before (``ghosts.py``).
+        ghost_share: share of these pixels where the rendering is not. This and the next are None without any of them.
+        psnr_disoccluded: dB over these pixels.
     """
 
     psnr: float
@@ -56,6 +64,17 @@ class Scores:
     flicker: float | None = None
     truth_flicker: float | None = None
     psnr_camera_color: float | None = None
+    psnr_half: float | None = None
+    ssim_half: float | None = None
+    psnr_stored: float | None = None
+    ssim_stored: float | None = None
+    disoccluded_share: float | None = None
+    ghost_share: float | None = None
+    psnr_disoccluded: float | None = None
+
+
+OF_DISOCCLUDED = ("ghost_share", "psnr_disoccluded")
+"""Scores of the disoccluded pixels: a mean weighs each picture by its number of them, of which some have hardly any."""
 
 
 @dataclass(frozen=True)
@@ -109,12 +128,14 @@ class Report:
 
 
 def mean_scores(scores: Iterable[Scores]) -> Scores:
-    """The mean of each score; a None is left out, and the mean of Nones is None."""
+    """The mean of each score; a None is left out, and the mean of Nones is None. See :data:`OF_DISOCCLUDED`."""
     rows = list(scores)
     means = {}
     for entry in fields(Scores):
-        values = [value for row in rows if (value := getattr(row, entry.name)) is not None]
-        means[entry.name] = float(np.mean(values)) if values else None
+        known = [row for row in rows if getattr(row, entry.name) is not None]
+        values = [getattr(row, entry.name) for row in known]
+        weights = [row.disoccluded_share or 0.0 for row in known] if entry.name in OF_DISOCCLUDED else None
+        means[entry.name] = float(np.average(values, weights=weights)) if values else None
     return Scores(**means)
 
 

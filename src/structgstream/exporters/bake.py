@@ -11,7 +11,7 @@ measurements behind the defaults of :class:`BakingConfig`.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -25,6 +25,7 @@ from structgstream.geometry import quaternion_matrices
 from structgstream.kernels.backend import Backend
 from structgstream.scene.harmonics import sh_basis
 from structgstream.scene.render import draw
+from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
 
 LEAST_OPACITY = 1.0 / 255.0
@@ -82,10 +83,23 @@ def bake(
         return sums.result()
 
 
+def with_low_pass(gaussians: BakedGaussians, sampling: RigSampling, variance: float) -> BakedGaussians:
+    """``gaussians`` widened by ``variance`` squared sampling intervals (``scene/sampling.py``), as a viewer that draws
+    larger pictures than the training pictures needs them: its own low-pass is of its own, smaller pixels.
+
+    Args:
+        gaussians: in the scene's units.
+        sampling: of the scene's training cameras.
+        variance: in squared training pixels, at least 0; what a scene is trained with is 0.3.
+    """
+    intervals = sampling.intervals(gaussians.means)
+    return replace(gaussians, scales=(gaussians.scales**2 + variance * intervals[:, None] ** 2).sqrt())
+
+
 def blend_weights(gaussians: Gaussians, camera: Camera, backend: Backend) -> Tensor:
     """Sum ``[N]`` of each Gaussian's blending weights over the picture, in pixels (gradient by its colour)."""
     colors = torch.zeros_like(gaussians.colors, requires_grad=True)
-    shown = Gaussians(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, colors, gaussians.ids)
+    shown = replace(gaussians, colors=colors)
     with torch.enable_grad():
         image = draw(shown, camera, backend).image[..., 0]
         (gradient,) = torch.autograd.grad(image.sum(), colors)

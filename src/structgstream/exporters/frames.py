@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from structgstream.codec.reader import StreamReader
-from structgstream.exporters.bake import BakingConfig, bake
+from structgstream.exporters.bake import BakingConfig, bake, with_low_pass
 from structgstream.exporters.formats import Format
 from structgstream.exporters.request import is_one_file
 from structgstream.exporters.write import write_gaussians
@@ -31,6 +31,7 @@ def write_frames(
     format: Format,
     backend: Backend,
     degree: int | None = None,
+    low_pass: float = 0.0,
 ) -> Iterator[WrittenFrame]:
     """Bakes frames as the training cameras see them and writes each, in the units of the capture.
 
@@ -41,6 +42,7 @@ def write_frames(
         format: of the files.
         backend: evaluates the MLPs.
         degree: of the spherical harmonics; None for the default.
+        low_pass: variance in squared training pixels that scales are widened by (``bake.with_low_pass``).
 
     Raises:
         StreamError: a frame is lost.
@@ -51,7 +53,10 @@ def write_frames(
     header = reader.header
     cameras = [header.camera(name) for name in header.rig.training]
     for number in numbers:
-        plain = bake(on_device(reader.scene(number), backend.device), cameras, backend, baking=baking)
+        scene = on_device(reader.scene(number), backend.device)
+        plain = bake(scene, cameras, backend, baking=baking)
+        if low_pass and scene.sampling is not None:
+            plain = with_low_pass(plain, scene.sampling, low_pass)
         path = output if single else output / f"frame_{number:06d}.{format}"
         size_bytes = write_gaussians(path, plain.in_capture_units(header.similarity), format=format)
         yield WrittenFrame(path, size_bytes, len(plain))

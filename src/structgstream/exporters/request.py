@@ -52,14 +52,16 @@ def destination(
     return output, format
 
 
-def check_page(*, frame: int | None, frames: tuple[int, int] | None, sh_degree: int | None) -> None:
+def check_page(*, frame: int | None, frames: tuple[int, int] | None, sh_degree: int | None, low_pass: float) -> None:
     """Check that no options of other formats are given for a page.
 
     Raises:
         ConfigError: one is given.
     """
-    if frame is not None or frames is not None or sh_degree is not None:
-        raise ConfigError("a page holds the whole stream; --frame, --frames and --sh-degree are for other formats.")
+    if frame is not None or frames is not None or sh_degree is not None or low_pass:
+        raise ConfigError(
+            "a page holds the whole stream; --frame, --frames, --sh-degree and --low-pass are for other formats."
+        )
 
 
 def check_degree(degree: int | None, format: Format) -> int | None:
@@ -77,6 +79,17 @@ def check_degree(degree: int | None, format: Format) -> int | None:
             raise ConfigError(f"a .splat file holds one colour a Gaussian; --sh-degree {degree} needs ply or spz.")
         return 0
     return degree
+
+
+def check_low_pass(variance: float) -> float:
+    """The variance, squared training pixels, by which exported Gaussians are widened.
+
+    Raises:
+        ConfigError: it is below 0, above 1 or no number.
+    """
+    if not 0.0 <= variance <= 1.0:
+        raise ConfigError(f"--low-pass {variance:g} is no variance in squared training pixels; expected 0 to 1.")
+    return variance
 
 
 def choose_frames(

@@ -8,7 +8,7 @@ a free Gaussian and the other has anchors, the mixture is wrong although nothing
 import torch
 from torch import Tensor
 
-from structgstream.cameras import CameraRig
+from structgstream.cameras import CameraRig, enlargement
 from structgstream.groups.border import BorderPictures
 from structgstream.kernels.backend import Backend
 from structgstream.scene.render import render
@@ -22,8 +22,8 @@ TOLERANCE = 3.0 / 255.0
 LEAST_EXCESS = 1.0 / 255.0
 """Mean distance beyond it, over the pixels that an anchor covers, from which on the anchor shows."""
 LEAST_PIXELS = 0.5
-"""What covers less does not count."""
-_SCALE = 0.5
+"""What covers less, in the reduced pictures, does not count."""
+_SCALE = 0.5  # of pictures of the reference size
 
 
 def visible_mixtures(mixed: Scene, pictures: BorderPictures, rig: CameraRig, backend: Backend) -> Tensor:
@@ -42,7 +42,8 @@ def visible_mixtures(mixed: Scene, pictures: BorderPictures, rig: CameraRig, bac
     with torch.no_grad():
         for name in pictures.first:
             camera = rig[name]
-            small = camera.resized(*(max(1, round(size * _SCALE)) for size in (camera.width, camera.height)))
+            scale = _SCALE / enlargement(camera.width, camera.height)
+            small = camera.resized(*(max(1, round(size * scale)) for size in (camera.width, camera.height)))
             shown = render(mixed, camera, backend).image
             excess = _excess(shown, pictures.before[name], pictures.first[name])
             excess = area_mean(excess[None, None], (small.height, small.width))

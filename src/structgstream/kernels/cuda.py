@@ -153,22 +153,20 @@ def _filtered(
     pictures a few pixels at the border lack it.
     """
     assert gaussians.sampling_intervals is not None
-    kept, added = screen_low_pass(gaussians.sampling_intervals, depths[0].detach().clamp(min=viewport.near), viewport.K)
+    trained, total = screen_low_pass(
+        gaussians.sampling_intervals, depths[0].detach().clamp(min=viewport.near), viewport.K
+    )
     a, b, c = conics[0].unbind(1)
     determinant = a * c - b * b
-    xx, xy, yy = (
-        c / determinant + (kept - LOW_PASS_PIXELS),
-        -b / determinant,
-        a / determinant + (kept - LOW_PASS_PIXELS),
-    )
-    before = (xx * yy - xy * xy).detach()
-    xx, yy = xx + added, yy + added
-    after = xx * yy - xy * xy
-    opacities = gaussians.opacities * (before / after.detach()).nan_to_num().clamp(0.0, 1.0).sqrt()
-    conics = torch.stack([yy, -xy, xx], dim=1) / after[:, None]
+    xx, xy, yy = c / determinant - LOW_PASS_PIXELS, -b / determinant, a / determinant - LOW_PASS_PIXELS
+    square, size = (xx * yy - xy * xy).detach().clamp(min=0.0), (xx + yy).detach()
+    before, after = (square + variance * (size + variance) for variance in (trained, total))
+    opacities = gaussians.opacities * (before / after).nan_to_num().clamp(0.0, 1.0).sqrt()
+    xx, yy = xx + total, yy + total
+    conics = torch.stack([yy, -xy, xx], dim=1) / (xx * yy - xy * xy)[:, None]
     reach = 2.0 * (255.0 * opacities.detach()).clamp(min=1.0).log()
     extents = (reach[:, None] * torch.stack([xx, yy], dim=1).detach()).clamp(min=0.0).sqrt().ceil()
-    drawn = (radii[0] > 0).all(1, keepdim=True) & (after.detach() > 0)[:, None]
+    drawn = (radii[0] > 0).all(1, keepdim=True) & torch.isfinite(extents)
     return torch.where(drawn, extents.to(radii.dtype), 0)[None], conics[None], opacities
 
 

@@ -59,14 +59,19 @@ def _project(gaussians: Gaussians, viewport: Viewport, screen_offsets: Tensor | 
     jacobian = torch.stack([fx / z, zero, -fx * clamped_x / z**2, zero, fy / z, -fy * clamped_y / z**2], dim=1).reshape(
         -1, 2, 3
     )
-    kept, added = _low_pass(gaussians.sampling_intervals, rows, z, K)
     axes = jacobian @ viewmat[:3, :3] @ (quaternion_matrices(quats[rows]) * scales[rows][:, None])  # [n, 2, 3]
     covariances = axes @ axes.transpose(1, 2)
-    xx, xy, yy = covariances[:, 0, 0] + kept, covariances[:, 0, 1], covariances[:, 1, 1] + kept
-    before = (xx * yy - xy * xy).detach()
-    xx, yy = xx + added, yy + added
+    xx, xy, yy = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
+    low_pass, opacities = LOW_PASS_PIXELS, opacities[rows]
+    if gaussians.sampling_intervals is not None:
+        trained, low_pass = screen_low_pass(gaussians.sampling_intervals[rows], z.detach(), K)
+        # That of the projection alone is the square of a cross product, which does not cancel for needles.
+        square = torch.linalg.cross(axes[:, 0].detach(), axes[:, 1].detach()).square().sum(1)
+        size = (xx + yy).detach()
+        before, after = (square + variance * (size + variance) for variance in (trained, low_pass))
+        opacities = opacities * (before / after).sqrt()
+    xx, yy = xx + low_pass, yy + low_pass
     determinant = xx * yy - xy * xy
-    opacities = opacities[rows] * (before / determinant.detach()).clamp(0.0, 1.0).sqrt()
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=1)
     if screen_offsets is not None:
         means2d = means2d + screen_offsets[rows]
@@ -88,11 +93,11 @@ def _project(gaussians: Gaussians, viewport: Viewport, screen_offsets: Tensor | 
 
 
 def screen_low_pass(intervals: Tensor, depths: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
-    """Variances ``[n]``, square pixels, of a Gaussian's low-pass on a picture: trained, and added against aliasing.
+    """Variances ``[n]``, square pixels, of a Gaussian's low-pass on a picture: of the training pictures, and in all.
 
-    The first is the low-pass of the training pictures and leaves the opacity as it is. The second is above zero on
-    smaller pictures; it keeps the Gaussian's light: the opacity is multiplied by the root of the ratio of the
-    determinants of the covariances before and after it. Both count as constants in gradients.
+    The first leaves the opacity as it is. The second is larger on pictures that are smaller than the training pictures,
+    against aliasing; what is added keeps the Gaussian's light: the opacity is multiplied by the root of the ratio of
+    the covariance's determinants before and after. Both count as constants in gradients.
 
     Args:
         intervals: ``[n]`` size of a training pixel at each Gaussian (``scene/sampling.py``, Note [Drawn as it was
@@ -101,13 +106,7 @@ def screen_low_pass(intervals: Tensor, depths: Tensor, K: Tensor) -> tuple[Tenso
         K: ``[3, 3]`` of the picture.
     """
     trained = LOW_PASS_PIXELS * K[0, 0] * K[1, 1] * (intervals / depths) ** 2
-    return trained, (SCREEN_LOW_PASS_PIXELS - trained).clamp(min=0.0)
-
-
-def _low_pass(intervals: Tensor | None, rows: Tensor, depths: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
-    if intervals is None:
-        return torch.full_like(depths, LOW_PASS_PIXELS).detach(), torch.zeros_like(depths).detach()
-    return screen_low_pass(intervals[rows], depths.detach(), K)
+    return trained, trained.clamp(min=SCREEN_LOW_PASS_PIXELS)
 
 
 def rasterize(

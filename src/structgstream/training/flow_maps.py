@@ -132,8 +132,8 @@ def flow_map(
     far = _grown(missed, REACH_CELLS * cell, where.shape)
     for box in far:
         earlier, later = _cut(first, box), _cut(second, box)
-        flows = block_search("capture", earlier, later, cell_pixels=cell, reach_cells=REACH_CELLS)
-        refine = dis_refinement("capture", finest_level=level, coarsest_level=max(level, floor(log2(cell)) - 1))
+        flows = block_search(earlier, later, cell_pixels=cell, reach_cells=REACH_CELLS)
+        refine = dis_refinement(finest_level=level, coarsest_level=max(level, floor(log2(cell)) - 1))
         found = consistent(box, refine(earlier, later, flows[0]), refine(later, earlier, flows[1]))
         missing = torch.from_numpy(where[box]) & (maps[0][box] == 0.0)
         maps[:, *box] = torch.where(missing, found, maps[:, *box])

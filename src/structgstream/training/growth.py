@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Growing and pruning anchors during frame 0, after Scaffold-GS (Lu et al., CVPR 2024)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from structgstream.kernels.anchor_types import StructuredGaussians
 from structgstream.scene.anchors import AnchorCloud
+
+MOST_ANCHORS = 400_000
+"""Bound of what larger pictures may have: about 1 GB of memory while frame 0 is trained."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +43,21 @@ class GrowthConfig:
     contribution_at: tuple[int, ...] = ()
     """The iterations after which anchors are pruned by contribution."""
     max_anchors: int = 1_000_000
-    """Largest number of anchors; proposals with the largest gradients are taken first (paper: no bound)."""
+    """Largest number of anchors for pictures of the reference size (:meth:`for_pictures`); proposals with the largest
+    gradients are taken first (paper: no bound)."""
     least_growth: float = 0.0
     """At least this share of the number of seeds may be added, even beyond ``max_anchors``."""
     room_until: int = 0
     """The allowed number of anchors rises linearly from ``start`` to this iteration; 0: all are allowed at once."""
+
+    def for_pictures(self, enlarged: float) -> "GrowthConfig":
+        """The same for pictures whose sides are ``enlarged`` times those of the reference size (``View.enlargement``).
+
+        Their detail has as many times the anchors: in proportion to the pictures' sides, since edges and not areas have
+        most of it, and at most :data:`MOST_ANCHORS` (docs/scaling.md).
+        """
+        most = min(round(self.max_anchors * enlarged), MOST_ANCHORS)
+        return replace(self, max_anchors=max(self.max_anchors, most))
 
     def room_at(self, iteration: int, seeds: int) -> int:
         """Allowed number of anchors after ``iteration``, with ``seeds`` initial ones.

@@ -2,6 +2,7 @@
 """Frame 0: a static reconstruction with anchors (paper, section Structured 3DGs)."""
 
 from dataclasses import dataclass, field, replace
+from statistics import median
 
 import torch
 from torch import Tensor
@@ -270,7 +271,8 @@ def _fit(
     views, extent = training_views(frame, rig, backend.device), rig_extent(rig)
     parameters = Parameters.of(template, trained=_trained(config))
     adam = Adam(backend, parameters.values)
-    densifier = Densifier.of(template, config=config.growth, iterations=config.iterations, voxel_size=config.voxel_size)
+    growth = config.growth.for_pictures(median(view.enlargement for view in views))
+    densifier = Densifier.of(template, config=growth, iterations=config.iterations, voxel_size=config.voxel_size)
     last_pass = LastPass(config.iterations - len(views))
     numbers = RandomNumbers(generator, backend.device)
     hooks = _FirstFrameHooks(

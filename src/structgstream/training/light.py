@@ -43,7 +43,7 @@ class LightConfig:
     enabled: bool = False
     """Follow it (paper: False); needs ``color_mlp`` in the dynamic set, of which only the output biases then change."""
     picture_scale: float = 0.25
-    """Scale of width and height of the pictures that are compared."""
+    """Scale of width and height, relative to the reference size, of the pictures that are compared."""
     same_threshold: float = 0.03
     """Largest mean difference over the channels (full scale 1), beyond the light followed so far, of a pixel that shows
     the same as in frame 0."""
@@ -71,7 +71,7 @@ class LightReference:
 
 def light_reference(scene: Scene, views: Sequence[View], *, config: LightConfig) -> LightReference:
     """The reference of a stream whose decoded frame 0 is ``scene`` and has the pictures ``views``."""
-    small = {view.index: view.reduced(config.picture_scale) for view in views}
+    small = {view.index: view.evidence(config.picture_scale) for view in views}
     return LightReference(small, scene.mlps.color.b2.detach().clone())
 
 
@@ -109,7 +109,7 @@ def _light_change(
         for view in views:
             if view.index in reference.views:
                 gains, biases = scene.camera_color.gains[view.index], scene.camera_color.biases[view.index]
-                now, then = view.reduced(config.picture_scale), reference.views[view.index]
+                now, then = view.evidence(config.picture_scale), reference.views[view.index]
                 change = _view_change(now, then, gains, biases, so_far, config)
                 found += [] if change is None else [change]
     return torch.stack(found).quantile(0.5, dim=0) if len(found) >= LEAST_VIEWS else so_far

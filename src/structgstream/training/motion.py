@@ -40,7 +40,10 @@ from structgstream.training.views import View, area_mean, blackened, mean_of_cou
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """Thresholds of motion segmentation; not in the paper."""
+    """Thresholds of motion segmentation; not in the paper.
+
+    Pixels are those of pictures of the reference size (``cameras.enlargement``).
+    """
 
     enabled: bool = False
     """Train only movers (paper: False, everything is trained)."""
@@ -68,7 +71,7 @@ class MotionConfig:
     unseen_pixels: float = 0.0
     """Free Gaussians that cover fewer pixels than this in every view, by blending weight, are removed. 0: none."""
     picture_scale: float = 0.25
-    """Scale of width and height of the pictures on which coverage is computed."""
+    """Scale of width and height, relative to the reference size, of the pictures on which coverage is computed."""
     margin_pixels: int = 8
     """Tiles within this many pixels of moving Gaussians are drawn too, so that these get gradients where they move."""
     full_every_frames: int = 0
@@ -76,8 +79,8 @@ class MotionConfig:
     rest_every: int = 1
     """Tiles in which nothing has changed are drawn only every this many times that a view is. 1: always."""
     tiles_around: int = -1
-    """Tiles farther than this many tiles from one in which something has changed are not drawn, though moving Gaussians
-    reach them. -1: all are."""
+    """Tiles (16 pixels) farther than this many tiles from one in which something has changed are not drawn, though
+    moving Gaussians reach them. -1: all are."""
     tiles: bool = True
     """Draw only the tiles that moving Gaussians reach. False: whole pictures, with the same result."""
 
@@ -89,7 +92,8 @@ class MotionConfig:
 SHARED_FIELDS: frozenset[FieldName] = frozenset(fields_of("shared", "camera"))
 """Shared fields are trained only in frames in which everything is, because still anchors depend on them."""
 FLOW_LEAST_PIXELS, FLOW_MOST_PIXELS = 0.3, 20.0
-"""Bounds of a mover's flow weight in a view, in pixels: below the first it is 0, above the second it is clamped."""
+"""Bounds of a mover's flow weight in a view, in pixels of a picture of the reference size: below the first it is 0,
+above the second it is clamped."""
 
 
 @dataclass(frozen=True)
@@ -247,12 +251,13 @@ class _ViewEvidence:
 
 
 def _shift_pixels(scene: Scene, view: View, config: MotionConfig, backend: Backend) -> float:
-    """How far the picture is shifted against the rendering of ``scene``, in pixels; 0 if that is not clear."""
-    small = view.reduced(config.picture_scale)
+    """How far the picture is shifted against the rendering of ``scene``, in pixels of a picture of the reference size;
+    0 if that is not clear."""
+    small = view.evidence(config.picture_scale)
     rendered = apply_camera_color(render(scene, small.camera, backend).image, scene.camera_color, view.index)
     picture = blackened(small.image, small.mask).cpu().numpy()
     shift, clarity = picture_shift(to_8bit_image(blackened(rendered, small.mask)), picture)
-    return shift * view.camera.width / small.camera.width if clarity > CLEAR_SHIFT else 0.0
+    return shift * view.camera.width / small.camera.width / view.enlargement if clarity > CLEAR_SHIFT else 0.0
 
 
 def _view_evidence(
@@ -265,11 +270,11 @@ def _view_evidence(
     ease: Tensor,
     floor: ResidualFloor | None,
 ) -> _ViewEvidence:
-    small = view.reduced(config.picture_scale)
+    small = view.evidence(config.picture_scale)
     gaussians = scene.gaussians(small.camera, backend)
     size = (small.camera.height, small.camera.width)
     counting = torch.ones(size).to(gaussians.means) if small.mask is None else small.mask.to(gaussians.means)
-    enlarged = view.camera.height * view.camera.width / counting.numel()
+    enlarged = view.reference_area / counting.numel()
     coverage = gaussians.means.new_zeros(slot_count(scene))
     if change is None:
         covered = enlarged * weigh_maps(gaussians, small.camera, counting[..., None], backend)

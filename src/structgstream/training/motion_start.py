@@ -170,7 +170,7 @@ def residual_motion(
 
     def flow_of(view: View) -> Tensor:
         picture = _last_drawing(focuses[view.index], view, moving)
-        inside, camera = focuses[view.index].tiles.pixels(), view.reduced(scale).camera
+        inside, camera = focuses[view.index].tiles.pixels(), view.evidence(scale).camera
         inside = inside if view.mask is None else inside & view.mask
         size = (camera.height, camera.width)
         return flow_map(picture, view.image, inside, size, mask=view.mask, config=config.flow, backend=backend).maps
@@ -179,12 +179,12 @@ def residual_motion(
     with torch.no_grad(), ThreadPoolExecutor(threads) as pool:
         flows = pool.map(flow_of, seen) if threads > 1 else map(flow_of, seen)
         for view, flow in zip(seen, flows, strict=True):
-            focus, small = focuses[view.index], view.reduced(scale)
+            focus, small = focuses[view.index], view.evidence(scale)
             gaussians = folded.gaussians(view.camera, backend)
             counting = torch.ones_like(flow[..., 0]) if small.mask is None else small.mask.to(flow)
             maps = torch.cat([flow, counting[..., None], small.colors], dim=-1)
             found = weigh_maps(gaussians, small.camera, maps, backend, still=focus.still)
-            found *= view.image.shape[0] * view.image.shape[1] / counting.numel()
+            found *= view.reference_area / counting.numel()
             sums.append(sum_by_mover(found, movers_of(gaussians, folded), folded))
             coverage[gaussians.ids] += found[:, 3]
     nothing = torch.zeros(len(moving.anchors) + len(moving.free), 3).to(moving.anchors.positions)

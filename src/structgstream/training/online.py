@@ -19,6 +19,7 @@ from structgstream.cameras import CameraRig
 from structgstream.frames import LEAST_CAMERAS, MultiViewFrame
 from structgstream.kernels.backend import Backend, nonblocking
 from structgstream.kernels.cuda_tiles import run_with_pair_budget
+from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import ParameterName
 from structgstream.training.coherence import MotionCoherence
@@ -88,8 +89,7 @@ def fit_next_frame(
         return held(scene)
     if config.patching.lifetime == "frame":
         scene = scene.without_free()
-    if not config.sampling_filter:
-        scene = replace(scene, sampling=None)
+    scene = replace(scene, sampling=RigSampling.of(rig) if config.sampling_filter else None)
     counts: dict[str, int] = {}
     if config.light.enabled and light is not None:
         step = None if steps is None else steps.get("color_mlp")
@@ -233,7 +233,7 @@ class FrameFit:
             last_pass=LastPass(0 if config.least_gain else iterations - len(seen)),
             backend=self.iteration_backend,
             watch=self.watch,
-            rest_every=config.motion.rest_every,
+            rest_every=rest_every(config.motion.rest_every, views=len(seen), iterations=iterations),
             iterations=iterations,
             average=MeanOfSteps(math.floor(iterations * (1.0 - config.mean_of_last))) if config.mean_of_last else None,
         )
@@ -250,6 +250,11 @@ class FrameFit:
         if start.reference is not None:
             known, free = Parameters.of(start.reference, trained=trained, steps=steps), False
         return parameters, BitPrice.of(known, steps, weight=rounding.rate_weight, free=free)
+
+
+def rest_every(most: int, *, views: int, iterations: int) -> int:
+    """At most ``most`` (``MotionConfig.rest_every``), and so few that each of the views draws all of its tiles once."""
+    return max(1, min(most, iterations // max(views, 1)))
 
 
 def _displace_parameters(parameters: Parameters, adam: Adam[ParameterName], start: StartingPoint) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from structgstream.cameras import Camera
+from structgstream.cameras import Camera, enlargement
 from structgstream.gaussians import concatenate
 from structgstream.kernels.backend import Backend
 from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tile_grid
@@ -103,14 +103,15 @@ def _focus(
     small = camera.resized(*(max(1, round(size * REACH_SCALE)) for size in (camera.width, camera.height)))
     reach = draw(in_motion, small, backend)
     reach = replace(reach, radii=reach.radii * (camera.width / small.width))
-    tiles = reached_tiles(reach, visible[in_motion.ids], camera, config.margin_pixels)
+    enlarged = enlargement(camera.width, camera.height)
+    tiles = reached_tiles(reach, visible[in_motion.ids], camera, round(config.margin_pixels * enlarged))
     if not tiles.mask.any():
         return None
     if not config.tiles:
         tiles = replace(tiles, mask=torch.ones_like(tiles.mask))
     tiles_of_change = changed_tiles(tiles, changed)
     if config.tiles and config.tiles_around >= 0:
-        tiles = replace(tiles, mask=tiles.mask & _grown(tiles_of_change.mask, config.tiles_around))
+        tiles = replace(tiles, mask=tiles.mask & _grown(tiles_of_change.mask, round(config.tiles_around * enlarged)))
     # The loss reads ten pixels beyond a tile: a ring of tiles around them is drawn once and kept.
     ring = replace(tiles, mask=_grown(tiles.mask, 1))
     at_rest = still.with_free_gaussians(still.structured(camera, backend, tiles=ring))

@@ -59,8 +59,8 @@ def detect_picture_changes(
         views: of a frame.
         before: of the previous frame.
         threshold: mean absolute difference of 3 x 3 pixels, in 0 ... 1, above which a pixel has changed.
-        reach_pixels: changed pixels are dilated by this many pixels.
-        scale: of the maps of flow, relative to the pictures.
+        reach_pixels: changed pixels are dilated by this many pixels of a picture of the reference size.
+        scale: of the maps of flow (``View.evidence``).
         backend: the compute back-end.
         flow_from: indices of the views in which flow is estimated.
         flow: how it is searched.
@@ -75,13 +75,14 @@ def detect_picture_changes(
                 continue
             both = _both(view.mask, last.mask)
             then, now = blackened(last.image, both), blackened(view.image, both)
-            changed = backend.changed_pixels(then, now, threshold=threshold, reach_pixels=reach_pixels)
+            reach = round(reach_pixels * view.enlargement)
+            changed = backend.changed_pixels(then, now, threshold=threshold, reach_pixels=reach)
             changed = changed if both is None else changed & both
-            small, found, far_boxes = view.reduced(scale).camera, None, 0
+            small, found, far_boxes = view.evidence(scale).camera, None, 0
             if view.index in flow_from:
                 size = (small.height, small.width)
                 estimated = flow_map(then, now, changed, size, mask=both, config=flow, backend=backend)
-                found, far_boxes = torch.cat([estimated.maps, last.reduced(scale).colors], dim=-1), estimated.far_boxes
+                found, far_boxes = torch.cat([estimated.maps, last.evidence(scale).colors], dim=-1), estimated.far_boxes
             changes.append(PictureChange(changed, _is_repeated(then, now, changed, both), found, far_boxes))
     return changes
 

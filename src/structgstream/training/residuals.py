@@ -19,7 +19,7 @@ from structgstream.scene.scene import Scene
 from structgstream.training.views import View
 
 FLOOR_PIXELS = 5
-"""Side, in pixels, of the square over which the floor takes the maximum residual."""
+"""Side, in pixels of its maps, of the square over which the floor takes the maximum residual."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class ResidualFloor:
     """Residuals of frame 0 by training view.
 
     Args:
-        scale: size of the maps relative to the pictures.
+        scale: size of the maps (``View.evidence``).
         maps: by view index ``[h, w]``, maximum residual over the 5 x 5 pixels around each, in 0 ... 1, and 1 where a
             mask left a pixel out. Cameras that were absent from frame 0 have none: their residuals indicate nothing.
     """
@@ -101,7 +101,8 @@ def residual(drawn: Tensor, view: View, color: CameraColor, backend: Backend) ->
 
 
 def mean_residual(scene: Scene, views: Sequence[View], *, scale: float, backend: Backend) -> float:
-    """Mean over ``views`` of the mean absolute difference of ``scene`` to the picture, at ``scale`` of its size.
+    """Mean over ``views`` of the mean absolute difference of ``scene`` to the picture, reduced by ``scale``
+    (``View.evidence``).
 
     Masked pixels are left out; a view that is masked everywhere counts as 0.
     """
@@ -109,7 +110,7 @@ def mean_residual(scene: Scene, views: Sequence[View], *, scale: float, backend:
     sums = []
     with torch.no_grad():
         for view in views:
-            small = view.reduced(scale)
+            small = view.evidence(scale)
             found = rendering_residual(scene.gaussians(small.camera, backend), small, scene, backend)
             pixels = found.numel() if small.mask is None else max(int(small.mask.sum()), 1)
             sums.append(float(found.sum(dtype=torch.float64)) / pixels)
@@ -117,12 +118,12 @@ def mean_residual(scene: Scene, views: Sequence[View], *, scale: float, backend:
 
 
 def residual_floor(scene: Scene, views: Sequence[View], *, scale: float, backend: Backend) -> ResidualFloor:
-    """Residuals of ``scene``, the decoded frame 0, at ``scale`` of the pictures' size."""
+    """Residuals of ``scene``, the decoded frame 0, in pictures reduced by ``scale`` (``View.evidence``)."""
     scene = scene.with_folded_appearance()
     maps = {}
     with torch.no_grad():
         for view in views:
-            small = view.reduced(scale)
+            small = view.evidence(scale)
             found = rendering_residual(scene.gaussians(small.camera, backend), small, scene, backend)
             floor = max_pool2d(found[None], FLOOR_PIXELS, stride=1, padding=FLOOR_PIXELS // 2)[0]
             maps[view.index] = floor if small.mask is None else torch.where(small.mask, floor, 1.0)

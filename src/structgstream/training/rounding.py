@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from structgstream.cameras import Camera
+from structgstream.cameras import Camera, enlargement
 from structgstream.scene.state import PARAMETERS, ParameterName
 
 
@@ -58,7 +58,8 @@ class RoundingConfig:
     """Quantization steps and price of bits for the codec ``compact``; not in the paper."""
 
     position_pixels: float = 0.25
-    """Step of positions of anchors and free Gaussians, in pixels of a median camera at a median distance."""
+    """Step of positions of anchors and free Gaussians, in pixels of a median camera at a median distance
+    (:func:`pixel_size`)."""
     log_scale_step: float = 0.02
     """Step of the logarithms of anchors' scales."""
     appearance_step: float = 1 / 16
@@ -100,7 +101,8 @@ class RoundingConfig:
 
 
 def pixel_size(positions: Tensor, cameras: Iterable[Camera]) -> float | None:
-    """Size of a pixel, in scene units, at the median distance of the anchors for the median camera.
+    """Size of a pixel of a picture of the reference size, in scene units, at the median distance of the anchors for the
+    median camera.
 
     Args:
         positions: ``[M, 3]`` of anchors.
@@ -117,5 +119,6 @@ def pixel_size(positions: Tensor, cameras: Iterable[Camera]) -> float | None:
         size = pixels.new_tensor([camera.width, camera.height])
         seen = (points[:, 2] > camera.near) & ((pixels >= 0) & (pixels < size)).all(1)
         if seen.any():
-            sizes.append(float(points[seen, 2].median() / K[0, 0]))
+            enlarged = enlargement(camera.width, camera.height)
+            sizes.append(enlarged * float(points[seen, 2].median() / K[0, 0]))
     return float(torch.tensor(sizes).median()) if sizes else None

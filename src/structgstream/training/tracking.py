@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from structgstream.cameras import CameraRig
+from structgstream.cameras import CameraRig, enlargement
 from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
@@ -219,7 +219,7 @@ def _seen(tracker: Tracker, scene: Scene, view: View, change: PictureChange) -> 
     backend, motion = tracker.backend, tracker.motion
     tiles = TileSelection.of(change.changed)
     gaussians = scene.with_free_gaussians(scene.structured(view.camera, backend, tiles=tiles))
-    small = view.reduced(tracker.config.picture_scale)
+    small = view.evidence(tracker.config.picture_scale)
     size = (small.camera.height, small.camera.width)
     inside = area_mean(_counting(tiles, view)[None, None].float(), size)[0, 0]
     part = area_mean(change.changed[None, None].float(), size)[0, 0]
@@ -274,7 +274,7 @@ def _rendered_flow(tracker: Tracker, scene: Scene, seen: _Seen, velocities: Tens
     # Outside the tiles nothing was drawn: there the picture replaces the rendering.
     rendered = as_picture(image)
     picture = seen.tiles.choose(blackened(rendered, view.mask), view.image)
-    small = view.reduced(tracker.config.picture_scale)
+    small = view.evidence(tracker.config.picture_scale)
     size = (small.camera.height, small.camera.width)
     found = flow_map(picture, view.image, counting, size, mask=counting, config=tracker.config.flow, backend=backend)
     inside = area_mean(counting[None, None].float(), size)[0, 0]
@@ -297,8 +297,9 @@ def _evidence(sums: Sequence[Tensor]) -> MotionEvidence:
 
 
 def _enlarged(tracker: Tracker, view: View, size: tuple[int, int]) -> float:
-    """Pixels of the stream's pictures for a pixel of the maps, so that thresholds mean what they mean there."""
-    return view.camera.height * view.camera.width / (size[0] * size[1]) / tracker.config.scale**2
+    """Pixels of the stream's pictures, at the reference size, for a pixel of the maps: thresholds are in these."""
+    width, height = (side / tracker.config.scale for side in (view.camera.width, view.camera.height))
+    return width * height / enlargement(width, height) ** 2 / (size[0] * size[1])
 
 
 def _counting(tiles: TileSelection, view: View) -> Tensor:

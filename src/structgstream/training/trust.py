@@ -21,8 +21,8 @@ BUMPED_SHARE, BUMPED_TIMES = 0.2, 8.0
 SUSPECT_SHARE, SUSPECT_TIMES = 0.02, 3.0
 """Least share of wrong pixels of a view whose shift is looked for, and least multiple of the median view's."""
 SHIFTED_PIXELS = 2.5
-"""Least shift of a whole picture. In basketball's 60 frames it is found to be 1.5 at most, and 4 or more of pictures
-that were shifted by 5 and 3 pixels."""
+"""Least shift of a whole picture, in pixels of a picture of the reference size. In basketball's 60 frames it is found
+to be 1.5 at most, and 4 or more of pictures that were shifted by 5 and 3 pixels."""
 CLEAR_SHIFT = 0.3
 """Least clarity of a shift, 0 to 1 (``flow.picture_shift``); basketball's are 0.53 or more."""
 FROZEN_SHARE = 0.005
@@ -38,7 +38,8 @@ class ViewChange:
         changed_share: share of its pixels that changed since the last frame; None if the camera was absent from that.
         wrong_share: share of its pixels with a residual above frame 0's.
         repeated: whether it is the last picture once more (``picture_change``).
-        shift_pixels: how far the picture is shifted as a whole; known of suspects only (:func:`suspects`).
+        shift_pixels: how far the picture is shifted as a whole, at the reference size; known of suspects only
+            (:func:`suspects`).
     """
 
     changed_share: float | None

@@ -19,7 +19,7 @@ from itertools import chain, islice
 import torch
 from torch import Tensor
 
-from structgstream.cameras import Camera, CameraRig
+from structgstream.cameras import Camera, CameraRig, enlargement
 from structgstream.frames import MultiViewFrame
 
 MOST_PHASES = 8
@@ -50,6 +50,20 @@ class View:
         if scale not in self._reduced:
             self._reduced[scale] = reduced(self, scale)
         return self._reduced[scale]
+
+    @property
+    def enlargement(self) -> float:
+        """How many of its pixels are one of a picture of the reference size (``cameras.enlargement``)."""
+        return enlargement(self.camera.width, self.camera.height)
+
+    @property
+    def reference_area(self) -> float:
+        """Number of its pixels at the reference size: in these, coverage is measured."""
+        return self.camera.width * self.camera.height / self.enlargement**2
+
+    def evidence(self, scale: float) -> "View":
+        """The view reduced by ``scale`` and to the reference size, for measurements whose lengths are in pixels."""
+        return self.reduced(scale / self.enlargement)
 
     @property
     def colors(self) -> Tensor:

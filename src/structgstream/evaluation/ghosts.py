@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ghosts: what is still drawn where something has been and is no more.
+
+Note [Ghosts]
+~~~~~~~~~~~~~
+The truth alone says where a ghost may be. Its *background* is the median, pixel by pixel, of at most 15 pictures that
+are spread over ten seconds: what is there most of the time. A pixel is *occupied* while the truth is off the background
+by more than 20 levels, and *disoccluded* if
+
+- something was there, or within 1.9 % of the picture's longer side of it, in an earlier frame of the last two seconds
+  (12 frames at least),
+- nothing is within 0.5 % of that side now, and
+- the truth is within 8 levels of the background: as it was before it came.
+
+A disoccluded pixel is a *ghost* if the rendering is off the truth by more than 8 levels, and, where it was seen before
+something came, off what was drawn then by as much: what was wrong all along is no ghost. A ghost counts as long as it
+stays.
+
+Differences of pictures are means over the channels and 3x3 pixels. Pictures whose longer side has 1280 pixels or more
+are reduced first, by a whole factor and by area mean, to 640 to 1279, so that size does not change the score.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.data.source import FrameSource
+from structgstream.data.wrappers import every_nth_frame, section
+from structgstream.evaluation.masks import blackened, differing, dilate
+from structgstream.evaluation.metrics import decibels, mean_of_squares, squared_errors
+from structgstream.evaluation.sizes import block_mask, block_means
+
+Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+OCCUPIED, RESTORED, WRONG = 20, 8, 8  # levels of 255; noise of cameras and compression is 2 to 4 after the 3x3 mean
+REACH, MARGIN = 12 / 640, 3 / 640  # shares of the longer side: soft edges, and shadows beside what moves
+SIDE = 640  # pixels of the longer side that a reduced picture has at least
+MEMORY_SECONDS, MEMORY_FRAMES = 2.0, 12
+SECTION_SECONDS, SECTION_FRAMES = 10.0, 60
+SAMPLES = 15  # pictures of a median
+NEVER = -(10**9)
+
+
+@dataclass(frozen=True)
+class Ghosts:
+    """The ghosts of one picture.
+
+    Args:
+        disoccluded: ``[h, w]``, where something was and the truth is as before; of the reduced picture.
+        ghosts: ``[h, w]``, those of them where the rendering is wrong.
+        pixels: how many pixels could be: those that count.
+        factor: pixels of the picture that a pixel of these masks is wide.
+        psnr: dB over the disoccluded pixels; None without any.
+    """
+
+    disoccluded: Mask
+    ghosts: Mask
+    pixels: int
+    factor: int
+    psnr: float | None
+
+    @property
+    def disoccluded_share(self) -> float:
+        """Share of the pixels that count."""
+        return int(np.count_nonzero(self.disoccluded)) / max(self.pixels, 1)
+
+    @property
+    def share(self) -> float | None:
+        """Ghosts' share of the disoccluded pixels; None without any."""
+        count = int(np.count_nonzero(self.disoccluded))
+        return int(np.count_nonzero(self.ghosts)) / count if count else None
+
+
+@dataclass
+class GhostFinder:
+    """One camera's ghosts, frame after frame.
+
+    Args:
+        memory: number of frames after which a pixel that something was on is one like others.
+        background: the present one, reduced; None before the first.
+        occupied: ``[h, w]`` number of the last frame in which something was on a pixel or near it.
+        before: the last rendering of each pixel with nothing on it, reduced.
+        seen: ``[h, w]``, where there is one.
+        stuck: ``[h, w]``, where the last picture had a ghost on a pixel that was seen before.
+    """
+
+    memory: int
+    background: Picture | None = None
+    occupied: NDArray[np.int32] = field(default_factory=lambda: np.empty((0, 0), np.int32))
+    before: Picture = field(default_factory=lambda: np.empty((0, 0, 3), np.uint8))
+    seen: Mask = field(default_factory=lambda: np.empty((0, 0), np.bool_))
+    stuck: Mask = field(default_factory=lambda: np.empty((0, 0), np.bool_))
+
+    def begin(self, background: Picture) -> None:
+        """Take another background, reduced; where it differs from the last one, nothing is known of before."""
+        if self.background is None:
+            shape = background.shape[:2]
+            self.occupied = np.full(shape, NEVER, np.int32)
+            self.before, self.seen, self.stuck = background, np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
+        else:
+            other = differing(background, self.background, RESTORED)
+            self.occupied[other] = NEVER
+            self.seen, self.stuck = self.seen & ~other, self.stuck & ~other
+        self.background = background
+
+    def find(self, picture: Picture, truth: Picture, *, index: int, mask: Mask | None = None) -> Ghosts:
+        """The ghosts of the rendering of frame ``index``; frames are given in order, with a background before.
+
+        Args:
+            picture: the rendering, ``[H, W, 3]``, as large as the truth.
+            truth: what the camera took.
+            index: number of the frame.
+            mask: ``[H, W]``, the pixels that count; None for all.
+        """
+        assert self.background is not None
+        factor = reduction(truth)
+        drawn, true = block_means(picture, factor), block_means(truth, factor)
+        counting = None if mask is None else ~dilate(~block_mask(mask, factor), 1)
+        there = differing(true, self.background, OCCUPIED)
+        there = there if counting is None else there & counting
+        near = dilate(there, pixels_of(REACH, true))
+        recent = index - self.occupied <= self.memory
+        free = ~dilate(there, pixels_of(MARGIN, true)) & ~differing(true, self.background, RESTORED)
+        disoccluded = (recent | self.stuck) & (free if counting is None else free & counting)
+        wrong = differing(drawn, true, WRONG)
+        ghosts = disoccluded & wrong & (~self.seen | differing(drawn, self.before, WRONG))
+        self.stuck = np.where(free, ghosts, self.stuck) & self.seen
+        undisturbed = ~recent & ~near & ~self.stuck
+        self.before = np.where(undisturbed[..., None], drawn, self.before)
+        self.seen = self.seen | undisturbed
+        self.occupied[near] = index
+        pixels = there.size if counting is None else int(np.count_nonzero(counting))
+        return Ghosts(disoccluded, ghosts, pixels, factor, _psnr(drawn, true, disoccluded))
+
+
+def pixels_of(share: float, picture: Picture) -> int:
+    """A share of the longer side of a picture ``[H, W, 3]`` in whole pixels, at least one."""
+    return max(1, round(share * max(picture.shape[:2])))
+
+
+def reduction(picture: Picture) -> int:
+    """The whole factor by which a picture ``[H, W, 3]`` is reduced."""
+    return max(1, max(picture.shape[:2]) // SIDE)
+
+
+def _psnr(drawn: Picture, true: Picture, where: Mask) -> float | None:
+    count = int(np.count_nonzero(where))
+    if not count:
+        return None
+    return decibels(mean_of_squares(int(np.sum(squared_errors(drawn, true), where=where, dtype=np.int64)), count))
+
+
+@dataclass
+class GhostSearch:
+    """The ghosts of several cameras, with the backgrounds that they need, section by section.
+
+    Args:
+        source: the capture, which is read again for the backgrounds.
+        names: of the cameras.
+        frames: number of frames that are scored.
+        finders: by camera.
+        ends: number of the frame that the next section begins with.
+    """
+
+    source: FrameSource
+    names: tuple[str, ...]
+    frames: int
+    finders: dict[str, GhostFinder] = field(default_factory=dict)
+    ends: int = 0
+
+    def __post_init__(self) -> None:
+        memory = max(round(MEMORY_SECONDS * self.source.fps), MEMORY_FRAMES)
+        self.finders = {name: GhostFinder(memory) for name in self.names}
+
+    def find(
+        self, camera: str, picture: Picture, truth: Picture, *, index: int, mask: Mask | None = None
+    ) -> Ghosts | None:
+        """See :meth:`GhostFinder.find`; None for a camera without any picture in this section's background."""
+        if index >= self.ends:
+            first, self.ends = next(one for one in sections(self.frames, self.source.fps) if one[1] > index)
+            for name, background in backgrounds(self.source, self.names, first=first, end=self.ends).items():
+                self.finders[name].begin(background)
+        finder = self.finders[camera]
+        return None if finder.background is None else finder.find(picture, truth, index=index, mask=mask)
+
+
+def sections(frames: int, fps: float) -> Iterator[tuple[int, int]]:
+    """First frame and end of each of the equal parts, of about ten seconds, that have a background each."""
+    length = max(round(SECTION_SECONDS * fps), SECTION_FRAMES)
+    count = max(1, round(frames / length))
+    for number in range(count):
+        yield number * frames // count, (number + 1) * frames // count
+
+
+def backgrounds(source: FrameSource, names: tuple[str, ...], *, first: int, end: int) -> Mapping[str, Picture]:
+    """The median picture of each camera over spread frames from ``first`` to ``end``, reduced; none of absent ones."""
+    step = -(-(end - first) // SAMPLES)
+    taken: dict[str, list[Picture]] = {}
+    for frame in every_nth_frame(section(source, start=first, frames=end - first), step).frames():
+        for name in frame.present(names):
+            picture = blackened(frame.images[name], frame.masks.get(name))
+            taken.setdefault(name, []).append(block_means(picture, reduction(picture)))
+    return {name: _median(pictures) for name, pictures in taken.items()}
+
+
+def _median(pictures: list[Picture]) -> Picture:
+    """The median of each value; of an even number the mean of the middle two, so that a tie is neither."""
+    ordered = np.sort(np.stack(pictures), axis=0)
+    low, high = ordered[(len(pictures) - 1) // 2], ordered[len(pictures) // 2]
+    return ((low.astype(np.uint16) + high) // 2).astype(np.uint8)

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scores at other sizes than a scene was trained at: a player shows streams at the size of its screen."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from structgstream.cameras import Camera
+from structgstream.data.source import FrameSource
+from structgstream.data.wrappers import select_cameras
+from structgstream.errors import CaptureError
+from structgstream.evaluation.masks import blackened
+from structgstream.evaluation.metrics import decibels, masked_ssim, mean_of_squares, squared_errors, ssim
+from structgstream.evaluation.pictures import spread_indices
+from structgstream.frames import MultiViewFrame
+from structgstream.kernels.backend import Backend
+from structgstream.scene.render import Drawable, render, to_8bit_image
+
+Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+STORED_FRAMES, STORED_SHARE = 5, 4
+"""Frames that are scored at the stored size: at most five, and one in four. Twice the size is four times the pixels."""
+
+
+def block_means(picture: Picture, factor: int) -> Picture:
+    """``picture`` ``[H, W, 3]`` reduced by a whole factor, by area mean, rounded.
+
+    Rows and columns at the end that fill no pixel are left out.
+    """
+    if factor == 1:
+        return picture
+    height, width = picture.shape[0] // factor, picture.shape[1] // factor
+    blocks = picture[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)
+    total = np.zeros((height, width, 3), np.uint32)
+    for row in range(factor):  # many times faster than sums over so short axes
+        for column in range(factor):
+            total += blocks[:, row, :, column]
+    return ((total + factor**2 // 2) // factor**2).astype(np.uint8)
+
+
+def block_mask(mask: Mask, factor: int) -> Mask:
+    """``mask`` ``[H, W]`` reduced as :func:`block_means`: a pixel counts if all that it is made of counts."""
+    height, width = mask.shape[0] // factor, mask.shape[1] // factor
+    blocks = mask[: height * factor, : width * factor].reshape(height, factor, width, factor)
+    return np.logical_and.reduce(blocks, axis=(1, 3))
+
+
+def halved(camera: Camera) -> Camera:
+    """The camera of a picture at exactly half the size, without a last row or column that is odd."""
+    half = torch.diag(torch.tensor([0.5, 0.5, 1.0], dtype=torch.float64))
+    return replace(camera, K=half @ camera.K, width=camera.width // 2, height=camera.height // 2)
+
+
+def half_scores(
+    scene: Drawable, camera: Camera, truth: Picture, *, backend: Backend, mask: Mask | None = None
+) -> dict[str, float | None]:
+    """PSNR and SSIM, by their names in ``Scores``, of a rendering at half size against the area mean of the truth.
+
+    Args:
+        scene: what is drawn.
+        camera: of the whole picture, scene units; as :func:`halved` where that is kept, so that it need not be made.
+        truth: what the camera took, ``[H, W, 3]``, black outside of ``mask``.
+        backend: the compute back-end.
+        mask: ``[H, W]``, the pixels that count; None for all.
+    """
+    small = None if mask is None else block_mask(mask, 2)
+    psnr, similarity = _scores(scene, camera, block_means(truth, 2), small, backend)
+    return {"psnr_half": psnr, "ssim_half": similarity}
+
+
+@dataclass
+class StoredSize:
+    """Scores at the size of the capture's stored pictures, which are larger than those that a stream was made from.
+
+    Args:
+        source: the capture at that size, the same frames.
+        views: cameras of the stream by name, scene units.
+        backend: the compute back-end.
+        frames: numbers of those that are scored.
+    """
+
+    source: FrameSource
+    views: Mapping[str, Camera]
+    backend: Backend
+    frames: frozenset[int]
+    _frame: tuple[int, MultiViewFrame] | None = field(default=None, init=False)
+
+    def scores(self, camera: str, scene: Drawable, *, index: int) -> dict[str, float | None]:
+        """PSNR and SSIM by their names in ``Scores``; none in frames that are not scored.
+
+        Raises:
+            CaptureError: the picture has gone.
+        """
+        if index not in self.frames:
+            return {}
+        if self._frame is None or self._frame[0] != index:
+            self._frame = index, next(self.source.frames(index))
+        truth, mask = self._frame[1].images.get(camera), self._frame[1].masks.get(camera)
+        if truth is None:
+            raise CaptureError(
+                f"The stored picture of camera {camera!r} in frame {index} of {self.source.name} has gone."
+            )
+        view = self.views[camera].resized(truth.shape[1], truth.shape[0])
+        psnr, similarity = _scores(scene, view, blackened(truth, mask), mask, self.backend)
+        return {"psnr_stored": psnr, "ssim_stored": similarity}
+
+
+def stored_size(source: FrameSource, views: Mapping[str, Camera], *, backend: Backend, frames: int) -> StoredSize:
+    """Scores at the size of ``source``, in evenly spread ones of ``frames`` frames."""
+    count = max(1, min(STORED_FRAMES, frames // STORED_SHARE))
+    chosen = frozenset(spread_indices(frames, count) if count > 1 else [frames - 1])
+    return StoredSize(select_cameras(source, tuple(views)), views, backend, chosen)
+
+
+def _scores(
+    scene: Drawable, camera: Camera, truth: Picture, mask: Mask | None, backend: Backend
+) -> tuple[float | None, float | None]:
+    if not truth.size or (mask is not None and not mask.any()):
+        return None, None
+    picture = blackened(to_8bit_image(render(scene, camera, backend).image), mask)
+    errors = squared_errors(picture, truth)
+    errors = errors if mask is None else errors[mask]
+    similarity = ssim(picture, truth, backend) if mask is None else masked_ssim(picture, truth, mask)
+    return decibels(mean_of_squares(int(errors.sum(dtype=np.int64)), errors.size)), similarity

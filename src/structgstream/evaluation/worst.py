@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The worst frames of a stream, and the worst window of each, chosen by the program.
+
+A frame is bad by its PSNR on changed pixels, or by its ghosts (``ghosts.py``). A mean over a picture or a stream hides
+both: what moves is a small part of it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.evaluation.masks import changed_pixels
+from structgstream.evaluation.metrics import squared_errors
+from structgstream.evaluation.pictures import side_by_side
+from structgstream.evaluation.report import FrameScores, Scores
+
+if TYPE_CHECKING:
+    from structgstream.evaluation.evaluate import Compared
+
+Reason = Literal["changed", "ghosts"]
+REASONS: tuple[Reason, ...] = ("changed", "ghosts")
+MOST = 3
+LEAST_SHARE = 0.001
+"""Of the pixels must have changed for a PSNR over them to say something."""
+WINDOW_SHARE = 0.25
+"""Side of a window, in longer sides of the picture."""
+
+
+def badness(scores: Scores, reason: Reason) -> float | None:
+    """How bad a picture is, larger is worse; None if it is not bad in this way."""
+    if reason == "changed":
+        few = scores.psnr_changed is None or scores.changed_share < LEAST_SHARE
+        return None if few or scores.psnr_changed is None else -scores.psnr_changed
+    return (scores.ghost_share or 0.0) * (scores.disoccluded_share or 0.0) or None
+
+
+def worst_facts(frames: Sequence[FrameScores]) -> dict[str, dict[str, Any] | None]:
+    """By reason the worst picture: ``frame``, ``camera``, and ``psnr_changed`` or ``ghost_share`` and
+    ``disoccluded_share``; None if none is bad."""
+    found: dict[str, dict[str, Any] | None] = {}
+    for reason in REASONS:
+        rows = [
+            (bad, frame.index, name, scores)
+            for frame in frames
+            for name, scores in frame.cameras.items()
+            if (bad := badness(scores, reason)) is not None
+        ]
+        worst = max(rows, key=lambda row: row[0], default=None)
+        found[reason] = None if worst is None else {"frame": worst[1], "camera": worst[2], **shown(worst[3], reason)}
+    return found
+
+
+def shown(scores: Scores, reason: Reason) -> dict[str, float | None]:
+    """The scores that a picture is chosen by."""
+    if reason == "changed":
+        return {"psnr_changed": scores.psnr_changed}
+    return {"ghost_share": scores.ghost_share, "disoccluded_share": scores.disoccluded_share}
+
+
+@dataclass(frozen=True)
+class Window:
+    """A square part of a picture, pixels.
+
+    Args:
+        x: first column.
+        y: first row.
+        width: of it.
+        height: of it.
+    """
+
+    x: int
+    y: int
+    width: int
+    height: int
+
+    def of(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """That part of a picture ``[H, W, 3]``."""
+        return picture[self.y : self.y + self.height, self.x : self.x + self.width]
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A bad window of a bad frame.
+
+    Args:
+        reason: why it was chosen.
+        frame: its number.
+        camera: that saw it.
+        scores: of the whole picture.
+        window: where it is.
+        picture: truth, rendering and their difference times four, side by side.
+    """
+
+    reason: Reason
+    frame: int
+    camera: str
+    scores: Mapping[str, float | None]
+    window: Window
+    picture: NDArray[np.uint8]
+
+
+@dataclass
+class WorstPictures:
+    """Keeps the worst pictures while an evaluation goes over all: at most one a frame and three a reason."""
+
+    _kept: dict[Reason, dict[int, tuple[float, "Compared"]]] = field(default_factory=dict, init=False)
+
+    def see(self, index: int, compared: "Compared") -> None:
+        """Takes the picture if it is among the worst so far."""
+        for reason in REASONS:
+            bad, kept = badness(compared.scores, reason), self._kept.setdefault(reason, {})
+            if bad is None or (index in kept and kept[index][0] >= bad):
+                continue
+            kept[index] = bad, compared
+            if len(kept) > MOST:
+                del kept[min(kept, key=lambda frame: kept[frame][0])]
+
+    def crops(self) -> list[Crop]:
+        """The worst window of each, the worst picture of each reason first."""
+        found = []
+        for reason in REASONS:
+            kept = sorted(self._kept.get(reason, {}).items(), key=lambda item: -item[1][0])
+            found += [_crop(reason, index, compared) for index, (_, compared) in kept]
+        return found
+
+
+def _crop(reason: Reason, index: int, compared: "Compared") -> Crop:
+    window = worst_window(_error_map(reason, compared))
+    picture = side_by_side(window.of(compared.truth), window.of(compared.picture))
+    return Crop(reason, index, compared.camera, shown(compared.scores, reason), window, picture)
+
+
+def _error_map(reason: Reason, compared: "Compared") -> NDArray[np.int64]:
+    """Squared errors ``[H, W]`` of the pixels that a picture was chosen by."""
+    errors = squared_errors(compared.picture, compared.truth).astype(np.int64)
+    if reason == "changed":
+        return errors * changed_pixels(compared.truth, compared.first, compared.counting)
+    assert compared.ghosts is not None
+    factor, (height, width) = compared.ghosts.factor, errors.shape
+    ghosts = compared.ghosts.ghosts.repeat(factor, 0).repeat(factor, 1)
+    return errors * np.pad(ghosts, ((0, height - ghosts.shape[0]), (0, width - ghosts.shape[1])))
+
+
+def worst_window(errors: NDArray[np.int64]) -> Window:
+    """The window with the largest sum of ``errors`` ``[H, W]``, the first of equal ones."""
+    height, width = errors.shape
+    side = max(1, round(WINDOW_SHARE * max(height, width)))
+    high, wide = min(side, height), min(side, width)
+    total = np.pad(errors.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    sums = total[high:, wide:] - total[:-high, wide:] - total[high:, :-wide] + total[:-high, :-wide]
+    y, x = divmod(int(sums.argmax()), sums.shape[1])
+    return Window(x, y, wide, high)

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ghosts of a square that moves over a background and stays drawn where it was, or does not."""
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rigs import arc_rig
+from structgstream.cameras import CameraRig
+from structgstream.evaluation.ghosts import Ghosts, GhostSearch, backgrounds, sections
+from structgstream.frames import MultiViewFrame
+
+Picture = NDArray[np.uint8]
+Drawing = Callable[[int], Picture]
+CAMERA = "cam00"
+FRAMES = 12
+BACKGROUND, SQUARE = (90, 90, 90), (200, 60, 40)
+
+
+@dataclass(frozen=True)
+class Film:
+    """Pictures of one camera, which another one never has."""
+
+    truth: Drawing
+    count: int = FRAMES
+    fps: float = 30.0
+    mask: NDArray[np.bool_] | None = None
+    absent: frozenset[int] = frozenset()
+    name: str = "film"
+    points: None = None
+
+    @property
+    def rig(self) -> CameraRig:
+        height, width = self.truth(0).shape[:2]
+        return arc_rig(3, width=width, height=height)
+
+    def __len__(self) -> int:
+        return self.count
+
+    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
+        masks = {} if self.mask is None else {CAMERA: self.mask}
+        for index in range(start, self.count):
+            images = {} if index in self.absent else {CAMERA: self.truth(index)}
+            yield MultiViewFrame(index, index / self.fps, images, masks if images else {})
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A noisy background with a square; everything scales with ``size``.
+
+    Args:
+        size: of a unit: the picture is 80 x 60 units, the square 8.
+        first: frame in which the square comes.
+        speed: units a frame.
+        residual: share of the square's colour that stays where it was.
+        from_start: the rendering is brighter there than the truth all the time by this many levels.
+        gone: frame from which on the square is away.
+    """
+
+    size: int = 4
+    first: int = 0
+    speed: int = 6
+    residual: float = 0.0
+    from_start: int = 0
+    gone: int = FRAMES
+
+    def truth(self, index: int) -> Picture:
+        """With noise, of another kind in each frame."""
+        return np.roll(_noise(self.size), 7 * index, axis=1) + self._scene([index])
+
+    def rendering(self, index: int) -> Picture:
+        """The truth without noise, and all places before as ghosts."""
+        drawn = self._scene([index])
+        if self.residual:
+            trail = self.square(range(index)) & ~self.square([index])
+            drawn[trail] = np.rint((1 - self.residual) * np.array(BACKGROUND) + self.residual * np.array(SQUARE))
+        return drawn + np.uint8(self.from_start)
+
+    def square(self, indices: Iterable[int]) -> NDArray[np.bool_]:
+        """Where it is in any of these frames, ``[H, W]``."""
+        where = np.zeros((60 * self.size, 80 * self.size), np.bool_)
+        for index in indices:
+            if self.first <= index < self.gone:
+                left = (2 + self.speed * (index - self.first)) * self.size
+                where[20 * self.size : 28 * self.size, left : left + 8 * self.size] = True
+        return where
+
+    def _scene(self, indices: Iterable[int]) -> Picture:
+        picture = np.full((60 * self.size, 80 * self.size, 3), BACKGROUND, np.uint8)
+        picture[self.square(indices)] = SQUARE
+        return picture
+
+
+@cache
+def _noise(size: int) -> Picture:
+    """Of two levels to each side, modulo 256."""
+    return np.random.default_rng(0).integers(-2, 3, (60 * size, 80 * size, 3)).astype(np.uint8)
+
+
+def found(scene: Scene, film: Film | None = None) -> list[Ghosts | None]:
+    """What is found, frame by frame."""
+    film = Film(scene.truth) if film is None else film
+    search = GhostSearch(film, (CAMERA,), len(film))
+    return [
+        search.find(CAMERA, scene.rendering(frame.index), frame.images[CAMERA], index=frame.index, mask=film.mask)
+        for frame in film.frames()
+        if frame.images
+    ]
+
+
+def ghost_pixels(ghosts: list[Ghosts | None]) -> list[int]:
+    return [0 if one is None else int(np.count_nonzero(one.ghosts)) for one in ghosts]
+
+
+def test_a_square_that_leaves_nothing_behind_has_no_ghosts() -> None:
+    ghosts = found(Scene())
+    assert ghost_pixels(ghosts) == [0] * FRAMES
+    assert ghosts[0] is not None
+    assert ghosts[0].share is None
+    assert ghosts[0].psnr is None
+    assert all(one is not None and one.share == 0.0 and one.psnr is not None and one.psnr > 40 for one in ghosts[1:])
+
+
+@pytest.mark.parametrize("first", [0, 3])
+def test_a_place_that_stays_drawn_is_a_ghost(first: int) -> None:
+    """Also that of frame 0, of which nobody knows what was there before."""
+    scene = Scene(first=first, residual=0.5)
+    ghosts = found(scene)
+    assert ghost_pixels(ghosts)[: first + 1] == [0] * (first + 1)
+    area = (8 * scene.size) ** 2
+    for index, one in enumerate(ghosts[first + 1 :], first + 1):
+        assert one is not None
+        places = scene.square(range(index)) & ~scene.square([index])
+        assert one.ghosts[places].mean() > 0.8  # all but what is near the square now
+        assert np.count_nonzero(one.ghosts & ~places) < 0.2 * places.sum()
+        assert np.count_nonzero(one.ghosts) > 0.4 * area
+        assert one.share is not None
+        assert one.share > 0.2
+        assert one.psnr is not None
+        assert one.psnr < 25
+
+
+def test_a_weak_residual_is_below_the_threshold() -> None:
+    weak, strong = (sum(ghost_pixels(found(Scene(residual=residual)))) for residual in (0.05, 0.3))
+    assert weak == 0 < strong
+
+
+def test_what_was_wrong_all_along_is_no_ghost() -> None:
+    """But where something stood in frame 0 nothing is known, and an error is what it is."""
+    known = found(Scene(first=3, from_start=12))
+    assert ghost_pixels(known) == [0] * FRAMES
+    assert all(one is not None and one.psnr is not None and one.psnr < 30 for one in known[4:])
+    assert max(ghost_pixels(found(Scene(first=0, from_start=12)))) > 0
+
+
+@pytest.mark.parametrize("size", [2, 4, 16])
+def test_the_score_does_not_depend_on_the_size_of_the_pictures(size: int) -> None:
+    """From 160 to 1280 pixels, of which the largest are reduced."""
+    ghosts = found(Scene(size=size, residual=0.5))
+    assert {one.factor for one in ghosts if one} == {max(1, 80 * size // 640)}
+    reference = found(Scene(size=4, residual=0.5))
+    for one, other in zip(ghosts[1:], reference[1:], strict=True):
+        assert one is not None
+        assert other is not None
+        assert one.disoccluded_share == pytest.approx(other.disoccluded_share, rel=0.12)
+        assert one.share == pytest.approx(other.share, rel=0.25)
+
+
+def test_a_ghost_counts_as_long_as_it_stays_and_its_place_two_seconds() -> None:
+    """Of 20 frames, at 4 a second, of which 12 are remembered."""
+    for residual in (0.0, 0.5):
+        scene = Scene(first=1, gone=3, residual=residual)
+        ghosts = found(scene, Film(scene.truth, count=20, fps=4.0))
+        shares = [0.0 if one is None else one.disoccluded_share for one in ghosts]
+        assert all(shares[3:15])
+        assert bool(shares[19]) == bool(ghost_pixels(ghosts)[19]) == bool(residual)
+
+
+def test_masked_pixels_have_no_ghosts() -> None:
+    scene = Scene(residual=0.5)
+    mask = np.zeros((240, 320), np.bool_)
+    mask[:, 160:] = True
+    ghosts = found(scene, Film(scene.truth, mask=mask))
+    assert max(ghost_pixels(ghosts)) > 0
+    for one in ghosts:
+        assert one is not None
+        assert not one.ghosts[:, :160].any()
+        assert not one.disoccluded[:, :160].any()
+        assert one.pixels <= 240 * 160
+
+
+def test_an_absent_camera_is_skipped_and_one_that_is_never_there_has_no_score() -> None:
+    scene = Scene(residual=0.5)
+    ghosts = found(scene, Film(scene.truth, absent=frozenset({4, 5})))
+    assert len(ghosts) == FRAMES - 2
+    assert ghost_pixels(ghosts)[-1] > 0
+    search = GhostSearch(Film(scene.truth), (CAMERA, "cam01"), FRAMES)
+    assert search.find("cam01", scene.truth(0), scene.truth(0), index=0) is None
+
+
+def test_backgrounds_are_medians_of_few_pictures_and_sections_cover_all_frames() -> None:
+    scene = Scene()
+    film = Film(scene.truth, count=100)
+    read: list[int] = []
+
+    def counted(index: int) -> Picture:
+        read.append(index)
+        return scene.truth(index)
+
+    (background,) = backgrounds(replace(film, truth=counted), (CAMERA,), first=40, end=100).values()
+    assert np.abs(background.astype(int) - 90).max() <= 2
+    assert set(read) - {0} <= set(range(40, 100))
+    for frames, fps in ((1, 30.0), (12, 30.0), (299, 30.0), (1000, 25.0), (77, 1.0)):
+        parts = list(sections(frames, fps))
+        assert parts[0][0] == 0
+        assert parts[-1][1] == frames
+        assert all(one[1] == other[0] for one, other in itertools.pairwise(parts))
+        assert max(end - first for first, end in parts) <= 1.5 * max(10 * fps, 60)
+
+
+def test_another_background_is_not_something_that_left() -> None:
+    """A lamp is switched between two sections: nothing was there before, so nothing is a ghost."""
+    dark = Scene(first=99)
+
+    def truth(index: int) -> Picture:
+        return dark.truth(index) + np.uint8(60 if index >= 60 else 0)
+
+    film = Film(truth, count=120, fps=6.0)
+    search = GhostSearch(film, (CAMERA,), 120)
+    ghosts = [search.find(CAMERA, dark.rendering(i), truth(i), index=i) for i in range(120)]
+    assert ghost_pixels(ghosts) == [0] * 120

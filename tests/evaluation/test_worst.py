@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which frames and windows are the worst, and that the page shows them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drawn import pixels_of
+from structgstream.evaluation.evaluate import Compared
+from structgstream.evaluation.ghosts import Ghosts
+from structgstream.evaluation.page import write_page
+from structgstream.evaluation.pictures import side_by_side
+from structgstream.evaluation.report import Scores
+from structgstream.evaluation.worst import Window, WorstPictures, badness, worst_window
+
+SCORES = Scores(30.0, 0.9, 31.0, 25.0, 32.0, 0.05, 0.1)
+
+
+def compared(
+    *, camera: str = "cam/0", at: tuple[int, int] = (50, 80), psnr: float = 25.0, ghost: bool = False
+) -> Compared:
+    """An error of 12x12 pixels, of a pixel that changed or of one where something was."""
+    first = np.full((120, 160, 3), 90, np.uint8)
+    truth, picture = first.copy(), first.copy()
+    y, x = at
+    picture[5:25, 5:25] = 200  # larger, but neither changed nor a ghost
+    picture[y : y + 12, x : x + 12] = 180
+    ghosts = np.zeros((60, 80), np.bool_)  # of a picture that was reduced
+    scores = replace(SCORES, psnr_changed=psnr)
+    if ghost:
+        ghosts[y // 2 : y // 2 + 6, x // 2 : x // 2 + 6] = True
+        scores = replace(SCORES, psnr_changed=None, disoccluded_share=0.1, ghost_share=0.2)
+    else:
+        truth[y : y + 12, x : x + 12] = 250
+    return Compared(camera, truth, picture, scores, first, None, Ghosts(ghosts, ghosts, 4800, 2, 20.0))
+
+
+@pytest.mark.parametrize("at", [(0, 0), (50, 80), (108, 148)])
+@pytest.mark.parametrize("ghost", [False, True])
+def test_the_window_holds_the_error_that_the_frame_was_chosen_by(at: tuple[int, int], ghost: bool) -> None:
+    worst = WorstPictures()
+    shown = compared(at=at, ghost=ghost)
+    worst.see(4, shown)
+    (crop,) = worst.crops()
+    window, (y, x) = crop.window, at
+    assert (crop.frame, crop.camera, crop.reason) == (4, "cam/0", "ghosts" if ghost else "changed")
+    assert (window.width, window.height) == (40, 40)
+    assert window.x <= x <= x + 12 <= window.x + 40 <= 160
+    assert window.y <= y <= y + 12 <= window.y + 40 <= 120
+    np.testing.assert_array_equal(crop.picture, side_by_side(window.of(shown.truth), window.of(shown.picture)))
+
+
+def test_the_worst_three_frames_are_kept_each_with_its_worst_camera() -> None:
+    worst = WorstPictures()
+    psnrs = {0: 26.0, 1: 21.0, 2: 25.0, 3: 19.0, 4: 24.0}
+    for index, psnr in psnrs.items():
+        worst.see(index, compared(psnr=psnr))
+        worst.see(index, compared(camera="b", psnr=psnr - 0.5 if index == 3 else 40.0))
+    assert [(crop.frame, crop.camera) for crop in worst.crops()] == [(3, "b"), (1, "cam/0"), (4, "cam/0")]
+
+
+def test_a_handful_of_changed_pixels_says_nothing() -> None:
+    assert badness(replace(SCORES, changed_share=1e-4, psnr_changed=5.0), "changed") is None
+    assert badness(SCORES, "ghosts") is None
+    assert badness(replace(SCORES, ghost_share=0.0, disoccluded_share=0.1), "ghosts") is None
+
+
+def test_small_pictures_have_a_window_of_one_pixel() -> None:
+    assert worst_window(np.array([[1, 5], [2, 0]], np.int64)) == Window(1, 0, 1, 1)
+    assert worst_window(np.zeros((1, 1), np.int64)) == Window(0, 0, 1, 1)
+
+
+def test_the_page_shows_every_crop_pixel_for_pixel(tmp_path: Path) -> None:
+    worst = WorstPictures()
+    worst.see(2, compared(psnr=20.0))
+    worst.see(3, compared(ghost=True))
+    crops = worst.crops()
+    write_page(tmp_path, crops, title="a <title>", pictures=["over_time.png"])
+    page = (tmp_path / "index.html").read_text()
+    assert "a &lt;title&gt;" in page
+    assert "20.00 dB on changed pixels" in page
+    assert "20.0% of the disoccluded pixels" in page
+    assert page.index("changed-000002-cam_0.png") < page.index("ghosts-000003-cam_0.png") < page.index("over_time.png")
+    for crop, name in zip(crops, ("changed-000002-cam_0", "ghosts-000003-cam_0"), strict=True):
+        np.testing.assert_array_equal(pixels_of(tmp_path / "worst" / f"{name}.png"), crop.picture)
