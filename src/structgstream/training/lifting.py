@@ -13,7 +13,7 @@ from structgstream.training.neighbours import nearest
 from structgstream.training.observation import MotionEvidence
 from structgstream.training.views import View
 
-NOISE_SHARE, LEAST_NOISE_PIXELS = 1 / 320, 1.0
+NOISE_SHARE, LEAST_NOISE_PIXELS = 1 / 640, 1.0
 """Errors of the flow of what hardly moves, in which its tolerance is measured (``kernels.operations.Lift``): a share of
 the picture's longer side, but at least so many pixels. They are means over what a mover covers and come from how bodies
 bend, from occlusion and from blending, which are as large in space however many pixels show them."""
