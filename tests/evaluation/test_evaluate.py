@@ -415,3 +415,22 @@ def test_a_stream_without_held_out_cameras_says_what_to_do(world: World) -> None
     assert report.stream["cameras"] == {"cam02": "training"}
     with pytest.raises(ConfigError, match="no camera 'cam99'"):
         run(reader, source, cameras=("cam99",))
+
+
+def test_other_sizes_and_the_worst_frames_are_in_the_report(world: World) -> None:
+    reader = in_the_stream(world, similarity=Similarity(), follow=False)
+    rig = world.rig.mapped({name: world.rig[name].resized(96, 64) for name in world.rig})
+    frames = [
+        replace(one, images={n: p.repeat(2, 0).repeat(2, 1) for n, p in one.images.items()}) for one in world.frames
+    ]
+    source = MemoryCapture(world.rig, world.frames)
+    report = run(reader, source, metrics="basic", stored=MemoryCapture(rig, frames))
+    scores = [mean_of(frame) for frame in report.frames]
+    assert all(one.psnr_half is not None and one.ssim_half is not None for one in scores)
+    assert [one.psnr_stored is not None for one in scores] == [False, False, False, True]
+    assert report.stream["stored_size_frames"] == [3]
+    assert all(one.disoccluded_share is not None for one in scores)
+    changed = [one.psnr_changed or 100.0 for one in scores]
+    worst = report.stream["worst"]["changed"]
+    assert (worst["frame"], worst["camera"]) == (int(np.argmin(changed)), "cam00")
+    assert as_json(report)["frames"][3]["cameras"]["cam00"]["psnr_stored"] == scores[3].psnr_stored

@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which frames and windows are the worst, and that the page shows them."""
+"""Which frames and windows are the worst."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from drawn import pixels_of
 from structgstream.evaluation.evaluate import Compared
 from structgstream.evaluation.ghosts import Ghosts
-from structgstream.evaluation.page import write_page
 from structgstream.evaluation.pictures import side_by_side
 from structgstream.evaluation.report import Scores
 from structgstream.evaluation.worst import Window, WorstPictures, badness, worst_window
@@ -70,18 +67,3 @@ def test_a_handful_of_changed_pixels_says_nothing() -> None:
 def test_small_pictures_have_a_window_of_one_pixel() -> None:
     assert worst_window(np.array([[1, 5], [2, 0]], np.int64)) == Window(1, 0, 1, 1)
     assert worst_window(np.zeros((1, 1), np.int64)) == Window(0, 0, 1, 1)
-
-
-def test_the_page_shows_every_crop_pixel_for_pixel(tmp_path: Path) -> None:
-    worst = WorstPictures()
-    worst.see(2, compared(psnr=20.0))
-    worst.see(3, compared(ghost=True))
-    crops = worst.crops()
-    write_page(tmp_path, crops, title="a <title>", pictures=["over_time.png"])
-    page = (tmp_path / "index.html").read_text()
-    assert "a &lt;title&gt;" in page
-    assert "20.00 dB on changed pixels" in page
-    assert "20.0% of the disoccluded pixels" in page
-    assert page.index("changed-000002-cam_0.png") < page.index("ghosts-000003-cam_0.png") < page.index("over_time.png")
-    for crop, name in zip(crops, ("changed-000002-cam_0", "ghosts-000003-cam_0"), strict=True):
-        np.testing.assert_array_equal(pixels_of(tmp_path / "worst" / f"{name}.png"), crop.picture)

@@ -9,12 +9,12 @@ by more than 20 levels, and *disoccluded* if
 
 - something was there, or within 1.9 % of the picture's longer side of it, in an earlier frame of the last two seconds
   (12 frames at least),
-- nothing is within 0.5 % of that side now, and
+- nothing is within 0.9 % of that side now, and
 - the truth is within 8 levels of the background: as it was before it came.
 
 A disoccluded pixel is a *ghost* if the rendering is off the truth by more than 8 levels, and, where it was seen before
-something came, off what was drawn then by as much: what was wrong all along is no ghost. A ghost counts as long as it
-stays.
+something came, off what was drawn then by as much: what was wrong all along is no ghost. Ghosts that no square of 0.8 %
+of the side fits into are left out: outlines that are a little off are no ghosts. One counts as long as it stays.
 
 Differences of pictures are means over the channels and 3x3 pixels. Pictures whose longer side has 1280 pixels or more
 are reduced first, by a whole factor and by area mean, to 640 to 1279, so that size does not change the score.
@@ -36,7 +36,8 @@ Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
 OCCUPIED, RESTORED, WRONG = 20, 8, 8  # levels of 255; noise of cameras and compression is 2 to 4 after the 3x3 mean
-REACH, MARGIN = 12 / 640, 3 / 640  # shares of the longer side: soft edges, and shadows beside what moves
+REACH, MARGIN = 12 / 640, 6 / 640  # shares of the longer side: soft edges, and shadows beside what moves
+SPECK = 2 / 640  # half the width of the smallest ghost; thinner are outlines that are a little off
 SIDE = 640  # pixels of the longer side that a reduced picture has at least
 MEMORY_SECONDS, MEMORY_FRAMES = 2.0, 12
 SECTION_SECONDS, SECTION_FRAMES = 10.0, 60
@@ -126,7 +127,9 @@ class GhostFinder:
         free = ~dilate(there, pixels_of(MARGIN, true)) & ~differing(true, self.background, RESTORED)
         disoccluded = (recent | self.stuck) & (free if counting is None else free & counting)
         wrong = differing(drawn, true, WRONG)
-        ghosts = disoccluded & wrong & (~self.seen | differing(drawn, self.before, WRONG))
+        ghosts = opened(
+            disoccluded & wrong & (~self.seen | differing(drawn, self.before, WRONG)), pixels_of(SPECK, true)
+        )
         self.stuck = np.where(free, ghosts, self.stuck) & self.seen
         undisturbed = ~recent & ~near & ~self.stuck
         self.before = np.where(undisturbed[..., None], drawn, self.before)
@@ -139,6 +142,11 @@ class GhostFinder:
 def pixels_of(share: float, picture: Picture) -> int:
     """A share of the longer side of a picture ``[H, W, 3]`` in whole pixels, at least one."""
     return max(1, round(share * max(picture.shape[:2])))
+
+
+def opened(mask: Mask, pixels: int) -> Mask:
+    """What squares that reach ``pixels`` from their middle to each side, and lie in ``mask`` ``[H, W]``, cover."""
+    return dilate(~dilate(~mask, pixels), pixels) & mask
 
 
 def reduction(picture: Picture) -> int:
