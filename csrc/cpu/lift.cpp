@@ -14,7 +14,7 @@ namespace SGS_ISA {
 namespace {
 
 // See kernels/reference_lift.py for the units and reasons.
-constexpr float kTolerancePixels = 1.0f, kToleranceShare = 0.1f;
+constexpr float kLeastTolerance = 1.0f, kToleranceShare = 0.1f;
 constexpr float kRobustScales[] = {4.0f, 2.5f, 1.5f, 1.5f, 1.0f, 1.0f};
 constexpr float kInlierScale = 1.5f;
 constexpr float kPriorShare = 0.02f, kPriorFloor = 0.05f, kTiny = 1e-12f;
@@ -67,7 +67,7 @@ void gather(const FlowLift& lift, int64_t target, Terms& terms) {
             if (!(values[8] > 0.0f) || !jacobian(lift, view, lift.centers + 3 * mover, values)) continue;
             values[6] = lift.flows[2 * at], values[7] = lift.flows[2 * at + 1];
             const float length = std::sqrt(values[6] * values[6] + values[7] * values[7]);
-            const float tolerance = kTolerancePixels + kToleranceShare * length;
+            const float tolerance = kLeastTolerance + kToleranceShare * length;
             values[9] = 1.0f / (tolerance * tolerance);
             terms.add(values);
         }

@@ -12,9 +12,9 @@ class ViewFlows(NamedTuple):
 
     Args:
         weights: ``[V, E]`` W, sum of the mover's blending weights over the pixels with reliable flow.
-        flows: ``[V, E, 2]`` f, pixels.
+        flows: ``[V, E, 2]`` f, in a unit of which it is known to one.
         viewmats: ``[V, 4, 4]``.
-        Ks: ``[V, 3, 3]``, for pictures of the size at which f is measured.
+        Ks: ``[V, 3, 3]``, pixels in that unit.
         near: ``[V]`` distance of the near plane along z.
     """
 

@@ -228,7 +228,7 @@ class Lift(Protocol):
     Minimises ``sum g W rho(J d - f) + reg |d - prior|^2`` over neighbours and views by iteratively reweighted least
     squares: one round without robust weights, then Geman-McClure weights ``1 / (1 + r^2 / (s tau)^2)^2`` of decreasing
     scale s (``reference_lift.ROBUST_SCALES``), with the residual ``r = |J d - f|`` and the tolerance ``tau = 1 +
-    0.1 |f|``, pixels. What has ``r < 1.5 tau`` in the end is an inlier. ``reg`` is ``0.02 sum + 0.05`` times the mean
+    0.1 |f|``. What has ``r < 1.5 tau`` in the end is an inlier. ``reg`` is ``0.02 sum + 0.05`` times the mean
     square of J, with the sum of the present weights.
 
     Args:

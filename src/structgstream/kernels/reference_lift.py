@@ -6,11 +6,10 @@ from torch import Tensor
 
 from structgstream.kernels.motion_types import Lifted, Neighbors, ViewFlows
 
-TOLERANCE_PIXELS, TOLERANCE_SHARE = 1.0, 0.1
-"""Tolerance of an observed flow f, pixels: the first plus the second times |f|.
+LEAST_TOLERANCE, TOLERANCE_SHARE = 1.0, 0.1
+"""Tolerance of an observed flow f: the first plus the second times |f|, in the unit of f.
 
-The first is the noise of the flow search, whose finest level is at most half the size of the pictures, however large
-they are (``flow_maps.FlowConfig``): a number of pixels, not a share of the width. The second covers what grows with the
+The unit is the error of the flow of what hardly moves (``training/lifting.py``). The second covers what grows with the
 displacement: the linearised projection, rotation of the object (one displacement fits several neighbours), and errors
 of the search on large motion, together 5 to 10 per cent of |f|."""
 ROBUST_SCALES = (4.0, 2.5, 1.5, 1.5, 1.0, 1.0)
@@ -41,7 +40,7 @@ def lift(centers: Tensor, seen: ViewFlows, neighbors: Neighbors, priors: Tensor,
     total = w.sum((0, 2))
     stiffness = (w * J.square().sum((-1, -2))).sum((0, 2)) / (2.0 * total.clamp(min=1e-12))
     eye = torch.eye(3, dtype=centers.dtype, device=centers.device)
-    tolerances = TOLERANCE_PIXELS + TOLERANCE_SHARE * f.norm(dim=-1)  # [V, T, N]
+    tolerances = LEAST_TOLERANCE + TOLERANCE_SHARE * f.norm(dim=-1)  # [V, T, N]
     d = priors
     for scale in (None, *ROBUST_SCALES):
         now = w
