@@ -39,7 +39,7 @@ def test_evaluate_reads_the_file(stream: Path, tmp_path: Path, capsys: pytest.Ca
     assert [frame["psnr_stored"] is None for frame in content["frames"]] == [True, True, False]
     assert all(8 < frame["psnr_half"] < 45 for frame in content["frames"])
     table = capsys.readouterr().out
-    assert re.search(r"camera +half size +SSIM +stored size +SSIM +disoccluded %", table)
+    assert re.search(r"camera +half +SSIM +stored +SSIM +disoccluded %", table)
     headline, beside = (f"{content['mean'][name]:.2f}" for name in ("psnr", "psnr_camera_color"))
     assert re.search(rf"mean +{headline} +{beside} ", table)
     assert "with the header shared over them" in " ".join(table.split())

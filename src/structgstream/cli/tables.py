@@ -31,9 +31,9 @@ FURTHER = (  # title, key, digits
 )
 
 AT_OTHER_SIZES = (  # title, key, factor, digits
-    ("half size", "psnr_half", 1, 2),
+    ("half", "psnr_half", 1, 2),
     ("SSIM", "ssim_half", 1, 4),
-    ("stored size", "psnr_stored", 1, 2),
+    ("stored", "psnr_stored", 1, 2),
     ("SSIM", "ssim_stored", 1, 4),
     ("disoccluded %", "disoccluded_share", 100, 2),
     ("ghosts %", "ghost_share", 100, 2),

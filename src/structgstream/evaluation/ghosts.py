@@ -12,9 +12,10 @@ by more than 20 levels, and *disoccluded* if
 - nothing is within 0.9 % of that side now, and
 - the truth is within 8 levels of the background: as it was before it came.
 
-A disoccluded pixel is a *ghost* if the rendering is off the truth by more than 8 levels, and, where it was seen before
-something came, off what was drawn then by as much: what was wrong all along is no ghost. Ghosts that no square of 0.8 %
-of the side fits into are left out: outlines that are a little off are no ghosts. One counts as long as it stays.
+A disoccluded pixel is a *ghost* if the rendering is off the truth by more than 8 levels, and not wrong all along: where
+it was seen before something came, it is off what was drawn then by more than 8 levels, too; elsewhere, as behind what
+stood there in the first frame, its error holds a quarter or more of the colour of what was there. Ghosts that no square
+of 0.8 % of the side fits into are left out: outlines that are a little off are no ghosts. It counts while it stays.
 
 Differences of pictures are means over the channels and 3x3 pixels. Pictures whose longer side has 1280 pixels or more
 are reduced first, by a whole factor and by area mean, to 640 to 1279, so that size does not change the score.
@@ -39,6 +40,7 @@ OCCUPIED, RESTORED, WRONG = 20, 8, 8  # levels of 255; noise of cameras and comp
 REACH, MARGIN = 12 / 640, 6 / 640  # shares of the longer side: soft edges, and shadows beside what moves
 SPECK = 2 / 640  # half the width of the smallest ghost; thinner are outlines that are a little off
 SIDE = 640  # pixels of the longer side that a reduced picture has at least
+RESIDUAL = 0.25  # of the difference between what was there and the truth
 MEMORY_SECONDS, MEMORY_FRAMES = 2.0, 12
 SECTION_SECONDS, SECTION_FRAMES = 10.0, 60
 SAMPLES = 15  # pictures of a median
@@ -83,6 +85,7 @@ class GhostFinder:
         memory: number of frames after which a pixel that something was on is one like others.
         background: the present one, reduced; None before the first.
         occupied: ``[h, w]`` number of the last frame in which something was on a pixel or near it.
+        left: the last truth of each pixel with something on it, reduced; the background where there was nothing.
         before: the last rendering of each pixel with nothing on it, reduced.
         seen: ``[h, w]``, where there is one.
         stuck: ``[h, w]``, where the last picture had a ghost on a pixel that was seen before.
@@ -91,6 +94,7 @@ class GhostFinder:
     memory: int
     background: Picture | None = None
     occupied: NDArray[np.int32] = field(default_factory=lambda: np.empty((0, 0), np.int32))
+    left: Picture = field(default_factory=lambda: np.empty((0, 0, 3), np.uint8))
     before: Picture = field(default_factory=lambda: np.empty((0, 0, 3), np.uint8))
     seen: Mask = field(default_factory=lambda: np.empty((0, 0), np.bool_))
     stuck: Mask = field(default_factory=lambda: np.empty((0, 0), np.bool_))
@@ -100,10 +104,12 @@ class GhostFinder:
         if self.background is None:
             shape = background.shape[:2]
             self.occupied = np.full(shape, NEVER, np.int32)
-            self.before, self.seen, self.stuck = background, np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
+            self.left = self.before = background
+            self.seen, self.stuck = np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
         else:
             other = differing(background, self.background, RESTORED)
             self.occupied[other] = NEVER
+            self.left = np.where(other[..., None], background, self.left)
             self.seen, self.stuck = self.seen & ~other, self.stuck & ~other
         self.background = background
 
@@ -126,15 +132,14 @@ class GhostFinder:
         recent = index - self.occupied <= self.memory
         free = ~dilate(there, pixels_of(MARGIN, true)) & ~differing(true, self.background, RESTORED)
         disoccluded = (recent | self.stuck) & (free if counting is None else free & counting)
-        wrong = differing(drawn, true, WRONG)
-        ghosts = opened(
-            disoccluded & wrong & (~self.seen | differing(drawn, self.before, WRONG)), pixels_of(SPECK, true)
-        )
+        newly = np.where(self.seen, differing(drawn, self.before, WRONG), shows(self.left, drawn, true))
+        ghosts = opened(disoccluded & differing(drawn, true, WRONG) & newly, pixels_of(SPECK, true))
         self.stuck = np.where(free, ghosts, self.stuck) & self.seen
         undisturbed = ~recent & ~near & ~self.stuck
         self.before = np.where(undisturbed[..., None], drawn, self.before)
         self.seen = self.seen | undisturbed
         self.occupied[near] = index
+        self.left = np.where(there[..., None], true, self.left)
         pixels = there.size if counting is None else int(np.count_nonzero(counting))
         return Ghosts(disoccluded, ghosts, pixels, factor, _psnr(drawn, true, disoccluded))
 
@@ -142,6 +147,17 @@ class GhostFinder:
 def pixels_of(share: float, picture: Picture) -> int:
     """A share of the longer side of a picture ``[H, W, 3]`` in whole pixels, at least one."""
     return max(1, round(share * max(picture.shape[:2])))
+
+
+def shows(thing: Picture, drawn: Picture, true: Picture) -> Mask:
+    """Where the error of ``drawn`` holds :data:`RESIDUAL` or more of the colour of ``thing``, which is not the truth's.
+
+    All are ``[H, W, 3]``; the share is that of the error's projection onto the difference of thing and truth.
+    """
+    error, whole = (np.subtract(one, true, dtype=np.int16).astype(np.int32) for one in (drawn, thing))
+    lengths = whole[..., 0] ** 2 + whole[..., 1] ** 2 + whole[..., 2] ** 2
+    along = error[..., 0] * whole[..., 0] + error[..., 1] * whole[..., 1] + error[..., 2] * whole[..., 2]
+    return (lengths > 3 * OCCUPIED**2) & (along >= RESIDUAL * lengths)
 
 
 def opened(mask: Mask, pixels: int) -> Mask:
