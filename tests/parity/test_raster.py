@@ -64,7 +64,7 @@ def run(
     dtype = inputs[0].dtype
     leaves = [value.to(device).clone().requires_grad_() for value in inputs]
     output = rasterize(
-        splats_of(*leaves[:5], None if intervals is None else intervals.to(device, dtype)),
+        splats_of(*leaves[:5], intervals=None if intervals is None else intervals.to(device, dtype)),
         camera(dtype, device),
         screen_offsets=leaves[5],
         background=None if background is None else background.to(device, dtype),
@@ -88,10 +88,10 @@ def safe_pixels(inputs: tuple[Tensor, ...], intervals: Tensor | None = None) -> 
             reference_raster.MIN_ALPHA = saved[0] * factor
             reference_raster.MAX_ALPHA = 1 - (1 - saved[1]) * factor
             reference_raster.MIN_TRANSMITTANCE = saved[2] * factor
-            pictures.append(reference(splats_of(*values[:5], intervals), camera()).image)
+            pictures.append(reference(splats_of(*values[:5], intervals=intervals), camera()).image)
         for factor in (1 - 1e-3, 1 + 1e-3):  # Stopping there shows in which pixels something begins to be faint.
             reference_raster.MIN_TRANSMITTANCE = reference_raster.MIN_GRADIENT_TRANSMITTANCE * factor
-            pictures.append(reference(splats_of(*values[:5], intervals), camera()).image)
+            pictures.append(reference(splats_of(*values[:5], intervals=intervals), camera()).image)
     finally:
         reference_raster.MIN_ALPHA, reference_raster.MAX_ALPHA, reference_raster.MIN_TRANSMITTANCE = saved
     apart = [(pictures[n] - pictures[n + 1]).abs().amax(-1) for n in (0, 2)]
@@ -151,7 +151,9 @@ def test_the_low_pass_of_the_training_pictures_on_the_cpu(isa: int, share: float
     intervals = intervals_at(share)
     check_against_reference(cpu_raster.rasterize, reference, background=background, intervals=intervals)
     plain, filtered = (
-        cpu_raster.rasterize(splats_of(*(v.float() for v in gaussians()[:5]), given), camera(torch.float32)).image
+        cpu_raster.rasterize(
+            splats_of(*(v.float() for v in gaussians()[:5]), intervals=given), camera(torch.float32)
+        ).image
         for given in (None, intervals.float())
     )
     assert (plain - filtered).abs().max() > 0.01
