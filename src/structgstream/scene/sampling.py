@@ -71,13 +71,13 @@ class RigSampling:
 
     def _intervals(self, points: Tensor) -> Tensor:
         projections, focals = self._on(points)
-        rows = points @ projections[:, :, :3].reshape(-1, 3).T + projections[:, :, 3].reshape(-1)  # [N, 3 V]
-        x, y, depths = rows.reshape(len(points), len(focals), 3).unbind(2)
+        x, y, depths = (torch.addmm(rows[:, 3], points, rows[:, :3].T) for rows in projections.unbind(1))  # [N, V]
         ahead = depths > 0
-        safe = torch.where(ahead, depths, 1.0)
-        weights = _inside(x / safe) * _inside(y / safe) + UNSEEN_WEIGHT
-        weights = torch.where(ahead & torch.isfinite(weights), weights, 0.0)
-        return (weights * depths / focals).sum(1) / weights.sum(1).clamp(min=torch.finfo(points.dtype).tiny)
+        depths = torch.where(ahead, depths, 1.0)
+        # In place: this runs in every iteration that moves Gaussians.
+        weights = _inside(x.div_(depths)).mul_(_inside(y.div_(depths))).add_(UNSEEN_WEIGHT).mul_(ahead)
+        total = weights.sum(1).clamp_(min=torch.finfo(points.dtype).tiny)
+        return weights.mul_(depths).matmul(1.0 / focals).div_(total)
 
     def _on(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """The cameras with the dtype and device of ``points``; kept, because a copy to a GPU blocks the host."""
@@ -88,8 +88,9 @@ class RigSampling:
 
 
 def _inside(share: Tensor) -> Tensor:
-    """Weight by a coordinate as a share of the picture's size."""
-    return ((INNER_SHARE + BORDER_SHARE - (share - 0.5).abs()) / BORDER_SHARE).clamp(0.0, 1.0)
+    """Weight by a coordinate as a share of the picture's size, in place."""
+    edge = INNER_SHARE + BORDER_SHARE
+    return share.sub_(0.5).abs_().neg_().add_(edge).div_(BORDER_SHARE).clamp_(0.0, 1.0)
 
 
 def _projection(camera: Camera) -> Tensor:

@@ -33,6 +33,8 @@ class Scene:
         environment: ``[(degree + 1)^2, 3]`` background coefficients (``scene/environment.py``); None for black.
         sampling: of the training cameras, by which Gaussians are filtered (``scene/sampling.py``); None: by the
             picture.
+        anchor_intervals: ``[M]`` sampling intervals that are held while iterations move the anchors, which is by far
+            less than their depth; None: those of the positions.
     """
 
     anchors: AnchorCloud
@@ -43,6 +45,7 @@ class Scene:
     appearance_basis: Tensor | None = None
     environment: Tensor | None = None
     sampling: RigSampling | None = None
+    anchor_intervals: Tensor | None = None
 
     @property
     def features(self) -> Tensor:
@@ -72,7 +75,9 @@ class Scene:
         """
         cloud = self.anchors
         anchors = Anchors(cloud.positions, cloud.log_offset_scales, cloud.log_base_scales, cloud.offsets, self.features)
-        intervals = None if self.sampling is None else self.sampling.intervals(cloud.positions)
+        intervals = self.anchor_intervals
+        if intervals is None and self.sampling is not None:
+            intervals = self.sampling.intervals(cloud.positions)
         generated = backend.generate_structured(
             anchors,
             self.mlps,

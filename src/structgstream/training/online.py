@@ -170,6 +170,9 @@ class FrameFit:
     def optimize(self, start: StartingPoint) -> FitResult[Scene]:
         """Fit the scene of ``start`` to the pictures."""
         config, seen = self.config, start.seen
+        if (sampling := start.scene.sampling) is not None:
+            held = sampling.intervals(start.scene.anchors.positions + start.displacements[: len(start.scene.anchors)])
+            start = replace(start, scene=replace(start.scene, anchor_intervals=held))
         # Each view is used as often as in a full frame.
         iterations = math.ceil(config.iterations * len(seen) / len(start.views))
         samples = shuffled_views(seen, self.generator)

@@ -79,6 +79,7 @@ class Parameters:
         rounded = round_all_straight_through([self.values[name] for name in self.steps], [*self.steps.values()])
         values |= dict(zip(self.steps, rounded, strict=True))
         found = scene_from(values, distance_input=template.distance_input, sampling=template.sampling)
+        found = replace(found, anchor_intervals=template.anchor_intervals)
         gauged = any(self.values[name].requires_grad for name in CAMERA_ROWS)
         return replace(found, camera_color=found.camera_color.gauged()) if gauged else found
 
