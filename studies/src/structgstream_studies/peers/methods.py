@@ -40,6 +40,7 @@ TINY_METHODS: Mapping[str, AnyMethod] = {
         ScaffoldGS(
             replace(
                 TINY.initial,
+                sampling_filter=False,
                 distance_input=SCAFFOLD.distance_input,
                 losses=SCAFFOLD.losses,
             )
