@@ -13,11 +13,6 @@ from structgstream.training.neighbours import nearest
 from structgstream.training.observation import MotionEvidence
 from structgstream.training.views import View
 
-NOISE_SHARE, LEAST_NOISE_PIXELS = 1 / 640, 1.0
-"""Errors of the flow of what hardly moves, in which its tolerance is measured (``kernels.operations.Lift``): a share of
-the picture's longer side, but at least so many pixels. They are means over what a mover covers and come from how bodies
-bend, from occlusion and from blending, which are as large in space however many pixels show them."""
-
 
 @dataclass(frozen=True)
 class LiftConfig:
@@ -82,8 +77,9 @@ def lift_motion(
         apart = (evidence.colors[neighbours] - evidence.colors[:, None]).square().sum(-1)
         affinities = affinities * torch.exp(-0.5 * apart / config.color_bandwidth**2)
     viewports = [view.camera.viewport(centers) for view in views]
-    # Flow in units of its noise, so that views of all sizes count for what they know.
-    noise = centers.new_tensor([_noise_pixels(view) for view in views])
+    # The tolerance has a unit of one pixel at the reference size: errors of the flow of what hardly moves come from how
+    # bodies bend, from occlusion and from blending, which are as large in space however many pixels show them.
+    noise = centers.new_tensor([view.enlargement for view in views])
     per_noise = torch.stack([1.0 / noise, 1.0 / noise, torch.ones_like(noise)], dim=-1)
     seen = ViewFlows(
         evidence.weights,
@@ -96,7 +92,3 @@ def lift_motion(
     lifted = (found.inlier_share > config.inlier_share) & (found.agreeing_views >= config.agreeing_views)
     displacements = torch.where(lifted[:, None], found.displacements, priors)
     return LiftedMotion(displacements, lifted)
-
-
-def _noise_pixels(view: View) -> float:
-    return max(LEAST_NOISE_PIXELS, NOISE_SHARE * max(view.camera.width, view.camera.height))

@@ -34,7 +34,7 @@ from structgstream.training.residuals import apply_camera_color
 from structgstream.training.views import View, as_picture, blackened
 
 FAST_SHARE = 1 / 80
-"""Flow per frame, relative to the longer side of the pictures, above which a mover counts as fast: 8 of 640 pixels."""
+"""Flow per frame, relative to the longer side of the pictures, above which motion counts as fast: 8 of 640 pixels."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class InitialMotion:
         focuses: by view index, the focus on the moving part.
         lifted_count: number of movers displaced by flow between pictures.
         corrected_count: number of movers displaced by flow from the rendering.
-        fast_count: number of movers whose flow between pictures is larger than :data:`FAST_SHARE`.
+        fast_count: number of rows of ``displacements`` whose flow between pictures is larger than :data:`FAST_SHARE`.
         fast_lifted_count: how many of them are displaced by it; the others are likely to leave ghosts.
     """
 
@@ -121,7 +121,7 @@ def estimate_initial_motion(
 
 
 def _is_fast(evidence: MotionEvidence, views: Sequence[View]) -> Tensor:
-    """Mask ``[E]`` of the movers whose mean flow over the views, as a share of the longer side, exceeds
+    """Mask ``[E]`` of the rows of ``evidence`` whose mean flow over the views, as a share of the longer side, exceeds
     :data:`FAST_SHARE`."""
     sides = evidence.flows.new_tensor([max(view.camera.width, view.camera.height) for view in views])
     speeds = evidence.flows.norm(dim=-1) / sides[:, None]
