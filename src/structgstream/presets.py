@@ -305,7 +305,6 @@ COMPACT = replace(
             MOTION.online.motion,
             moved_ease=0.5,
             carried_share=0.4,
-            unseen_pixels=0.1,
             residual_threshold=0.05,
             picture_scale=0.5,
             tiles_around=1,
