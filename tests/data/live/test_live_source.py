@@ -195,6 +195,44 @@ def test_every_set_of_files_comes_and_then_the_stream_ends(tmp_path: Path, caplo
     assert not (tmp_path / "x.queue").exists()
 
 
+@pytest.mark.parametrize("content", [None, b"", b"no video at all"], ids=["missing", "empty", "no video"])
+def test_a_file_that_cannot_be_read_is_absent_and_the_stream_ends(
+    tmp_path: Path, content: bytes | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Frame 0 does not wait for it either."""
+    path = files(tmp_path)
+    (tmp_path / "a.ts").unlink()
+    if content is not None:
+        (tmp_path / "a.ts").write_bytes(content)
+    with caplog.at_level(logging.WARNING):
+        frames = list(LiveSource(path, tmp_path / "x.sgs", LiveOptions(policy="every")).frames())
+    assert len(frames) >= 20
+    assert all([*frame.images] == ["b", "c"] for frame in frames)
+    (told,) = [text for text in caplog.messages if "camera 'a'" in text]
+    assert f"its file {tmp_path / 'a.ts'} cannot be read (" in told
+    assert "correct its url in the rig file, or give follow = true" in told
+    assert "have come to their end" in caplog.text
+
+
+def test_a_rig_without_a_frame_is_refused(tmp_path: Path) -> None:
+    path = files(tmp_path)
+    for name in "ab":
+        (tmp_path / f"{name}.ts").unlink()
+    with pytest.raises(CaptureError, match=r"rig has no frame: all files .* Frame 0 needs pictures of 2 training cam"):
+        list(LiveSource(path, tmp_path / "x.sgs").frames())
+
+
+def test_a_file_that_ends_first_is_not_waited_for(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = files(tmp_path)
+    (tmp_path / "b.ts").write_bytes(sent_stream(frames=12))
+    with caplog.at_level(logging.WARNING):
+        frames = list(LiveSource(path, tmp_path / "x.sgs", LiveOptions(policy="every", held_out=())).frames())
+    assert round(frames[-1].pts_seconds * FPS) == 29
+    assert [*frames[-1].images] == ["a", "c"]
+    assert f"camera 'b' has come to the end of its file {tmp_path / 'b.ts'}; it is absent from now on" in caplog.text
+    assert "again" not in caplog.text
+
+
 @pytest.mark.parametrize("policy", ["every", "latest"])
 def test_frame_0_is_averaged_and_no_set_that_waits_is_lost(tmp_path: Path, policy: Policy) -> None:
     """The film moves everywhere but at its rims; with ``every`` the averaged sets are frames of their own, too."""
