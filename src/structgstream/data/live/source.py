@@ -269,8 +269,8 @@ class LiveSource:
             if frame is None:
                 if ended and complete:
                     raise CaptureError(
-                        f"{self.name} has no frame: {ended}. Frame 0 needs pictures of {LEAST_CAMERAS} training cameras "
-                        "of one instant; the warnings before this say what is wrong with each camera."
+                        f"{self.name} has no frame: {ended}. Frame 0 needs pictures of {LEAST_CAMERAS} training "
+                        "cameras of one instant; the warnings before this say what is wrong with each camera."
                     )
                 if ended:
                     log.warning("%s: %s", self.name, ended)
