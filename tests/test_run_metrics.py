@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from reports import frame_report
+from structgstream.cli.termination import Terminated
 from structgstream.data.live.status import CameraStatus, LiveStatus
 from structgstream.run_metrics import RunMetrics, free_bytes, metrics_path
 
@@ -94,7 +95,10 @@ def test_before_the_first_frame_and_of_a_recording_what_is_unknown_is_null(tmp_p
     assert read(tmp_path / "x.sgs")["train_psnr"] is None
 
 
-@pytest.mark.parametrize(("error", "state"), [(None, "finished"), (KeyboardInterrupt, "finished"), (OSError, "failed")])
+@pytest.mark.parametrize(
+    ("error", "state"),
+    [(None, "finished"), (KeyboardInterrupt, "finished"), (Terminated, "finished"), (OSError, "failed")],
+)
 def test_how_a_run_ended_is_the_last_word(tmp_path: Path, error: type[BaseException] | None, state: str) -> None:
     metrics = RunMetrics(tmp_path / "x.sgs", fps=30.0)
 

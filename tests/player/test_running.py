@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A port is ours before anything is told of it, and a browser opens where there is a screen."""
 
+import asyncio
 import socket
 import sys
 import webbrowser
@@ -15,6 +16,27 @@ def test_a_connection_is_accepted_before_the_server_runs() -> None:
     with bound(0) as listening, socket.create_connection((ADDRESS, listening.getsockname()[1]), timeout=5) as client:
         assert client.getpeername()[0] == ADDRESS
         assert listening.getsockname()[0] == ADDRESS
+
+
+def test_responses_of_a_connection_are_not_delayed() -> None:
+    """asyncio sets TCP_NODELAY only where the socket says that it is TCP."""
+    accepted = asyncio.Event()
+    delays: list[int] = []
+
+    async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        delays.append(writer.get_extra_info("socket").getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
+        accepted.set()
+        writer.close()
+
+    async def serve() -> None:
+        with bound(0) as listening:
+            async with await asyncio.start_server(answer, sock=listening):
+                _, writer = await asyncio.open_connection(*listening.getsockname())
+                await asyncio.wait_for(accepted.wait(), 10)
+                writer.close()
+
+    asyncio.run(serve())
+    assert delays == [1]
 
 
 @pytest.mark.parametrize("port", [-1, 65536, "taken"])

@@ -83,7 +83,7 @@ def test_before_a_calibration_motion_may_fail_and_nothing_else(tmp_path: Path) -
     for how in ("auto", "motion"):
         found = first_clocks(footage, PrepareOptions(synchronize=how))
         assert (found.method, found.sure, dict(found.clocks)) == ("motion", False, dict.fromkeys(NAMES, Clock()))
-        assert found.told.startswith("motion: not without the calibration (")
+        assert found.told.startswith("motion: not without the calibration. ")
     with pytest.raises(CaptureError):
         first_clocks(footage, PrepareOptions(synchronize="audio"))
     (tmp_path / TIMESTAMPS).write_text("a,b\n")

@@ -90,12 +90,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except UsageError as error:
         _say(f"structgstream: {error}")
         return USAGE
-    except (KeyboardInterrupt, Interrupted) as error:
-        _say(f"\nInterrupted. {error}".rstrip())
-        return INTERRUPTED
     except Terminated as error:
         _say(f"\nTerminated. {error}")
         return TERMINATED
+    except (KeyboardInterrupt, Interrupted) as error:
+        _say(f"\nInterrupted. {error}".rstrip())
+        return INTERRUPTED
     except BrokenPipeError:
         # The reader of our output has exited (`| head`). Python would raise again while it closes stdout.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -95,7 +95,7 @@ def _fit(options: ReconstructGroup, task: "SegmentTask") -> bool:
                 done = report.index + 1
                 if ending.asked and done != task.end:
                     raise Terminated
-    except (KeyboardInterrupt, Terminated) as error:
+    except KeyboardInterrupt as error:
         kept = f"{done - task.first} of {task.end - task.first} frames are safe; give the same command to go on."
         raise (Terminated if isinstance(error, Terminated) else Interrupted)(kept) from None
     return True

@@ -101,7 +101,7 @@ def _run(
                     break
         if done != total and (ending.asked or pressed.stopped):
             raise Terminated if ending.asked else KeyboardInterrupt
-    except (KeyboardInterrupt, Terminated) as error:
+    except KeyboardInterrupt as error:
         of = "" if total is None else f" of {total}"
         kept = f"{output} has {done}{of} frames in all qualities; continue with the same command and --resume."
         raise (Terminated if isinstance(error, Terminated) else Interrupted)(kept) from None

@@ -268,7 +268,7 @@ def run_reconstruction(
                     raise Terminated
             if ending.asked and done != total:  # Live cameras had nothing to give any more.
                 raise Terminated
-    except (KeyboardInterrupt, Terminated) as error:
+    except KeyboardInterrupt as error:
         of = "" if total is None else f" of {total}"
         kept = f"{output} has {done}{of} frames; continue with the same command and --resume."
         ended = Terminated if isinstance(error, Terminated) else Interrupted

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from types import FrameType
 
 
-class Terminated(Exception):
-    """The process was asked to end; the message states what is stored and how to continue."""
+class Terminated(KeyboardInterrupt):
+    """The process was asked to end, as by Ctrl-C; the message states what is stored and how to continue."""
 
 
 class Termination:

@@ -115,7 +115,7 @@ def _track(
                 bars.update(task, completed=done)
                 if ending.asked and done + 1 < len(source):
                     raise Terminated
-    except (KeyboardInterrupt, Terminated) as error:
+    except KeyboardInterrupt as error:
         ended = Terminated if isinstance(error, Terminated) else Interrupted
         raise ended(
             f"Frame {done} of {len(source) - 1} was tracked; give the same command to go on from the last start."

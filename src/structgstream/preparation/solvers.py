@@ -115,7 +115,7 @@ def first_clocks(footage: Footage, options: PrepareOptions) -> Clocks:
     except CaptureError as error:
         if options.synchronize not in ("auto", "motion") or (footage.where / TIMESTAMPS).is_file():
             raise
-        told = f"motion: not without the calibration ({str(error).split('; ')[0].split('. ')[0].rstrip('.')})"
+        told = f"motion: not without the calibration. {error}"
         return Clocks({name: Clock() for name in footage.cameras}, "motion", told, sure=False)
 
 

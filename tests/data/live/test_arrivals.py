@@ -145,7 +145,7 @@ def test_files_that_end_end_the_stream_when_everything_was_taken() -> None:
     bench.outlet.waiting = 1
     assert bench.arrivals.ended is None
     bench.outlet.waiting = 0
-    assert bench.arrivals.ended == "all files of cameras have come to their end"
+    assert bench.arrivals.ended == "all files of cameras have come to their end, or cannot be read"
     bench.arrivals.feeds["b"].ended = False
     assert bench.arrivals.ended is None
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whole live sources over loopback and over files: small streams, a second or two each."""
 
+import io
 import logging
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from itertools import islice, pairwise
 from pathlib import Path
@@ -19,6 +20,7 @@ from structgstream.data.denoising import DenoisingConfig
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.live import recording
 from structgstream.data.live import source as source_module
+from structgstream.data.live.calibration import read_calibration
 from structgstream.data.live.faults import FaultLog
 from structgstream.data.live.matching import LivePicture, PictureSet
 from structgstream.data.live.source import LiveOptions, LiveSource, Policy
@@ -195,6 +197,44 @@ def test_every_set_of_files_comes_and_then_the_stream_ends(tmp_path: Path, caplo
     assert not (tmp_path / "x.queue").exists()
 
 
+@pytest.mark.parametrize("content", [None, b"", b"no video at all"], ids=["missing", "empty", "no video"])
+def test_a_file_that_cannot_be_read_is_absent_and_the_stream_ends(
+    tmp_path: Path, content: bytes | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Frame 0 does not wait for it either."""
+    path = files(tmp_path)
+    (tmp_path / "a.ts").unlink()
+    if content is not None:
+        (tmp_path / "a.ts").write_bytes(content)
+    with caplog.at_level(logging.WARNING):
+        frames = list(LiveSource(path, tmp_path / "x.sgs", LiveOptions(policy="every")).frames())
+    assert len(frames) >= 20
+    assert all([*frame.images] == ["b", "c"] for frame in frames)
+    (told,) = [text for text in caplog.messages if "camera 'a'" in text]
+    assert f"its file {tmp_path / 'a.ts'} cannot be read (" in told
+    assert "correct its url in the rig file, or give follow = true" in told
+    assert "have come to their end" in caplog.text
+
+
+def test_a_rig_without_a_frame_is_refused(tmp_path: Path) -> None:
+    path = files(tmp_path)
+    for name in "ab":
+        (tmp_path / f"{name}.ts").unlink()
+    with pytest.raises(CaptureError, match=r"rig has no frame: all files .* Frame 0 needs pictures of 2 training cam"):
+        list(LiveSource(path, tmp_path / "x.sgs").frames())
+
+
+def test_a_file_that_ends_first_is_not_waited_for(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = files(tmp_path)
+    (tmp_path / "b.ts").write_bytes(sent_stream(frames=12))
+    with caplog.at_level(logging.WARNING):
+        frames = list(LiveSource(path, tmp_path / "x.sgs", LiveOptions(policy="every", held_out=())).frames())
+    assert round(frames[-1].pts_seconds * FPS) == 29
+    assert [*frames[-1].images] == ["a", "c"]
+    assert f"camera 'b' has come to the end of its file {tmp_path / 'b.ts'}; it is absent from now on" in caplog.text
+    assert "again" not in caplog.text
+
+
 @pytest.mark.parametrize("policy", ["every", "latest"])
 def test_frame_0_is_averaged_and_no_set_that_waits_is_lost(tmp_path: Path, policy: Policy) -> None:
     """The film moves everywhere but at its rims; with ``every`` the averaged sets are frames of their own, too."""
@@ -289,6 +329,55 @@ def test_a_long_recording_goes_on_in_parts_at_key_frames(tmp_path: Path, monkeyp
     first, second = (list(open_capture(part).frames()) for part in (folder, folder / "part-001"))
     assert [shown(frame.images["b"]) for frame in first] == list(range(12))
     assert [shown(frame.images["b"]) for frame in second] == [n % 12 for n in range(18)]
+
+
+def coded(codec: str, numbers: Iterable[int]) -> bytes:
+    """These pictures of the film as a transport stream, at their times."""
+    written = io.BytesIO()
+    with av.open(written, "w", format="mpegts") as output:
+        stream = output.add_stream(codec, rate=30, options={"g": "6", "bf": "0", "tune": "zerolatency"})
+        assert isinstance(stream, av.VideoStream)
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 128, 96, "yuv420p", 2_000_000
+        for number in numbers:
+            frame = av.VideoFrame.from_ndarray(moving_pictures()[number % 12], format="rgb24")
+            frame.pts = number
+            output.mux(stream.encode(frame))
+        output.mux(stream.encode(None))
+    return written.getvalue()
+
+
+def record(recorder: recording.CameraRecorder, stream: bytes) -> None:
+    with av.open(io.BytesIO(stream), "r") as container:
+        for packet in container.demux(video=0):
+            if packet.size:
+                recorder.keep(packet, shift_seconds=0.0)
+
+
+def test_a_camera_that_comes_back_with_another_codec_goes_on_in_the_next_part(tmp_path: Path) -> None:
+    folder = tmp_path / "take"
+    kept = recording.Recording(folder, read_calibration(calibrated(tmp_path / "c")), fps=FPS, unit_name="rig")
+    recorders = {name: kept.camera(name, FaultLog("rig", now=lambda: 0.0)) for name in NAMES}
+    for first in range(0, 48, 12):
+        for name in NAMES:
+            codec = "mpeg2video" if name == "b" and first >= 24 else "libx264"
+            record(recorders[name], coded(codec, range(first, first + 12)))
+    kept.close()
+    assert not (folder / "part-002").exists(), "one change, one part"
+    parts = [list(open_capture(part).frames()) for part in (folder, folder / "part-001")]
+    assert [len(frames) for frames in parts] == [24, 24]
+    for frame in (*parts[0], *parts[1]):
+        assert {shown(image) for image in frame.images.values()} == {frame.index % 12}
+        assert [*frame.images] == list(NAMES)
+
+
+def test_a_recording_names_the_cameras_that_sent_something(tmp_path: Path) -> None:
+    """Its capture would be refused otherwise, for a file that was never there."""
+    path, folder = files(tmp_path), tmp_path / "take"
+    (tmp_path / "a.ts").unlink()
+    list(LiveSource(path, tmp_path / "x.sgs", LiveOptions(policy="every", record=folder)).frames())
+    again = open_capture(folder)
+    assert [*again.rig] == ["b", "c"]
+    assert len(again) == 30
 
 
 def test_a_recording_that_cannot_be_written_does_not_end_the_stream(

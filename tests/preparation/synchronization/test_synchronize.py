@@ -77,6 +77,11 @@ def test_problems_are_one_sentence_with_the_camera() -> None:
         synchronize(still, method="motion", cameras=lenses(VIEWS))
     with pytest.raises(CaptureError, match=r"Too little moves .* Nor can sound be used: Camera 'cam0' has no sound"):
         synchronize(still, cameras=lenses(VIEWS))
+    named = {"cam. 0; left (top)" if name == "cam0" else name: view for name, view in VIEWS.items()}
+    stamps = dict.fromkeys(named, STAMPS["cam0"])
+    still = MadeStreams(stamps, named, dict(zip(named, CLOCKS.values(), strict=True)), still=frozenset({"cam1"}))
+    with pytest.raises(CaptureError, match=r"Nor can sound be used: Camera 'cam\. 0; left \(top\)' has no sound\.$"):
+        synchronize(still, cameras=lenses(named))
     mute = heard_streams()
     mute = MadeStreams(mute.own_stamps, VIEWS, CLOCKS, {name: mute.sounds[name] for name in ("cam0", "cam2")})
     with pytest.raises(CaptureError, match=r"^Camera 'cam1' has no sound; synchronise by motion or timestamps.csv"):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from structgstream.errors import CaptureError
-from structgstream.preparation.synchronization.wall_clocks import creation_seconds, timecode_seconds, wall_clocks
+from structgstream.preparation.synchronization.wall_clocks import creation_seconds, timecode, wall_clocks
 
 STAMPS = {"a": np.arange(90) / 25, "b": np.arange(90) / 25}
 DROPPED = np.arange(90) * 1001 / 30000
@@ -54,16 +54,42 @@ def test_files_that_count_from_zero_share_no_clock(texts: dict[str, dict[str, st
         wall_clocks(STAMPS, texts)
 
 
+@pytest.mark.parametrize("first", ["a", "b"])
+@pytest.mark.parametrize(
+    ("before", "after", "stamps", "seconds"),
+    [
+        ("23:59:58:00", "00:00:01:00", STAMPS["a"], 3.0),
+        ("23:59:58;00", "00:00:01;00", DROPPED, 90 * 1001 / 30000),
+        ("23:59:58:00", "00:00:01:00", DROPPED, 90 * 1001 / 30000),
+    ],
+    ids=["25", "29.97 drop", "29.97"],
+)
+def test_timecode_across_midnight(first: str, before: str, after: str, stamps: np.ndarray, seconds: float) -> None:
+    """Camera a begins before midnight, b after it, whichever is listed first."""
+    texts = {"a": {"timecode": before}, "b": {"timecode": after}}
+    names = ("a", "b") if first == "a" else ("b", "a")
+    clocks = wall_clocks(dict.fromkeys(names, stamps), texts)
+    assert clocks["a"].clock.offset_seconds == 0
+    assert clocks["b"].clock.offset_seconds == pytest.approx(seconds)
+
+
+def of_day(text: str, stamps: np.ndarray) -> float:
+    found = timecode(text, stamps)
+    assert found is not None
+    return found.seconds
+
+
 def test_dropped_frames_of_timecode() -> None:
     """Drop-frame timecode of ten minutes is 17982 frames of 1001/30000 s; the first minute skips two numbers."""
-    assert timecode_seconds("00:10:00;00", DROPPED) == pytest.approx(17982 * 1001 / 30000)
-    assert timecode_seconds("00:01:00;02", DROPPED) == pytest.approx(1800 * 1001 / 30000)
-    assert timecode_seconds("00:00:59;29", DROPPED) == pytest.approx(1799 * 1001 / 30000)
+    assert of_day("00:10:00;00", DROPPED) == pytest.approx(17982 * 1001 / 30000)
+    assert of_day("00:01:00;02", DROPPED) == pytest.approx(1800 * 1001 / 30000)
+    assert of_day("00:00:59;29", DROPPED) == pytest.approx(1799 * 1001 / 30000)
 
 
 def test_other_texts() -> None:
-    assert timecode_seconds("", STAMPS["a"]) is None
-    assert timecode_seconds("00:61:00:00", STAMPS["a"]) is None
+    assert timecode("", STAMPS["a"]) is None
+    assert timecode("00:61:00:00", STAMPS["a"]) is None
+    assert timecode("24:00:00:00", STAMPS["a"]) is None
     assert creation_seconds("yesterday") is None
     assert creation_seconds("1970-01-01T00:01:00.25") == 60.25
     assert creation_seconds("1970-01-01T01:00:00+01:00") == 0

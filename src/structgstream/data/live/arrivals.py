@@ -127,6 +127,11 @@ class Arrivals:
             return self._matcher.present(self._now())
 
     @property
+    def coming(self) -> list[str]:
+        """Cameras of which pictures may still come: all but files that have ended or cannot be read."""
+        return [name for name, feed in self.feeds.items() if not feed.ended]
+
+    @property
     def ended(self) -> str | None:
         """Why nothing comes any more, or None.
 
@@ -135,8 +140,8 @@ class Arrivals:
         """
         if self._failed is not None:
             raise self._failed
-        if all(feed.ended for feed in self.feeds.values()) and not self._outlet.status.waiting and self._idle:
-            return "all files of cameras have come to their end"
+        if not self.coming and not self._outlet.status.waiting and self._idle:
+            return "all files of cameras have come to their end, or cannot be read"
         limit, silent = self._rig.end_seconds, self._now() - self._last_arrival
         if limit is not None and silent > limit and not self._outlet.status.waiting:
             return f"no camera has sent a picture for {silent:.0f} s, so the stream ends (end_seconds in the rig file)"

@@ -30,6 +30,7 @@ FIRST_WAIT_SECONDS, MOST_WAIT_SECONDS = 0.5, 8.0
 MPEGTS_STAMPS = 2**33
 MOST_UNSTAMPED = 30  # pictures before a camera is taken to have no stamps
 SAMPLED_ROWS = 4  # every so many rows are compared to find pictures that stand still
+ENDED = "it ended"
 PROBE_OPTIONS = {"analyzeduration": "2000000", "probesize": "2000000", "fpsprobesize": "0"}
 
 
@@ -61,7 +62,7 @@ Opens = Callable[[LiveCamera, float], AbstractContextManager[Any]]
 
 
 class CameraFeed:
-    """Reads one camera until it is stopped, or until its file ends.
+    """Reads one camera until it is stopped, or until its file ends or cannot be read.
 
     Args:
         name: of the camera.
@@ -138,10 +139,10 @@ class CameraFeed:
             reason = self._connection()
             if self._stop.is_set():
                 return
-            self._gone(reason)
-            if self._camera.is_file and self.decoded:
-                self.ended = True
+            if self._camera.is_file:
+                self._end(reason)
                 return
+            self._gone(reason)
             wait = FIRST_WAIT_SECONDS if self.decoded > before else min(2 * wait, MOST_WAIT_SECONDS)
             self._wait(wait)
 
@@ -158,7 +159,7 @@ class CameraFeed:
         except Exception as error:  # Whatever it is: a thread that ends would be a camera that never comes back.
             log.exception("camera %r cannot be read", self.name)
             return f"{type(error).__name__}: {error}"
-        return "it ended"
+        return ENDED
 
     def _read(self, container: Any) -> None:
         if not container.streams.video:
@@ -298,6 +299,20 @@ class CameraFeed:
         self._faults.tell(self.name, Fault.STUCK, text)
         self._receiver.lost(self.name)
         return True
+
+    def _end(self, reason: str) -> None:
+        """Nothing more comes of a file: it was read, or cannot be."""
+        self._receiver.lost(self.name)
+        if self.decoded:
+            how = "" if reason is ENDED else f" ({reason})"
+            text = f"has come to the end of its file {self._camera.shown_url}{how}; it is absent from now on"
+        else:
+            text = (
+                f"is absent, because its file {self._camera.shown_url} cannot be read ({reason}); correct its url in "
+                "the rig file, or give follow = true if the file is still to be written"
+            )
+        self._faults.tell(self.name, Fault.GONE, text)
+        self.ended = True
 
     def _gone(self, reason: str) -> None:
         if self._gone_since is None:

@@ -4,21 +4,25 @@
 Each camera has a file: MPEG-TS for codecs that it holds, Matroska for others; both can be read up to where a crash cut
 them. Stamps are those of the common clock, less its value at the beginning, so that a camera that was opened again or
 whose clock jumped stays in step; pictures are not coded again. ``capture.json`` beside them makes the folder a prepared
-capture. Damaged packets, and pictures of another size, are not kept.
+capture of the cameras that sent something. Damaged packets, and pictures of another size, are not kept.
 
-MPEG-TS counts 26 hours. After :data:`PART_SECONDS` a camera goes on, at its next key frame, in the folder ``part-001``,
-then ``part-002``, each a capture too.
+A file holds one coding, and MPEG-TS counts 26 hours. After :data:`PART_SECONDS`, and when a camera comes back with
+another codec, size or parameters, every camera goes on, at its next key frame, in the folder ``part-001``, then
+``part-002``, each a capture too.
 """
 
 import json
 import logging
 import threading
+from bisect import bisect_right
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
+from structgstream.data.live.calibration import chosen_cameras
 from structgstream.data.live.faults import FaultLog
 from structgstream.data.prepared import FILE, PreparedCapture, write_prepared
 from structgstream.data.timeline import Clock
@@ -53,12 +57,12 @@ class Recording:
 
     def __init__(self, folder: Path, calibration: PreparedCapture, *, fps: float, unit_name: str) -> None:
         self._folder, self._calibration, self._fps, self.name = folder, calibration, fps, unit_name
-        self._zero: float | None = None
+        self._begins: list[float] = []  # of the parts, on the common clock
         self._lock = threading.Lock()
         self._first = 0
         while (_part(folder, self._first) / FILE).exists():
             self._first += 1
-        self._begun: dict[int, Path] = {}
+        self._files: dict[int, dict[str, str]] = {}
         self._cameras: list[CameraRecorder] = []
         self._texts: dict[Path, IO[str]] = {}
         self.part(0, {})
@@ -68,41 +72,59 @@ class Recording:
         self._cameras.append(CameraRecorder(self, name, faults))
         return self._cameras[-1]
 
-    def position(self, common_seconds: float) -> tuple[int, float]:
-        """The part in which an instant of the common clock lies, and its stamp there, seconds."""
+    def number(self, common_seconds: float) -> int:
+        """The part in which an instant of the common clock lies."""
         with self._lock:
-            if self._zero is None:
-                self._zero = common_seconds - LEAD_SECONDS
-        since = common_seconds - self._zero
-        number = max(int(since // PART_SECONDS), 0)
-        return number, since - number * PART_SECONDS
+            return self._number(common_seconds)
 
-    def part(self, number: int, files: dict[str, str]) -> Path:
-        """The folder of a part, whose ``capture.json`` names the cameras' files."""
+    def stamp(self, number: int, common_seconds: float) -> float:
+        """Seconds from the beginning of a part to an instant of the common clock; negative before it."""
+        with self._lock:
+            return common_seconds - self._begins[number]
+
+    def number_after(self, part: int, common_seconds: float) -> int | None:
+        """The part in which a file may begin with an instant, after one in ``part``; None if a later one may."""
+        with self._lock:
+            number = self._number(common_seconds)
+            if number == part == len(self._begins) - 1:
+                self._begins.append(common_seconds)
+                return number + 1
+            return number if number > part and common_seconds >= self._begins[number] else None
+
+    def _number(self, common_seconds: float) -> int:
+        if not self._begins:
+            self._begins = [common_seconds - LEAD_SECONDS]
+        while common_seconds - self._begins[-1] >= PART_SECONDS:
+            self._begins.append(self._begins[-1] + PART_SECONDS)
+        return max(bisect_right(self._begins, common_seconds) - 1, 0)
+
+    def part(self, number: int, files: Mapping[str, str]) -> Path:
+        """The folder of a part, whose ``capture.json`` names the files of cameras that sent something."""
         with self._lock:
             folder = _part(self._folder, self._first + number)
-            if number not in self._begun:
-                self._begun[number] = folder
+            if number not in self._files:
+                self._files[number] = {}
                 try:
                     folder.mkdir(parents=True, exist_ok=True)
                 except OSError as error:
                     raise StorageError(f"The folder {folder} cannot be made ({error.strerror}).") from None
-                self._files = {name: f"{name}.ts" for name in self._calibration.cameras}
-            self._files.update(files)
+            known = self._files[number]
+            known.update(files)
             cameras = {
-                name: replace(camera, files=self._files[name], clock=Clock())
+                name: replace(camera, files=known.get(name, f"{name}.ts"), clock=Clock())
                 for name, camera in self._calibration.cameras.items()
             }
-            write_prepared(folder, replace(self._calibration, cameras=cameras, fps=self._fps, points=None))
+            capture = replace(self._calibration, cameras=cameras, fps=self._fps, points=None)
+            write_prepared(folder, chosen_cameras(capture, [*known]) if known else capture)
             return folder
 
     def frame(self, frame: MultiViewFrame, *, common_seconds: float) -> None:
         """Notes which instant became which frame of the stream."""
-        number, stamp = self.position(common_seconds)
+        number = self.number(common_seconds)
         entry = {
             "index": frame.index,
             "pts_seconds": round(frame.pts_seconds, 6),
-            "recorded_seconds": round(stamp, 6),
+            "recorded_seconds": round(self.stamp(number, common_seconds), 6),
             "captured_unix_seconds": frame.captured_unix_seconds,
             "cameras": [*frame.images],
         }
@@ -114,8 +136,9 @@ class Recording:
         Raises:
             StorageError: it cannot be written.
         """
-        folder = self._begun.get(number) or self.part(number, {})
-        path = folder / file
+        if number not in self._files:
+            self.part(number, {})
+        path = _part(self._folder, self._first + number) / file
         try:
             with self._lock:
                 text = self._texts.get(path)
@@ -143,7 +166,7 @@ class CameraRecorder:
         self._recording, self._name, self._faults = recording, name, faults
         self._output: Any = None
         self._stream: Any = None
-        self._source: Any = None
+        self._coding: tuple[object, ...] | None = None
         self._part = -1
         self._last = -1
         self._failed = False
@@ -177,12 +200,15 @@ class CameraRecorder:
         assert packet.pts is not None
         pts = float(packet.pts * packet.time_base)
         common = pts + shift_seconds
-        number, stamp = self._recording.position(common)
-        if (self._output is None or number != self._part) and packet.is_keyframe and stamp >= 0:
-            self._begin(packet, number)
-        if self._output is None or number < self._part:
+        number = self._recording.number(common)
+        same = self._output is not None and _coding(packet.stream) == self._coding
+        begins = packet.is_keyframe and (number > self._part or not same)
+        if begins and (new := self._recording.number_after(self._part, common)) is not None:
+            self._begin(packet, new)
+            number, same = new, True
+        if not same or number < self._part:
             return
-        stamp += (number - self._part) * PART_SECONDS  # until the next key frame
+        stamp = self._recording.stamp(self._part, common)
         behind = 0.0 if packet.dts is None else pts - float(packet.dts * packet.time_base)
         self._write(packet, round(stamp * TICKS), round(behind * TICKS))
         line = f"{self._name},{stamp:.6f},{common:.6f},{int(packet.is_keyframe)}\n"
@@ -200,20 +226,25 @@ class CameraRecorder:
         self._output.mux(copy)
 
     def _begin(self, packet: "Packet", number: int) -> None:
-        if self._source is not packet.stream or number != self._part:
-            self._finish()
+        self._finish()
         codec = packet.stream.codec_context.name
         suffix, kind = ("ts", "mpegts") if codec in TRANSPORTED else ("mkv", "matroska")
         name = f"{self._name}.{suffix}"
         folder = self._recording.part(number, {self._name: name})
         self._output = load_av().open(str(folder / name), "w", format=kind, options={"flush_packets": "1"})
         self._stream = self._output.add_stream_from_template(packet.stream)
-        self._source, self._part, self._last = packet.stream, number, -1
+        self._coding, self._part, self._last = _coding(packet.stream), number, -1
 
     def _finish(self) -> None:
         if self._output is not None:
             output, self._output = self._output, None
             output.close()
+
+
+def _coding(stream: Any) -> tuple[object, ...]:
+    """What a file states once for all of its packets."""
+    context = stream.codec_context
+    return context.name, context.width, context.height, bytes(context.extradata or b"")
 
 
 def _part(folder: Path, number: int) -> Path:

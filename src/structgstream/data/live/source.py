@@ -36,7 +36,7 @@ from structgstream.data.live.status import LiveStatus, SetAges
 from structgstream.data.source import FrameSource
 from structgstream.data.video_index import load_av
 from structgstream.data.video_pictures import srgb
-from structgstream.errors import ConfigError, StorageError
+from structgstream.errors import CaptureError, ConfigError, StorageError
 from structgstream.frames import LEAST_CAMERAS, MultiViewFrame
 
 log = logging.getLogger(__name__)
@@ -263,10 +263,15 @@ class LiveSource:
         begun = told = self._now()
         quiet = HEARTBEAT_SECONDS
         while not self.stopped:
-            ended = arrivals.ended  # asked before, so that a set put in between is not lost
+            ended, coming = arrivals.ended, arrivals.coming  # asked before, so that a set put in between is not lost
             frame = outlet.take(POLL_SECONDS)
             now = self._now()
             if frame is None:
+                if ended and complete:
+                    raise CaptureError(
+                        f"{self.name} has no frame: {ended}. Frame 0 needs pictures of {LEAST_CAMERAS} training "
+                        "cameras of one instant; the warnings before this say what is wrong with each camera."
+                    )
                 if ended:
                     log.warning("%s: %s", self.name, ended)
                     return
@@ -275,15 +280,16 @@ class LiveSource:
                     log.warning("%s: no set of pictures yet; %s", self.name, arrivals.waiting_for())
                 continue
             told, quiet = now, HEARTBEAT_SECONDS
-            if complete and len(frame.images) < len(self._filmed) and now - begun < self._live.start_seconds:
+            absent = [name for name in self._filmed if name not in frame.images]
+            if complete and now - begun < self._live.start_seconds and {*absent} & {*coming}:
                 continue
-            if complete and len(frame.images) < len(self._filmed):
-                absent = ", ".join(name for name in self._filmed if name not in frame.images)
-                log.warning("%s: frame 0 has no picture of %s, so what only they see is missing", self.name, absent)
-            complete = False
             if len(frame.showing(self.rig.training)) < LEAST_CAMERAS:
                 arrivals.count_small()
                 continue
+            if complete and absent:
+                missing = ", ".join(absent)
+                log.warning("%s: frame 0 has no picture of %s, so what only they see is missing", self.name, missing)
+            complete = False
             yield frame
 
     @contextmanager

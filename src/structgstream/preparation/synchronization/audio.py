@@ -60,23 +60,36 @@ class Sound(Recording):
     onsets: Signal
 
 
+class UnusableSoundError(CaptureError):
+    """The sound of cameras cannot synchronise them.
+
+    Args:
+        reason: a sentence without its full stop.
+        remedy: what to do, the rest of the sentence.
+    """
+
+    def __init__(self, reason: str, remedy: str) -> None:
+        super().__init__(f"{reason}; {remedy}.")
+        self.reason = reason
+
+
 def sound_of(name: str, audio: tuple[NDArray[np.float32], float]) -> Sound:
     """What camera ``name`` recorded.
 
     Raises:
-        CaptureError: silence, or less than a second.
+        UnusableSoundError: silence, or less than a second.
     """
     samples, rate = audio
     if len(samples) < LEAST_OVERLAP_SECONDS * rate:
-        raise CaptureError(
-            f"Camera {name!r} has {len(samples) / rate:.2f} s of sound; expected at least {LEAST_OVERLAP_SECONDS:g} "
-            "s to "
-            "compare with other cameras. Synchronise by motion or timestamps.csv."
+        raise UnusableSoundError(
+            f"Camera {name!r} has {len(samples) / rate:.2f} s of sound, less than the {LEAST_OVERLAP_SECONDS:g} s "
+            "that can be compared",
+            "synchronise by motion or timestamps.csv",
         )
     if not np.ptp(samples) > 0:
-        raise CaptureError(
-            f"The sound of camera {name!r} is silence; switch its microphone on, or synchronise by motion or "
-            "timestamps.csv."
+        raise UnusableSoundError(
+            f"The sound of camera {name!r} is silence",
+            "switch its microphone on, or synchronise by motion or timestamps.csv",
         )
     return Sound(samples, rate, _onsets(samples, rate))
 

@@ -14,6 +14,7 @@ from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.preparation.synchronization.audio import (
     SPEED_OF_SOUND,
+    UnusableSoundError,
     audio_lags,
     connected_by,
     solve_by_audio,
@@ -106,12 +107,13 @@ def _automatic(
     try:
         return _by_audio(streams, stamps, distances, "all cameras have sound")
     except CaptureError as problem:
-        reason = f"sound cannot be used ({str(problem).split('; ')[0].split('. ')[0].rstrip('.')})"
+        unusable = problem.reason if isinstance(problem, UnusableSoundError) else str(problem).rstrip(".")
+    reason = f"sound cannot be used ({unusable})"
     _log.info("synchronised by motion: %s", reason)
     try:
         return _by_motion(streams, stamps, cameras, motion_seconds, reason)
     except CaptureError as problem:
-        raise CaptureError(f"{problem} Nor can sound be used: {reason.split('(', 1)[1].rstrip(')')}.") from None
+        raise CaptureError(f"{problem} Nor can sound be used: {unusable}.") from None
 
 
 def _by_csv(file: Path, stamps: Mapping[str, NDArray[np.float64]]) -> Synchronization:
@@ -148,17 +150,17 @@ def _by_audio(
     recorded = {name: streams.audio(name) for name in stamps}
     mute = next((name for name, sound in recorded.items() if sound is None), None)
     if mute is not None:
-        raise CaptureError(f"Camera {mute!r} has no sound; synchronise by motion or timestamps.csv.")
+        raise UnusableSoundError(f"Camera {mute!r} has no sound", "synchronise by motion or timestamps.csv")
     sounds = {name: sound_of(name, sound) for name, sound in recorded.items() if sound is not None}
     lags = audio_lags(sounds)
     takes = {name: (0.0, len(sound.samples) / sound.rate) for name, sound in sounds.items()}
     groups = connected_by(list(takes), lags)
     if len(groups) > 1:
         apart = ", ".join(repr(name) for group in groups[1:] for name in group)
-        raise CaptureError(
+        raise UnusableSoundError(
             f"The sound of {apart} has nothing in common with that of {groups[0][0]!r}: no lag stands out, or the "
-            "videos are shorter "
-            "than the time between their starts; film a clap that all hear, or synchronise by motion or timestamps.csv."
+            "videos are shorter than the time between their starts",
+            "film a clap that all hear, or synchronise by motion or timestamps.csv",
         )
     solution = solve_by_audio(takes, lags, distances=distances)
     way = 0.0 if distances else SOUND_SPREAD_METRES / SPEED_OF_SOUND

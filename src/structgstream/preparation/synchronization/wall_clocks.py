@@ -2,9 +2,9 @@
 """Time stamps of files that share a clock: timecode, the time of creation, or stamps of one transmission.
 
 Most files' stamps start at 0 when a camera starts and share no clock, so stamps are trusted only when the user asks
-for it. Timecode counts frames, so it is good to a frame. A time of creation counts when it has a fraction of a second
-that is not 0 in some file: whole seconds are 30 frames. Stamps that start far from 0 are of a transmission (MPEG-TS,
-RTP) and hold as they are.
+for it. Timecode counts frames, so it is good to a frame; it starts again at midnight, so cameras lie within half a day
+of the first. A time of creation counts when it has a fraction of a second that is not 0 in some file: whole seconds are
+30 frames. Stamps that start far from 0 are of a transmission (MPEG-TS, RTP) and hold as they are.
 """
 
 import re
@@ -48,10 +48,12 @@ def wall_clocks(stamps: Mapping[str, Floats], metadata: Mapping[str, Mapping[str
         CaptureError: the files have no stamps of a common clock.
     """
     texts = {name: metadata.get(name, {}) for name in stamps}
-    codes = {name: timecode_seconds(texts[name].get("timecode", ""), stamps[name]) for name in stamps}
-    if all(seconds is not None for seconds in codes.values()):
+    codes = {name: timecode(texts[name].get("timecode", ""), stamps[name]) for name in stamps}
+    if all(code is not None for code in codes.values()):
+        first = next(code.seconds for code in codes.values() if code is not None)
+        starts = {name: code and code.nearest(first) for name, code in codes.items()}
         sigmas = {name: period_seconds(stamps[name]) / 12**0.5 for name in stamps}
-        return _started(codes, stamps, sigmas, "timecode")
+        return _started(starts, stamps, sigmas, "timecode")
     created = {name: creation_seconds(texts[name].get("creation_time", "")) for name in stamps}
     if all(seconds is not None for seconds in created.values()) and any((s or 0.0) % 1 for s in created.values()):
         return _started(created, stamps, dict.fromkeys(stamps, CREATION_SIGMA_SECONDS), "creation time")
@@ -66,8 +68,25 @@ def wall_clocks(stamps: Mapping[str, Floats], metadata: Mapping[str, Mapping[str
     )
 
 
-def timecode_seconds(text: str, stamps: Floats) -> float | None:
-    """Seconds since midnight of a timecode ``HH:MM:SS:FF``; None for other text.
+@dataclass(frozen=True)
+class Timecode:
+    """A time of day by frames.
+
+    Args:
+        seconds: since midnight.
+        day_seconds: of the frames from midnight to midnight; not 86,400 where timecode does not follow the clock.
+    """
+
+    seconds: float
+    day_seconds: float
+
+    def nearest(self, seconds: float) -> float:
+        """The time in seconds, on the day on which it is nearest to ``seconds``."""
+        return self.seconds + round((seconds - self.seconds) / self.day_seconds) * self.day_seconds
+
+
+def timecode(text: str, stamps: Floats) -> Timecode | None:
+    """The timecode ``HH:MM:SS:FF`` of frames at ``stamps`` ``[T]``, in seconds; None for other text.
 
     With a semicolon frames are dropped from the count so that it follows the clock at 29.97 and 59.94 frames a second
     (SMPTE ST 12-1): two, or four, at each minute that is no multiple of ten.
@@ -78,13 +97,15 @@ def timecode_seconds(text: str, stamps: Floats) -> float | None:
     hours, minutes, seconds, frames = (int(match[group]) for group in (1, 2, 3, 5))
     rate = 1 / period_seconds(stamps)
     counted = round(rate)
-    if frames >= counted or minutes > 59 or seconds > 59:
+    if frames >= counted or hours > 23 or minutes > 59 or seconds > 59:
         return None
-    total = ((hours * 60 + minutes) * 60 + seconds) * counted + frames
-    if match[4] in ";.":
-        whole = hours * 60 + minutes
-        total -= (counted // 15) * (whole - whole // 10)
-    return total / rate
+
+    def at(whole: int) -> int:
+        """Frames up to a minute of the day."""
+        dropped = (counted // 15) * (whole - whole // 10) if match[4] in ";." else 0
+        return whole * 60 * counted - dropped
+
+    return Timecode((at(hours * 60 + minutes) + seconds * counted + frames) / rate, at(24 * 60) / rate)
 
 
 def creation_seconds(text: str) -> float | None:
