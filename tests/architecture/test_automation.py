@@ -3,6 +3,8 @@
 
 import os
 import re
+import shutil
+import subprocess
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -70,3 +72,28 @@ def test_pre_commit_fetches_nothing() -> None:
     repositories = parsed(ROOT / ".pre-commit-config.yaml")["repos"]
     assert [repository["repo"] for repository in repositories] == ["local"]
     assert {hook["language"] for hook in repositories[0]["hooks"]} == {"system"}
+
+
+@pytest.mark.parametrize(
+    ("settings", "status", "said"),
+    [
+        ({"CI": "true"}, 1, r"no Chromium .* leave these tests out with SKIP_BROWSER_TESTS=1"),
+        ({"CI": "true", "SKIP_BROWSER_TESTS": "1"}, 0, "SKIPPED: the tests in a browser"),
+        ({}, 0, "SKIPPED: the tests in a browser"),
+    ],
+    ids=["ci", "asked", "elsewhere"],
+)
+def test_ci_without_a_browser_fails_unless_it_is_asked_to_skip(
+    tmp_path: Path, settings: dict[str, str], status: int, said: str
+) -> None:
+    """On a machine that has bash and little more, where nothing can be installed."""
+    for name in ("bash", "dirname", "timeout"):
+        (tmp_path / name).symlink_to(str(shutil.which(name)))
+    for name, line in {"id": "echo 1000", "make": "echo made"}.items():
+        (tmp_path / name).write_text(f"#!{shutil.which('bash')}\n{line}\n")
+        (tmp_path / name).chmod(0o755)
+    command = [str(tmp_path / "bash"), str(ROOT / ".ci" / "run")]
+    ran = subprocess.run(command, capture_output=True, text=True, env={"PATH": str(tmp_path), **settings}, check=False)
+    assert ran.returncode == status, ran.stderr
+    assert re.search(said, " ".join([ran.stdout, ran.stderr]))
+    assert ("made" in ran.stdout) == (status == 0)

@@ -208,7 +208,8 @@ async def _refused(request: Request, error: Exception) -> Response:
 
 async def _unrouted(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException), "what the handler is for"
-    return PlainTextResponse("There is nothing at this address.", error.status_code, PASSING)
+    text = "Only GET and HEAD are answered." if error.status_code == 405 else "There is nothing at this address."
+    return PlainTextResponse(text, error.status_code, {**PASSING, **(error.headers or {})})
 
 
 async def _broken(request: Request, error: Exception) -> Response:

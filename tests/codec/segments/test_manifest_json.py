@@ -2,7 +2,9 @@
 """A manifest comes back as it was written, and what a hostile host sends is refused in words."""
 
 import json
+import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -34,6 +36,9 @@ from structgstream.codec.segments.manifest_json import (
 from structgstream.errors import StreamError
 
 SHA = sha256_of(b"something")
+VECTORS = Path(__file__).parents[2] / "vectors"
+GOLDEN = (VECTORS / "segments-1" / "manifest.json").read_bytes()
+RULES: list[dict[str, Any]] = json.loads((VECTORS / "manifest-rules.json").read_text())
 
 
 def segment(number: int, frames: int = 3) -> SegmentEntry:
@@ -112,10 +117,10 @@ BAD: list[tuple[tuple[Any, ...], Any, str]] = [
     (("version",), 2, "has version 2; this program reads 1"),
     (("sequence",), -1, "'sequence' -1; expected a whole number"),
     (("sequence",), True, "'sequence' true; expected a whole number"),
-    (("sequence",), 1.0, "'sequence' 1.0; expected a whole number"),
+    (("sequence",), 1.5, "'sequence' 1.5; expected a whole number"),
     (("live",), 1, "'live' 1; expected true or false"),
-    (("fps",), 0, "'fps' 0; expected a positive number"),
-    (("fps",), "30", "'fps' \"30\"; expected a number from 0"),
+    (("fps",), 0, "'fps' 0; expected a number from 1e-09"),
+    (("fps",), "30", "'fps' \"30\"; expected a number from 1e-09"),
     (("name",), "x" * 1001, "expected a text of at most 1000 characters"),
     (("edge", "frame"), 14, "lists frames 0 to 13, and its edge is frame 14"),
     (("edge", "pts_seconds"), 1e300, r"expected a number from -1e\+15 to 1e\+15"),
@@ -184,8 +189,34 @@ def test_what_is_no_manifest_is_refused(data: bytes) -> None:
 def test_numbers_without_a_value_are_refused() -> None:
     for text in ("NaN", "Infinity", "-Infinity", "1e999"):
         data = manifest_to_json(manifest()).replace(b'"fps":30.0', f'"fps":{text}'.encode())
-        with pytest.raises(StreamError, match="'fps'"):
+        with pytest.raises(StreamError, match="'fps'|is not JSON"):
             read(data)
+
+
+@pytest.mark.parametrize("rule", RULES, ids=[f"{rule['at']} {rule['json'][:24]}" for rule in RULES])
+def test_the_rules_that_the_player_follows_too(rule: dict[str, Any]) -> None:
+    """viewer/packages/player/test/manifest.test.ts reads the same cases."""
+    plain = json.loads(GOLDEN)
+    place = plain
+    for key in rule["at"][:-1]:
+        place = place[key]
+    place[rule["at"][-1]] = "@"
+    value = re.sub(r"<(.+?)\*(\d+)>", lambda found: found[1] * int(found[2]), rule["json"])
+    data = json.dumps(plain).replace('"@"', value).encode()
+    if rule["taken"]:
+        read(data)
+    else:
+        with pytest.raises(StreamError, match=r"^manifest.json"):
+            read(data)
+
+
+def test_a_byte_order_mark_and_what_is_too_long_are_refused() -> None:
+    read(GOLDEN)
+    with pytest.raises(StreamError, match="is not JSON"):
+        read(b"\xef\xbb\xbf" + GOLDEN)
+    read(GOLDEN + b" " * (MOST_MANIFEST_BYTES - len(GOLDEN)))
+    with pytest.raises(StreamError, match="expected at most 4194304"):
+        read(GOLDEN + b" " * (MOST_MANIFEST_BYTES + 1 - len(GOLDEN)))
 
 
 @given(st.data())

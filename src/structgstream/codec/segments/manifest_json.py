@@ -31,6 +31,7 @@ MOST_ENTRIES = 4096
 MOST_GROUP_FRAMES = 65_536
 MOST_SEGMENT_BYTES = 2**40
 MOST_LEVEL = 8
+MIN_FPS = 1e-9
 
 
 def manifest_to_json(manifest: Manifest) -> bytes:
@@ -52,9 +53,9 @@ def manifest_from_json(data: bytes, *, name: str) -> Manifest:
         raise StreamError(f"{name} has version {version}; this program reads {VERSION}. Install a newer structgstream.")
     edge, window = top.fields("edge"), top.fields("window")
     manifest = Manifest(
-        sequence=top.whole("sequence", most=2**53),
+        sequence=top.whole("sequence", most=2**53 - 1),
         live=top.flag("live"),
-        fps=_positive(top, "fps"),
+        fps=top.number("fps", least=MIN_FPS),
         name=top.text("name"),
         target_latency_seconds=top.number("target_latency_seconds", least=0.0),
         frame_seconds=None if top.is_none("frame_seconds") else top.number("frame_seconds", least=0.0),
@@ -107,12 +108,6 @@ def page_from_json(data: bytes, entry: HistoryEntry) -> tuple[SegmentEntry, ...]
 
 def _dumped(value: dict[str, Any]) -> bytes:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode() + b"\n"
-
-
-def _positive(fields: Fields, name: str) -> float:
-    if (value := fields.number(name, least=0.0)) <= 0.0:
-        fields.refuse(f"has {name!r} {value:g}; expected a positive number")
-    return value
 
 
 def _optional(fields: Fields, name: str) -> float | None:
@@ -191,6 +186,8 @@ def _check(manifest: Manifest, name: str) -> None:
         raise StreamError(f"{name} lists frames 0 to {frame - 1}, and its edge is frame {manifest.edge.frame}.")
     if manifest.parts and not manifest.live:
         raise StreamError(f"{name} has parts although its run has ended.")
+    if manifest.parts and manifest.parts[0].kind is not PacketKind.KEY:
+        raise StreamError(f"{name} has parts that do not begin with a key frame.")
     if window.first_frame >= frame or window.first_segment > segment:
         raise StreamError(f"{name} has a window that begins after its edge.")
     periods = manifest.periods

@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading JSON of a host that may be hostile: every value is checked for its type and bounds before it is used."""
+"""Reading JSON of a host that may be hostile: every value is checked for its type and bounds before it is used.
+
+The player's reader (viewer/packages/player/src/source/checks.ts) follows the same rules, which docs/segments.md states:
+`12.0` and `1.2e1` are whole numbers, what is not RFC 8259 is refused also where nobody asks for it, and so is a byte
+order mark.
+"""
 
 import json
 import re
@@ -105,9 +110,10 @@ class Fields:
         return self._value[name]
 
     def _whole(self, name: str, value: Any, least: int, most: int) -> int:
-        if type(value) is not int or not least <= value <= most:
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not number or not least <= value <= most or value != int(value):
             self._refuse(name, value, f"a whole number from {least} to {most}")
-        return value
+        return int(value)
 
     def _number(self, name: str, value: Any, least: float, most: float) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
@@ -127,10 +133,19 @@ def parse_object(data: bytes, where: str, *, most_bytes: int) -> Fields:
     if len(data) > most_bytes:
         raise StreamError(f"{where} has {len(data)} bytes; expected at most {most_bytes}.")
     try:
-        value = json.loads(data.decode())
+        value = json.loads(data.decode(), parse_int=_number, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
         raise StreamError(f"{where} is not JSON ({error}).") from None
     return Fields(value, where)
+
+
+def _number(text: str) -> int | float:
+    """Python refuses to convert very many digits, which are a number nevertheless."""
+    return int(text) if len(text) < 20 else float(text)
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise ValueError(f"it holds {name}")
 
 
 def _shown(value: object) -> str:

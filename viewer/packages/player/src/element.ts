@@ -11,6 +11,8 @@
  * | `theme` | `dark` or `light`; otherwise as the system's |
  * | `truth` | address of a list of cameras that have pictures, `truth.json`; they are at `truth/CAMERA/FRAME.jpg` beside it |
  * | `isolated` | the page's address (`?src=&t=&view=&embed=1`) means nothing to this player |
+ *
+ * It dispatches what the player tells as events of these names, which do not bubble; `detail` has what each brings.
  */
 
 import { type Camera, type RenderStats, type ResourceCounts, SplatRenderer } from "@structgstream/gl";
@@ -32,13 +34,9 @@ interface Running {
   readonly observer: ResizeObserver;
 }
 
-type Name = keyof PlayerEvents;
-
 export class StructgstreamPlayer extends HTMLElement {
   static readonly observedAttributes = ["src", "loop", "controls", "embed"];
   private running: Running | undefined;
-  private readonly listeners: { readonly name: Name; readonly listener: (event: never) => void; off?: () => void }[] =
-    [];
   private ticking: number | undefined;
   private link: Link | undefined;
   /** The stream's address where a link can lead to it. */
@@ -184,14 +182,10 @@ export class StructgstreamPlayer extends HTMLElement {
   }
 
   /** Listens to the player; what comes back ends the listening. Kept when another stream is loaded. */
-  on<EventName extends Name>(name: EventName, listener: (event: PlayerEvents[EventName]) => void): () => void {
-    const entry: (typeof this.listeners)[number] = { name, listener: listener as (event: never) => void };
-    this.listeners.push(entry);
-    if (this.running) entry.off = this.running.player.on(name, listener);
-    return () => {
-      entry.off?.();
-      this.listeners.splice(this.listeners.indexOf(entry), 1);
-    };
+  on<EventName extends keyof PlayerEvents>(name: EventName, listener: (event: PlayerEvents[EventName]) => void): () => void {
+    const heard = (event: Event) => listener((event as CustomEvent<PlayerEvents[EventName]>).detail);
+    this.addEventListener(name, heard);
+    return () => this.removeEventListener(name, heard);
   }
 
   /** The picture as it is, as PNG. */
@@ -241,7 +235,7 @@ export class StructgstreamPlayer extends HTMLElement {
     const observer = new ResizeObserver(() => this.resized());
     observer.observe(this);
     this.running = { player, surface, observer };
-    for (const entry of this.listeners) entry.off = player.on(entry.name, entry.listener as (event: unknown) => void);
+    player.relay = this.tell;
     player.still = matchMedia("(prefers-reduced-motion: reduce)").matches;
     player.setLoop(this.hasAttribute("loop"));
     this.applyAttributes(surface);
@@ -262,10 +256,12 @@ export class StructgstreamPlayer extends HTMLElement {
     middle.className = "middle bad";
     middle.append(text);
     root.replaceChildren(style, middle);
-    for (const { name, listener } of this.listeners) {
-      if (name === "error") (listener as (event: unknown) => void)({ message: text.textContent, fatal: true });
-    }
+    this.tell("error", { message: text.textContent, fatal: true });
   }
+
+  private readonly tell = (name: string, detail: unknown): void => {
+    this.dispatchEvent(new CustomEvent(name, { detail }));
+  };
 
   private stop(): void {
     if (this.ticking !== undefined) cancelAnimationFrame(this.ticking);
@@ -274,7 +270,6 @@ export class StructgstreamPlayer extends HTMLElement {
     this.running = undefined;
     running?.observer.disconnect();
     running?.player.destroy();
-    for (const entry of this.listeners) delete entry.off;
     this.shadowRoot?.replaceChildren();
   }
 

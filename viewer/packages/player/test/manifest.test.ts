@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 /** Manifests of honest and of hostile hosts. */
 
+import { readFileSync } from "node:fs";
 import { describe, expect, test } from "vitest";
 import { SourceError } from "../src/source/byteSource.ts";
 import { type Manifest, manifestIn, type PageEntry, pageIn } from "../src/source/manifest.ts";
@@ -82,6 +83,36 @@ test.each([
 ] as const)("refused: %s %j", (path, value) => {
   if (path === "__proto__") expect(parsed(but(path, value)).live).toBe(true);
   else expect(() => parsed(but(path, value))).toThrow(/manifest\.json/);
+});
+
+const VECTORS = new URL("../../../../tests/vectors/", import.meta.url);
+const GOLDEN = readFileSync(new URL("segments-1/manifest.json", VECTORS), "utf8");
+type Rule = { readonly at: readonly (string | number)[]; readonly json: string; readonly taken: boolean };
+const RULES = JSON.parse(readFileSync(new URL("manifest-rules.json", VECTORS), "utf8")) as readonly Rule[];
+
+test.each(RULES)("the rules that the Python reader follows too: $at $json", ({ at, json, taken }) => {
+  const plain = JSON.parse(GOLDEN) as Json;
+  let place: Json = plain;
+  for (const key of at.slice(0, -1)) place = place[key] as Json;
+  place[at.at(-1)!] = "@";
+  const value = json.replace(/<(.+?)\*(\d+)>/, (_, unit: string, times: string) => unit.repeat(Number(times)));
+  const read = () => parsed(JSON.stringify(plain).replace('"@"', value));
+  if (taken) expect(read().live).toBe(true);
+  else expect(read).toThrow(/manifest\.json/);
+});
+
+test("a byte order mark and what is too long are refused", () => {
+  const padded = (bytes: number) => () => parsed(GOLDEN.padEnd(bytes));
+  expect(padded(2 ** 22)).not.toThrow();
+  expect(padded(2 ** 22 + 1)).toThrow("expected at most 4194304");
+  expect(() => parsed(`\u{feff}${GOLDEN}`)).toThrow("is no JSON");
+  const listed = JSON.stringify({
+    format: "structgstream-qualities",
+    version: 1,
+    qualities: [{ name: "a", manifest: "a/manifest.json", bits_per_second: 1 }],
+  });
+  expect(parsed(listed.padEnd(2 ** 16))).toHaveLength(1);
+  expect(() => parsed(listed.padEnd(2 ** 16 + 1))).toThrow("expected at most 65536");
 });
 
 test.each([

@@ -2,6 +2,8 @@
 
 /** Calls who listens; `Events` maps names of events to what they bring. */
 export class Emitter<Events extends object> {
+  /** Gets every event, after those who listen to it. */
+  relay: ((name: keyof Events, event: unknown) => void) | undefined;
   private readonly listeners = new Map<keyof Events, Set<(event: never) => void>>();
 
   /** @returns a function that ends the listening */
@@ -13,9 +15,11 @@ export class Emitter<Events extends object> {
 
   emit<Name extends keyof Events>(name: Name, event: Events[Name]): void {
     for (const listener of [...(this.listeners.get(name) ?? [])]) (listener as (event: Events[Name]) => void)(event);
+    this.relay?.(name, event);
   }
 
   clear(): void {
     this.listeners.clear();
+    this.relay = undefined;
   }
 }

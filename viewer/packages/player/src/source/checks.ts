@@ -32,8 +32,9 @@ export function number(least = -1e15): Check<number> {
 
 export const flag: Check<boolean> = checked((value) => typeof value === "boolean", "true or false");
 
+/** Characters are Unicode's, and there are no halves of any: JSON may hold these. */
 export const text: Check<string> = checked(
-  (value) => typeof value === "string" && value.length <= 1000,
+  (value) => typeof value === "string" && [...value].length <= 1000 && !/\p{Cs}/u.test(value),
   "a text of at most 1000 characters",
 );
 
@@ -78,13 +79,13 @@ export function fieldOf(where: string, name: string): string {
 }
 
 /**
- * The value that JSON stands for.
+ * The value that JSON stands for, in UTF-8 without a byte order mark.
  *
  * @throws SourceError it is none
  */
 export function parsedJson(bytes: Uint8Array, where: string): unknown {
   try {
-    return JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(bytes));
+    return JSON.parse(new TextDecoder("utf-8", { fatal: true, ignoreBOM: true }).decode(bytes));
   } catch {
     throw new SourceError(`${where} is no JSON: it was cut or changed, or is something else.`);
   }

@@ -25,6 +25,7 @@ const MOST_ENTRIES = 4096;
 const MOST_GROUP_FRAMES = 65_536;
 const MOST_RECORD_BYTES = 2 ** 33;
 const MOST_QUALITIES = 8;
+const MOST_LIST_BYTES = 2 ** 16;
 
 const count = whole(1);
 const storedFile = {
@@ -116,7 +117,10 @@ export type Quality = ReturnType<typeof qualities>[number];
  */
 export function manifestIn(bytes: Uint8Array, name: string): Manifest | readonly Quality[] {
   const value = parsedJson(bytes, name);
-  if ((value as { format?: unknown } | null)?.format === QUALITIES) {
+  const listed = (value as { format?: unknown } | null)?.format === QUALITIES;
+  const most = listed ? MOST_LIST_BYTES : MOST_MANIFEST_BYTES;
+  if (bytes.length > most) throw new SourceError(`${name} has ${bytes.length} bytes; expected at most ${most}.`);
+  if (listed) {
     const found = shaped({ version: only(1), qualities })(value, name).qualities;
     return found.length ? found : refuse(fieldOf(name, "qualities"), [], "at least one");
   }
