@@ -223,6 +223,7 @@ class FrameFit:
             backend=self.backend,
             generator=self.generator,
         )
+        rests = rest_every(config.motion.rest_every, views=len(seen), iterations=iterations)
         return NextFrameHooks(
             start=start,
             parameters=parameters,
@@ -233,10 +234,13 @@ class FrameFit:
             early_stopping=EarlyStopping(config.least_gain * len(start.views) / max(1, config.iterations), len(seen)),
             patch_at=math.ceil(patching.iteration * len(seen) / len(start.views)),
             patches="free" in config.dynamic,
-            last_pass=LastPass(0 if config.least_gain else iterations - len(seen)),
+            last_pass=LastPass(
+                0 if config.least_gain else iterations - len(seen),
+                terms_after=0 if config.least_gain else iterations - rests * len(seen),
+            ),
             backend=self.iteration_backend,
             watch=self.watch,
-            rest_every=rest_every(config.motion.rest_every, views=len(seen), iterations=iterations),
+            rest_every=rests,
             iterations=iterations,
             average=MeanOfSteps(math.floor(iterations * (1.0 - config.mean_of_last))) if config.mean_of_last else None,
         )
