@@ -26,7 +26,7 @@ def loss_of(grey: int, index: int = 0) -> tuple[ViewLoss, View]:
         backend=BACKEND,
         weights=LossWeights(),
         track_screen=False,
-        watch=Stopwatch(CPU),
+        watch=Stopwatch(),
     )
     return loss, view
 

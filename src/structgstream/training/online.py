@@ -141,7 +141,7 @@ def run_frame_fit(
     """Calls ``fit_with`` with a :class:`FrameFit`, on a GPU again with more memory if that of ``slots`` is short."""
 
     def run(iteration_backend: Backend) -> FitResult[Scene]:
-        generator, watch = torch.Generator().manual_seed(seed), Stopwatch(backend.device)
+        generator, watch = torch.Generator().manual_seed(seed), Stopwatch()
         return fit_with(
             FrameFit(config, backend, iteration_backend, frame_index, generator, watch, steps or {}, on_step)
         )
