@@ -57,7 +57,6 @@ def fit_next_frame(
     config: OnlineConfig,
     backend: Backend,
     seed: int,
-    before: MultiViewFrame | None = None,
     pictures: FramePictures | None = None,
     steps: Mapping[str, float] | None = None,
     older: Scene | None = None,
@@ -78,13 +77,12 @@ def fit_next_frame(
         older: the decoded scene two frames before, if :func:`needs_older`; None for none.
         floor: residuals of frame 0, for ``config.motion.residual_threshold`` and for births; None for none.
         light: frame 0's, for ``config.light``; None for none.
-        before: the previous frame, for motion segmentation (``config.motion``); without it everything is trained.
-        pictures: of ``frame`` and their changes since ``before``
-            (:func:`~structgstream.training.pictures.pictures_of`), if computed already.
+        pictures: of ``frame``, and their changes since the previous one for motion segmentation (``config.motion``;
+            :func:`~structgstream.training.pictures.pictures_of`); without them everything is trained.
         on_step: called after every iteration.
     """
     if pictures is None:
-        pictures = pictures_of(frame, rig, before=before, motion=config.motion, start=config.start, backend=backend)
+        pictures = pictures_of(frame, rig, before=None, motion=config.motion, start=config.start, backend=backend)
     if len(pictures.views) < min(LEAST_CAMERAS, len(rig.training)):
         return held(scene)
     if config.patching.lifetime == "frame":
