@@ -19,6 +19,7 @@ from structgstream.kernels.backend import Backend, cpu_backend
 from structgstream.presets import MOTION, PAPER
 from structgstream.training.online import fit_next_frame
 from structgstream.training.online_config import OnlineConfig
+from structgstream.training.pictures import pictures_of
 from structgstream.training.result import FitResult
 
 NOISE = 1.0  # Levels of 255: what a good camera leaves after denoising.
@@ -47,8 +48,16 @@ def _fitting(
     fits: list[FitResult] = []
 
     def run() -> Results:
+        pictures = pictures_of(
+            world.frame,
+            world.rig,
+            before=world.previous,
+            motion=config.motion,
+            start=config.start,
+            backend=backend,
+        )
         fit = fit_next_frame(
-            world.before, world.frame, world.rig, config=config, backend=backend, seed=0, before=world.previous
+            world.before, world.frame, world.rig, config=config, backend=backend, seed=0, pictures=pictures
         )
         fits[:] = [fit]
         quality = held_out_psnr(fit.scene, world, cpu_backend())

@@ -10,7 +10,6 @@ the process started. It covers all threads: a prefetched frame counts in the sta
 readers of the mark, ``ru_maxrss`` included, see the reset value.
 """
 
-import sys
 from enum import StrEnum
 from pathlib import Path
 
@@ -86,10 +85,9 @@ def status_bytes(name: str) -> int | None:
 
 
 def process_peak_bytes() -> int | None:
-    """Largest resident size of the process, on Linux since the last reset; None where unknown."""
+    """Largest resident size of the process since the last reset; None where unknown."""
     try:
         import resource
     except ImportError:
         return None
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

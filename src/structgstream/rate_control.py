@@ -4,8 +4,10 @@
 Note [Pressure]
 ~~~~~~~~~~~~~~~
 The quantization steps of a stream are fixed in its header. Rate control changes the price of a bit in the loss, and the
-gradient threshold for spawning free Gaussians, by one factor, the pressure; 1 leaves the configuration's values. It is
-a function of the sizes of earlier packets only, so that a resumed stream is identical.
+gradient threshold for spawning free Gaussians (without effect where ``patching.spawn`` is off), by one factor, the
+pressure; 1 leaves the configuration's values. Gaussians that ``births`` spawns do not follow it: their number and bytes
+are the same at every pressure. It is a function of the sizes of earlier packets only, so that a resumed stream is
+identical.
 
 Note [Windows]
 ~~~~~~~~~~~~~~
@@ -131,7 +133,10 @@ class RateController:
     def _tell(self, index: int) -> None:
         """Warns when the target begins to be missed."""
         if self.missed and not self._said:
-            remedy = "nothing more can be saved: take coarser steps (online.rounding.quality) or a higher target"
+            remedy = (
+                "nothing more can be saved: take coarser steps (online.rounding.quality), spawn fewer Gaussians "
+                "(online.births.most) or take a higher target"
+            )
             _log.warning(
                 "Frame %d: the last %d frames take %.3g Mbit/s, the target is %.3g; %s.",
                 index,

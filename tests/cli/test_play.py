@@ -184,11 +184,8 @@ def test_a_missing_extra_is_told(
 def test_a_browser_is_opened_only_where_there_is_a_screen(monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
     monkeypatch.setattr(running.webbrowser, "open", lambda address: not opened.append(address))
-    monkeypatch.setattr(running.sys, "platform", "linux")
     assert not running.open_browser("http://127.0.0.1:1/", environ={"DISPLAY": ""})
     assert opened == []
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
         assert running.open_browser("http://127.0.0.1:1/", environ={name: "x"})
-    monkeypatch.setattr(running.sys, "platform", "darwin")
-    assert running.open_browser("http://127.0.0.1:1/", environ={})
-    assert len(opened) == 4
+    assert len(opened) == 3

@@ -6,8 +6,6 @@ import pytest
 
 from structgstream.evaluation.affine import (
     ChannelFit,
-    affine_fit,
-    apply_color_matrix,
     channel_fit,
     psnr_affine,
     psnr_camera_color,
@@ -21,16 +19,15 @@ def picture(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(30, 200, (24, 31, 3)).astype(np.uint8)
 
 
-def test_a_planted_matrix_is_recovered() -> None:
-    source = picture()
-    truth = np.rint(apply_color_matrix(source, PLANTED)).astype(np.uint8)
-    # Rounding of the truth is noise of 0.29 / 255 a value, averaged over 744 pixels.
-    np.testing.assert_allclose(affine_fit(source, truth), PLANTED, atol=1e-3)
+def recolored(source: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """``source`` ``[H, W, 3]`` through a 3x4 colour matrix, whose last column is a bias, full scale 1."""
+    through = source @ matrix[:, :3].T + 255.0 * matrix[:, 3]
+    return np.rint(np.clip(through, 0, 255)).astype(np.uint8)
 
 
 def test_colour_is_forgiven_and_structure_is_not() -> None:
     source = picture()
-    truth = np.rint(apply_color_matrix(source, PLANTED)).astype(np.uint8)
+    truth = recolored(source, PLANTED)
     assert psnr(source, truth) < 26
     assert psnr_affine(source, truth) > 55  # what rounding leaves
     assert psnr_affine(picture(1), truth) < 20
@@ -44,7 +41,6 @@ def test_the_fit_never_loses_on_pictures_inside_the_range() -> None:
 def test_a_picture_of_one_colour_has_a_fit() -> None:
     grey = np.full((6, 7, 3), 90, np.uint8)
     truth = np.full((6, 7, 3), 120, np.uint8)
-    assert np.isfinite(affine_fit(grey, truth)).all()
     assert psnr_affine(grey, truth) == pytest.approx(PSNR_OF_EQUALS, abs=250)
     assert psnr_affine(grey, truth) > 80
 
@@ -55,7 +51,7 @@ IDENTITY = ChannelFit(gains=(1.0, 1.0, 1.0), biases=(0.0, 0.0, 0.0))
 
 def taken(scene: np.ndarray, fit: ChannelFit = EXPOSURE) -> np.ndarray:
     """What a camera of that exposure records."""
-    return np.rint(apply_color_matrix(scene, np.column_stack([np.diag(fit.gains), fit.biases]))).astype(np.uint8)
+    return recolored(scene, np.column_stack([np.diag(fit.gains), fit.biases]))
 
 
 def test_a_cameras_gain_and_bias_are_found_in_one_frame_and_hold_in_another() -> None:
@@ -72,7 +68,7 @@ def test_a_held_fit_does_not_forgive_light_that_changes_nor_colours_that_mix() -
     later = picture(1)
     darker = taken(later, ChannelFit(gains=(0.6, 0.6, 0.6), biases=EXPOSURE.biases))
     assert psnr_camera_color(later, darker, fit) < 20 < psnr_affine(later, darker)
-    mixed = np.rint(apply_color_matrix(later, PLANTED)).astype(np.uint8)
+    mixed = recolored(later, PLANTED)
     assert psnr_camera_color(later, mixed, channel_fit(later, mixed)) < psnr_affine(later, mixed) - 10
 
 

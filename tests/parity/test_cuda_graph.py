@@ -17,6 +17,7 @@ from structgstream.training.motion import MotionConfig
 from structgstream.training.online import fit_next_frame
 from structgstream.training.online_config import OnlineConfig
 from structgstream.training.patching import PatchingConfig
+from structgstream.training.pictures import pictures_of
 from worlds import moving_world
 
 
@@ -84,7 +85,14 @@ def test_a_frame_of_recorded_iterations_is_that_of_single_ones(device: str) -> N
             config=config,
             backend=backend,
             seed=0,
-            before=world.frames[0],
+            pictures=pictures_of(
+                world.frames[1],
+                world.rig,
+                before=world.frames[0],
+                motion=config.motion,
+                start=config.start,
+                backend=backend,
+            ),
             steps={str(name): step for name, step in config.rounding.steps(0.01).items()},
         )
         for backend in (recorded, single)

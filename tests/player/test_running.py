@@ -3,7 +3,6 @@
 
 import asyncio
 import socket
-import sys
 import webbrowser
 
 import pytest
@@ -47,7 +46,6 @@ def test_a_port_that_cannot_be_used_is_one_sentence(port: int | str) -> None:
             bound(number)
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is always a screen")
 def test_a_browser_needs_a_screen(monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
     monkeypatch.setattr(webbrowser, "open", lambda address: opened.append(address) or True)

@@ -228,6 +228,11 @@ def test_nothing_can_be_changed(server: Served, method: str) -> None:
     assert (answer.status, answer.headers["connection"]) == (405, "close")
 
 
+def test_what_is_allowed_is_named(server: Served) -> None:
+    answer = server.ask("/streams/studio/manifest.json", method="OPTIONS")
+    assert (answer.status, answer.headers["allow"]) == (405, "GET, HEAD")
+
+
 def test_a_request_has_no_body(server: Served) -> None:
     for header in (b"Content-Length: 100000000", b"Transfer-Encoding: chunked"):
         answer = answer_to(server, b"GET /health HTTP/1.1\r\nHost: localhost\r\n" + header + b"\r\n\r\n1\r\nx\r\n")

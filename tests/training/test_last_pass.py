@@ -26,7 +26,7 @@ def loss_of(grey: int, index: int = 0) -> tuple[ViewLoss, View]:
         backend=BACKEND,
         weights=LossWeights(),
         track_screen=False,
-        watch=Stopwatch(CPU),
+        watch=Stopwatch(),
     )
     return loss, view
 
@@ -45,6 +45,18 @@ def test_the_last_pass_reports_psnr_in_decibels_and_terms() -> None:
     last.add(2, bright, second)
     assert last.psnr == pytest.approx((psnr(dark, first) + psnr(bright, second)) / 2, abs=1e-4)
     assert last.terms["l1"] == pytest.approx((dark.terms["l1"].item() + bright.terms["l1"].item()) / 2)
+
+
+def test_terms_of_other_tiles_are_left_out() -> None:
+    """A visit of changed tiles alone has another l1; the last visit of all of them counts."""
+    (dark, view), (bright, _) = loss_of(90), loss_of(200)
+    last = LastPass(after=4, terms_after=2)
+    last.add(2, bright, view)
+    assert last.terms == {}
+    last.add(3, bright, view)
+    last.add(5, dark, view, comparable=False)
+    assert last.terms["l1"] == pytest.approx(bright.terms["l1"].item())
+    assert last.psnr == pytest.approx(psnr(dark, view), abs=1e-4)
 
 
 def test_a_view_counts_once_and_what_came_before_does_not() -> None:

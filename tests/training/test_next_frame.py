@@ -82,7 +82,7 @@ def hooks_of(
         patches=patches,
         last_pass=LastPass(),
         backend=BACKEND,
-        watch=Stopwatch(CPU),
+        watch=Stopwatch(),
         rest_every=rest_every,
     )
 

@@ -17,6 +17,7 @@ from structgstream.training.motion import MotionConfig
 from structgstream.training.online import fit_next_frame
 from structgstream.training.online_config import OnlineConfig, OnlineRates
 from structgstream.training.patching import BIRTHS_PER_FRAME, PatchingConfig
+from structgstream.training.pictures import pictures_of
 from structgstream.training.result import Step
 from worlds import moving_world, psnr, rendered
 
@@ -159,15 +160,10 @@ FOLLOWING = replace(
 
 
 def followed(scene, world, index, *, config=FOLLOWING, seed=0, older=None, backend: Backend | None = None):
+    backend, frame, before = backend or quickest_backend(), world.frames[index], world.frames[index - 1]
+    pictures = pictures_of(frame, world.rig, before=before, motion=config.motion, start=config.start, backend=backend)
     return fit_next_frame(
-        scene,
-        world.frames[index],
-        world.rig,
-        config=config,
-        backend=backend or quickest_backend(),
-        seed=seed,
-        before=world.frames[index - 1],
-        older=older,
+        scene, frame, world.rig, config=config, backend=backend, seed=seed, pictures=pictures, older=older
     )
 
 

@@ -33,7 +33,7 @@ def loss_of(parameters, scene, **weights):
         weights=LossWeights(**weights),
         voxel_size=0.01,
         track_screen=True,
-        watch=Stopwatch(CPU),
+        watch=Stopwatch(),
     )
 
 
@@ -72,7 +72,7 @@ def run(iterations: int, until: int = 10**9, **stages: int) -> tuple[int, Parabo
     adam = Adam(reference_backend(), leaves({"x": torch.zeros(1)}))
     hooks, steps = Parabola(adam, until), []
     schedule = Schedule(iterations, lambda iteration: {"x": 0.1 * iteration}, **stages)
-    done = optimize(adam, cycle([1.0, 2.0]), schedule, hooks, watch=Stopwatch(CPU), on_step=steps.append)
+    done = optimize(adam, cycle([1.0, 2.0]), schedule, hooks, watch=Stopwatch(), on_step=steps.append)
     return done, hooks, steps
 
 
@@ -95,7 +95,7 @@ def test_iterations_that_are_recorded_take_the_steps_of_their_time() -> None:
         adam = Adam(reference_backend(), {**leaves({"x": torch.zeros(1)}), "fixed": torch.ones(1)})
         hooks = Repeating(adam)
         schedule: Schedule[str] = Schedule(9, lambda iteration: {"x": 0.1 * iteration, "fixed": 0.0})
-        optimize(adam, cycle([1.0, 2.0]), schedule, hooks, watch=Stopwatch(CPU), recorder=recorder)
+        optimize(adam, cycle([1.0, 2.0]), schedule, hooks, watch=Stopwatch(), recorder=recorder)
         found.append([x for what, _, x in hooks.seen if what == "after"])
         if recorder is not None:
             assert recorder.keys == [2.0, 1.0, 2.0, 1.0, 2.0, 1.0]  # The first iteration is not recorded.
@@ -116,19 +116,19 @@ def test_progress_counts_all_stages_of_a_frame() -> None:
 def test_empty_and_fixed_leaves_have_no_gradient() -> None:
     values = {**leaves({"x": torch.ones(2), "none": torch.zeros(0)}), "fixed": torch.ones(2)}
     total = (values["x"] * values["fixed"]).sum() + values["none"].sum()
-    gradients, screen = gradients_of(Loss(total, {}), values, Stopwatch(CPU))
+    gradients, screen = gradients_of(Loss(total, {}), values, Stopwatch())
     assert (list(gradients), screen) == (["x"], None)
-    assert gradients_of(Loss(values["fixed"].sum(), {}), values, Stopwatch(CPU)) == ({}, None)
+    assert gradients_of(Loss(values["fixed"].sum(), {}), values, Stopwatch()) == ({}, None)
     scene = random_scene()
     parameters = Parameters.of(scene, trained=frozenset(FREE_ROWS))
-    assert gradients_of(loss_of(parameters, scene), parameters.values, Stopwatch(CPU))[0] == {}
+    assert gradients_of(loss_of(parameters, scene), parameters.values, Stopwatch())[0] == {}
 
 
 def test_gradients_reach_exactly_the_trained_parameters() -> None:
     scene = random_scene(free=3)
     parameters = Parameters.of(scene, trained=parameters_of_fields(PAPER_DYNAMIC))
     loss = loss_of(parameters, scene)
-    gradients, screen = gradients_of(loss, parameters.values, Stopwatch(CPU))
+    gradients, screen = gradients_of(loss, parameters.values, Stopwatch())
     assert set(gradients) == parameters_of_fields(PAPER_DYNAMIC)
     assert screen is not None
     assert screen.shape == (len(loss.rendering.gaussians), 2)
@@ -143,6 +143,6 @@ def test_a_view_that_shows_nothing_has_no_gradients() -> None:
     parameters = Parameters.of(scene, trained=parameters_of_fields(PAPER_DYNAMIC))
     loss = loss_of(parameters, scene, volume=0.0)
     assert len(loss.rendering.gaussians) == 0
-    gradients, screen = gradients_of(loss, parameters.values, Stopwatch(CPU))
+    gradients, screen = gradients_of(loss, parameters.values, Stopwatch())
     assert all(not gradient.any() for gradient in gradients.values())
     assert screen is None or not len(screen)

@@ -95,10 +95,10 @@ def test_a_focus_draws_and_learns_what_the_whole_picture_would(build: Callable[[
                 weights=LossWeights(volume=0.0),
                 voxel_size=0.0,
                 track_screen=False,
-                watch=Stopwatch(CPU),
+                watch=Stopwatch(),
                 focus=place,
             )
-            found.append(gradients_of(loss, parameters.values, Stopwatch(CPU))[0])
+            found.append(gradients_of(loss, parameters.values, Stopwatch())[0])
         for name, theirs in found[1].items():
             rows = partition.segmentation.free if name.startswith("free") else partition.segmentation.anchors
             ours = found[0][name][rows]

@@ -30,7 +30,7 @@ def loss_of(parameters, scene, **weights):
         weights=LossWeights(**weights),
         voxel_size=0.01,
         track_screen=True,
-        watch=Stopwatch(CPU),
+        watch=Stopwatch(),
     )
     return loss, view
 
@@ -90,7 +90,7 @@ def test_masked_pixels_have_no_influence_on_loss_and_gradient(learned: bool, foc
         backend=backend,
         weights=weights,
         track_screen=False,
-        watch=Stopwatch(CPU),
+        watch=Stopwatch(),
         focus=focus if focused else None,
     )
     (found,) = torch.autograd.grad(loss.total, colors)

@@ -7,7 +7,7 @@ import torch
 
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.motion import MotionConfig
-from structgstream.training.trust import ViewChange, is_scene_cut, suspects, trusted_views
+from structgstream.training.trust import ViewChange, is_scene_cut, suspects, trusted_views, unrecognized_faults
 from structgstream.training.views import training_views
 from worlds import moved_since, moving_world
 
@@ -67,6 +67,23 @@ def test_when_all_change_everywhere_it_is_a_jump_and_all_are_believed() -> None:
 
 def test_two_views_are_always_left() -> None:
     assert trusted_views([USUAL, replace(USUAL, changed_share=0.9)]) == [True, True]
+
+
+def test_what_few_views_cannot_show_is_said() -> None:
+    """The sentences are what :func:`trusted_views` does."""
+    frozen = ViewChange(changed_share=0.0, wrong_share=0.02, repeated=True)
+    bumped, wrong = replace(USUAL, shift_pixels=9.0), replace(USUAL, wrong_share=0.9)
+    for views in range(2, 6):
+        found = {
+            name: not trusted_views([odd, *[USUAL] * (views - 1)])[0]
+            for name, odd in (("frozen", frozen), ("bumped", bumped), ("fails", wrong))
+        }
+        said = unrecognized_faults(views) or ""
+        assert found == {name: name not in said for name in found}, views
+    assert (
+        unrecognized_faults(3)
+        == "With 3 training cameras one that is frozen cannot be recognised; that takes 4 or more."
+    )
 
 
 def test_a_black_picture_moves_nothing() -> None:

@@ -176,6 +176,7 @@ def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, con
     from structgstream.evaluation.capture import part_metadata
     from structgstream.kernels.backend import select_backend
     from structgstream.presets import departures
+    from structgstream.training.trust import unrecognized_faults
 
     if options.live.live:
         source = open_live(
@@ -199,6 +200,9 @@ def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, con
     )
     if differences := departures(preset, source.rig):
         console.print(f"The paper's data of {preset} are others: {'; '.join(differences)}.", highlight=False)
+    blind = unrecognized_faults(len(source.rig.training)) if config.online.motion.enabled else None
+    if blind is not None:
+        console.print(blind, highlight=False)
     part = part_metadata(start=options.capture.start, scale=options.capture.scale, every=options.capture.every)
     metadata = {"preset": preset, **part}
     return OpenedScene(source, captured, backend, metadata)

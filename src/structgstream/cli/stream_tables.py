@@ -49,7 +49,10 @@ def facts_table(header: Mapping[str, Any], rows: "Sequence[Row]", *, packets: Se
     if acts:
         table.add_row("acts", ", ".join(f"{name} {count:,}" for name, count in acts.items()))
     state = "damaged" if header["damage"] else "not finished"
-    table.add_row("state", "complete" if header["complete"] else f"{state}: {header['cut_reason']}")
+    table.add_row(
+        "state",
+        "complete: its run ended or was stopped in order" if header["complete"] else f"{state}: {header['cut_reason']}",
+    )
     return table
 
 

@@ -25,22 +25,6 @@ from structgstream.evaluation.metrics import decibels
 CHUNK = 256  # pixels whose products of bytes can be added exactly in float32
 
 
-def affine_fit(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """The 3x4 matrix ``A`` with the least squared error of ``A [r, g, b, 1]`` (0 to 1) against ``truth``.
-
-    Both pictures are ``[H, W, 3]`` uint8. If the solution is not unique, as for a uniform picture, the least-norm one
-    is returned.
-    """
-    return _fit_matrix(_planes(picture, truth))
-
-
-def apply_color_matrix(picture: NDArray[np.uint8], matrix: NDArray[np.float64]) -> NDArray[np.float32]:
-    """``picture`` ``[H, W, 3]`` through a 3x4 colour matrix, 0 to 255, clamped and not rounded."""
-    height, width, _ = picture.shape
-    through = _apply_matrix(_planes(picture), matrix)
-    return through[:, : height * width].T.reshape(height, width, 3).numpy()
-
-
 def psnr_affine(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
     """PSNR of ``picture`` after its best affine change of colour towards ``truth``, dB."""
     planes = _planes(picture, truth)

@@ -60,8 +60,7 @@ class CommandProcess:
         seconds = time.monotonic() - self._begun
         with self._log:
             said = tail_of(self._log, self._began_at)
-        peak = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-        return Ending(self.name, code, seconds, attempts, peak, said)
+        return Ending(self.name, code, seconds, attempts, usage.ru_maxrss * 1024, said)
 
     def ask(self) -> None:
         """Asks it to end."""

@@ -2,7 +2,6 @@
 """Loads the native library once, and keeps the reason if it cannot be loaded."""
 
 import ctypes
-import sys
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -10,14 +9,13 @@ from pathlib import Path
 from structgstream.errors import BackendError
 from structgstream.kernels.prototypes import PROTOTYPES, declare
 
-_NAMES = {"win32": "structgstream.dll", "darwin": "libstructgstream.dylib"}
 ABI_VERSION = 7
 """As in csrc/include/structgstream.h, which states when it is incremented."""
 
 
 def library_path() -> Path:
     """Where the library is installed."""
-    return Path(str(files("structgstream") / "_native" / _NAMES.get(sys.platform, "libstructgstream.so")))
+    return Path(str(files("structgstream") / "_native" / "libstructgstream.so"))
 
 
 @cache

@@ -3,7 +3,6 @@
 
 import os
 import socket
-import sys
 import webbrowser
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -63,7 +62,5 @@ def bound(port: int, *, address: str = ADDRESS) -> socket.socket:
 
 def open_browser(address: str, *, environ: Mapping[str, str] = os.environ) -> bool:
     """Opens ``address``; False without a screen, where a text browser would take over the terminal."""
-    graphical = sys.platform in ("darwin", "win32") or any(
-        environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
-    )
+    graphical = any(environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
     return graphical and webbrowser.open(address)

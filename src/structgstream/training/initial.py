@@ -265,7 +265,7 @@ def _fit(
     on_step: StepListener | None = None,
 ) -> FitResult[Scene]:
     """Train ``template`` in the iterations of frame 0 after the first ``done``."""
-    watch = Stopwatch(backend.device)
+    watch = Stopwatch()
     template = replace(template, sampling=RigSampling.of(rig) if config.sampling_filter else None)
     views, extent = training_views(frame, rig, backend.device), rig_extent(rig)
     parameters = Parameters.of(template, trained=_trained(config))

@@ -15,17 +15,19 @@ class LastPass:
 
     Args:
         after: number of first iterations to ignore.
+        terms_after: the same for loss terms, where not every visit of a view has terms that can be compared.
     """
 
-    def __init__(self, after: int = 0) -> None:
-        self._after = after
+    def __init__(self, after: int = 0, *, terms_after: int | None = None) -> None:
+        self._after, self._terms_after = after, after if terms_after is None else terms_after
         self._terms: dict[int, dict[str, Tensor]] = {}
         self._squared_errors: dict[int, Tensor] = {}
 
-    def add(self, iteration: int, loss: ViewLoss, view: View) -> None:
-        """Record a view's result, replacing its earlier one."""
+    def add(self, iteration: int, loss: ViewLoss, view: View, *, comparable: bool = True) -> None:
+        """Record a view's result, replacing its earlier one; its loss terms only if they are ``comparable``."""
         if iteration > self._after:
             self._squared_errors[view.index] = loss.squared_error(view)
+        if comparable and iteration > self._terms_after:
             # Copies: the next recorded iteration writes over the tensors of this one.
             self._terms[view.index] = {name: value.detach().clone() for name, value in loss.terms.items()}
 

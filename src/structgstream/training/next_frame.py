@@ -88,7 +88,7 @@ class NextFrameHooks(Hooks[View, PricedLoss]):
         early_stopping: early stopping.
         patch_at: the iteration after which free Gaussians are pruned and spawned, unless the frame stops before.
         patches: whether they are.
-        last_pass: gets the result of each view.
+        last_pass: gets the result of each view; loss terms of visits of all its tiles only.
         backend: the compute back-end.
         watch: seconds by stage.
         rest_every: tiles in which nothing has changed are drawn every this many times that a view is.
@@ -175,10 +175,11 @@ class NextFrameHooks(Hooks[View, PricedLoss]):
 
     def after_step(self, iteration: int, sample: View, loss: PricedLoss, screen_gradient: Tensor | None) -> None:
         # A loss over other tiles than in most visits cannot be compared with theirs.
-        if self._rests(sample) or not self._alternates(sample):
+        rests = self._rests(sample)
+        if rests or not self._alternates(sample):
             self.early_stopping.add(sample.index, loss.unpriced)
         self.visits[sample.index] = self.visits.get(sample.index, 0) + 1
-        self.last_pass.add(iteration, loss, sample)
+        self.last_pass.add(iteration, loss, sample, comparable=not rests)
         if iteration < self.patch_at and self.early_stopping.should_stop:
             self.patch_at = iteration
         if screen_gradient is not None:

@@ -57,7 +57,6 @@ def fit_next_frame(
     config: OnlineConfig,
     backend: Backend,
     seed: int,
-    before: MultiViewFrame | None = None,
     pictures: FramePictures | None = None,
     steps: Mapping[str, float] | None = None,
     older: Scene | None = None,
@@ -78,13 +77,12 @@ def fit_next_frame(
         older: the decoded scene two frames before, if :func:`needs_older`; None for none.
         floor: residuals of frame 0, for ``config.motion.residual_threshold`` and for births; None for none.
         light: frame 0's, for ``config.light``; None for none.
-        before: the previous frame, for motion segmentation (``config.motion``); without it everything is trained.
-        pictures: of ``frame`` and their changes since ``before``
-            (:func:`~structgstream.training.pictures.pictures_of`), if computed already.
+        pictures: of ``frame``, and their changes since the previous one for motion segmentation (``config.motion``;
+            :func:`~structgstream.training.pictures.pictures_of`); without them everything is trained.
         on_step: called after every iteration.
     """
     if pictures is None:
-        pictures = pictures_of(frame, rig, before=before, motion=config.motion, start=config.start, backend=backend)
+        pictures = pictures_of(frame, rig, before=None, motion=config.motion, start=config.start, backend=backend)
     if len(pictures.views) < min(LEAST_CAMERAS, len(rig.training)):
         return held(scene)
     if config.patching.lifetime == "frame":
@@ -141,7 +139,7 @@ def run_frame_fit(
     """Calls ``fit_with`` with a :class:`FrameFit`, on a GPU again with more memory if that of ``slots`` is short."""
 
     def run(iteration_backend: Backend) -> FitResult[Scene]:
-        generator, watch = torch.Generator().manual_seed(seed), Stopwatch(backend.device)
+        generator, watch = torch.Generator().manual_seed(seed), Stopwatch()
         return fit_with(
             FrameFit(config, backend, iteration_backend, frame_index, generator, watch, steps or {}, on_step)
         )
@@ -223,6 +221,7 @@ class FrameFit:
             backend=self.backend,
             generator=self.generator,
         )
+        rests = rest_every(config.motion.rest_every, views=len(seen), iterations=iterations)
         return NextFrameHooks(
             start=start,
             parameters=parameters,
@@ -233,10 +232,13 @@ class FrameFit:
             early_stopping=EarlyStopping(config.least_gain * len(start.views) / max(1, config.iterations), len(seen)),
             patch_at=math.ceil(patching.iteration * len(seen) / len(start.views)),
             patches="free" in config.dynamic,
-            last_pass=LastPass(0 if config.least_gain else iterations - len(seen)),
+            last_pass=LastPass(
+                0 if config.least_gain else iterations - len(seen),
+                terms_after=0 if config.least_gain else iterations - rests * len(seen),
+            ),
             backend=self.iteration_backend,
             watch=self.watch,
-            rest_every=rest_every(config.motion.rest_every, views=len(seen), iterations=iterations),
+            rest_every=rests,
             iterations=iterations,
             average=MeanOfSteps(math.floor(iterations * (1.0 - config.mean_of_last))) if config.mean_of_last else None,
         )

@@ -30,7 +30,6 @@ class Renewal:
         thin_count: how many of them are thin content's.
         thin_refused_count: how many thin ones were not born because they would have been too many.
         merged_count: how many more would have been born, had they not been made coarser because they were too many.
-        missing_share: share of missing pixels in all training views.
         refused: whether too much is missing for births.
     """
 
@@ -39,7 +38,6 @@ class Renewal:
     thin_count: int = 0
     thin_refused_count: int = 0
     merged_count: int = 0
-    missing_share: float = 0.0
     refused: bool = False
 
     @property
@@ -91,9 +89,8 @@ def renew_free_gaussians(
             eased = floor.eased(partition.segmentation.changed, medians=config.changed_floor_medians)
         sweep = Sweep(moving, still, views, focuses, eased, config, backend)
         missing = sweep.missing()
-        share = missing_share(missing)
-        if share > config.most_missing_share:
-            return replace(none, missing_share=share, refused=True)
+        if missing_share(missing) > config.most_missing_share:
+            return replace(none, refused=True)
         kept = everything
         if len(moving.free):
             kept = ~_blamed_mask(moving, missing, focuses, least_pixels=least_pixels, config=config, backend=backend)
@@ -103,12 +100,12 @@ def renew_free_gaussians(
         room = max(0, room - int(kept.sum()))
         large = sweep.births(missing, first_birth=first_birth, room=room)
         if len(large.free) or not config.thin.enabled:
-            return Renewal(kept, large.free, merged_count=large.merged_count, missing_share=share)
+            return Renewal(kept, large.free, merged_count=large.merged_count)
         known = {entry.view.index: entry for entry in missing}
         # With all of frame 0's floor: by these low thresholds an eased one would take all that moves for thin content.
         thin_sweep = replace(sweep, floor=floor, config=config.for_thin, known=known)
         thin = _thin_births(thin_sweep, first_birth=first_birth, room=room)
-    return Renewal(kept, thin.free, len(thin.free), thin.refused_count, missing_share=share)
+    return Renewal(kept, thin.free, len(thin.free), thin.refused_count)
 
 
 def _thin_births(sweep: Sweep, *, first_birth: int, room: int) -> Births:

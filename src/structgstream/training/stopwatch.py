@@ -5,15 +5,12 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import torch
-
 
 class Stopwatch:
-    """Adds up wall-clock seconds by stage name; synchronises with a GPU only if configured."""
+    """Adds up wall-clock seconds by stage name, without waiting for a GPU."""
 
-    def __init__(self, device: torch.device, *, synchronise: bool = False) -> None:
+    def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
-        self._wait = synchronise and device.type == "cuda"
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -22,6 +19,4 @@ class Stopwatch:
         try:
             yield
         finally:
-            if self._wait:
-                torch.cuda.synchronize()
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started

@@ -161,7 +161,7 @@ def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tra
         past: one frame before.
         pictures: of this frame.
     """
-    watch, velocities = Stopwatch(tracker.backend.device), torch.zeros_like(past.velocities)
+    watch, velocities = Stopwatch(), torch.zeros_like(past.velocities)
     scene = past.scene.with_folded_appearance()
     with torch.no_grad():
         with watch.stage("gate"):

@@ -6,6 +6,9 @@ view did not. Or it has many times the large residuals of the median view, as of
 stays right where it shows plain surfaces. Or it has several times them and its picture is shifted as a whole, as of a
 bumped camera that shows little else. Or it is the last one once more while others changed: the camera is frozen. If
 most views changed everywhere, motion between the frames cannot be segmented.
+
+The median needs a majority, and two views are left at least: of two views none can be an outlier, and of three none is
+taken for frozen, as two of three may show nothing that moves (:func:`unrecognized_faults`).
 """
 
 from collections.abc import Sequence
@@ -28,6 +31,9 @@ CLEAR_SHIFT = 0.3
 FROZEN_SHARE = 0.005
 """Least share of changed pixels in the median view for a repeated picture to count as frozen; at most one view in
 four may be."""
+
+FEW_VIEWS = 3
+"""Up to this many views cannot show every fault of one of them."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +75,14 @@ def trusted_views(changes: Sequence[ViewChange]) -> list[bool]:
         for c in changes
     ]
     return found if sum(found) >= 2 else [True] * len(found)
+
+
+def unrecognized_faults(views: int) -> str | None:
+    """A sentence on the faults of cameras that so many training views cannot show; None where they can show all."""
+    if views > FEW_VIEWS:
+        return None
+    fault = "fails, is frozen or was bumped" if views < FEW_VIEWS else "is frozen"
+    return f"With {views} training cameras one that {fault} cannot be recognised; that takes {FEW_VIEWS + 1} or more."
 
 
 def is_scene_cut(changes: Sequence[ViewChange]) -> bool:

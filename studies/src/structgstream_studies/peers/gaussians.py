@@ -166,7 +166,7 @@ def fit_gaussians(
     Raises:
         CaptureError: fewer than four distinct points.
     """
-    generator, watch, extent = torch.Generator().manual_seed(seed), Stopwatch(backend.device), rig_extent(rig)
+    generator, watch, extent = torch.Generator().manual_seed(seed), Stopwatch(), rig_extent(rig)
     views = training_views(frame, rig, backend.device)
     with watch.stage("initialise"):
         start = initial_gaussians(points, views, config)

@@ -187,7 +187,7 @@ class ThreeDGStream(PicturesOnly):
     def next(self, past: Past[StreamedGaussians, Cache], task: FrameTask) -> FitResult[StreamedGaussians]:
         """Both stages of a later frame."""
         config, state, base, backend = self.config, past.state, past.state.base, task.backend
-        generator, watch = torch.Generator().manual_seed(task.seed), Stopwatch(backend.device)
+        generator, watch = torch.Generator().manual_seed(task.seed), Stopwatch()
         views = task.pictures.views
         order = shuffled_views(views, generator)
         with watch.stage("look up"):

@@ -59,7 +59,7 @@ def warm_up(
     ]
     hooks = _WarmUpHooks(adam, grid)
     rates = dict.fromkeys(adam.values, config.rate)
-    optimize(adam, cycle(pool), Schedule(config.iterations, lambda _: rates), hooks, watch=Stopwatch(device))
+    optimize(adam, cycle(pool), Schedule(config.iterations, lambda _: rates), hooks, watch=Stopwatch())
     value = math.nan if hooks.last is None else float(hooks.last.total.detach())
     return Cache.of({name: leaf.detach() for name, leaf in adam.values.items()}), value
 

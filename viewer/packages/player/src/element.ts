@@ -182,7 +182,10 @@ export class StructgstreamPlayer extends HTMLElement {
   }
 
   /** Listens to the player; what comes back ends the listening. Kept when another stream is loaded. */
-  on<EventName extends keyof PlayerEvents>(name: EventName, listener: (event: PlayerEvents[EventName]) => void): () => void {
+  on<EventName extends keyof PlayerEvents>(
+    name: EventName,
+    listener: (event: PlayerEvents[EventName]) => void,
+  ): () => void {
     const heard = (event: Event) => listener((event as CustomEvent<PlayerEvents[EventName]>).detail);
     this.addEventListener(name, heard);
     return () => this.removeEventListener(name, heard);

@@ -174,6 +174,22 @@ describe.skipIf(!executable)("the player in a browser", () => {
     expectQuiet();
   });
 
+  test("what it tells is dispatched as events of the DOM, as a video's are", async () => {
+    const page = await open("isolated");
+    const heard = await ask(
+      page,
+      (player) =>
+        new Promise<unknown>((resolve) => {
+          const listen = (event: Event) =>
+            resolve([event.type, event.bubbles, event.target === player, (event as CustomEvent).detail]);
+          player.addEventListener("error", listen, { once: true });
+          player.load(new Blob(["no stream"]));
+        }),
+    );
+    expect(heard).toEqual(["error", false, true, { message: expect.stringMatching(/\.$/), fatal: true }]);
+    expectQuiet();
+  });
+
   test("damaged streams come to an end: a picture or a sentence", async () => {
     const page = await open("isolated");
     const vector = readFileSync(new URL("../../../../../tests/vectors/version-2-compact.sgs", import.meta.url));
