@@ -108,8 +108,8 @@ def _as_text(by_number: FrameSource, as_text: CameraRig) -> bool:
         shares.append(confirmed_share(cameras, matcher, PoseCheckConfig()))
     if max(shares) < LEAST_CONFIRMED or shares[0] == shares[1]:
         log.warning(
-            "%s: the pictures do not say whether the rows of %s follow the names by number or as text; they are taken by "
-            "number. Names with leading zeros (cam01) are clear.",
+            "%s: the pictures do not say whether the rows of %s follow the names by number or as text; by "
+            "number is taken. Names with leading zeros (cam01) are clear.",
             by_number.name, POSES,
         )  # fmt: skip
         return False
