@@ -123,7 +123,7 @@ def calibration_below(path: Path) -> Path | None:
 
 def inner_folders(path: Path) -> list[Path]:
     """The folders in ``path`` that may hold calibrations, in natural order."""
-    skipped = {*NO_CAMERAS, *ROOTS} - {"calibration"}
+    skipped = {*NO_CAMERAS, *ROOTS, "sparse", "sparse_"} - {"calibration"}
     entries = (entry for entry in path.iterdir() if not is_hidden(entry) and entry.name not in skipped)
     return sorted((entry for entry in entries if entry.is_dir()), key=lambda entry: natural(entry.name))
 

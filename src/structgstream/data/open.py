@@ -152,8 +152,9 @@ def _recognized(path: Path) -> FrameSource:
     path = path.resolve()  # a name, even for "."
     if (opens := _opener(path)) is not None:
         return with_masks(opens(path), path / FOLDER)
-    below = [*inner_folders(path), *(inner_folders(path / DENSE) if (path / DENSE).is_dir() else ())]
-    inner = [folder for folder in below if _opener(folder) is not None]
+    inner = [folder for folder in inner_folders(path) if _opener(folder) is not None]
+    if not inner and (path / DENSE).is_dir():
+        inner = [folder for folder in inner_folders(path / DENSE) if _opener(folder) is not None]
     if len(inner) == 1:
         log.warning("%s is no capture, but holds one, which is opened: %s", path, inner[0])
         return _recognized(inner[0])

@@ -150,7 +150,9 @@ def _layout(folders: Pictures, calibration: Calibration, root: Path) -> tuple[Pi
             per_frame.setdefault(stem, {})[folder] = file
     found: list[tuple[Pictures, dict[str, PosedCamera]]] = []
     reasons: list[CalibrationError] = []
-    for files in (folders, per_frame):
+    names = [_parts(posed.name) for posed in calibration.cameras]
+    in_frames = any(len(parts) == 1 or not folders.keys().isdisjoint(parts[:-1]) for parts in names)
+    for files in (folders, per_frame) if in_frames else (folders,):
         try:
             found.append((files, _poses(calibration, files)))
         except CalibrationError as error:
@@ -178,9 +180,9 @@ def _poses(calibration: Calibration, cameras: Collection[str]) -> dict[str, Pose
     file_of = _by_word(names, cameras)
     if not file_of:
         numbered = {_number(name): name for name in cameras}
-        if None in numbered or len(numbered) != len(cameras) or {_number(name) for (name,) in parts} != set(numbered):
+        if None in numbered or len(numbered) != len(cameras) or not {_number(name) for name in names} >= set(numbered):
             return {}
-        file_of = {name: numbered[_number(name)] for (name,) in parts}
+        file_of = {name: numbered[_number(name)] for name in names if _number(name) in numbered}
     return _still(calibration, [file_of.get(posed.name) for posed in calibration.cameras])
 
 
@@ -216,8 +218,9 @@ def _still(calibration: Calibration, names: Sequence[str | None]) -> dict[str, P
         if name is None:
             continue
         first = found.setdefault(name, posed)
-        turn = np.trace(first.viewmat[:3, :3] @ posed.viewmat[:3, :3].T)
-        degrees = np.degrees(np.arccos(np.clip((turn - 1) / 2, -1, 1)))
+        # From the difference, which rounding in the file changes little; the trace's arc cosine turns 1e-4 into 0.6.
+        turn = float(np.linalg.norm(first.viewmat[:3, :3] - posed.viewmat[:3, :3])) / np.sqrt(8)
+        degrees = np.degrees(2 * np.arcsin(min(1.0, turn)))
         shift = float(np.linalg.norm(first.center - posed.center))
         if shift > STILL_FRACTION * extent or degrees > STILL_DEGREES:
             raise CalibrationError(
@@ -239,6 +242,10 @@ def _check(
         check_names(poses, sorted(pictured, key=natural), calibration=calibration.where, pictures=root)
         used = {posed.name for posed in poses.values()}
         idle = [posed.name for posed in calibration.cameras if posed.name not in used and not _is_file(posed.name)]
+        numbered = {name: posed.name for name, posed in poses.items() if name not in (*_parts(posed.name), posed.name)}
+        if numbered and not _by_word(list(numbered.values()), list(numbered)):
+            pairs = ", ".join(f"{name} is {own!r}" for name, own in sorted(numbered.items())[:3])
+            log.warning("%s: no names are the same, so cameras are told by their numbers alone: %s", root, pairs)
         if idle:
             log.warning("%s has no pictures of %s of %s; left out", root, listed(idle), calibration.where)
         return

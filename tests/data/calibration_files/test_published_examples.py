@@ -139,7 +139,8 @@ def test_opencv_files_without_a_pose(tmp_path: Path, caplog: pytest.LogCaptureFi
     file = tmp_path / "cam01.yml"
     file.write_text(file.read_text().replace("R: !!", "unknown: !!"))
     found = opencv_cameras.read(next(opencv_cameras.find(tmp_path)))
-    assert [camera.name for camera in found.cameras] == ["cam00", "cam02"] and found.unposed == ("cam01",)
+    assert [camera.name for camera in found.cameras] == ["cam00", "cam02"]
+    assert found.unposed == ("cam01",)
     assert "has no pose of camera 'cam01'; left out" in caplog.text
     file.write_text("%YAML:1.0\n---\na: [\n")
     with pytest.raises(CalibrationError, match=r"Camera 'cam01' of .* cannot be read"):

@@ -30,11 +30,10 @@ def find(folder: Path) -> Iterator[tuple[Path, ...]]:
     for file in sorted(folder.iterdir()):
         if file.suffix.lower() in (".yaml", ".yml") and file.is_file() and file.stat().st_size < LARGEST_BYTES:
             try:
-                if CHAIN.search(read_text(file)):
+                if "camchain" in file.stem or CHAIN.search(read_text(file)):
                     yield (file,)
             except (OSError, Unreadable):
-                if "camchain" in file.stem:
-                    yield (file,)
+                continue  # no file of Kalibr
 
 
 def read(files: tuple[Path, ...]) -> Calibration:

@@ -17,7 +17,7 @@ from structgstream.data.calibration_files.opencv_storage import is_storage, read
 from structgstream.data.calibration_files.reading import LARGEST_BYTES, NoPose, calibration_of
 from structgstream.data.lenses import fisheye_lens, from_integer_centers, opencv_lens
 from structgstream.data.posed import Calibration, PosedCamera, rigid
-from structgstream.data.text_files import Unreadable, pixels, reason
+from structgstream.data.text_files import Unreadable, pixels, read_text, reason
 from structgstream.errors import CalibrationError
 
 EXPECTED = (
@@ -68,8 +68,11 @@ def _files(folder: Path) -> tuple[Path, ...]:
         try:
             if _tables(file):
                 holding.append(file)
-        except (OSError, Unreadable):
-            broken.append(file)
+        except OSError:
+            continue
+        except Unreadable:  # YAML of others is no camera's
+            if re.search("opencv[-_](matrix|storage)", read_text(file)):
+                broken.append(file)
     return tuple(holding + broken if holding else broken)
 
 
