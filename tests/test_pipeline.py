@@ -5,11 +5,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from numpy.typing import NDArray
 
 from backends import quickest_backend
-from structgstream.pipeline import FrameTask
+from structgstream.pipeline import MAX_INTERVALS, FrameTask, Past
 from structgstream.training.pictures import FramePictures
 from worlds import moving_world
 
@@ -35,3 +36,14 @@ def test_a_blank_training_camera_is_absent_and_a_blank_held_out_one_is_scored() 
     for name in (TRAINING[1], HELD_OUT):
         images[name] = np.zeros_like(images[name])
     assert absent(images) == (TRAINING[1],)
+
+
+def test_time_goes_on_in_intervals_and_a_regular_stream_has_exactly_one() -> None:
+    """0.1 + 0.2 is not 0.3: rates that are no binary fraction have unequal differences."""
+    for fps in (25.0, 30.0, 29.97, 59.94):
+        pasts = (Past(WORLD.scene, None, None, ((n - 2) / fps, (n - 1) / fps)) for n in range(2, 500))
+        assert {past.intervals(n / fps) for n, past in enumerate(pasts, 2)} == {1.0}
+    assert Past(WORLD.scene, None, None, (0.0, 0.1)).intervals(0.3) == pytest.approx(2.0)
+    assert Past(WORLD.scene, None, None, (0.0, 0.2)).intervals(0.3) == pytest.approx(0.5)
+    assert Past(WORLD.scene, None, None, (0.0, 0.1)).intervals(60.0) == MAX_INTERVALS
+    assert Past(WORLD.scene, None).intervals(7.0) == 1.0

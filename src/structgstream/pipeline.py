@@ -87,6 +87,12 @@ class FrameRemarks:
     mean_of: float
 
 
+EQUAL_INTERVALS = 0.25
+"""Intervals between frames that differ by this share or less count as equal: stamps of a regular stream jitter."""
+MAX_INTERVALS = 3.0
+"""After a longer gap what moved is expected no farther than after so many intervals."""
+
+
 @dataclass(frozen=True)
 class Past(Generic[State, Memory]):
     """The state from which a frame is fitted.
@@ -95,11 +101,24 @@ class Past(Generic[State, Memory]):
         state: the previous decoded frame (``codec.encoder``, Note [Closed loop]).
         memory: see :meth:`Method.prepare`.
         older: the decoded frame before that, if the method needs it and it is of the same period.
+        seconds: presentation times of ``older`` and ``state``; None where one of them is unknown.
     """
 
     state: State
     memory: Memory
     older: State | None = None
+    seconds: tuple[float, float] | None = None
+
+    def intervals(self, pts_seconds: float) -> float:
+        """The time from ``state`` to a frame in times of that from ``older`` to ``state``.
+
+        Exactly 1 where they are nearly equal, and without ``seconds``; at most :data:`MAX_INTERVALS`.
+        """
+        if self.seconds is None or self.seconds[1] <= self.seconds[0]:
+            return 1.0
+        older, state = self.seconds
+        found = (pts_seconds - state) / (state - older)
+        return 1.0 if abs(found - 1.0) <= EQUAL_INTERVALS else min(found, MAX_INTERVALS)
 
 
 class Method(Protocol[State, Memory]):

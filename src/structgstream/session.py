@@ -83,6 +83,7 @@ class Session(Generic[State, Memory]):
         self._controller = RateController(pipeline.rate, source.fps, keys=self._keys)
         self._coder: FrameCoder[State] | None = None
         self._steps: Mapping[str, float] = {}
+        self._times: deque[float] = deque(maxlen=2)
         if resumed is not None:
             check_resumable(resumed.header, self._facts)
 
@@ -188,6 +189,7 @@ class Session(Generic[State, Memory]):
     def _note(self, packet: Packet | PacketInfo, size: int, *, begins: bool) -> None:
         """A packet has been written: what follows depends on it."""
         index, pts_seconds = packet.index, packet.pts_seconds
+        self._times.append(pts_seconds)
         if packet.kind is PacketKind.KEY:
             self._keys.begin(index, pts_seconds)
         self._controller.add(size, packet.kind, index=index, pts_seconds=pts_seconds, begins=begins)
@@ -207,11 +209,16 @@ class Session(Generic[State, Memory]):
         method = self._pipeline.method
         if past is not None and task.begins is None:
             self._measure(state, task)
-            return Past(state, past.memory, past.state if method.needs_older else None)
+            return Past(state, past.memory, past.state if method.needs_older else None, self._last_two)
         self._plan.begin(task.frame.index, task.frame.pts_seconds)
         keep_frames(self._source, task.frame.index, last=self._plan.remembered)
         self._measure(state, task)
         return Past(state, method.prepare(state, lambda: task))
+
+    @property
+    def _last_two(self) -> tuple[float, float] | None:
+        """Presentation times of the last two frames; None before the second."""
+        return (self._times[0], self._times[1]) if len(self._times) == 2 else None
 
     def _measure(self, state: State, task: FrameTask) -> None:
         """How well a decoded frame shows its pictures, for the plan of periods, if that asks for it."""
@@ -239,7 +246,9 @@ class Session(Generic[State, Memory]):
         keep_frames(self._source, first, last=self._plan.remembered)
         if self._pipeline.period.enabled:
             self._restore_plan(resumed, period)
-        return Past(state, method.prepare(resumed.scene(first), partial(self._task_again, first)), older)
+        return Past(
+            state, method.prepare(resumed.scene(first), partial(self._task_again, first)), older, self._last_two
+        )
 
     def _restore_plan(self, resumed: StoredStream[State], period: Period) -> None:
         """What the plan of periods knew: when the last period began, and residuals measured again."""

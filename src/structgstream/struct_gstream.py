@@ -121,6 +121,7 @@ class StructGStream:
             floor=past.memory.floor,
             light=past.memory.light,
             older=None if past.older is None else on_device(past.older, device),
+            intervals=past.intervals(task.frame.pts_seconds),
             on_step=task.on_step,
         )
 

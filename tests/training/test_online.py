@@ -159,12 +159,10 @@ FOLLOWING = replace(
 )
 
 
-def followed(scene, world, index, *, config=FOLLOWING, seed=0, older=None, backend: Backend | None = None):
+def followed(scene, world, index, *, config=FOLLOWING, seed=0, backend: Backend | None = None, **past):
     backend, frame, before = backend or quickest_backend(), world.frames[index], world.frames[index - 1]
     pictures = pictures_of(frame, world.rig, before=before, motion=config.motion, start=config.start, backend=backend)
-    return fit_next_frame(
-        scene, frame, world.rig, config=config, backend=backend, seed=seed, pictures=pictures, older=older
-    )
+    return fit_next_frame(scene, frame, world.rig, config=config, backend=backend, seed=seed, pictures=pictures, **past)
 
 
 def earlier(scene: Scene, motion: torch.Tensor) -> Scene:
@@ -199,6 +197,8 @@ def test_what_moves_begins_where_its_last_step_leads() -> None:
         went = (steps != 0).any(1)
         assert went.sum() == result.moving > 10
         torch.testing.assert_close(steps[went], 0.5 * motion[went])
+        later = followed(world.scene, world, 1, config=moved, older=older, intervals=2.0)
+        torch.testing.assert_close((later.scene.anchors.positions - world.scene.anchors.positions)[went], motion[went])
     assert torch.equal(
         followed(world.scene, world, 1, config=config).scene.anchors.positions[went],
         world.scene.anchors.positions[went],

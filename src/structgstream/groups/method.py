@@ -132,7 +132,7 @@ class GroupMethod:
         if entry is not None and task.frame.index == entry.frame:
             return self._begin(entry, past, task)
         if entry is not None and task.frame.index == entry.frame + 1:
-            past = replace(past, older=_older(past.state, entry.velocities))
+            past = replace(past, older=_older(past.state, entry.velocities), seconds=None)
         return StructGStream(self._config_at(task.frame.index)).next(past, task)
 
     def _begin(self, entry: GroupEntry, past: Past[Scene, FirstFrame], task: FrameTask) -> FitResult[Scene]:

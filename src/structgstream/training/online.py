@@ -60,6 +60,7 @@ def fit_next_frame(
     pictures: FramePictures | None = None,
     steps: Mapping[str, float] | None = None,
     older: Scene | None = None,
+    intervals: float = 1.0,
     floor: ResidualFloor | None = None,
     light: LightReference | None = None,
     on_step: StepListener | None = None,
@@ -75,6 +76,7 @@ def fit_next_frame(
         seed: of all random numbers, so that a frame can be repeated alone.
         steps: quantization steps (Note [Bins]); the parameters it names are drawn and returned quantized.
         older: the decoded scene two frames before, if :func:`needs_older`; None for none.
+        intervals: media time since the previous frame, in times of that between the two before: what moved goes on.
         floor: residuals of frame 0, for ``config.motion.residual_threshold`` and for births; None for none.
         light: frame 0's, for ``config.light``; None for none.
         pictures: of ``frame``, and their changes since the previous one for motion segmentation (``config.motion``;
@@ -96,11 +98,10 @@ def fit_next_frame(
         scene = lit
 
     def fit_with(fit: FrameFit) -> FitResult[Scene]:
+        displacements = _prior_displacements(scene, older, intervals * config.motion_prior)
         if pictures.changes is None:
-            return fit.optimize(
-                StartingPoint(scene, pictures.views, _prior_displacements(scene, older, config.motion_prior))
-            )
-        return _fit_moving_part(fit, scene, pictures.views, pictures.changes, older=older, floor=floor)
+            return fit.optimize(StartingPoint(scene, pictures.views, displacements))
+        return _fit_moving_part(fit, scene, pictures.views, pictures.changes, displacements, older=older, floor=floor)
 
     result = run_frame_fit(
         fit_with,
@@ -289,13 +290,13 @@ def _fit_moving_part(
     scene: Scene,
     views: list[View],
     changes: list[PictureChange | None],
+    displacements: Tensor,
     *,
     older: Scene | None,
     floor: ResidualFloor | None,
 ) -> FitResult[Scene]:
     """Fit the moving part of ``scene``, after the motion start, and keep the still part."""
     config, backend, watch = fit.config, fit.backend, fit.watch
-    displacements = _prior_displacements(scene, older, config.motion_prior)
     with watch.stage("find motion"):
         segmentation = segment_motion(
             scene, views, changes, config=config.motion, backend=backend, older=older, floor=floor

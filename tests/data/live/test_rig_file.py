@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import os
 from pathlib import Path
 
 import pytest
@@ -31,6 +32,35 @@ def written(folder: Path, text: str) -> Path:
     path = folder / "rig.toml"
     path.write_text(text)
     return path
+
+
+def test_what_ends_for_good_is_a_file(tmp_path: Path) -> None:
+    """Whatever names it; streams and devices may come back."""
+    (tmp_path / "a.ts").touch()
+    os.mkfifo(tmp_path / "pipe")
+    text = 'calibration = "."\n' + "".join(
+        f"[cameras.{name}]\nurl = '{url}'\n{more}\n"
+        for name, url, more in [
+            ("path", "a.ts", ""),
+            ("format", "a.ts", 'format = "mpegts"'),
+            ("missing", "b.ts", ""),
+            ("folder", ".", ""),
+            ("url", f"file:{tmp_path}/a.ts", ""),
+            ("url2", f"file://{tmp_path}/a.ts", ""),
+            ("gone", f"file://{tmp_path}/b.ts", ""),
+            ("growing", "a.ts", "follow = true"),
+            ("pipe", "pipe", ""),
+            ("device", "/dev/null", ""),
+            ("driver", "video=Camera", 'format = "dshow"'),
+            ("network", "udp://10.0.0.1:5000", ""),
+        ]
+    )
+    cameras = read_rig(written(tmp_path, text)).cameras
+    assert [name for name, camera in cameras.items() if camera.is_file] == [
+        "path", "format", "missing", "folder", "url", "url2", "gone"
+    ]  # fmt: skip
+    assert cameras["format"].url == str(tmp_path / "a.ts")
+    assert cameras["driver"].url == "video=Camera"
 
 
 def test_everything_that_a_file_can_say(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from structgstream.errors import CaptureError
 
 Made = TypeVar("Made")
 SECRET = re.compile(r"(?<=://)[^/@\s]*@")
+FILE_URL = re.compile(r"^file:(//(?=/))?", re.IGNORECASE)
 SCHEME = re.compile(r"^[a-z][a-z0-9+.-]+:", re.IGNORECASE)
 
 
@@ -50,8 +51,13 @@ class LiveCamera:
 
     @property
     def is_file(self) -> bool:
-        """Whether it is a file, which ends for good, and not a stream, which may come back."""
-        return self.format is None and not self.follow and not self.is_session and not SCHEME.match(self.url)
+        """Whether it is a file, which ends for good, and not a stream or a device, which may come back."""
+        if self.follow or self.is_session:
+            return False
+        path = Path(name := FILE_URL.sub("", self.url))
+        if SCHEME.match(name) or path.is_fifo() or path.is_char_device():
+            return False
+        return self.format is None or path.is_file()
 
     @property
     def is_session(self) -> bool:
@@ -137,14 +143,15 @@ def _resolved(rig: LiveRig, path: Path) -> LiveRig:
     """Files and folders are relative to the rig file; names of devices stay."""
     folder = path.parent
     cameras = {
-        name: _in_folder(camera, folder) if camera.is_session or _is_path(camera) else camera
+        name: _in_folder(camera, folder) if camera.is_session or _is_path(camera, folder) else camera
         for name, camera in rig.cameras.items()
     }
     return replace(rig, calibration=folder / rig.calibration, cameras=cameras)
 
 
-def _is_path(camera: LiveCamera) -> bool:
-    return camera.format is None and not SCHEME.match(camera.url)
+def _is_path(camera: LiveCamera, folder: Path) -> bool:
+    """Whether the URL is a path; with a format it may be the name of a device."""
+    return not SCHEME.match(camera.url) and (camera.format is None or (folder / camera.url).is_file())
 
 
 def _in_folder(camera: LiveCamera, folder: Path) -> LiveCamera:
