@@ -36,6 +36,11 @@ def partial_path(path: Path) -> Path:
     return path.with_name(f"{path.name}.partial")
 
 
+def side_path(stream: Path, ending: str) -> Path:
+    """The file beside a stream, by its whole name without ``.sgs``: ``a.b.log.jsonl`` for ``a.b`` and ``a.b.sgs``."""
+    return stream.with_name(f"{stream.name.removesuffix('.sgs')}{ending}")
+
+
 def write_whole(
     path: Path,
     content: bytes | Iterable[bytes | memoryview],
