@@ -142,6 +142,6 @@ def test_opencv_files_without_a_pose(tmp_path: Path, caplog: pytest.LogCaptureFi
     assert [camera.name for camera in found.cameras] == ["cam00", "cam02"]
     assert found.unposed == ("cam01",)
     assert "has no pose of camera 'cam01'; left out" in caplog.text
-    file.write_text("%YAML:1.0\n---\na: [\n")
-    with pytest.raises(CalibrationError, match=r"Camera 'cam01' of .* cannot be read"):
+    file.write_text("%YAML:1.0\n---\nK: !!opencv-matrix\n  rows: [\n")
+    with pytest.raises(CalibrationError, match=r"Camera 'cam01' of .* cannot be read \(it is not YAML at line \d\)"):
         opencv_cameras.read(next(opencv_cameras.find(tmp_path)))

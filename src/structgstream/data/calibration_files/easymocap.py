@@ -16,7 +16,7 @@ from structgstream.data.calibration_files.opencv_storage import read_storage
 from structgstream.data.calibration_files.reading import calibration_of, readable
 from structgstream.data.lenses import from_integer_centers, opencv_lens
 from structgstream.data.posed import Calibration, PosedCamera, rigid
-from structgstream.data.text_files import pixels
+from structgstream.data.text_files import number, pixels
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
 EXPECTED = "names, K_NAME and D_NAME in intri.yml, and R_NAME or Rot_NAME and T_NAME in extri.yml"
@@ -52,6 +52,6 @@ def _camera(content: dict[str, Any], name: str, _: str) -> PosedCamera:
         name=name,
         viewmat=rigid(turned, content[f"T_{name}"]),
         K=from_integer_centers(content[f"K_{name}"]),
-        size=None if -1 in size else pixels(size),
+        size=pixels(size) if min(map(number, size)) > 0 else None,
         lens=opencv_lens([] if coefficients is None else np.ravel(coefficients).tolist()),
     )

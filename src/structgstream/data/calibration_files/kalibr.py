@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from structgstream.data.calibration_files.opencv_storage import parsed_yaml
 from structgstream.data.calibration_files.reading import LARGEST_BYTES, calibration_of, readable
 from structgstream.data.lenses import Lens, Pinhole, fisheye_lens, from_integer_centers, opencv_lens
 from structgstream.data.posed import Calibration, PosedCamera, intrinsics
 from structgstream.data.text_files import Unreadable, mapping, pixels, read_text
-from structgstream.errors import CalibrationError, MissingExtraError
+from structgstream.errors import CalibrationError
 
 EXPECTED = (
     "cam0, cam1, ... with camera_model, intrinsics, distortion_model, distortion_coeffs, resolution and T_cn_cnm1"
@@ -43,20 +44,9 @@ def read(files: tuple[Path, ...]) -> Calibration:
         CalibrationError: the file is broken, or a camera has a model that is not known here.
         MissingExtraError: PyYAML is not installed.
     """
-    try:
-        import yaml
-    except ImportError:
-        raise MissingExtraError("yaml", "capture") from None
     (file,) = files
     with readable(file, EXPECTED):
-        text = re.sub(r"\A\s*%YAML:.*", "", read_text(file))  # OpenCV's header, which is not YAML's
-        try:
-            content = mapping(yaml.safe_load(text))
-        except yaml.MarkedYAMLError as error:
-            line = f" at line {error.problem_mark.line + 1}" if error.problem_mark else ""
-            raise Unreadable(f"it is not YAML{line}") from None
-        except yaml.YAMLError:
-            raise Unreadable("it is not YAML") from None
+        content = mapping(parsed_yaml(read_text(file)))
         names = [str(name) for name in content if CAMERA.fullmatch(str(name))]
         entries = [(name, content[name]) for name in sorted(names, key=lambda name: int(name.removeprefix("cam")))]
     viewmat = np.eye(4)
@@ -80,4 +70,4 @@ def _lens(name: str, entry: dict[str, Any], file: Path) -> Lens:
             f"Camera {name!r} of {file} is of the model {model[0]}-{model[1]}, which is not known here; calibrate it "
             "as pinhole-radtan or pinhole-equi."
         )
-    return models[model[1]](entry.get("distortion_coeffs", ()))
+    return models[model[1]](entry.get("distortion_coeffs") or ())

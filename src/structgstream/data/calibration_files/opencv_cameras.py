@@ -17,7 +17,7 @@ from structgstream.data.calibration_files.opencv_storage import is_storage, read
 from structgstream.data.calibration_files.reading import LARGEST_BYTES, NoPose, calibration_of
 from structgstream.data.lenses import fisheye_lens, from_integer_centers, opencv_lens
 from structgstream.data.posed import Calibration, PosedCamera, rigid
-from structgstream.data.text_files import Unreadable, pixels, read_text, reason
+from structgstream.data.text_files import Unreadable, number, pixels, read_text, reason
 from structgstream.errors import CalibrationError
 
 EXPECTED = (
@@ -110,14 +110,15 @@ def _camera(name: str, content: dict[str, Any]) -> PosedCamera:
     if K is None:
         raise KeyError(" or ".join(SPELLINGS["K"][:4]))
     width, height, size = (_value(content, key) for key in ("width", "height", "size"))
-    size = (width, height) if size is None and width and height else size
+    if size is None and width is not None and height is not None and number(width) > 0 and number(height) > 0:
+        size = (width, height)
     coefficients = _value(content, "distortion")
     return PosedCamera(
         name=name,
         viewmat=_pose(content),
         K=from_integer_centers(K),
         size=None if size is None else pixels(np.ravel(size).tolist()),
-        lens=(fisheye_lens if _value(content, "fisheye") else opencv_lens)(
+        lens=(fisheye_lens if str(_value(content, "fisheye") or 0) not in ("0", "false") else opencv_lens)(
             [] if coefficients is None else np.ravel(coefficients).tolist()
         ),
     )
