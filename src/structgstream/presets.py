@@ -281,7 +281,7 @@ COMPACT = replace(
         ),
         losses=replace(MOTION.initial.losses, l1=0.6, ssim=0.45),
         disturbance=PerturbationConfig(dropped_share=0.2, noise_scales=0.5, until_share=0.7),
-        regularizers=RegularizerConfig(depth_spread=0.05, color_spread=1.5, feature_difference=0.05),
+        regularizers=RegularizerConfig(depth_spread=0.05),
         free_space=FreeSpaceConfig(enabled=True),
         random_background=True,
         sampling_filter=True,
