@@ -8,7 +8,7 @@ from typing import Any
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.store import is_ours
 from structgstream.errors import StorageError, StreamError
-from structgstream.remote_folders import open_url, reason_of
+from structgstream.remote_folders import open_url, reason_of, shown_address
 
 IMMUTABLE = "public, max-age=31536000, immutable"
 """Cache-Control of everything but the manifest."""
@@ -33,8 +33,9 @@ class CloudStore:
     """
 
     def __init__(self, url: str, **options: Any) -> None:
-        self.name = url.rstrip("/")
-        self._files, self._root = open_url(self.name, **options)
+        self._url = url.rstrip("/")
+        self.name = shown_address(self._url)
+        self._files, self._root = open_url(self._url, **options)
         protocols = self._files.protocol
         self._scheme = protocols if isinstance(protocols, str) else protocols[0]
 
@@ -55,7 +56,7 @@ class CloudStore:
         try:
             return self._files.cat_file(f"{self._root}/{name}")
         except Exception as error:
-            raise StreamError(f"Cannot read {name} in {self.name} ({reason_of(error)}).") from error
+            raise StreamError(f"Cannot read {name} in {self.name} ({reason_of(error, self._url)}).") from error
 
     def delete(self, name: str) -> None:
         """See ``Store.delete``."""
@@ -73,7 +74,7 @@ class CloudStore:
         except FileNotFoundError:
             return frozenset()
         except Exception as error:
-            raise StreamError(f"Cannot list {self.name} ({reason_of(error)}).") from error
+            raise StreamError(f"Cannot list {self.name} ({reason_of(error, self._url)}).") from error
         return frozenset(filter(is_ours, (str(path).rsplit("/", 1)[-1] for path in found)))
 
     def free_bytes(self) -> int | None:
@@ -91,4 +92,4 @@ class CloudStore:
         try:
             yield
         except Exception as error:
-            raise StorageError(f"Cannot {what} in {self.name} ({reason_of(error)}).") from error
+            raise StorageError(f"Cannot {what} in {self.name} ({reason_of(error, self._url)}).") from error
