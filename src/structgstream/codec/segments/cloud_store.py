@@ -51,12 +51,16 @@ class CloudStore:
                 self._files.pipe_file(temporary, data)
                 self._files.mv(temporary, path)
 
-    def get(self, name: str) -> bytes:
+    def get(self, name: str, *, most_bytes: int | None = None) -> bytes:
         """See ``Store.get``."""
+        end = None if most_bytes is None else most_bytes + 1
         try:
-            return self._files.cat_file(f"{self._root}/{name}")
+            data = self._files.cat_file(f"{self._root}/{name}", end=end)
         except Exception as error:
             raise StreamError(f"Cannot read {name} in {self.name} ({reason_of(error, self._url)}).") from error
+        if most_bytes is not None and len(data) > most_bytes:
+            raise StreamError(f"{name} in {self.name} has more than the expected {most_bytes} bytes.")
+        return data
 
     def delete(self, name: str) -> None:
         """See ``Store.delete``."""
