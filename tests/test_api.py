@@ -14,7 +14,7 @@ from backends import QUICKEST
 from small_presets import QUICK
 from structgstream.cli import main
 from structgstream.data.clip import bundled_clip_path
-from structgstream.errors import ConfigError, StorageError, StreamError
+from structgstream.errors import CaptureError, ConfigError, StorageError, StreamError
 from structgstream.evaluation.evaluate import rendered
 from structgstream.evaluation.report import as_json
 from structgstream.evaluation.run_log import read_log
@@ -170,3 +170,9 @@ def test_what_is_returned_is_exported() -> None:
             returned |= classes_in(hint)
     assert {kind.__name__ for kind in returned} >= {"FrameReport", "FrameScores", "Report", "Scores", "StreamReader"}
     assert not {kind.__name__ for kind in returned} - {*structgstream.__all__}
+
+
+def test_a_capture_that_cannot_be_opened_leaves_nothing_behind(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError):
+        structgstream.reconstruct(tmp_path / "missing", tmp_path / "out", sink="segments")
+    assert not any(tmp_path.iterdir())

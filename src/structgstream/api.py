@@ -152,13 +152,6 @@ def reconstruct(
     )
     if seed is not None:
         config = replace(config, seed=seed)
-    path = Path(path)
-    storage = None
-    if sink == "segments":
-        store = segments_folder(path, may_exist=resume or overwrite)
-        storage = segments_at(store, options=SegmentsOptions(window_seconds))
-    else:
-        check_output(path, may_exist=resume or overwrite)
     metadata: dict[str, object] = {} if named is None else {"preset": named}
     if isinstance(capture, Path | str):
         source = open_capture(
@@ -173,6 +166,14 @@ def reconstruct(
     else:
         source = capture
     pipeline, chosen = stream_pipeline(config), select_backend(backend)
+    # Last, since it leaves a folder and a lock behind.
+    path = Path(path)
+    storage = None
+    if sink == "segments":
+        store = segments_folder(path, may_exist=resume or overwrite)
+        storage = segments_at(store, options=SegmentsOptions(window_seconds))
+    else:
+        check_output(path, may_exist=resume or overwrite)
     run = record(path, source, pipeline, chosen, resume=resume, storage=storage, metadata=metadata)
     reports = []
     with closing(run.reports) as recording:

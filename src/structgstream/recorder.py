@@ -13,10 +13,11 @@ from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.sink import Clocks, SegmentsSink
 from structgstream.codec.segments.store import FolderStore, Store
+from structgstream.codec.segments.stored_bytes import read_manifest
 from structgstream.codec.stored_segments import StoredSegments, resume_segments
 from structgstream.data.prefetch import read_ahead
 from structgstream.data.source import FrameStream, frame_count
-from structgstream.errors import StorageError
+from structgstream.errors import StorageError, StreamError
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry
 from structgstream.frame_report import FrameReport
 from structgstream.kernels.backend import Backend
@@ -130,16 +131,23 @@ def segments_folder(path: Path, *, may_exist: bool) -> FolderStore:
     """The folder of a stream of segments, made if it is not there, checked before frame 0 is fitted for minutes.
 
     Raises:
-        StorageError: it holds a stream, cannot be made or written, or another process writes to it.
+        StorageError: it holds a stream, or another program's manifest.json, cannot be made or written, or another
+            process writes to it.
     """
     store = FolderStore(path)
-    store.make()
-    store.lock()
-    store.prepare()
-    if MANIFEST in store.names() and not may_exist:
+    there = store.names() if path.is_dir() else frozenset()
+    if MANIFEST in there and not may_exist:
         raise StorageError(
             f"{path} holds a stream; continue it with --resume, replace it with --overwrite, or choose another name."
         )
+    if there == {MANIFEST}:
+        try:
+            read_manifest(store)
+        except StreamError as error:
+            raise StorageError(f"{path} has a {MANIFEST} of another program ({error}); choose another name.") from None
+    store.make()
+    store.lock()
+    store.prepare()
     return store
 
 

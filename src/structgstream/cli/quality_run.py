@@ -52,10 +52,10 @@ def reconstruct(options: Reconstruct, config: "StreamConfig", *, preset: str) ->
         for quality in qualities:
             configured(config, quality)
     console, names = Console(), [quality.name for quality in qualities]
+    opened = open_scene(options, config, preset=preset, console=console)
     folders = options.segments.quality_folders(
         options.output, names, resume=options.resume, overwrite=options.overwrite
     )
-    opened = open_scene(options, config, preset=preset, console=console)
     storages = {name: storage(opened.captured) for name, storage in folders.items()}
     _run(options, config, qualities, opened=opened, storages=storages)
     say(console, f"Wrote {options.output}: {', '.join(names)}")

@@ -120,20 +120,21 @@ def main(arguments: list[str]) -> None:
         config = with_budget(config, name=preset, quality=options.quality, mbits=options.mbits)
     console = Console()
     may_exist = options.resume or options.overwrite
+    options.segments.chosen(options.output)
+    opened = open_scene(options, config, preset=preset, console=console)
     with options.segments.storage(options.output, may_exist=may_exist, tell=partial(say, console)) as storage:
-        _reconstruct(options, config, preset=preset, storage=storage, console=console)
+        _reconstruct(options, config, opened, storage=storage, console=console)
     say(console, f"Wrote {options.output}")
 
 
 def _reconstruct(
     options: Reconstruct,
     config: "StreamConfig",
+    opened: "OpenedScene",
     *,
-    preset: str,
     storage: "SegmentsStorage | None",
     console: Console,
 ) -> None:
-    opened = open_scene(options, config, preset=preset, console=console)
     peaks = run_reconstruction(
         opened.source,
         config,
@@ -275,8 +276,9 @@ def run_reconstruction(
     except KeyboardInterrupt as error:
         of = "" if total is None else f" of {total}"
         kept = f"{output} has {done}{of} frames; continue with the same command and --resume."
+        nothing = "No frame was done, so no stream was written; its log and its metrics were begun."
         ended = Terminated if isinstance(error, Terminated) else Interrupted
-        raise ended(kept if done else "No frame was done, so nothing was written.") from None
+        raise ended(kept if done else nothing) from None
     return peaks
 
 

@@ -140,7 +140,7 @@ class SegmentOptions:
             finally:
                 if left := mirror.finish(wait_seconds=FINISH_SECONDS):
                     tell(
-                        f"{left} files of {output} are not yet in {self.publish}; the next run with --resume, or any "
+                        f"{left} files of {output} are not yet in {remote.name}; the next run with --resume, or any "
                         "program that copies folders, brings them there."
                     )
 

@@ -8,6 +8,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from structgstream.cli.plain_text import printable
 from structgstream.cli.progress import human_bytes
 
 if TYPE_CHECKING:
@@ -61,8 +62,8 @@ def name_value_table() -> Table:
 
 
 def literal_cells(*cells: str) -> tuple[Text, ...]:
-    """Cells without markup, because names and paths may contain square brackets."""
-    return tuple(Text(cell) for cell in cells)
+    """Cells without markup, because names may contain square brackets, and without what a terminal would obey."""
+    return tuple(Text(printable(cell)) for cell in cells)
 
 
 def compact_table() -> Table:

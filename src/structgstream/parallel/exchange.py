@@ -142,7 +142,7 @@ class ObjectStore:
         if there is None or (there.identity == here.identity if here is not None else there.key == key):
             return there
         raise StorageError(
-            f"{self._store.url} holds the parts of another run than {self._parts.folder}; nothing there was changed. "
+            f"{self._store.name} holds the parts of another run than {self._parts.folder}; nothing there was changed. "
             "Choose another --store, or go on with the output and the options of that run."
         )
 

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from structgstream.errors import StorageError
 from structgstream.owned_folders import MARKER, Owner, parse_owner
-from structgstream.remote_folders import open_url, reason_of
+from structgstream.remote_folders import open_url, reason_of, shown_address
 
 T = TypeVar("T")
 TRIES = 8
@@ -35,6 +35,8 @@ class ObjectFolder:
 
     def __init__(self, url: str) -> None:
         self.url = url.rstrip("/")
+        self.name = shown_address(self.url)
+        """For messages."""
         self._files, self._root = open_url(self.url)
 
     def write(self, name: str, data: bytes) -> None:
@@ -101,7 +103,7 @@ class ObjectFolder:
         found = None if data is None else parse_owner(data)
         if found is None:
             raise StorageError(
-                f"{self.url} holds objects and no marker of structgstream ({MARKER}), so they may be somebody else's; "
+                f"{self.name} holds objects and no marker of structgstream ({MARKER}), so they may be somebody else's; "
                 "nothing there was changed. Choose a --store that is empty."
             )
         return found
@@ -140,7 +142,7 @@ class ObjectFolder:
                 return action()
             except Exception as error:  # Each file system has its own.
                 if attempt + 1 == TRIES:
-                    raise StorageError(f"Cannot {what} in {self.url} ({reason_of(error)}).") from error
+                    raise StorageError(f"Cannot {what} in {self.name} ({reason_of(error, self.url)}).") from error
             time.sleep(delay)
             delay = min(2 * delay, LONGEST_DELAY_SECONDS)
         raise AssertionError("unreachable")

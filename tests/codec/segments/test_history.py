@@ -35,7 +35,7 @@ class Memory:
     def put(self, name: str, data: bytes) -> None:
         self.files[name] = data
 
-    def get(self, name: str) -> bytes:
+    def get(self, name: str, *, most_bytes: int | None = None) -> bytes:
         return self.files[name]
 
     def delete(self, name: str) -> None:

@@ -4,7 +4,7 @@
 import json
 import struct
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, NoReturn
 
 from zstandard import ZstdCompressor, ZstdDecompressor, ZstdError, frame_content_size
 
@@ -58,7 +58,9 @@ def read_description(payload: bytes) -> dict[str, Any]:
         size = frame_content_size(packed)
         if not 0 <= size <= MAX_JSON_BYTES:
             raise ValueError(f"its description unpacks to {size} bytes, at most {MAX_JSON_BYTES} are allowed")
-        return json.loads(ZstdDecompressor().decompress(packed, max_output_size=MAX_JSON_BYTES))
+        return json.loads(
+            ZstdDecompressor().decompress(packed, max_output_size=MAX_JSON_BYTES), parse_constant=_refuse_constant
+        )
     except ZstdError as error:
         raise ValueError(str(error)) from error
 
@@ -71,3 +73,7 @@ def field_sizes(payload: bytes) -> dict[str, int]:
     """
     blocks = iterate_blocks(payload, first_block(payload), where="The init record")
     return {block.name: block.end - block.start for block in blocks}
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no number of JSON")

@@ -8,7 +8,7 @@ from typing import Any
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.store import is_ours
 from structgstream.errors import StorageError, StreamError
-from structgstream.remote_folders import open_url, reason_of
+from structgstream.remote_folders import open_url, reason_of, shown_address
 
 IMMUTABLE = "public, max-age=31536000, immutable"
 """Cache-Control of everything but the manifest."""
@@ -33,8 +33,9 @@ class CloudStore:
     """
 
     def __init__(self, url: str, **options: Any) -> None:
-        self.name = url.rstrip("/")
-        self._files, self._root = open_url(self.name, **options)
+        self._url = url.rstrip("/")
+        self.name = shown_address(self._url)
+        self._files, self._root = open_url(self._url, **options)
         protocols = self._files.protocol
         self._scheme = protocols if isinstance(protocols, str) else protocols[0]
 
@@ -50,12 +51,16 @@ class CloudStore:
                 self._files.pipe_file(temporary, data)
                 self._files.mv(temporary, path)
 
-    def get(self, name: str) -> bytes:
+    def get(self, name: str, *, most_bytes: int | None = None) -> bytes:
         """See ``Store.get``."""
+        end = None if most_bytes is None else most_bytes + 1
         try:
-            return self._files.cat_file(f"{self._root}/{name}")
+            data = self._files.cat_file(f"{self._root}/{name}", end=end)
         except Exception as error:
-            raise StreamError(f"Cannot read {name} in {self.name} ({reason_of(error)}).") from error
+            raise StreamError(f"Cannot read {name} in {self.name} ({reason_of(error, self._url)}).") from error
+        if most_bytes is not None and len(data) > most_bytes:
+            raise StreamError(f"{name} in {self.name} has more than the expected {most_bytes} bytes.")
+        return data
 
     def delete(self, name: str) -> None:
         """See ``Store.delete``."""
@@ -73,7 +78,7 @@ class CloudStore:
         except FileNotFoundError:
             return frozenset()
         except Exception as error:
-            raise StreamError(f"Cannot list {self.name} ({reason_of(error)}).") from error
+            raise StreamError(f"Cannot list {self.name} ({reason_of(error, self._url)}).") from error
         return frozenset(filter(is_ours, (str(path).rsplit("/", 1)[-1] for path in found)))
 
     def free_bytes(self) -> int | None:
@@ -91,4 +96,4 @@ class CloudStore:
         try:
             yield
         except Exception as error:
-            raise StorageError(f"Cannot {what} in {self.name} ({reason_of(error)}).") from error
+            raise StorageError(f"Cannot {what} in {self.name} ({reason_of(error, self._url)}).") from error

@@ -96,9 +96,9 @@ class MirroredStore:
             self._started()
             self._changed.notify_all()
 
-    def get(self, name: str) -> bytes:
+    def get(self, name: str, *, most_bytes: int | None = None) -> bytes:
         """From the folder."""
-        return self._folder.get(name)
+        return self._folder.get(name, most_bytes=most_bytes)
 
     def delete(self, name: str) -> None:
         """Remove from the folder, when it is not being copied; the copy goes later; a manifest's stays."""

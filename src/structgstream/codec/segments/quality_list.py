@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from structgstream.codec.segments.manifest import MANIFEST
+from structgstream.codec.segments.store import read_bounded
 from structgstream.codec.segments.strict_json import Fields, parse_object
 from structgstream.errors import StreamError
 from structgstream.whole_files import write_whole
@@ -79,12 +80,9 @@ def read_list(folder: Path) -> tuple[ListedQuality, ...] | None:
         StreamError: the list is none, or cannot be read.
     """
     path = folder / QUALITIES
-    try:
-        data = path.read_bytes()
-    except (FileNotFoundError, NotADirectoryError):
+    if not path.exists():
         return None
-    except OSError as error:
-        raise StreamError(f"Cannot read {path} ({error.strerror}).") from error
+    data = read_bounded(path, most_bytes=MOST_LIST_BYTES)
     return list_from_json(data, name=str(path))
 
 

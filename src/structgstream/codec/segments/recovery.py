@@ -14,7 +14,7 @@ from structgstream.codec.packet_kind import PacketKind
 from structgstream.codec.segments.group import part_of
 from structgstream.codec.segments.history import verified
 from structgstream.codec.segments.manifest import MANIFEST, Edge, Manifest, PartEntry, sha256_of
-from structgstream.codec.segments.manifest_json import manifest_from_json
+from structgstream.codec.segments.manifest_json import MOST_MANIFEST_BYTES, manifest_from_json
 from structgstream.codec.segments.next_manifest import (
     Draft,
     empty_manifest,
@@ -77,7 +77,8 @@ def stale_files(manifest: Manifest, there: frozenset[str]) -> frozenset[str]:
 
 def _named(store: Store, there: frozenset[str]) -> Draft | None:
     """What the manifest names; a damaged last part is as one that was never written."""
-    manifest = manifest_from_json(store.get(MANIFEST), name=f"{MANIFEST} in {store.name}")
+    data = store.get(MANIFEST, most_bytes=MOST_MANIFEST_BYTES)
+    manifest = manifest_from_json(data, name=f"{MANIFEST} in {store.name}")
     segments = [entry for entry in manifest.segments if entry.segment >= manifest.window.first_segment]
     for entry in (*manifest.periods, *manifest.history, *segments):
         if entry.file not in there:

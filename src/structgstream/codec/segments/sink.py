@@ -24,7 +24,7 @@ from structgstream.codec.segments.manifest import (
     Manifest,
     Window,
 )
-from structgstream.codec.segments.manifest_json import manifest_from_json, manifest_to_json
+from structgstream.codec.segments.manifest_json import MOST_MANIFEST_BYTES, manifest_from_json, manifest_to_json
 from structgstream.codec.segments.next_manifest import (
     Draft,
     empty_manifest,
@@ -191,7 +191,8 @@ class SegmentsSink:
         sequence = 0
         if MANIFEST in there:
             with suppress(StreamError):  # It is being replaced, whatever it says.
-                sequence = manifest_from_json(self._store.get(MANIFEST), name=MANIFEST).sequence
+                data = self._store.get(MANIFEST, most_bytes=MOST_MANIFEST_BYTES)
+                sequence = manifest_from_json(data, name=MANIFEST).sequence
         for name in sorted(there, key=lambda name: (name != MANIFEST, not name.startswith("init-"), name)):
             self._store.delete(name)
         return sequence

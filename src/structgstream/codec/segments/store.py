@@ -3,6 +3,7 @@
 
 import os
 import re
+import stat
 import weakref
 from pathlib import Path
 from typing import Protocol
@@ -12,6 +13,8 @@ from structgstream.errors import StorageError, StreamError
 from structgstream.file_locks import lock_file, open_lockable
 from structgstream.whole_files import replacing
 
+MOST_FILE_BYTES = 2**32
+"""Of a file whose size no manifest states."""
 _TEMPORARY = ".new-"
 _LOCK = ".writer"
 _OURS = re.compile(r"manifest\.json|(init|part|segment)-\d{4,}-[0-9a-f]{16}\.sgs|history-\d{8,}-[0-9a-f]{16}\.json")
@@ -20,6 +23,25 @@ _OURS = re.compile(r"manifest\.json|(init|part|segment)-\d{4,}-[0-9a-f]{16}\.sgs
 def is_ours(name: str) -> bool:
     """Whether a file has a name that the sink gives; nothing else in a folder is ever touched."""
     return _OURS.fullmatch(name) is not None
+
+
+def read_bounded(path: Path, *, most_bytes: int) -> bytes:
+    """The bytes of a regular file; pipes, devices and files that are too large are refused before they are read.
+
+    Raises:
+        StreamError: it cannot be read, is no regular file, or has more bytes.
+    """
+    try:
+        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise StreamError(f"{path} is not a regular file; expected one that a run has written.")
+            data = file.read(most_bytes + 1) if status.st_size <= most_bytes else None
+    except OSError as error:
+        raise StreamError(f"Cannot read {path} ({error.strerror}).") from error
+    if data is None or len(data) > most_bytes:
+        raise StreamError(f"{path} has {status.st_size} bytes; expected at most {most_bytes}.")
+    return data
 
 
 class Store(Protocol):
@@ -38,11 +60,11 @@ class Store(Protocol):
         """
         ...
 
-    def get(self, name: str) -> bytes:
+    def get(self, name: str, *, most_bytes: int | None = None) -> bytes:
         """The bytes of a file.
 
         Raises:
-            StreamError: there is none, or it cannot be read.
+            StreamError: there is none, or it cannot be read, or has more bytes than ``most_bytes``.
         """
         ...
 
@@ -128,13 +150,9 @@ class FolderStore:
                 f"Cannot write {len(data)} bytes to {self.folder / name} ({error.strerror or error})."
             ) from error
 
-    def get(self, name: str) -> bytes:
+    def get(self, name: str, *, most_bytes: int | None = None) -> bytes:
         """See :meth:`Store.get`."""
-        path = self.folder / name
-        try:
-            return path.read_bytes()
-        except OSError as error:
-            raise StreamError(f"Cannot read {path} ({error.strerror}).") from error
+        return read_bounded(self.folder / name, most_bytes=MOST_FILE_BYTES if most_bytes is None else most_bytes)
 
     def delete(self, name: str) -> None:
         """See :meth:`Store.delete`."""

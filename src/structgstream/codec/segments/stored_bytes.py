@@ -13,7 +13,7 @@ from structgstream.codec.container.records import PREFIX, RecordType
 from structgstream.codec.packet_kind import PacketKind
 from structgstream.codec.segments.history import segments_from, verified
 from structgstream.codec.segments.manifest import MANIFEST, Manifest, PartEntry, SegmentEntry, StoredFile
-from structgstream.codec.segments.manifest_json import manifest_from_json
+from structgstream.codec.segments.manifest_json import MOST_MANIFEST_BYTES, manifest_from_json
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.errors import StreamError
 
@@ -173,7 +173,7 @@ class StoredBytes:
     def _read(self, entry: StoredFile) -> bytes:
         if self._check:
             return verified(self._store, entry)
-        data = self._store.get(entry.file)
+        data = self._store.get(entry.file, most_bytes=entry.bytes)
         if len(data) != entry.bytes:
             raise StreamError(
                 f"{entry.file} in {self._store.name} has {len(data)} bytes; the manifest states {entry.bytes}."
@@ -209,4 +209,4 @@ def read_manifest(store: Store) -> Manifest:
     """
     if MANIFEST not in store.names():
         raise StreamError(f"{store.name} has no {MANIFEST}; expected a folder written with --sink segments.")
-    return manifest_from_json(store.get(MANIFEST), name=f"{MANIFEST} in {store.name}")
+    return manifest_from_json(store.get(MANIFEST, most_bytes=MOST_MANIFEST_BYTES), name=f"{MANIFEST} in {store.name}")

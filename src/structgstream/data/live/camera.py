@@ -19,6 +19,7 @@ from structgstream.data.live.matching import LivePicture
 from structgstream.data.live.rig_file import LiveCamera, TimeBase
 from structgstream.data.live.stamps import StampReader
 from structgstream.data.video_index import load_av
+from structgstream.remote_folders import without_secrets
 
 if TYPE_CHECKING:
     from av.packet import Packet
@@ -158,7 +159,8 @@ class CameraFeed:
             return str(getattr(error, "strerror", None) or error)
         except Exception as error:  # Whatever it is: a thread that ends would be a camera that never comes back.
             log.exception("camera %r cannot be read", self.name)
-            return f"{type(error).__name__}: {error}"
+            said = without_secrets(str(error), self._camera.url, *self._camera.options.values())
+            return f"{type(error).__name__}: {said}"
         return ENDED
 
     def _read(self, container: Any) -> None:

@@ -11,9 +11,9 @@ from typing import Any, TypeVar
 
 from structgstream.data.text_files import Unreadable, read_toml, reason
 from structgstream.errors import CaptureError
+from structgstream.remote_folders import shown_address, without_secrets
 
 Made = TypeVar("Made")
-SECRET = re.compile(r"(?<=://)[^/@\s]*@")
 FILE_URL = re.compile(r"^file:(//(?=/))?", re.IGNORECASE)
 SCHEME = re.compile(r"^[a-z][a-z0-9+.-]+:", re.IGNORECASE)
 
@@ -46,8 +46,8 @@ class LiveCamera:
 
     @property
     def shown_url(self) -> str:
-        """The URL without user and password, for messages."""
-        return SECRET.sub("", self.url)
+        """The URL without secrets, for messages."""
+        return shown_address(self.url)
 
     @property
     def is_file(self) -> bool:
@@ -161,7 +161,7 @@ def _in_folder(camera: LiveCamera, folder: Path) -> LiveCamera:
 def _made(kind: type[Made], entry: Any, *, where: str) -> Made:
     """A dataclass from a table, each of whose values is checked."""
     if not isinstance(entry, dict):
-        raise CaptureError(f"The entry of {where} must be a table, got {entry!r}.")
+        raise CaptureError(f"The entry of {where} must be a table, got {without_secrets(repr(entry))}.")
     known = {item.name: item for item in fields(kind)}  # type: ignore[arg-type]
     if unknown := [key for key in entry if key not in known]:
         raise CaptureError(f"There is no key {unknown[0]!r} in {where}; its keys are {', '.join(known)}.")
@@ -175,7 +175,8 @@ def _checked(key: str, value: Any, where: str) -> Any:
     try:
         return CHECKS[key](value)
     except (ValueError, TypeError):
-        raise CaptureError(f"{key} = {value!r} in {where} is invalid; expected {EXPECTED[key]}.") from None
+        found = "..." if key in ("url", "options") else repr(value)  # these may have a password
+        raise CaptureError(f"{key} = {found} in {where} is invalid; expected {EXPECTED[key]}.") from None
 
 
 def _text(value: Any) -> str:
