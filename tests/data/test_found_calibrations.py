@@ -202,5 +202,5 @@ def test_numbers_alone_are_said(tmp_path: Path, caplog: pytest.LogCaptureFixture
     write_videos(tmp_path, ["right_0", "right_1", "right_2"], frames=2)
     calibrated(tmp_path, truths(names=("left_2", "left_1", "left_0"), dist=(0, 0, 0, 0)))
     assert list(open_capture(tmp_path).rig) == ["right_0", "right_1", "right_2"]
-    assert "cameras are told by their numbers alone: right_0 is 'left_0'" in caplog.text
+    assert "cameras are matched by their numbers alone: right_0 is 'left_0'" in caplog.text
     caplog.clear()

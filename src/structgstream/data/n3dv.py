@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.aligned_points import aligned_points
 from structgstream.data.calibration import calibrated_camera, calibrated_rig
-from structgstream.data.calibration_files.reading import readable
+from structgstream.data.calibration_files.reading import read_array, readable
 from structgstream.data.camera_files import pictures_in
 from structgstream.data.colmap import find_model, read_model
 from structgstream.data.folder_files import by_stem, files_of
@@ -49,6 +49,7 @@ POSES = "poses_bounds.npy"
 HELD_OUT = ("cam00", "cam_0")
 MODELS = ("", "colmap", "colmap_0")
 SIDE = 640  # pixels, of pictures that are matched to tell the order of rows
+LARGEST = 1e100  # of a number of a pose
 LEAST_CONFIRMED = 0.5  # of the pairs of neighbours
 
 
@@ -125,18 +126,16 @@ def _points(path: Path, rig: CameraRig) -> NDArray[np.float64] | None:
 def _read_poses(file: Path) -> NDArray[np.float64]:
     """``[V, 3, 5]`` matrices of the file."""
     try:
-        rows = np.asarray(np.load(file, allow_pickle=False), dtype=np.float64)
+        rows = read_array(file)
     except BROKEN as error:
-        raise CalibrationError(
-            f"{file} cannot be read as an array of numbers ({reason(error)}); copy or export it again."
-        ) from None
+        raise CalibrationError(f"{file} cannot be read ({reason(error)}); copy or export it again.") from None
     if rows.ndim != 2 or rows.shape[1] != 17:
         raise CalibrationError(f"{file} has shape {rows.shape}; expected (cameras, 17): 3x5 poses and two bounds.")
     return rows[:, :15].reshape(-1, 3, 5)
 
 
 def _camera(name: str, pose: NDArray[np.float64], where: Path) -> PosedCamera:
-    if not np.isfinite(pose).all():
+    if not (np.abs(pose) < LARGEST).all():
         raise CalibrationError(f"Camera {name!r} of {where} has a number that is not finite (NaN or infinity).")
     down, right, backward, center, (height, width, focal) = pose.T
     rotation = np.stack([right, down, -backward])  # rows of world to camera: x right, y down, z forward

@@ -218,6 +218,8 @@ def _still(calibration: Calibration, names: Sequence[str | None]) -> dict[str, P
         if name is None:
             continue
         first = found.setdefault(name, posed)
+        if not np.isfinite(posed.viewmat).all():
+            continue  # refused where it becomes a camera
         # From the difference, which rounding in the file changes little; the trace's arc cosine turns 1e-4 into 0.6.
         turn = float(np.linalg.norm(first.viewmat[:3, :3] - posed.viewmat[:3, :3])) / np.sqrt(8)
         degrees = np.degrees(2 * np.arcsin(min(1.0, turn)))
@@ -245,7 +247,7 @@ def _check(
         numbered = {name: posed.name for name, posed in poses.items() if name not in (*_parts(posed.name), posed.name)}
         if numbered and not _by_word(list(numbered.values()), list(numbered)):
             pairs = ", ".join(f"{name} is {own!r}" for name, own in sorted(numbered.items())[:3])
-            log.warning("%s: no names are the same, so cameras are told by their numbers alone: %s", root, pairs)
+            log.warning("%s: no names are the same, so cameras are matched by their numbers alone: %s", root, pairs)
         if idle:
             log.warning("%s has no pictures of %s of %s; left out", root, listed(idle), calibration.where)
         return

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import calibrated_camera, calibrated_rig
-from structgstream.data.calibration_files.reading import positive, readable
+from structgstream.data.calibration_files.reading import positive, read_array, readable
 from structgstream.data.folder_files import by_stem, files_of
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
@@ -234,7 +234,7 @@ def _read_points(path: Path, capture: PreparedCapture) -> NDArray[np.float64] | 
         return None
     file = path / capture.points
     with readable(file, "points as an array of shape [P, 3]"):
-        points = np.asarray(np.load(file, allow_pickle=False), np.float64)
+        points = read_array(file)
         if points.ndim != 2 or points.shape[1] != 3:
             raise Unreadable(f"an array of shape {points.shape}")
     return points

@@ -38,8 +38,9 @@ def read(files: tuple[Path, ...]) -> Calibration:
     for file in files:
         with readable(file, EXPECTED):
             content |= read_storage(file)
-        names = [str(name) for name in content.get("names") or ()]
-    if not all(f"K_{name}" in content for name in names):  # YAML reads 00 as a number
+    stated = content.get("names")
+    names = [str(name) for name in stated] if isinstance(stated, list) else []
+    if not all(f"K_{name}" in content for name in names):
         names = [key.removeprefix("K_") for key in content if key.startswith("K_")]
     return calibration_of(((name, name) for name in names), partial(_camera, content), file=files[0], expected=EXPECTED)
 

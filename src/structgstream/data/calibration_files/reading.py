@@ -7,6 +7,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from structgstream.data.calibration import listed
 from structgstream.data.posed import Calibration, PosedCamera
 from structgstream.data.text_files import BROKEN, Unreadable, number, read_text, reason
@@ -58,7 +61,11 @@ def calibration_of(
     cameras, unposed = [], []
     for name, entry in entries:
         try:
-            cameras.append(read(name, entry))
+            with np.errstate(all="ignore"):  # what overflows is not finite, which is refused
+                camera = read(name, entry)
+            if not (np.isfinite(camera.viewmat).all() and np.isfinite(camera.K).all()):
+                raise Unreadable("a number that is not finite (NaN or infinity)")
+            cameras.append(camera)
         except CalibrationError:
             raise
         except NoPose:
@@ -73,6 +80,21 @@ def calibration_of(
     if unposed:
         log.warning("%s has no pose of %s; left out", file, listed(unposed))
     return Calibration(file, tuple(cameras), unposed=tuple(unposed))
+
+
+def read_array(file: Path) -> NDArray[np.float64]:
+    """The numbers of an ``.npy`` file.
+
+    Raises:
+        Unreadable: it holds something else, or is cut.
+        OSError: it cannot be read.
+    """
+    try:
+        return np.asarray(np.load(file, allow_pickle=False), dtype=np.float64)
+    except OSError:
+        raise
+    except Exception:  # a damaged header can raise anything
+        raise Unreadable("it is no array of numbers, or is cut") from None
 
 
 def positive(content: Mapping[str, Any], key: str) -> float:
