@@ -26,7 +26,7 @@ from structgstream.data.picture_size import picture_size
 from structgstream.data.prepared import pictures_of
 from structgstream.data.timeline import natural, picture_slots
 from structgstream.data.video import measured_fps
-from structgstream.data.video_index import VIDEO_SUFFIXES, VideoTrack, open_video, scan_videos
+from structgstream.data.video_index import VIDEO_SUFFIXES, VideoTrack, open_video, scan_videos, video_stream
 from structgstream.data.video_pictures import pictures_at
 from structgstream.errors import CaptureError
 
@@ -143,7 +143,7 @@ class Footage:
         if name not in self.tracks:
             return {}
         with open_video(self.files[name]) as container:
-            stated = {**container.streams.video[0].metadata, **container.metadata}
+            stated = {**video_stream(container).metadata, **container.metadata}
         return {key.lower(): value for key, value in stated.items()}
 
     def only(self, names: Collection[str]) -> "Footage":
