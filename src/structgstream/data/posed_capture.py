@@ -69,7 +69,7 @@ def open_posed(
         CaptureError: no pictures or videos, or not of the calibrated cameras.
         CalibrationError: a camera without calibration, one that moves, or pictures of other proportions.
     """
-    for root in (path / name for name in ROOTS):
+    for root in _roots(path):
         if videos := _videos(root):
             videos = videos if complete else _posed(videos, calibration, root)
             return undistort(*_of_videos(path, videos, root=root, calibration=calibration), target=target)
@@ -85,6 +85,23 @@ def open_posed(
         f"{path} has the calibration {calibration.where} but no frames; expected images/CAMERA/FRAME.ext, "
         "frames/FRAME/CAMERA.ext, images/CAMERA.ext or one video per camera."
     )
+
+
+def _roots(path: Path) -> list[Path]:
+    """The folders to look through, in order; videos before pictures that are stills of the same cameras."""
+    roots = [path / name for name in ROOTS]
+    stills = next(
+        (root for root in roots if (own := _folders(root)) and all(len(files) == 1 for files in own.values())), None
+    )
+    first = next((root for root in roots if _folders(root) or _videos(root)), None)
+    filmed = next((root for root in roots if _videos(root)), None)
+    if filmed is None or first is None or first == filmed:
+        return roots
+    if first == stills and (len(_folders(first)) > 1 and len(_folders(first)) >= len(_videos(filmed))):
+        log.warning("%s has one picture of each camera in %s; the videos in %s are read", path.name, first, filmed)
+        return [filmed, *roots]
+    log.warning("%s has pictures in %s and videos in %s; the pictures are read", path.name, first, filmed)
+    return roots
 
 
 def _posed(files: Mapping[str, Of], calibration: Calibration, root: Path) -> Mapping[str, Of]:
@@ -191,6 +208,10 @@ def _poses(calibration: Calibration, cameras: Collection[str]) -> dict[str, Pose
         if None in numbered or len(numbered) != len(cameras) or {_number(name) for (name,) in parts} != set(numbered):
             return {}
         file_of = {name: numbered[_number(name)] for (name,) in parts}
+        pairs = ", ".join(f"{name!r} is {file!r}" for name, file in list(file_of.items())[:4])
+        log.warning(
+            "The cameras of %s have other names than the files and are matched by number: %s", calibration.where, pairs
+        )
     return _still(calibration, [file_of.get(posed.name) for posed in calibration.cameras])
 
 

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.audio import read_audio
-from structgstream.data.folder_files import REPORT, files_of, is_hidden
-from structgstream.data.images import PICTURE_SUFFIXES, read_picture
+from structgstream.data.folder_files import REPORT, check_link, files_of, is_hidden
+from structgstream.data.images import PICTURE_SUFFIXES, read_picture, significant_bits
 from structgstream.data.picture_size import picture_size
 from structgstream.data.prepared import pictures_of
 from structgstream.data.timeline import natural, picture_slots
@@ -92,6 +92,10 @@ class Footage:
         return self._slots[name] / self.picture_fps
 
     @cached_property
+    def _bits(self) -> int:
+        return significant_bits(self.stills)
+
+    @cached_property
     def _slots(self) -> Mapping[str, NDArray[np.intp]]:
         """Which instant each picture is of, from 0 on."""
         return picture_slots(self.stills)
@@ -108,7 +112,9 @@ class Footage:
         else:
             size = self.size(name)
             for index in indices:
-                yield _of_size(read_picture(self.stills[name][index]), size, name, self.stills[name][index])
+                yield _of_size(
+                    read_picture(self.stills[name][index], bits=self._bits), size, name, self.stills[name][index]
+                )
 
     def _decoded(self, name: str, track: VideoTrack, indices: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
         def tell(lost: int, following: int | None, reason: str) -> None:
@@ -171,13 +177,32 @@ def find_footage(where: Path, *, picture_fps: float | None = None) -> Footage:
     if not where.is_dir():
         kind = "a file" if where.exists() else "missing"
         raise CaptureError(f"{where} is {kind}; give the folder that holds the cameras' videos ({LAYOUTS}).")
-    for root in (where / name for name in SUBFOLDERS):
-        if root.is_dir() and (files := _found(root)):
+    roots = [where / name for name in SUBFOLDERS if (where / name).is_dir()]
+    for root in _likely_first(roots):
+        if files := _found(root):
             ordered = {name: files[name] for name in sorted(files, key=natural)}
             return _footage(where, ordered, picture_fps or PICTURE_FPS)
     held = ", ".join(sorted(entry.name for entry in where.iterdir())[:6])
     found = f"holds no videos and no pictures, but {held}" if held else "is empty"
     raise CaptureError(f"{where} {found}; expected {LAYOUTS}.")
+
+
+def _likely_first(roots: list[Path]) -> list[Path]:
+    """The folders, and those first that hold files or folders of several cameras: one picture may lie above them."""
+
+    def is_alone(root: Path) -> bool:
+        filmed = [entry for entry in root.iterdir() if entry.suffix.lower() in VIDEO_SUFFIXES | PICTURE_SUFFIXES]
+        folders = [entry for entry in root.iterdir() if entry.is_dir() and entry.name not in NO_CAMERAS]
+        return len(filmed) == 1 and not folders and not is_hidden(filmed[0])
+
+    alone = {root: is_alone(root) for root in roots}
+    if all(alone.values()) or not any(alone.values()):
+        return roots
+    for root in (root for root in roots if alone[root]):
+        filled = [other for other in roots if other != root and not alone[other] and any(other.iterdir())]
+        if filled:
+            _log.warning("One file alone in %s is left out, since %s holds more", root, filled[0])
+    return sorted(roots, key=lambda root: alone[root])
 
 
 def _of_size(picture: NDArray[np.uint8], size: tuple[int, int], name: str, file: Path) -> NDArray[np.uint8]:
@@ -223,6 +248,9 @@ def _footage(where: Path, files: Mapping[str, Path], picture_fps: float) -> Foot
 def _found(root: Path) -> dict[str, Path]:
     """Files or folders of the cameras of ``root`` by name; nothing when there are none."""
     entries = sorted(entry for entry in root.iterdir() if not is_hidden(entry))
+    for entry in entries:
+        if entry.suffix.lower() in VIDEO_SUFFIXES | PICTURE_SUFFIXES:
+            check_link(entry)
     for suffixes in (VIDEO_SUFFIXES, PICTURE_SUFFIXES):
         found: dict[str, Path] = {}
         for entry in entries:
