@@ -152,13 +152,13 @@ def test_what_a_mac_and_a_check_leave_is_no_footage(tmp_path: Path) -> None:
 
 def test_a_file_of_another_kind_is_not_lost_unnoticed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_videos(tmp_path, ["a", "b"], frames=2)
-    for name in ("c.AVI", "d.jpg", "notes.txt", "cameras.json"):
+    for name in ("c.DNG", "d.jpg", "notes.txt", "cameras.json"):
         (tmp_path / name).write_bytes(b"")
     with caplog.at_level(logging.WARNING):
         assert find_footage(tmp_path).cameras == ("a", "b")
     left = [record.getMessage().split(" is left out")[0].split("/")[-1] for record in caplog.records]
-    assert left == ["c.AVI", "d.jpg"]
-    assert "c.AVI is left out: it is not of the kind of" in caplog.text
+    assert left == ["c.DNG", "d.jpg"]
+    assert "c.DNG is left out: it is not of the kind of" in caplog.text
 
 
 def test_the_folder_above_the_videos(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -16,8 +16,28 @@ def is_hidden(path: Path) -> bool:
 
 
 def files_of(folder: Path, suffixes: Collection[str]) -> list[Path]:
-    """The files of these kinds (lower-case suffixes, with the dot) in a folder, sorted by name, without hidden ones."""
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() in suffixes and not is_hidden(file))
+    """The files of these kinds (lower-case suffixes, with the dot) in a folder, sorted by name, without hidden ones.
+
+    Raises:
+        CaptureError: one is a link to a file that is not there.
+    """
+    found = sorted(file for file in folder.iterdir() if file.suffix.lower() in suffixes and not is_hidden(file))
+    for file in found:
+        check_link(file)
+    return found
+
+
+def check_link(file: Path) -> None:
+    """A link leads somewhere.
+
+    Raises:
+        CaptureError: it does not.
+    """
+    if file.is_symlink() and not file.exists():
+        raise CaptureError(
+            f"{file} is a link to {file.readlink()}, which does not exist; restore that file, or move the link out of "
+            "the folder."
+        )
 
 
 def by_stem(files: Iterable[Path]) -> dict[str, Path]:

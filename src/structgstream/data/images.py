@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Captures whose frames are picture files: one list of files per camera."""
 
+import io
+import logging
 import os
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,11 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig
-from structgstream.data.timeline import common_slots, natural
+from structgstream.data.timeline import common_slots, instants_of, natural
 from structgstream.errors import CalibrationError, CaptureError, MissingExtraError
 from structgstream.frames import MultiViewFrame
 
-PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"})
+PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".heic", ".heif", ".avif"})
+HEIF_BRANDS = frozenset({b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1", b"avif", b"avis"})
+OPAQUE = 0.98
+"""Share of opacity from which on a pixel counts."""
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -42,6 +49,7 @@ class ImageSource:
     points: NDArray[np.float64] | None = None
     instants: tuple[str, ...] = ()
     apart_seconds: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    _bits: dict[int, int] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __len__(self) -> int:
         return min(len(files) for files in self.files.values())
@@ -52,12 +60,18 @@ class ImageSource:
         Raises:
             CaptureError: a picture has gone, cannot be decoded, or has another size than its intrinsics.
         """
-        opencv()  # missing, it is told once
+        opencv()  # missing, it is reported once
+        if 0 not in self._bits:
+            self._bits[0] = significant_bits(self.files)
+        bits = self._bits[0]
         with ThreadPoolExecutor(min(len(self.rig), os.cpu_count() or 1), "pictures") as pool:
             for index in range(start, len(self)):
                 paths = {name: path for name in self.rig if (path := self.files[name][index]) is not None}
-                pictures = pool.map(_picture, paths.values(), [self.rig[name] for name in paths])
-                yield MultiViewFrame(index, index / self.fps, dict(zip(paths, pictures, strict=True)))
+                found = pool.map(_picture, paths.values(), [self.rig[name] for name in paths], [bits] * len(paths))
+                pictures = dict(zip(paths, found, strict=True))
+                masks = {name: mask for name, (_, mask) in pictures.items() if mask is not None}
+                images = {name: picture for name, (picture, _) in pictures.items()}
+                yield MultiViewFrame(index, index / self.fps, images, masks=masks)
 
 
 def opencv() -> ModuleType:
@@ -94,6 +108,12 @@ def common_pictures(
     Raises:
         CaptureError: see :func:`~structgstream.data.timeline.common_slots`.
     """
+    keys = instants_of({camera: list(pictures) for camera, pictures in files.items()})
+    named = {keys[camera][instant]: instant for camera, pictures in files.items() for instant in pictures}
+    files = {
+        camera: {named[keys[camera][instant]]: file for instant, file in pictures.items()}
+        for camera, pictures in files.items()
+    }
     instants = sorted({instant for pictures in files.values() for instant in pictures}, key=natural)
     slot_of = {instant: slot for slot, instant in enumerate(instants)}
     slots = {camera: sorted(slot_of[instant] for instant in pictures) for camera, pictures in files.items()}
@@ -104,43 +124,166 @@ def common_pictures(
     )
 
 
-def read_picture(path: Path) -> NDArray[np.uint8]:
+def read_picture(path: Path, *, bits: int = 16) -> NDArray[np.uint8]:
     """One picture as ``[H, W, 3]`` sRGB, as its pixels are stored.
+
+    Args:
+        path: the file.
+        bits: of which the values of pictures of 16 bits are (:func:`significant_bits`).
 
     Raises:
         CaptureError: it cannot be read or decoded.
+    """
+    return read_picture_and_mask(path, bits=bits)[0]
+
+
+def read_picture_and_mask(path: Path, *, bits: int = 16) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+    """As :func:`read_picture`, and where it is opaque, ``[H, W]``; None where it is everywhere.
+
+    Raises:
+        CaptureError: it cannot be read or decoded.
+    """
+    cv2 = opencv()
+    stored = stored_picture(path)
+    mask = None
+    if stored.ndim == 3 and stored.shape[2] == 4:
+        opaque = stored[..., 3] >= OPAQUE * np.iinfo(stored.dtype).max
+        mask = None if opaque.all() else opaque
+        stored = np.ascontiguousarray(stored[..., :3])
+    if stored.dtype == np.uint16:
+        if bits < 16 and stored.max() >> bits:
+            raise CaptureError(
+                f"The picture {path} has values up to {stored.max()}, others of its capture are of {bits} bits; "
+                "expected one depth: export all pictures again with 8 or 16 bits."
+            )
+        stored = (stored >> (bits - 8)).astype(np.uint8)
+    return cv2.cvtColor(stored, cv2.COLOR_GRAY2RGB if stored.ndim == 2 else cv2.COLOR_BGR2RGB), mask
+
+
+def significant_bits(files: Mapping[str, Sequence[Path | None]]) -> int:
+    """Of how many bits the values of pictures of 16 bits are: 10, 12, 14 or 16, one number for a capture.
+
+    Machine vision cameras store 10 to 14 bits in 16. The first, middle and last picture of each camera decide, so that
+    it does not depend on where reading starts.
+
+    Raises:
+        CaptureError: a picture cannot be read or decoded.
+    """
+    most = 0
+    for own in files.values():
+        present = [file for file in own if file is not None]
+        for file in dict.fromkeys((present[0], present[len(present) // 2], present[-1]) if present else ()):
+            if not _may_be_deep(file):
+                break
+            stored = stored_picture(file)
+            if stored.dtype != np.uint16:
+                break
+            most = max(most, int((stored[..., :3] if stored.ndim == 3 else stored).max()))
+    bits = next(bits for bits in (10, 12, 14, 16) if not most >> bits) if most else 16
+    if bits < 16:
+        log.warning(
+            "The pictures of 16 bits, such as %s, have values up to %d: they are read as %d bits",
+            next(file for own in files.values() for file in own if file is not None), most, bits,
+        )  # fmt: skip
+    return bits
+
+
+def _may_be_deep(path: Path) -> bool:
+    """Whether a file may hold more than 8 bits, by its header."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(25)
+    except OSError as error:
+        raise CaptureError(f"The picture {path} cannot be read ({error.strerror}); restore it.") from None
+    return head[24:25] == b"\x10" if head[:8] == b"\x89PNG\r\n\x1a\n" else head[:2] in (b"II", b"MM")
+
+
+def stored_picture(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """The values of a file, ``[H, W]``, or ``[H, W, 3 or 4]`` in OpenCV's order of colours.
+
+    Raises:
+        CaptureError: it cannot be read or decoded, or is none of whole numbers.
     """
     cv2 = opencv()
     try:
         data = path.read_bytes()
     except OSError as error:
         raise CaptureError(f"The picture {path} cannot be read ({error.strerror}); restore it.") from None
-    picture = None
-    # A cut JPEG decodes to a picture that is grey below the cut, so look for its end marker (byte stuffing
-    # keeps the marker out of the picture's data).
-    cut = data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[-4096:]
-    if data and not cut:
-        # Calibrations are made on the stored pixels, so a rotation tag must not turn them.
-        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if data[4:8] == b"ftyp" and data[8:12] in HEIF_BRANDS:
+        data = _converted_heif(path, data)
+    if not data or is_cut_jpeg(data):
+        raise _undecodable(path, data)
+    # Calibrations are made on the stored pixels, so a rotation tag must not turn them.
+    content = np.frombuffer(data, np.uint8)
+    try:
+        picture = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
+        if picture is not None and (picture.dtype not in (np.uint8, np.uint16) or data[:2] == b"\xff\xd8"):
+            deep = picture.dtype not in (np.uint8, np.uint16)
+            picture = None if deep else cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+            if deep:
+                raise CaptureError(
+                    f"The picture {path} has values that are no whole numbers of 8 or 16 bits; expected sRGB of 8 or "
+                    "16 bits: convert it, with the transfer function of sRGB if its values are linear."
+                )
+    except cv2.error:
+        picture = None
     if picture is None:
+        raise _undecodable(path, data)
+    return picture
+
+
+def _undecodable(path: Path, data: bytes) -> CaptureError:
+    return CaptureError(
+        f"The picture {path} cannot be decoded ({len(data)} bytes, empty, cut or damaged); restore it, or move it out "
+        "of the capture: its camera then is absent from that frame."
+    )
+
+
+def is_cut_jpeg(data: bytes) -> bool:
+    """Whether a JPEG ends before its picture does. It decodes all the same, grey below the cut.
+
+    The end marker is looked for behind the first scan, since thumbnails before it have one, and what follows a picture
+    may be of any length (the videos of motion photos). Byte stuffing keeps the marker out of the picture's data.
+    """
+    if data[:2] != b"\xff\xd8":
+        return False
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return data.find(b"\xff\xd9", at) < 0
+
+
+def _converted_heif(path: Path, data: bytes) -> bytes:
+    """A picture of HEIC or AVIF as PNG.
+
+    Raises:
+        CaptureError: it cannot be decoded.
+        MissingExtraError: the library that reads it is not installed.
+    """
+    try:
+        import pillow_heif  # pyright: ignore[reportMissingImports]
+    except ImportError:
         raise CaptureError(
-            f"The picture {path} cannot be decoded ({len(data)} bytes, empty, cut or damaged); restore it, or delete "
-            "it: its camera then is absent from that frame."
-        )
-    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+            f"The picture {path} is HEIC or AVIF, which needs the Python package pillow-heif; install it, or convert "
+            "the pictures to JPEG or PNG."
+        ) from None
+    try:
+        image = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=True).to_pillow().convert("RGB")
+    except (ValueError, OSError, EOFError, RuntimeError):
+        raise _undecodable(path, data) from None
+    return bytes(opencv().imencode(".png", np.asarray(image)[..., ::-1])[1])
 
 
-def _picture(path: Path, camera: Camera) -> NDArray[np.uint8]:
-    """One picture, checked against the size of its camera."""
-    picture = read_picture(path)
+def _picture(path: Path, camera: Camera, bits: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+    """One picture and where it is opaque, checked against the size of its camera."""
+    picture, mask = read_picture_and_mask(path, bits=bits)
     height, width = picture.shape[:2]
     if (width, height) != (camera.width, camera.height):
         raise CalibrationError(
             f"The picture {path} has {width}x{height} pixels, its camera's intrinsics are for "
             f"{camera.width}x{camera.height}; scale the intrinsics, or use the pictures that were calibrated."
         )
-    return picture
+    return picture, mask
 
 
 def reduced_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:

@@ -68,7 +68,11 @@ class MaskedSource(SourceWrapper):
             for frame in self.source.frames(start):
                 names = [name for name in frame.images if name in self.files]
                 masks = pool.map(self._mask, names, [frame.index] * len(names))
-                counting = {name: mask for name, mask in zip(names, masks, strict=True) if mask is not None}
+                counting = {
+                    name: mask & frame.masks[name] if name in frame.masks else mask
+                    for name, mask in zip(names, masks, strict=True)
+                    if mask is not None
+                }
                 yield replace(frame, masks={**frame.masks, **counting})
 
     def resized(self, rig: CameraRig) -> "MaskedSource":

@@ -4,9 +4,7 @@
 import struct
 from pathlib import Path
 
-import numpy as np
-
-from structgstream.data.images import opencv
+from structgstream.data.images import stored_picture
 from structgstream.errors import CaptureError
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -28,7 +26,7 @@ def picture_size(path: Path) -> tuple[int, int]:
         size = struct.unpack(">II", data[16:24])
     elif data[:2] == b"\xff\xd8":
         size = _jpeg_size(data)
-    return size or _decoded_size(data, path)
+    return size or stored_picture(path).shape[1::-1]
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
@@ -40,12 +38,3 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
             return width, height
         at += 2 + length
     return None
-
-
-def _decoded_size(data: bytes, path: Path) -> tuple[int, int]:
-    cv2 = opencv()
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-    if picture is None:
-        raise CaptureError(f"The picture {path} cannot be decoded ({len(data)} bytes); restore it.")
-    return picture.shape[1], picture.shape[0]

@@ -70,7 +70,7 @@ def open_posed(
         CaptureError: no pictures or videos, or not of the calibrated cameras.
         CalibrationError: a camera without calibration, one that moves, or pictures of other proportions.
     """
-    for root in chain((path / name for name in ROOTS), other_roots(path)):
+    for root in chain(_roots(path), other_roots(path)):
         if videos := videos_in(root):
             partial = not complete or calibration.unposed
             videos = _posed(videos, calibration, root) if partial else videos
@@ -91,6 +91,23 @@ def open_posed(
         f"{path} has the calibration {calibration.where} but no frames; expected images/CAMERA/FRAME.ext, "
         "frames/FRAME/CAMERA.ext, images/CAMERA.ext, CAMERA.mp4 or CAMERA/anything.mp4."
     )
+
+
+def _roots(path: Path) -> list[Path]:
+    """The folders to look through, in order; videos before pictures that are stills of the same cameras."""
+    roots = [path / name for name in ROOTS]
+    pictures = {root: found for root in roots if (found := pictures_in(root))}
+    videos = {root: found for root in roots if (found := videos_in(root))}
+    first = next((root for root in roots if root in pictures or root in videos), None)
+    filmed = next(iter(videos), None)
+    if filmed is None or first is None or first == filmed:
+        return roots
+    single = all(len(files) == 1 for files in pictures[first].values())
+    if single and len(pictures[first]) > 1 and len(pictures[first]) >= len(videos[filmed]):
+        log.warning("%s has one picture of each camera in %s; the videos in %s are read", path.name, first, filmed)
+        return [filmed, *roots]
+    log.warning("%s has pictures in %s and videos in %s; the pictures are read", path.name, first, filmed)
+    return roots
 
 
 def _posed(files: Mapping[str, Of], calibration: Calibration, root: Path) -> Mapping[str, Of]:
@@ -183,6 +200,10 @@ def _poses(calibration: Calibration, cameras: Collection[str]) -> dict[str, Pose
         if None in numbered or len(numbered) != len(cameras) or not {_number(name) for name in names} >= set(numbered):
             return {}
         file_of = {name: numbered[_number(name)] for name in names if _number(name) in numbered}
+        pairs = ", ".join(f"{name!r} is {file!r}" for name, file in list(file_of.items())[:4])
+        log.warning(
+            "The cameras of %s have other names than the files and are matched by number: %s", calibration.where, pairs
+        )
     return _still(calibration, [file_of.get(posed.name) for posed in calibration.cameras])
 
 

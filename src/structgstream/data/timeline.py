@@ -39,16 +39,49 @@ def natural(text: str) -> tuple[tuple[int, int, str], ...]:
     return tuple((0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts)
 
 
+def instants_of(stems: Mapping[str, Sequence[str]]) -> dict[str, dict[str, str]]:
+    """By camera and name of a picture, a key of its instant that all cameras share.
+
+    Numbers are compared whatever their padding. Where a camera then shares no name with another and its names differ in
+    their last number alone, that number counts, whatever stands before it (``00_00_00000012``).
+    """
+    keys = {name: _distinct({stem: re.sub(r"\d+", _unpadded, stem) for stem in own}) for name, own in stems.items()}
+    taken = Counter(key for own in keys.values() for key in own.values())
+    if len(keys) < 2 or all(any(taken[key] > 1 for key in own.values()) for own in keys.values()):
+        return keys
+    numbered = {name: _last_numbers(own) for name, own in stems.items()}
+    return {name: own or keys[name] for name, own in numbered.items()} if all(numbered.values()) else keys
+
+
+def _unpadded(digits: re.Match[str]) -> str:
+    return str(int(digits.group()))
+
+
+def _distinct(keys: dict[str, str]) -> dict[str, str]:
+    """The keys; the names themselves where two have one key."""
+    return keys if len(set(keys.values())) == len(keys) else {stem: stem for stem in keys}
+
+
+def _last_numbers(stems: Sequence[str]) -> dict[str, str]:
+    """The last number of each name, where the names differ in nothing else; else nothing."""
+    parts = {stem: re.fullmatch(r"(.*?)(\d+)(\D*)", stem) for stem in stems}
+    found = {stem: (part.group(1), str(int(part.group(2))), part.group(3)) for stem, part in parts.items() if part}
+    same = {(before, after) for before, _, after in found.values()}
+    numbers = {stem: number for stem, (_, number, _) in found.items()}
+    return numbers if len(found) == len(stems) == len(set(numbers.values())) and len(same) == 1 else {}
+
+
 def picture_slots(pictures: Mapping[str, Sequence[Path]]) -> dict[str, NDArray[np.intp]]:
     """Which instant each picture of each camera is of, ``[N]`` from 0 on, ascending.
 
-    Cameras that share names of files number their pictures alike, so one that lacks a name lacks that instant. Where a
-    camera shares none with any other, each numbers as it likes, and pictures are counted.
+    Cameras that share instants (:func:`instants_of`) number their pictures alike, so one that lacks a name lacks that
+    instant. Where a camera shares none with any other, each numbers as it likes, and pictures are counted.
 
     Args:
         pictures: camera name to its pictures, in :func:`natural` order of their stems, which differ.
     """
-    stems = {name: [file.stem for file in files] for name, files in pictures.items()}
+    keys = instants_of({name: [file.stem for file in files] for name, files in pictures.items()})
+    stems = {name: [keys[name][file.stem] for file in files] for name, files in pictures.items()}
     taken = Counter(stem for own in stems.values() for stem in own)
     if not all(any(taken[stem] > 1 for stem in own) for own in stems.values()):
         return {name: np.arange(len(own)) for name, own in stems.items()}

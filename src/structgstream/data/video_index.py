@@ -4,7 +4,9 @@
 Videos are opened by :func:`open_video` alone.
 """
 
+import logging
 import os
+from bisect import bisect_left
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.transfer import stated_colors
 from structgstream.errors import CaptureError, MissingExtraError
 
 if TYPE_CHECKING:
@@ -23,8 +26,12 @@ if TYPE_CHECKING:
     from av.video.frame import VideoFrame
     from av.video.stream import VideoStream
 
-# Containers that store presentation times; AVI does not.
-VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".webm", ".m4v", ".ts"})
+log = logging.getLogger(__name__)
+
+VIDEO_SUFFIXES = frozenset({
+    ".mp4", ".mov", ".m4v", ".3gp", ".360", ".mkv", ".webm", ".avi", ".ts", ".mts", ".m2ts", ".mpg", ".mpeg", ".mxf",
+    ".nut", ".flv", ".asf", ".wmv", ".ogv", ".ogg",
+})  # fmt: skip
 PROGRESSIVE = 1  # the largest AVFieldOrder of pictures that are not fields; 0 is unknown
 # The upper left of a display matrix (ISO/IEC 14496-12) and the quarter turns counterclockwise that it stands for.
 TURNS = {(1, 0, 0, 1): 0, (0, -1, 1, 0): 1, (-1, 0, 0, -1): 2, (0, 1, -1, 0): 3}
@@ -42,6 +49,7 @@ class VideoTrack:
         height: height of the picture as it is shown, pixels.
         quarter_turns: counterclockwise quarter turns of the stored picture to the shown one, 0 to 3.
         keyframes: presentation times, ascending, in ticks, of the frames that decode alone.
+        colors: what the file states of its colours, in words.
     """
 
     path: Path
@@ -51,6 +59,7 @@ class VideoTrack:
     height: int
     quarter_turns: int = 0
     keyframes: tuple[int, ...] = ()
+    colors: str = ""
 
     @property
     def seconds(self) -> NDArray[np.float64]:
@@ -62,8 +71,8 @@ def scan_videos(paths: Mapping[str, Path]) -> dict[str, VideoTrack]:
     """The index of every video; only the first frame of each is decoded.
 
     Raises:
-        CaptureError: a file is missing, truncated, or not a video; its codec is unknown; it is interlaced, or turned by
-            an angle that is not a quarter turn.
+        CaptureError: a file is missing, truncated, or not a video; its codec or its transfer function is unknown; it is
+            interlaced, or turned by an angle that is not a quarter turn.
     """
     with ThreadPoolExecutor(min(len(paths), os.cpu_count() or 1) or 1) as pool:
         return dict(zip(paths, pool.map(_scan, paths.values()), strict=True))
@@ -97,9 +106,10 @@ def open_video(path: Path) -> "InputContainer":
             "copy or record it again."
         ) from None
     reason = None
-    if not container.streams.video:
+    found = _pictures_streams(container)
+    if not found:
         reason = f"The file {path} has no video stream; expected one video per camera."
-    elif container.streams.video[0].codec_context is None:
+    elif found[0].codec_context is None:
         reason = (
             f"The video {path} is coded in a way that the installed PyAV cannot decode; convert it to H.264 or HEVC "
             "in mp4, keeping the time of each frame."
@@ -110,37 +120,105 @@ def open_video(path: Path) -> "InputContainer":
     return container
 
 
+def video_stream(container: "InputContainer") -> "VideoStream":
+    """The stream that was filmed: no cover picture, no thumbnail, and of several the one with the most pixels."""
+    return _pictures_streams(container)[0]
+
+
+def _pictures_streams(container: "InputContainer") -> list["VideoStream"]:
+    """The streams of pictures, the one that was filmed first."""
+    av = load_av()
+
+    def rank(stream: "VideoStream") -> tuple[bool, bool, bool, int]:
+        attached = bool(stream.disposition & av.stream.Disposition.attached_pic)
+        known = stream.codec_context is not None
+        return attached, not known, stream.frames == 1, -(stream.width * stream.height if known else 0)
+
+    return sorted(container.streams.video, key=rank)
+
+
 def _scan(path: Path) -> VideoTrack:
     """Reads all packets of a file for their time stamps, and checks that none is missing."""
     av = load_av()
     with open_video(path) as container:
-        stream = container.streams.video[0]
+        stream = video_stream(container)
+        _report_other_streams(path, container, stream)
         first: VideoFrame | None = None
         packets: list[Packet] = []
+        started = False
         try:
             for packet in container.demux(stream):
-                first = _first_frame(packet) if first is None else first
+                started = started or packet.is_keyframe
+                first = _first_frame(packet) if first is None and started else first
                 if packet.size:
                     packets.append(packet)
         except av.error.FFmpegError as error:
             raise CaptureError(f"The video {path} is damaged ({error.strerror}); copy or record it again.") from None
-        if not packets or any(packet.is_corrupt for packet in packets) or len(packets) < stream.frames:
+        whole = sum(not packet.is_corrupt for packet in packets)
+        if not whole or len(packets) < stream.frames or (packets[-1].is_corrupt and not packets[-1].is_keyframe):
             raise CaptureError(
                 f"The video {path} is truncated: its index announces {stream.frames or 'some'} frames, "
-                f"{sum(not packet.is_corrupt for packet in packets)} are there; copy or record it again."
+                f"{whole} are there; copy or record it again."
             )
         shown = [packet for packet in packets if not packet.is_discard]
-        stamps = [packet.pts for packet in shown if packet.pts is not None]
+        stamps = sorted(packet.pts for packet in shown if packet.pts is not None)
         if len(stamps) != len(shown) or stream.time_base is None:
             raise CaptureError(
                 f"The video {path} has frames without time stamps, so it cannot be synchronised; "
                 "remux it to a container that stores them (mp4, mkv)."
             )
         keys = [packet.pts for packet in packets if packet.is_keyframe and packet.pts is not None]
+        seconds = float(stream.time_base)
+        if not started:  # Some recorders mark no key frame, or write none.
+            first = _first_of(path)
+        stamps = _decodable(path, stamps, first, seconds)
         turns = _quarter_turns(path, stream, first)
         size = (stream.height, stream.width) if turns % 2 else (stream.width, stream.height)
-        seconds = float(stream.time_base)
-        return VideoTrack(path, tuple(sorted(stamps)), seconds, *size, turns, tuple(sorted(keys)))
+        colors = stated_colors(path, first)
+        return VideoTrack(path, tuple(stamps), seconds, *size, turns, tuple(sorted(keys)), colors)
+
+
+def _decodable(path: Path, stamps: list[int], first: "VideoFrame | None", seconds: float) -> list[int]:
+    """The time stamps from the first frame that decodes on: what is before the first key frame lacks its beginning.
+
+    So which frames a video has does not depend on where reading starts.
+    """
+    if first is None or first.pts is None:
+        return stamps
+    begin = bisect_left(stamps, first.pts)
+    if 0 < begin < len(stamps):
+        log.warning(
+            "The video %s begins within a group of pictures: %d frames before its first one that decodes, at %.3f s, "
+            "are left out",
+            path, begin, first.pts * seconds,
+        )  # fmt: skip
+        return stamps[begin:]
+    return stamps
+
+
+def _report_other_streams(path: Path, container: "InputContainer", taken: "VideoStream") -> None:
+    """A warning where several streams may have been meant."""
+    size = (taken.width, taken.height)
+    alike = [
+        stream.index
+        for stream in _pictures_streams(container)
+        if stream.codec_context is not None and stream.frames != 1 and (stream.width, stream.height) == size
+    ]
+    if len(alike) > 1:
+        log.warning(
+            "The video %s has %d streams of %dx%d pixels, numbers %s; number %d is read. If another is meant, write it "
+            "to a file of its own",
+            path, len(alike), *size, ", ".join(map(str, alike)), taken.index,
+        )  # fmt: skip
+
+
+def _first_of(path: Path) -> "VideoFrame | None":
+    """The first frame that the decoder gives out; None without one."""
+    with open_video(path) as container:
+        try:
+            return next(container.decode(video_stream(container)), None)
+        except load_av().error.FFmpegError:
+            return None
 
 
 def _first_frame(packet: "Packet") -> "VideoFrame | None":

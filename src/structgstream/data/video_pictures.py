@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.video_index import VideoTrack, load_av, open_video
+from structgstream.data.transfer import BT2020, HIGH_RANGE, high_range_to_srgb, transfer_of
+from structgstream.data.video_index import VideoTrack, load_av, open_video, video_stream
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
@@ -112,7 +113,7 @@ class _Run:
         """The frames in the order in which they are shown, each as the index says."""
         av, stamps, begin = load_av(), self.track.stamps, self.begin
         with open_video(self.track.path) as container:
-            stream = container.streams.video[0]
+            stream = video_stream(container)
             stream.codec_context.thread_count = 1  # the cameras are the parallelism
             try:
                 if begin is not None:
@@ -124,7 +125,7 @@ class _Run:
                         self.landed_late = container.format.name == "mpegts"
                         return
                     if not self.met:
-                        self.expected, self.met = bisect_left(stamps, frame.pts), True
+                        self.expected, self.met = 0 if begin is None else bisect_left(stamps, begin), True
                     if self.expected == len(stamps) or frame.pts != stamps[self.expected] or frame.is_corrupt:
                         return
                     self.expected += 1
@@ -151,19 +152,22 @@ def srgb(frame: "VideoFrame", reformatter: "VideoReformatter", *, width: int, he
     """Colours by the frame's own matrix and range, stated because the defaults differ between tools.
 
     A file that states no matrix gets BT.709 from 720 lines on and BT.601 below, as broadcasting has it; one
-    that states no range is taken as limited unless its pixel format says otherwise.
+    that states no range is taken as limited unless its pixel format says otherwise. HLG and PQ are converted
+    (``transfer``).
     """
     matrix = MATRICES.get(int(frame.colorspace), BT709 if frame.height >= 720 else BT601)
     source_range = int(frame.color_range)
     if source_range not in (FULL_RANGE, LIMITED_RANGE):
         full = frame.format.name.startswith(("yuvj", "rgb", "bgr", "gbr"))
         source_range = FULL_RANGE if full else LIMITED_RANGE
+    transfer = transfer_of(frame)
+    high = transfer in HIGH_RANGE
     shrinks = width < frame.width or height < frame.height
     converted = reformatter.reformat(
         frame,
         width=width,
         height=height,
-        format="rgb24",
+        format="rgb48le" if high else "rgb24",
         src_colorspace=matrix,
         dst_colorspace=matrix,
         src_color_range=source_range,
@@ -171,4 +175,7 @@ def srgb(frame: "VideoFrame", reformatter: "VideoReformatter", *, width: int, he
         interpolation=(AREA if shrinks else BICUBIC) | FULL_CHROMA | ACCURATE_ROUNDING,
         threads=1,
     )
+    if high:
+        wide = int(getattr(frame, "color_primaries", BT2020)) == BT2020
+        return high_range_to_srgb(cast(NDArray[np.uint16], converted.to_ndarray()), transfer, wide=wide)
     return cast(NDArray[np.uint8], converted.to_ndarray())

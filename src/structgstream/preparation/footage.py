@@ -22,13 +22,13 @@ from numpy.typing import NDArray
 
 from structgstream.data.audio import read_audio
 from structgstream.data.camera_files import NO_CAMERAS, ROOTS, filmed_folder, other_roots
-from structgstream.data.folder_files import files_of, is_hidden
-from structgstream.data.images import PICTURE_SUFFIXES, read_picture
+from structgstream.data.folder_files import check_link, files_of, is_hidden
+from structgstream.data.images import PICTURE_SUFFIXES, read_picture, significant_bits
 from structgstream.data.picture_size import picture_size
 from structgstream.data.prepared import pictures_of
 from structgstream.data.timeline import natural, picture_slots
 from structgstream.data.video import measured_fps
-from structgstream.data.video_index import VIDEO_SUFFIXES, VideoTrack, open_video, scan_videos
+from structgstream.data.video_index import VIDEO_SUFFIXES, VideoTrack, open_video, scan_videos, video_stream
 from structgstream.data.video_pictures import pictures_at
 from structgstream.errors import CaptureError
 
@@ -93,6 +93,10 @@ class Footage:
         return self._slots[name] / self.picture_fps
 
     @cached_property
+    def _bits(self) -> int:
+        return significant_bits(self.stills)
+
+    @cached_property
     def _slots(self) -> Mapping[str, NDArray[np.intp]]:
         """Which instant each picture is of, from 0 on."""
         return picture_slots(self.stills)
@@ -109,7 +113,9 @@ class Footage:
         else:
             size = self.size(name)
             for index in indices:
-                yield _of_size(read_picture(self.stills[name][index]), size, name, self.stills[name][index])
+                yield _of_size(
+                    read_picture(self.stills[name][index], bits=self._bits), size, name, self.stills[name][index]
+                )
 
     def _decoded(self, name: str, track: VideoTrack, indices: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
         def tell(lost: int, following: int | None, reason: str) -> None:
@@ -144,7 +150,7 @@ class Footage:
         if name not in self.tracks:
             return {}
         with open_video(self.files[name]) as container:
-            stated = {**container.streams.video[0].metadata, **container.metadata}
+            stated = {**video_stream(container).metadata, **container.metadata}
         return {key.lower(): value for key, value in stated.items()}
 
     def only(self, names: Collection[str]) -> "Footage":
@@ -234,6 +240,9 @@ def _footage(where: Path, files: Mapping[str, Path], picture_fps: float) -> Foot
 def _found(root: Path) -> dict[str, Path]:
     """Files or folders of the cameras of ``root`` by name; nothing when there are none."""
     entries = sorted(entry for entry in root.iterdir() if not is_hidden(entry))
+    for entry in entries:
+        if entry.suffix.lower() in VIDEO_SUFFIXES | PICTURE_SUFFIXES:
+            check_link(entry)
     for suffixes in (VIDEO_SUFFIXES, PICTURE_SUFFIXES):
         found: dict[str, Path] = {}
         several: list[tuple[Path, list[Path]]] = []

@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures and videos as cameras and recorders write them."""
+
+import logging
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from captures import small_rig
+from structgstream.data.folder_files import files_of
+from structgstream.data.images import ImageSource, common_pictures, read_picture
+from structgstream.data.timeline import picture_slots
+from structgstream.data.transfer import HLG, PQ, high_range_to_srgb
+from structgstream.data.video import synchronised
+from structgstream.data.video_index import scan_videos
+from structgstream.errors import CaptureError, StructGStreamError
+from structgstream.preparation.footage import find_footage
+
+RIG = small_rig(3)
+
+
+def encode(path: Path, *, skip: int = 0, frames: int = 12, codec: str = "libx264", thumbnail: bool = False) -> None:
+    """Pictures whose grey is their number times 16, in groups of four, without the first ``skip`` packets."""
+    with av.open(str(path), "w") as container:
+        small: Any = container.add_stream("mjpeg", rate=30) if thumbnail else None
+        stream: Any = container.add_stream(codec, rate=30, options={"g": "4", "bf": "0", "sc_threshold": "0"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        if thumbnail:
+            small.width, small.height, small.pix_fmt = 32, 24, "yuvj420p"
+            container.mux(small.encode(av.VideoFrame.from_ndarray(np.zeros((24, 32, 3), np.uint8), format="rgb24")))
+            container.mux(small.encode())
+        packets = []
+        for number in range(frames):
+            frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 16 * number, np.uint8), format="rgb24")
+            frame.pts, frame.time_base = number, Fraction(1, 30)
+            packets += stream.encode(frame)
+        for packet in [*packets, *stream.encode()][skip:]:
+            container.mux(packet)
+
+
+def numbers(source: Any, start: int = 0) -> list[int | None]:
+    return [
+        round(float(frame.images["cam01"].mean()) / 16) if "cam01" in frame.images else None
+        for frame in source.frames(start)
+    ]
+
+
+def videos(folder: Path, ending: str, **odd: Any) -> dict[str, Path]:
+    files = {name: folder / f"{name}{ending}" for name in RIG}
+    for name, file in files.items():
+        encode(file, **(odd if name == "cam01" else {}))
+    return files
+
+
+@pytest.mark.parametrize("ending", [".mkv", ".ts"])
+def test_a_video_that_begins_within_a_group_has_the_frames_that_decode(tmp_path: Path, ending: str) -> None:
+    tracks = scan_videos(videos(tmp_path, ending, skip=2))
+    source = synchronised(tracks, RIG, where=tmp_path)
+    assert len(tracks["cam01"].stamps) == 8, "what counts is what decodes"
+    assert numbers(source) == [4, 5, 6, 7, 8, 9, 10, 11]
+    assert numbers(source, 5) == [9, 10, 11], "a resumed run has the same frames"
+
+
+def test_lost_packets_of_a_transport_stream_are_an_absence_up_to_the_next_key_frame(tmp_path: Path) -> None:
+    files = videos(tmp_path, ".ts")
+    content = files["cam01"].read_bytes()
+    packets = [content[at : at + 188] for at in range(0, len(content), 188)]
+    files["cam01"].write_bytes(b"".join(packets[: len(packets) // 2] + packets[len(packets) // 2 + 1 :]))
+    found = numbers(synchronised(scan_videos(files), RIG, where=tmp_path))
+    assert found[-1] == 11
+    assert all(number in (place, None) for place, number in enumerate(found))
+
+
+def test_the_video_is_read_and_not_its_thumbnail(tmp_path: Path) -> None:
+    files = videos(tmp_path, ".mp4", thumbnail=True)
+    track = scan_videos(files)["cam01"]
+    assert (track.width, track.height, len(track.stamps)) == (64, 48, 12)
+
+
+def test_avi_is_read(tmp_path: Path) -> None:
+    assert numbers(synchronised(scan_videos(videos(tmp_path, ".avi", codec="mpeg4")), RIG, where=tmp_path))[3] == 3
+
+
+@pytest.mark.parametrize(("transfer", "signal", "expected"), [(HLG, 0.5, 137), (PQ, 0.508, 186), (PQ, 1.0, 255)])
+def test_high_dynamic_range_is_converted_to_srgb(transfer: int, signal: float, expected: int) -> None:
+    grey = np.full((1, 1, 3), round(signal * 65535), np.uint16)
+    np.testing.assert_allclose(high_range_to_srgb(grey, transfer, wide=True), expected, atol=1)
+
+
+def picture_source(folder: Path, content: np.ndarray[Any, Any]) -> ImageSource:
+    files = {}
+    for name in RIG:
+        cv2.imwrite(str(folder / f"{name}.png"), content)
+        files[name] = (folder / f"{name}.png",)
+    return ImageSource("take", RIG, 25.0, files)
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+def test_values_of_10_12_and_14_bits_in_16_are_read_at_their_scale(tmp_path: Path, bits: int) -> None:
+    stored = np.full((48, 64, 3), 200 << (bits - 8), np.uint16)
+    assert (next(picture_source(tmp_path, stored).frames()).images["cam00"] == 200).all()
+
+
+def test_what_alpha_hides_does_not_count(tmp_path: Path) -> None:
+    stored = np.full((48, 64, 4), 255, np.uint8)
+    stored[:10, :, 3] = 0
+    frame = next(picture_source(tmp_path, stored).frames())
+    assert not frame.masks["cam00"][:10].any()
+    assert frame.masks["cam00"][10:].all()
+
+
+def test_a_jpeg_may_carry_a_video_behind_its_end_but_not_be_cut(tmp_path: Path) -> None:
+    content = cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8))[1].tobytes()
+    (tmp_path / "a.jpg").write_bytes(content + bytes(9000))
+    assert read_picture(tmp_path / "a.jpg").shape == (48, 64, 3)
+    (tmp_path / "b.jpg").write_bytes(content[: len(content) // 2])
+    with pytest.raises(CaptureError, match="cut or damaged.; restore it, or move it out") as raised:
+        read_picture(tmp_path / "b.jpg")
+    assert "delete" not in str(raised.value)
+
+
+def test_float_pictures_and_heic_are_refused_for_what_they_are(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.tiff"), np.zeros((48, 64, 3), np.float32))
+    with pytest.raises(CaptureError, match="no whole numbers of 8 or 16 bits"):
+        read_picture(tmp_path / "a.tiff")
+    (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
+    with pytest.raises(CaptureError, match="pillow-heif|cannot be decoded"):
+        read_picture(tmp_path / "a.heic")
+
+
+@pytest.mark.parametrize(
+    "stem",
+    [
+        lambda camera, k: f"{k:0{4 + camera}d}",
+        lambda camera, k: f"00_{camera:02d}_{k:08d}",
+        lambda camera, k: f"c{camera}-{k}",
+    ],
+)
+def test_numbers_are_instants_whatever_their_padding_and_prefix(stem: Callable[[int, int], str]) -> None:
+    """The last camera begins one instant later."""
+    pictures = {
+        f"00_{camera:02d}": [Path(f"{stem(camera, k + (camera == 2))}.png") for k in range(8, 12)]
+        for camera in range(3)
+    }
+    slots = picture_slots(pictures)
+    assert slots["00_00"].tolist() == [0, 1, 2, 3]
+    assert slots["00_02"].tolist() == [1, 2, 3, 4]
+    common = common_pictures(
+        {name: {file.stem: file for file in files} for name, files in pictures.items()}, where=Path("take")
+    )
+    assert len(common.files["00_00"]) == 4 or len(common.files["00_00"]) == 3
+    assert common.files["00_00"][0] == pictures["00_00"][1]
+
+
+def test_a_link_that_leads_nowhere_is_named(tmp_path: Path) -> None:
+    (tmp_path / "cam00.mp4").symlink_to(tmp_path / "gone.mp4")
+    with pytest.raises(CaptureError, match="is a link to .*gone.mp4, which does not exist"):
+        files_of(tmp_path, (".mp4",))
+    with pytest.raises(CaptureError, match="is a link to"):
+        find_footage(tmp_path)
+
+
+def test_a_picture_beside_the_folder_of_videos_is_no_camera(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "videos").mkdir()
+    videos(tmp_path / "videos", ".mp4")
+    cv2.imwrite(str(tmp_path / "plan.jpg"), np.zeros((48, 64, 3), np.uint8))
+    with caplog.at_level(logging.WARNING):
+        assert find_footage(tmp_path).cameras == tuple(RIG)
+    assert "left out" in caplog.text
+
+
+@pytest.mark.parametrize("ending", [".jpg", ".png", ".tiff", ".webp", ".bmp", ".mp4", ".mkv", ".ts", ".avi"])
+def test_mutated_and_truncated_files_are_read_or_refused(tmp_path: Path, ending: str) -> None:
+    rng = np.random.default_rng(1)
+    file = tmp_path / f"cam00{ending}"
+    if ending in (".mp4", ".mkv", ".ts", ".avi"):
+        encode(file, frames=6, codec="mpeg4" if ending == ".avi" else "libx264")
+    else:
+        cv2.imwrite(str(file), rng.integers(0, 255, (24, 32, 3), np.uint8))
+    whole = file.read_bytes()
+    for _ in range(8):
+        content = bytearray(whole)
+        for at in rng.integers(0, len(content), 5):
+            content[at] = rng.integers(256)
+        file.write_bytes(bytes(content[: rng.integers(1, len(content))] if rng.random() < 0.4 else content))
+        try:
+            if ending in (".mp4", ".mkv", ".ts", ".avi"):
+                footage = find_footage(tmp_path)
+                list(footage.pictures("cam00", range(len(footage.stamps("cam00")))))
+            else:
+                read_picture(file)
+        except StructGStreamError:
+            continue
