@@ -17,7 +17,7 @@ TINY_RIG = replace(
         seed_voxels=1,
         losses=RIG.initial.losses,
         disturbance=RIG.initial.disturbance,
-        solidity=RIG.initial.solidity,
+        regularizers=RIG.initial.regularizers,
         free_space=RIG.initial.free_space,
         random_background=False,
     ),

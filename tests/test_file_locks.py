@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.file_locks import lock_file
+from structgstream.file_locks import lock_file, open_lockable
 
 TRY = "import sys; from structgstream.file_locks import lock_file\n"
 TRY += "print(lock_file(open(sys.argv[1], 'w'), holder=sys.argv[2]))"
@@ -49,3 +49,16 @@ def test_a_file_system_without_locks_gives_them_to_everyone(
     monkeypatch.setattr("fcntl.lockf", unknown)
     with (tmp_path / "lock").open("w") as file:
         assert lock_file(file, holder="file" if holder == "file" else "process")
+
+
+def test_what_is_in_a_lockable_file_stays_and_a_link_to_a_file_is_not_followed(tmp_path: Path) -> None:
+    mine, link, dangling = tmp_path / "mine", tmp_path / "link", tmp_path / "dangling"
+    mine.write_text("mine")
+    link.symlink_to(mine)
+    dangling.symlink_to(tmp_path / "missing")
+    open_lockable(mine).close()
+    for path in (link, dangling):
+        with pytest.raises(OSError, match=f"{path.name} in it is a link, which is not followed"):
+            open_lockable(path)
+    assert mine.read_text() == "mine"
+    assert not (tmp_path / "missing").exists()

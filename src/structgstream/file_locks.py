@@ -3,7 +3,9 @@
 
 import errno
 import fcntl
-from typing import IO, Any, Literal
+import os
+from pathlib import Path
+from typing import IO, Any, BinaryIO, Literal, cast
 
 _HELD = (errno.EACCES, errno.EAGAIN)  # what POSIX lets a system say of a lock that another has
 
@@ -23,3 +25,16 @@ def lock_file(file: IO[Any], *, holder: Literal["file", "process"] = "file") -> 
     except OSError as error:
         return error.errno not in _HELD
     return True
+
+
+def open_lockable(path: Path, *, buffering: int = -1) -> BinaryIO:
+    """The file ``path``, made if it is missing, open for writing at its beginning; what is in it stays.
+
+    A link is followed to a device only: a file that it points to is another's.
+
+    Raises:
+        OSError: it cannot be opened, or is a link.
+    """
+    if path.is_symlink() and not path.is_char_device():
+        raise OSError(errno.ELOOP, f"{path.name} in it is a link, which is not followed", str(path))
+    return cast(BinaryIO, os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o666), "wb", buffering))

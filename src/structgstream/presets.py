@@ -28,8 +28,8 @@ from structgstream.training.online_config import OnlineConfig
 from structgstream.training.optim import LearningRate
 from structgstream.training.patching import PatchingConfig
 from structgstream.training.perturbation import PerturbationConfig
+from structgstream.training.regularizers import RegularizerConfig
 from structgstream.training.rounding import RoundingConfig
-from structgstream.training.solidity import SolidityConfig
 
 MOST_QUALITY = 6.0  # steps 64 times as small, or as large
 
@@ -281,7 +281,7 @@ COMPACT = replace(
         ),
         losses=replace(MOTION.initial.losses, l1=0.6, ssim=0.45),
         disturbance=PerturbationConfig(dropped_share=0.2, noise_scales=0.5, until_share=0.7),
-        solidity=SolidityConfig(weight=0.05, every=4),
+        regularizers=RegularizerConfig(depth_spread=0.05, color_spread=1.5, feature_difference=0.05),
         free_space=FreeSpaceConfig(enabled=True),
         random_background=True,
         sampling_filter=True,
@@ -305,7 +305,6 @@ COMPACT = replace(
             MOTION.online.motion,
             moved_ease=0.5,
             carried_share=0.4,
-            unseen_pixels=0.1,
             residual_threshold=0.05,
             picture_scale=0.5,
             tiles_around=1,

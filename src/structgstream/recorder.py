@@ -143,8 +143,13 @@ def segments_folder(path: Path, *, may_exist: bool) -> FolderStore:
     return store
 
 
-def check_output(path: Path, *, may_exist: bool) -> None:
+def check_output(path: Path, *, may_exist: bool, resume: bool = True) -> None:
     """Check that the stream can be written, before frame 0 is fitted for minutes.
+
+    Args:
+        path: the file.
+        may_exist: whether it is replaced, or continued.
+        resume: whether the message names ``--resume``.
 
     Raises:
         StorageError: the file exists, its folder cannot be created, or there is no permission to write.
@@ -154,9 +159,8 @@ def check_output(path: Path, *, may_exist: bool) -> None:
             f"{path} is a folder; give the name of a file, such as {path / 'scene.sgs'}, or add --sink segments."
         )
     if path.exists() and not may_exist:
-        raise StorageError(
-            f"{path} exists; continue it with --resume, replace it with --overwrite, or choose another name."
-        )
+        ways = "continue it with --resume, replace it" if resume else "replace it"
+        raise StorageError(f"{path} exists; {ways} with --overwrite, or choose another name.")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

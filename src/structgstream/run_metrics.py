@@ -23,7 +23,7 @@ from structgstream.data.live.status import LiveStatus
 from structgstream.errors import StorageError
 from structgstream.frame_report import FrameReport
 from structgstream.memory import resident_bytes
-from structgstream.whole_files import write_whole
+from structgstream.whole_files import side_path, write_whole
 
 FORMAT, VERSION = "structgstream-metrics", 1
 BEAT_SECONDS = 2.0
@@ -42,7 +42,7 @@ class RunState(StrEnum):
 
 def metrics_path(stream: Path) -> Path:
     """The path of a stream's metrics."""
-    return stream.with_suffix(".metrics.json")
+    return side_path(stream, ".metrics.json")
 
 
 class Figures:

@@ -12,13 +12,13 @@ the file under the other name is locked.
 
 import errno
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import BinaryIO
 
 from structgstream.errors import StorageError
-from structgstream.file_locks import lock_file
+from structgstream.file_locks import lock_file, open_lockable
 
 _WITHOUT_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EACCES, errno.EPERM, errno.EBADF, errno.ENOSYS)
 """What file systems say that cannot sync a folder, and folders that may be written but not read."""
@@ -34,6 +34,11 @@ _ADVICE = {
 def partial_path(path: Path) -> Path:
     """The name of a file while it is written."""
     return path.with_name(f"{path.name}.partial")
+
+
+def side_path(stream: Path, ending: str) -> Path:
+    """The file beside a stream, by its whole name without ``.sgs``: ``a.b.log.jsonl`` for ``a.b`` and ``a.b.sgs``."""
+    return stream.with_name(f"{stream.name.removesuffix('.sgs')}{ending}")
 
 
 def write_whole(
@@ -64,14 +69,22 @@ def write_whole(
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[BinaryIO]:
+def whole_file(path: Path, *, check: Callable[[Path], object] | None = None) -> Iterator[BinaryIO]:
     """A file that gets the name ``path`` at the end of the block, if that is reached (Note [Whole files]).
+
+    Args:
+        path: the file.
+        check: called with the name that the file has until then, when it is written to its end; if it raises, what was
+            there before stays.
 
     Raises:
         StorageError: as :func:`write_whole`.
     """
     with _told(path, ""), replacing(path) as file:
         yield file
+        if check is not None:
+            file.flush()
+            check(partial_path(path.resolve() if path.is_symlink() else path))
 
 
 @contextmanager
@@ -125,8 +138,7 @@ def open_alone(partial: Path, *, of: Path, buffering: int = -1) -> BinaryIO:
         StorageError: another process writes it.
     """
     while True:
-        descriptor = os.open(partial, os.O_RDWR | os.O_CREAT, 0o666)
-        file = cast(BinaryIO, os.fdopen(descriptor, "wb", buffering))
+        file = open_lockable(partial, buffering=buffering)
         if not lock_file(file):
             file.close()
             raise StorageError(f"Another process writes {of}; wait for its end, or choose another name.")

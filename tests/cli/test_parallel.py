@@ -11,6 +11,10 @@ from structgstream.cli.options import CaptureOptions
 from structgstream.cli.parallel import Parallel, WorkerOptions, _job, join_words
 from structgstream.codec.reader import open_stream
 from structgstream.evaluation.environment import usable_cores
+from structgstream.executors.task import Ending
+from structgstream.owned_folders import MARKER, Owner
+from structgstream.parallel.object_folder import ObjectFolder
+from structgstream.parallel.parts import PURPOSE, Parts
 
 GROUPS = ["--frames", "6", "--groups", "2", "--odd", "--executor", "inline"]
 pytestmark = pytest.mark.usefixtures("quick_tiny")
@@ -77,6 +81,57 @@ def test_an_output_that_is_no_parallel_run_is_not_replaced(tmp_path: Path, capsy
         ["parallel", CLIP, "-o", str(tmp_path / "out.sgs"), *GROUPS], capsys, status=1
     )
     assert (tmp_path / "out.sgs").read_bytes() == b"mine"
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("more", [[], ["--overwrite"], ["--overwrite", "--groups", "2", "--odd"]])
+@pytest.mark.parametrize(
+    ("capture", "whose", "status", "said"),
+    [
+        ("/no/such/capture", "ours", 1, "/no/such/capture"),
+        (CLIP, "parts", 1, "out.sgs.parts is needed for the parts of a parallel run, and holds files"),
+        (CLIP, "store", 1, "holds objects and no marker of structgstream"),
+        (CLIP, "other run", 1, "holds the parts of another run than"),
+    ],
+)
+def test_folders_and_stores_of_others_are_refused_with_every_option_and_nothing_is_gone(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    more: list[str],
+    capture: str,
+    whose: str,
+    status: int,
+    said: str,
+) -> None:
+    output, store = tmp_path / "out.sgs", tmp_path / "store"
+    parts = Parts(tmp_path / "out.sgs.parts")
+    store.mkdir()
+    output.write_bytes(b"mine")
+    if whose == "parts":
+        parts.folder.mkdir()
+        (parts.folder / "plan.json").write_text("{}")
+    else:
+        with parts.held():
+            parts.header.write_bytes(b"mine")
+            parts.note(Ending("header", 0, 1.0), "key", parts.header, frames=1)
+    (store / "segments").mkdir()
+    (store / "segments" / "group-000000-000004.sgs").write_bytes(b"mine")
+    if whose in ("ours", "other run"):
+        owner = parts.check() if whose == "ours" else Owner.new(PURPOSE)
+        assert owner is not None
+        ObjectFolder(f"file://{store}").write(MARKER, owner.content)
+    before = snapshot(tmp_path)
+    words = ["parallel", capture, "-o", str(output), "--store", f"file://{store}", "--executor", "inline"]
+    assert said in error_of([*words, "--frames", "3", *QUARTER, *more], capsys, status=status)
+    assert snapshot(tmp_path) == before
+
+
+def test_a_wrong_capture_leaves_nothing_behind(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    error_of(["parallel", "/no/such/capture", "-o", str(tmp_path / "out.sgs")], capsys, status=1)
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -134,3 +135,27 @@ def test_where_a_model_is_looked_for(tmp_path: Path) -> None:
     for folder in (tmp_path, tmp_path / "sparse", tmp_path / "sparse" / "0"):
         write_text_model(folder, RIG, IMAGES)
         assert find_model(tmp_path) == folder
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param(lambda text: "\ufeff" + text.replace("\n", "\r\n"), id="windows"),
+        pytest.param(lambda text: text.replace(".0", ",0").replace(".5", ",5"), id="decimal-commas"),
+        pytest.param(
+            lambda text: "\n".join(row for row in text.split("\n") if row not in ("", "1.5 2.5 -1")), id="short"
+        ),
+    ],
+)
+def test_text_as_people_have_it(tmp_path: Path, change: Callable[[str], str]) -> None:
+    """Also a list of pictures without lines of 2D points; one whose name ends with numbers is a picture."""
+    images = [*IMAGES, ("take 1 0001", "cam00")]
+    write_text_model(tmp_path, RIG, images)
+    plain = read_model(tmp_path)
+    for file in tmp_path.iterdir():
+        head, body = file.read_text().split("\n", 1)
+        file.write_text(head + "\n" + change(body) if "\ufeff" not in change("") else change(head + "\n" + body))
+    found = read_model(tmp_path)
+    assert [image.name for image in found.cameras] == [image.name for image in plain.cameras]
+    for image, other in zip(found.cameras, plain.cameras, strict=True):
+        np.testing.assert_array_equal(image.viewmat, other.viewmat)

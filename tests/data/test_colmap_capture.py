@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from captures import all_numbers, picture, small_rig, write_picture, write_text_model, write_videos
-from structgstream.data.colmap_capture import open_colmap
+from structgstream.data.open import open_capture
 from structgstream.errors import CalibrationError, CaptureError
 
 RIG = small_rig(3)
@@ -40,7 +40,7 @@ def test_folders_per_camera_and_per_frame(tmp_path: Path, pattern: str, names: l
     write_pictures(tmp_path, pattern)
     images = [(file.replace("CAM", name), name) for file in names for name in RIG]
     write_text_model(tmp_path / "sparse/0", RIG, images, points=np.eye(3))
-    source = open_colmap(tmp_path)
+    source = open_capture(tmp_path)
     assert list(source.rig) == list(RIG)
     assert source.rig.held_out == frozenset()
     assert source.points is not None
@@ -56,7 +56,7 @@ def test_videos_beside_a_model(tmp_path: Path, folder: str) -> None:
     write_videos(tmp_path / folder, list(RIG), frames=FRAMES)
     write_text_model(tmp_path / "sparse", RIG, [(f"{name}.png", name) for name in RIG], points=np.eye(3))
     write_picture(tmp_path / "images" / "cam00.png", picture(0, 0))  # what the model was made from
-    source = open_colmap(tmp_path)
+    source = open_capture(tmp_path)
     assert all_numbers(source.frames()) == EXPECTED
     assert source.points is not None
     assert source.fps == 30.0
@@ -66,14 +66,14 @@ def test_a_camera_without_calibration(tmp_path: Path) -> None:
     write_pictures(tmp_path, "images/CAM/FRAME.png")
     write_text_model(tmp_path / "sparse", RIG, [(f"{name}.png", name) for name in list(RIG)[1:]])
     with pytest.raises(CalibrationError, match=r"pictures of camera 'cam00', for which .*sparse has no calibration"):
-        open_colmap(tmp_path)
+        open_capture(tmp_path)
 
 
 def test_a_calibration_that_belongs_to_nothing(tmp_path: Path) -> None:
     write_pictures(tmp_path, "images/CAM/FRAME.png")
     write_text_model(tmp_path / "sparse", RIG, [(f"other{name[-1]}.png", name) for name in RIG])
     with pytest.raises(CalibrationError, match=r"No camera of .*sparse belongs to .*'other0\.png'.*'cam0\d'"):
-        open_colmap(tmp_path)
+        open_capture(tmp_path)
 
 
 def test_a_camera_that_moves(tmp_path: Path) -> None:
@@ -81,21 +81,21 @@ def test_a_camera_that_moves(tmp_path: Path) -> None:
     images = [(f"{name}/000000.png", name) for name in RIG] + [("cam01/000001.png", "cam02")]
     write_text_model(tmp_path / "sparse", RIG, images)
     with pytest.raises(CalibrationError, match=r"'cam01' moves in .*'cam01/000000.png' and 'cam01/000001.png'"):
-        open_colmap(tmp_path)
+        open_capture(tmp_path)
 
 
 def test_a_missing_picture_is_an_absent_camera(tmp_path: Path) -> None:
     write_pictures(tmp_path, "frames/FRAME/CAM.png")
     write_text_model(tmp_path / "sparse", RIG, [(f"{name}.png", name) for name in RIG])
     (tmp_path / "frames/000002/cam01.png").unlink()
-    absent = [set(RIG).difference(frame.images) for frame in open_colmap(tmp_path).frames()]
+    absent = [set(RIG).difference(frame.images) for frame in open_capture(tmp_path).frames()]
     assert [index for index, names in enumerate(absent) if names] == [2]
     assert absent[2] == {"cam01"}
     (
         tmp_path / "frames/000000/cam02.png"
     ).unlink()  # the range begins with it, and cam01's first picture is a later one
     (tmp_path / "frames/000001/cam01.png").unlink()
-    assert set(RIG).difference(next(open_colmap(tmp_path).frames()).images) == {"cam01"}
+    assert set(RIG).difference(next(open_capture(tmp_path).frames()).images) == {"cam01"}
 
 
 @pytest.mark.parametrize("folder", ["images", "images_2", "images_4", "images_8", ""])
@@ -104,7 +104,7 @@ def test_reduced_pictures_scale_the_intrinsics(tmp_path: Path, folder: str) -> N
     write_pictures(tmp_path / folder, "CAM/FRAME.png")
     large = RIG.mapped({name: RIG[name].resized(257, 193) for name in RIG})
     write_text_model(tmp_path / "sparse", large, [(f"{name}.png", name) for name in RIG])
-    source = open_colmap(tmp_path)
+    source = open_capture(tmp_path)
     for name in RIG:
         torch.testing.assert_close(source.rig[name].K, RIG[name].K)
         assert (source.rig[name].width, source.rig[name].height) == (64, 48)
@@ -119,7 +119,7 @@ def test_full_pictures_are_preferred_to_reduced_ones(tmp_path: Path) -> None:
                 tmp_path / "images_2" / name / f"{frame:06d}.png", picture(number, frame, width=32, height=24)
             )
     write_text_model(tmp_path / "sparse", RIG, [(f"{name}.png", name) for name in RIG])
-    assert open_colmap(tmp_path).rig["cam00"].width == 64
+    assert open_capture(tmp_path).rig["cam00"].width == 64
 
 
 def test_pictures_of_other_proportions_than_the_model(tmp_path: Path) -> None:
@@ -127,7 +127,7 @@ def test_pictures_of_other_proportions_than_the_model(tmp_path: Path) -> None:
     large = RIG.mapped({name: RIG[name].resized(128, 90) for name in RIG})
     write_text_model(tmp_path / "sparse", large, [(f"{name}.png", name) for name in RIG])
     with pytest.raises(CalibrationError, match=r"'cam00' have 64x48 pixels, .*sparse is for 128x90: other proportions"):
-        open_colmap(tmp_path)
+        open_capture(tmp_path)
 
 
 @pytest.mark.parametrize("folder", ["images", "images_4", ""])
@@ -136,7 +136,7 @@ def test_a_static_folder_is_a_capture_of_one_frame(tmp_path: Path, folder: str, 
     for number, name in enumerate(RIG):
         write_picture(tmp_path / folder / f"{name}.{suffix}", picture(number, 7))
     write_text_model(tmp_path / "sparse/0", RIG, [(f"{name}.JPG", name) for name in RIG], points=np.eye(3))
-    source = open_colmap(tmp_path)
+    source = open_capture(tmp_path)
     assert (len(source), list(source.rig), source.rig.held_out) == (1, list(RIG), frozenset())
     assert source.points is not None
     assert all_numbers(source.frames()) == [[(camera, 7) for camera in range(3)]]
@@ -147,7 +147,7 @@ def test_photos_that_the_model_could_not_place_are_left_out(tmp_path: Path, capl
         write_picture(tmp_path / "images" / f"{name}.png", picture(number, 7))
     write_picture(tmp_path / "images/blurred.png", picture(9, 7))
     write_text_model(tmp_path / "sparse/0", RIG, [(f"{name}.png", name) for name in RIG])
-    assert list(open_colmap(tmp_path).rig) == list(RIG)
+    assert list(open_capture(tmp_path).rig) == list(RIG)
     assert "has no pose of camera 'blurred' of " in caplog.text
 
 
@@ -162,7 +162,7 @@ def test_a_model_with_lenses_is_undistorted(tmp_path: Path, videos: bool) -> Non
     lenses = ["OPENCV 64 48 40 40 32 24 -0.05 0.01 0.001 0", "OPENCV_FISHEYE 64 48 40 40 32 24 0.01 0 0 0"]
     cameras = [f"{number} {lens}" for number, lens in enumerate([*lenses, "PINHOLE 64 48 40 40 32 24"], start=1)]
     (tmp_path / "sparse/cameras.txt").write_text("\n".join(cameras))
-    source = open_colmap(tmp_path)
+    source = open_capture(tmp_path)
     assert source.points is not None
     assert torch.equal(source.rig["cam02"].K, RIG["cam02"].K)
     for name in RIG:
@@ -175,9 +175,7 @@ def test_a_model_with_lenses_is_undistorted(tmp_path: Path, videos: bool) -> Non
 def test_a_model_without_frames(tmp_path: Path) -> None:
     write_text_model(tmp_path / "sparse", RIG, [(f"{name}.png", name) for name in RIG])
     with pytest.raises(CaptureError, match="has the calibration .*sparse but no frames"):
-        open_colmap(tmp_path)
-    with pytest.raises(CaptureError, match="no COLMAP model"):
-        open_colmap(tmp_path / "sparse" / "elsewhere")
+        open_capture(tmp_path)
 
 
 def test_nan_names_the_camera(tmp_path: Path) -> None:
@@ -187,8 +185,8 @@ def test_nan_names_the_camera(tmp_path: Path) -> None:
     line = next(row for row in text.splitlines() if row.endswith("cam01.png"))
     words = line.split()
     (tmp_path / "sparse/images.txt").write_text(text.replace(line, " ".join([*words[:5], "nan", *words[6:]])))
-    with pytest.raises(CalibrationError, match=r"'cam01' of .*not finite"):
-        open_colmap(tmp_path)
+    with pytest.raises(CalibrationError, match=r"picture 'cam01\.png': a number that is not finite"):
+        open_capture(tmp_path)
 
 
 def test_cameras_may_have_pictures_of_different_sizes(tmp_path: Path) -> None:
@@ -197,6 +195,13 @@ def test_cameras_may_have_pictures_of_different_sizes(tmp_path: Path) -> None:
         write_picture(tmp_path / f"images/cam01/{frame:06d}.png", picture(1, frame, width=32, height=24))
     mixed = RIG.mapped({**RIG.cameras, "cam01": dataclasses.replace(RIG["cam01"].resized(32, 24))})
     write_text_model(tmp_path / "sparse", mixed, [(f"{name}.png", name) for name in RIG])
-    source = open_colmap(tmp_path)
+    source = open_capture(tmp_path)
     assert all_numbers(source.frames()) == EXPECTED
     assert next(source.frames()).images["cam01"].shape == (24, 32, 3)
+
+
+def test_folders_of_other_names_do_not_move(tmp_path: Path) -> None:
+    write_pictures(tmp_path, "images/CAM_x/FRAME.png")
+    write_text_model(tmp_path / "sparse", RIG, [(f"{name}/000000.png", name) for name in RIG])
+    with pytest.raises(CalibrationError, match=r"No camera of .* belongs to the pictures .*'cam00/000000\.png'"):
+        open_capture(tmp_path)

@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -6,9 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from captures import all_numbers, small_rig, write_meet_room, write_n3dv, write_text_model
+from captures import all_numbers, picture, small_rig, write_meet_room, write_n3dv, write_picture, write_text_model
+from structgstream.data import clip
+from structgstream.data.clip import bundled_clip
 from structgstream.data.n3dv import open_n3dv
 from structgstream.errors import CalibrationError
+
+CLIP_FOLDER = Path(clip.__file__).parent / "clip"
 
 
 def test_poses_become_opencv_world_to_camera(tmp_path: Path) -> None:
@@ -128,3 +133,36 @@ def test_a_file_that_is_something_else(tmp_path: Path, content: bytes | None) ->
         (tmp_path / "poses_bounds.npy").write_bytes(content)
     with pytest.raises(CalibrationError, match=r"poses_bounds\.npy (cannot be read|has shape \(4, 3\))"):
         open_n3dv(tmp_path)
+
+
+@pytest.mark.parametrize("as_text", [True, False])
+def test_the_pictures_tell_the_order_of_rows(tmp_path: Path, as_text: bool) -> None:
+    """LLFF sorts cam1, cam10, cam2 as text; others by number."""
+    whole = bundled_clip().rig
+    names = {f"cam{number}": name for number, name in enumerate(whole, start=1)}
+    for name, theirs in names.items():
+        shutil.copy(CLIP_FOLDER / f"{theirs}.mp4", tmp_path / f"{name}.mp4")
+    rows = []
+    for name in sorted(names) if as_text else names:
+        camera = whole[names[name]]
+        pose = camera.viewmat.inverse().numpy()
+        hwf = np.array([camera.height, camera.width, float(camera.K[0, 0])])
+        columns = [pose[:3, 1], pose[:3, 0], -pose[:3, 2], pose[:3, 3], hwf]
+        rows.append(np.concatenate([np.stack(columns, axis=1).ravel(), [0.5, 9.0]]))
+    np.save(tmp_path / "poses_bounds.npy", np.array(rows))
+    source = open_n3dv(tmp_path)
+    assert list(source.rig) == list(names)
+    for name, theirs in names.items():
+        torch.testing.assert_close(source.rig[name].viewmat, whole[theirs].viewmat)
+
+
+def test_decoded_pictures(tmp_path: Path) -> None:
+    """4DGaussians leaves camXX/images/FRAME.png."""
+    rig = write_n3dv(tmp_path)
+    for camera, name in enumerate(rig):
+        (tmp_path / f"{name}.mp4").unlink()
+        for frame in range(2):
+            write_picture(tmp_path / name / f"images/{frame:04d}.png", picture(camera, frame))
+    source = open_n3dv(tmp_path)
+    assert (source.rig.testing, len(source)) == (("cam00",), 2)
+    assert all_numbers(source.frames(1)) == [[(camera, 1) for camera in range(4)]]

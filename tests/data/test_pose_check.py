@@ -91,3 +91,30 @@ def test_too_little_to_judge_by_refuses_nothing() -> None:
     rig = CLIP.rig
     blank = {name: np.full((144, 192, 3), 128, dtype=np.uint8) for name in rig}
     assert not check_poses(MultiViewFrame(0, 0.0, blank), rig).conclusive
+
+
+def permuted(rig: CameraRig, names: list[str]) -> CameraRig:
+    """The rig with the poses of these cameras handed round."""
+    poses = {name: rig[other].viewmat for name, other in zip(names, [*names[1:], names[0]])}
+    return rig.mapped({name: replace(rig[name], viewmat=poses.get(name, rig[name].viewmat)) for name in rig})
+
+
+@pytest.mark.parametrize("wrong", [["cam02", "cam03"], ["cam04", "cam06"], ["cam01", "cam05", "cam08"]])
+def test_exchanged_cameras_are_named(
+    clip_frame: MultiViewFrame, wrong: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    check = check_poses(clip_frame, permuted(CLIP.rig, wrong))
+    assert set(wrong) <= set(check.suspects)
+    assert len(check.suspects) <= len(wrong) + 1
+    assert f"The poses or names of cameras {', '.join(map(repr, check.suspects))} of 9 look wrong" in caplog.text
+    caplog.clear()
+
+
+def test_a_third_of_a_rig_is_never_permuted_silently(
+    clip_frame: MultiViewFrame, caplog: pytest.LogCaptureFixture
+) -> None:
+    training = list(CLIP.rig.training)
+    for seed in range(8):
+        wrong = [training[place] for place in np.random.default_rng(seed).permutation(len(training))[:3]]
+        assert check_poses(clip_frame, permuted(CLIP.rig, wrong)).suspects
+    caplog.clear()

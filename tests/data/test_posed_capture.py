@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras of a calibration for pictures of some names and sizes; whole captures are opened in ``test_colmap_capture``
-and ``test_calibrated_capture``."""
+"""Cameras of a calibration for pictures of some names and sizes; whole captures are opened in ``test_colmap_capture``,
+``test_calibrated_capture`` and ``test_found_calibrations``."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -114,3 +114,20 @@ def test_poses_of_one_camera_must_agree(share: float, moves: bool) -> None:
             filmed_by(given, sizes, root=ROOT)
     else:
         assert owners(filmed_by(given, sizes, root=ROOT), given)["a"] == "a/1.png"  # the first one's pose
+
+
+def test_rounded_rotations_stand_still() -> None:
+    """With four decimals the trace of R R^T is off by enough for half a degree, if one asks its arc cosine."""
+    for seed in range(20):
+        turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+        turn *= np.sign(np.linalg.det(turn))
+        given = calibration(["left", "middle", "right"])
+        cameras = []
+        for camera in given.cameras:
+            viewmat = camera.viewmat.copy()
+            viewmat[:3, :3] = (viewmat[:3, :3] @ turn).round(4)
+            cameras.append(replace(camera, viewmat=viewmat))
+        found = filmed_by(
+            replace(given, cameras=tuple(cameras)), dict.fromkeys(("left", "middle"), (WIDTH, HEIGHT)), root=ROOT
+        )
+        assert list(found) == ["left", "middle"]

@@ -160,5 +160,32 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize("change", [{"camera_model": "EQUIRECTANGULAR"}, {"k4": 0.1}])
 def test_lenses_that_are_not_known(tmp_path: Path, change: dict) -> None:
     write(tmp_path, "rgb/CAM_FRAME.png", **change)
-    with pytest.raises(CalibrationError, match="which is not known here; expected PINHOLE, OPENCV"):
+    with pytest.raises(CalibrationError, match="which is not known here; expected PINHOLE, SIMPLE_PINHOLE, PERSP"):
         open_transforms(tmp_path)
+
+
+def test_a_rate_serves_files_without_times(tmp_path: Path) -> None:
+    """Also where times are null, paths are of another machine, and lenses have COLMAP's names."""
+    write(tmp_path, "images/CAM/FRAME.png", fps=60, camera_model="SIMPLE_RADIAL", k1=0.01, w=str(WIDTH), h=HEIGHT)
+
+    def change(content: dict) -> None:
+        for entry in content["frames"]:
+            entry["time"] = None
+            entry["file_path"] = "D:\\scene\\" + entry["file_path"].replace("/", "\\")
+
+    edit(tmp_path / "transforms.json", change)
+    source = open_capture(tmp_path)
+    assert (len(source), source.fps, list(source.rig)) == (FRAMES, 60.0, ["cam00", "cam01", "cam02"])
+
+
+@pytest.mark.parametrize("file", ["/data/scene/images/CAM/FRAME.png", "images/CAM/FRAME", "images/CAM/FRAME.jpg"])
+def test_paths_of_other_machines(tmp_path: Path, file: str) -> None:
+    write(tmp_path, "images/CAM/FRAME.png")
+
+    def change(content: dict) -> None:
+        for number, entry in enumerate(content["frames"]):
+            camera, frame = divmod(number, FRAMES)
+            entry["file_path"] = file.replace("CAM", f"cam{camera:02d}").replace("FRAME", f"{frame:04d}")
+
+    edit(tmp_path / "transforms.json", change)
+    assert all_numbers(open_capture(tmp_path).frames(1))[0] == [(camera, 1) for camera in range(3)]

@@ -53,3 +53,29 @@ def test_a_new_run_forgets_the_old_one(tmp_path: Path) -> None:
 def test_a_folder_that_is_missing_is_said(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="cannot be written"):
         append_log(tmp_path / "no" / "ball.sgs", {"index": 0})
+
+
+def test_names_with_dots_have_logs_of_their_own(tmp_path: Path) -> None:
+    names = ["studio.2026-11-27", "studio.2026-11-28", "studio.sgs", "studio.2026-11-27.mp4"]
+    assert len({log_path(tmp_path / name) for name in names}) == len(names)
+    assert log_path(tmp_path / "studio.2026-11-28.sgs").name == "studio.2026-11-28.log.jsonl"
+
+
+@pytest.mark.parametrize("side", ["log", "metrics"])
+def test_a_stream_that_would_share_the_files_of_another_is_refused(tmp_path: Path, side: str) -> None:
+    if side == "log":
+        append_log(tmp_path / "now.sgs", {"index": 0})
+    else:
+        (tmp_path / "now.metrics.json").write_text('{"stream": "now.sgs"}')
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(StorageError, match="belongs to the stream now.sgs, and now would need"):
+        begin_log(tmp_path / "now")
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+    begin_log(tmp_path / "now.sgs")
+
+
+def test_a_stream_that_was_renamed_with_its_log_goes_on(tmp_path: Path) -> None:
+    append_log(tmp_path / "ball.sgs", {"index": 0})
+    log_path(tmp_path / "ball.sgs").rename(log_path(tmp_path / "best.sgs"))
+    begin_log(tmp_path / "best.sgs", frames=1)
+    assert list(read_log(tmp_path / "best.sgs")) == [0]

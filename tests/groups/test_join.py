@@ -11,8 +11,10 @@ from streams import moved, small_scene, write_stream
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
-from structgstream.errors import ConfigError, StreamError
+from structgstream.errors import ConfigError, StorageError, StreamError
+from structgstream.groups import join
 from structgstream.groups.join import check_births, join_segments
+from structgstream.owned_folders import MARKER
 from structgstream.training.patching import BIRTHS_PER_FRAME
 
 
@@ -68,3 +70,32 @@ def test_births_of_another_group_are_found(tmp_path: Path) -> None:
     check_births(path, [0])
     with pytest.raises(StreamError, match="Frame 2 .* born in frames 0 to 0; its group begins at frame 2"):
         check_births(path, [0, 2])
+
+
+def test_a_result_that_fails_its_check_replaces_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.sgs"
+    path.write_bytes(b"good")
+
+    def refuse(found: Path, firsts: list[int]) -> None:
+        with open_stream(found) as reader:
+            assert len(reader) == FRAMES
+        raise StreamError(f"{firsts}")
+
+    monkeypatch.setattr(join, "check_births", refuse)
+    with pytest.raises(StreamError, match="0, 2, 4"):
+        join_segments(made().segments, path, check=True)
+    assert path.read_bytes() == b"good"
+    assert [*tmp_path.iterdir()] == [path]
+
+
+def test_a_folder_of_others_where_runs_are_handed_over_stays(tmp_path: Path) -> None:
+    folder = tmp_path / "a.sgs.runs"
+    folder.mkdir()
+    (folder / "run-0").write_text("mine")
+    with pytest.raises(StorageError, match="somebody else's"), join._folder_of_runs(tmp_path / "a.sgs"):
+        pass
+    assert (folder / "run-0").read_text() == "mine"
+    with join._folder_of_runs(tmp_path / "b.sgs") as made_here:
+        (made_here / "run-0").touch()
+        (made_here / "mine").touch()
+    assert sorted(path.name for path in made_here.iterdir()) == ["mine", MARKER]

@@ -14,7 +14,8 @@ from structgstream.errors import ConfigError, StorageError, TaskError
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.inline import InlineEngine
 from structgstream.executors.task import PYTHON, Ending, Task
-from structgstream.parallel.driver import Job, Status, drive
+from structgstream.parallel.driver import Job, Status, _Drive, drive
+from structgstream.parallel.exchange import SharedFolder
 from structgstream.parallel.parts import Parts, group_name
 
 GROUPS = [(0, 4), (4, 8), (8, 12)]
@@ -153,3 +154,11 @@ def test_a_worker_that_does_not_see_the_folder_is_told(tmp_path: Path) -> None:
     given = job(tmp_path)
     with pytest.raises(StorageError, match="do all machines see this folder at the same place"):
         run(replace(given, unit=replace(given.unit, program=("true",))), Parts(tmp_path / "parts"))
+
+
+def test_the_log_has_what_the_last_attempt_on_another_machine_has_printed(tmp_path: Path) -> None:
+    parts = Parts(tmp_path / "parts")
+    drive = _Drive(job(tmp_path), parts, workers(), SharedFolder(), print)
+    for said in ("first failure\n", "second failure\n", "second failure\n"):
+        drive._keep_words(Ending("header", 1, 1.0, 1, 0, said))
+    assert parts.log("header").read_text() == "first failure\nsecond failure\n"

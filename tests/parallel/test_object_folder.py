@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Objects are what was written, or none; what fails is tried again, and no longer than that."""
 
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from structgstream.errors import StorageError
+from structgstream.owned_folders import MARKER, Owner
 from structgstream.parallel import object_folder
 from structgstream.parallel.object_folder import TRIES, ObjectFolder
 
@@ -27,13 +29,24 @@ def test_what_is_written_is_read(store: ObjectFolder) -> None:
 def test_what_is_not_there_is_none(store: ObjectFolder) -> None:
     assert store.read("a") is None
     assert store.names("deep") == []
-    store.clear()
+    assert store.owner() is None
+    store.remove(re.compile(".*"))
 
 
-def test_cleared_is_empty(store: ObjectFolder) -> None:
+def test_only_a_marked_folder_is_emptied_and_only_of_what_is_named(store: ObjectFolder, tmp_path: Path) -> None:
+    owner = Owner.new("parts of a parallel run")
     store.write("deep/b", b"b")
-    store.clear()
+    for action in (store.owner, lambda: store.remove(re.compile(".*"))):
+        with pytest.raises(StorageError, match="may be somebody else's; nothing there was changed"):
+            action()
+    assert store.read("deep/b") == b"b"
+    store.write(MARKER, owner.content)
+    (tmp_path / "store" / "mine.txt").write_text("mine")
+    assert store.owner() == owner
+    store.remove(re.compile("deep/.*"))
     assert store.read("deep/b") is None
+    assert (tmp_path / "store" / "mine.txt").read_text() == "mine"
+    assert store.owner() == owner
 
 
 @pytest.mark.parametrize("damaged", [b"", b"short", None])

@@ -9,6 +9,7 @@ import pytest
 from killed import folders_of_the_killed
 from structgstream.errors import ConfigError, StorageError
 from structgstream.executors.task import Ending
+from structgstream.owned_folders import MARKER
 from structgstream.parallel.parts import Parts, read_notes
 
 
@@ -94,11 +95,59 @@ def test_killed_at_any_step_of_clearing_what_is_left_is_refused_as_before_or_not
 def test_cleared_is_empty(parts: Parts) -> None:
     with parts.held():
         parts.clear()
-        assert [path.name for path in parts.folder.rglob("*")] == [".driver", "segments"]
+        assert sorted(path.name for path in parts.folder.rglob("*")) == [".driver", "segments", MARKER]
     assert not parts.notes
+
+
+def test_what_others_have_put_beside_the_parts_stays(parts: Parts) -> None:
+    others = ["mine.txt", "header.txt", "segments/mine.sgs", "logs/diary.txt", "deep/down/plan.json"]
+    for name in others:
+        (parts.folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (parts.folder / name).write_text("mine")
+    (parts.folder / "header.log.jsonl").symlink_to(parts.folder / "mine.txt")
+    with parts.held():
+        parts.clear()
+    assert all((parts.folder / name).read_text() == "mine" for name in others)
+    assert not parts.header.exists()
+    assert not (parts.folder / "header.log.jsonl").exists()
+
+
+def test_a_folder_that_is_not_of_parts_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "out.sgs.parts"
+    (folder / "segments").mkdir(parents=True)
+    (folder / "plan.json").write_text("{}")
+    with pytest.raises(StorageError, match="somebody else's; nothing in it was changed"), Parts(folder).held():
+        pass
+    with pytest.raises(StorageError, match="somebody else's"):
+        Parts(folder).clear()
+    assert (folder / "plan.json").read_text() == "{}"
+    assert not (folder / MARKER).exists()
+
+
+def test_a_lock_that_is_a_link_is_not_followed(parts: Parts, tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("mine")
+    (parts.folder / ".driver").unlink()
+    (parts.folder / ".driver").symlink_to(tmp_path / "mine")
+    with pytest.raises(StorageError, match=".driver in it is a link, which is not followed"), parts.held():
+        pass
+    assert (tmp_path / "mine").read_text() == "mine"
+
+
+def test_a_run_that_begins_anew_has_another_name(parts: Parts) -> None:
+    parts.keep_to({"capture": "a"})
+    first = parts.run
+    parts.keep_to({"capture": "a"})
+    assert parts.run == first != ""
+    with parts.held():
+        parts.clear()
+    parts.keep_to({"capture": "a"})
+    assert parts.run not in ("", first)
 
 
 def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(StorageError, match="parts cannot be made"), Parts(tmp_path / "file" / "parts").held():
+    with (
+        pytest.raises(StorageError, match="cannot be used for the parts of a parallel run"),
+        Parts(tmp_path / "file" / "parts").held(),
+    ):
         pass

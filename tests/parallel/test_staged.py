@@ -58,15 +58,33 @@ def test_needs_are_brought_and_results_taken(store: ObjectFolder, tmp_path: Path
     assert not scratch(tmp_path)
 
 
-def test_what_a_failing_command_has_left_is_not_taken_and_stays_here(store: ObjectFolder, tmp_path: Path) -> None:
+def test_what_a_killed_command_has_left_is_not_taken_and_stays_here(store: ObjectFolder, tmp_path: Path) -> None:
     store.write("a", b"a")
     flags = ("--needs", "a", "--gives", "b")
-    assert run(store, 'echo half > "$0/b"; exit 3', *flags) == 3
+    assert run(store, 'echo half > "$0/b"; exit 137', *flags) == 137
     assert store.read("b") is None
     # The next attempt finds it.
     assert run(store, 'grep -q half "$0/b"', *flags) == 0
     assert store.read("b") == b"half\n"
     assert not scratch(tmp_path)
+
+
+def test_what_a_failing_command_has_left_is_removed(store: ObjectFolder, tmp_path: Path) -> None:
+    assert run(store, 'echo half > "$0/b"; exit 3', "--gives", "b") == 3
+    assert not scratch(tmp_path)
+
+
+def test_a_run_that_was_begun_anew_finds_nothing_of_the_one_before(store: ObjectFolder, tmp_path: Path) -> None:
+    flags = ("--needs", "header", "--gives", "b")
+    store.write("header", b"old")
+    assert run(store, 'echo half > "$0/b"; exit 137', "--run", "1", *flags) == 137
+    store.write("header", b"new")
+    assert run(store, 'grep -q new "$0/header"; [ -e "$0/b" ]; exit 137', "--run", "1", *flags) == 137
+    (other,) = scratch(tmp_path)
+    mine = other.with_name(other.name.replace("-1", "-mine"))
+    mine.mkdir()
+    assert run(store, 'grep -q new "$0/header" && [ ! -e "$0/b" ]', "--run", "2", *flags) == 0
+    assert scratch(tmp_path) == [mine], "a folder without a marker stays"
 
 
 def test_an_earlier_attempt_here_is_not_replaced_by_the_store(staging: Staging) -> None:
@@ -162,7 +180,7 @@ def test_a_disk_of_this_machine_without_room_is_a_sentence(
     assert staged.main() == 1
     error = capsys.readouterr().err
     assert error.startswith("structgstream: ")
-    assert error.endswith("a cannot be written (No space left on device); make room.\n")
+    assert error.endswith("cannot be written (No space left on device); make room.\n")
 
 
 def test_a_store_that_cannot_be_used_is_a_sentence(

@@ -159,3 +159,27 @@ def test_a_file_of_another_kind_is_not_lost_unnoticed(tmp_path: Path, caplog: py
     left = [record.getMessage().split(" is left out")[0].split("/")[-1] for record in caplog.records]
     assert left == ["c.AVI", "d.jpg"]
     assert "c.AVI is left out: it is not of the kind of" in caplog.text
+
+
+def test_the_folder_above_the_videos(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_videos(tmp_path / "take", ["a", "b", "c"], frames=2)
+    assert find_footage(tmp_path).path("b") == tmp_path / "take/b.mp4"
+    (tmp_path / "take").rename(tmp_path / "videos")
+    write_picture(tmp_path / "plan.png", picture(0, 0))
+    write_videos(tmp_path, ["preview"], frames=2)
+    assert find_footage(tmp_path).path("b") == tmp_path / "videos/b.mp4"
+    assert "preview.mp4 is left out: the cameras are those of" in caplog.text
+    caplog.clear()
+
+
+def test_cards_that_were_copied_whole(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_videos(tmp_path / name / "DCIM/100GOPRO", ["GX010001"], frames=2)
+    assert find_footage(tmp_path).path("b") == tmp_path / "b/DCIM/100GOPRO/GX010001.mp4"
+
+
+def test_links_beside_what_they_lead_to(tmp_path: Path) -> None:
+    write_videos(tmp_path / "store", ["a", "b"], frames=2)
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.mp4").symlink_to(tmp_path / "store" / f"{name}.mp4")
+    assert find_footage(tmp_path).cameras == ("a", "b")

@@ -222,7 +222,7 @@ def left_by_a_kill(run: QualitiesRun, folder: Path, *, after: tuple[str, int]) -
             copy = folder.with_name("killed")
             shutil.copytree(folder, copy / "out")
             if kept_folder(folder).exists():
-                shutil.copytree(kept_folder(folder), copy / "out.live")
+                shutil.copytree(kept_folder(folder), kept_folder(copy / "out"))
             run.reports.close()
             shutil.rmtree(folder)
             shutil.rmtree(kept_folder(folder), ignore_errors=True)

@@ -209,10 +209,10 @@ def test_counts_are_those_of_the_moving_anchors_and_of_all_free_gaussians() -> N
     scene = random_scene(60, free=5, cameras=4, seed=4)
     assert hooks_of(started(scene)).counts() == (60, 5)
     anchors = torch.arange(60) < 20
-    parted = SimpleNamespace(anchors=anchors, free=torch.arange(5) < 2, unseen=torch.tensor([False] * 4 + [True]))
+    parted = SimpleNamespace(anchors=anchors, free=torch.arange(5) < 2)
     partition = Partition.of(scene, cast(Any, parted))
     start = StartingPoint(partition.moving, VIEWS, torch.zeros(22, 3), partition)
-    assert hooks_of(start).counts() == (20, 4)  # One is seen by nobody.
+    assert hooks_of(start).counts() == (20, 5)
 
 
 def test_each_frame_ends_with_the_psnr_of_its_last_pictures() -> None:

@@ -36,9 +36,7 @@ def some(scene=SCENE) -> Partition:
     anchors[[3, 17]] = True
     free = torch.arange(len(scene.free)) == 5
     slots = torch.ones(len(scene.anchors) * scene.anchors.offsets_per_anchor + len(scene.free), dtype=torch.bool)
-    return Partition.of(
-        scene, MotionSegmentation(anchors, free, torch.zeros_like(free), {view.index: slots for view in VIEWS})
-    )
+    return Partition.of(scene, MotionSegmentation(anchors, free, {view.index: slots for view in VIEWS}))
 
 
 def test_the_parts_make_the_whole_again() -> None:

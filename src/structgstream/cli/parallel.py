@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``structgstream parallel``."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,7 +9,14 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError, usage_errors
-from structgstream.cli.options import CaptureOptions, Device, Folder, parse_known_options, resolve_config
+from structgstream.cli.options import (
+    CaptureOptions,
+    Device,
+    Folder,
+    open_selected_capture,
+    parse_known_options,
+    resolve_config,
+)
 from structgstream.cli.parallel_display import ParallelDisplay
 from structgstream.cli.plain_text import say
 from structgstream.cli.progress import human_bytes
@@ -18,7 +25,9 @@ from structgstream.executors.opening import ExecutorName, ExecutorOptions
 if TYPE_CHECKING:
     from structgstream.executors.executor import TaskQueue
     from structgstream.parallel.driver import Job
+    from structgstream.parallel.exchange import ObjectStore
     from structgstream.parallel.parts import Parts
+    from structgstream.presets import StreamConfig
 
 
 @dataclass(frozen=True)
@@ -70,7 +79,7 @@ class Parallel:
     groups: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Frames of a group: a multiple of the key interval. Default: one key interval."""
     quiet: bool = False
-    """Begin groups where little moves."""
+    """Begin each group at the frame near its border where least moves."""
     odd: bool = False
     """Allow an N that is no multiple of the key interval; each group then costs a key packet more."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
@@ -91,31 +100,58 @@ class Parallel:
 
 def main(arguments: list[str]) -> None:
     """Runs with a display of all groups."""
+    from structgstream.presets import with_budget
+
     options, rest = parse_known_options(Parallel, "parallel", arguments=arguments)
-    resolve_config(options.preset, rest, command="parallel", seed=options.seed)
+    config, preset = resolve_config(options.preset, rest, command="parallel", seed=options.seed)
+    with usage_errors():
+        config = with_budget(config, name=preset, quality=options.quality, mbits=None)
     chosen = options.run.chosen
     if options.groups is not None and options.groups < 1:
         raise UsageError(f"--groups counts frames, from 1; got {options.groups}.")
-    from structgstream.errors import StorageError
+    from structgstream.owned_folders import Owner
+    from structgstream.parallel.exchange import ObjectStore
     from structgstream.parallel.object_folder import ObjectFolder
-    from structgstream.parallel.parts import Parts
+    from structgstream.parallel.parts import PURPOSE, Parts
 
-    parts = Parts(parts_folder(options.output))
-    console = Console()
-    with parts.held():
-        if options.overwrite:
-            # Killed in between, the folder still has the old plan, with which no other run goes on.
-            if options.store is not None:
-                ObjectFolder(options.store).clear()
-            parts.clear()
-        if options.output.exists() and not options.overwrite and not parts.notes:
-            raise StorageError(f"{options.output} exists; replace it with --overwrite, or choose another name.")
-        with usage_errors():
-            executor = opened(chosen, options.device)
-        with executor:
-            _drive(_job(options, rest), parts, executor, options.store, console)
+    parts, console = Parts(parts_folder(options.output)), Console()
+    # All that can be refused is refused before anything is made or removed.
+    _check(options, config, parts)
+    with usage_errors():
+        executor = opened(chosen, options.device)
+    with executor:
+        job = _job(options, rest)
+        store = None if options.store is None else ObjectStore(ObjectFolder(options.store), parts, cut=job.unit.cut)
+        there = None if store is None else store.claim(job.key)
+        owner = parts.check() or there or replace(Owner.new(PURPOSE), key=job.key)
+        with parts.held(owner=owner):
+            if store is not None and there is None:
+                store.mark(owner)
+            if options.overwrite:
+                # Killed in between, the folder still has the old plan, with which no other run goes on.
+                if store is not None:
+                    store.clear()
+                parts.clear()
+            _drive(job, parts, executor, store, console)
     size = human_bytes(options.output.stat().st_size)
-    say(console, f"Wrote {options.output}: {size}. Its parts are in {parts.folder}, which can be deleted.")
+    say(console, f"Wrote {options.output}: {size}. Its parts are in {parts.folder}; they are needed no more.")
+
+
+def _check(options: Parallel, config: "StreamConfig", parts: "Parts") -> None:
+    """Check the options against the capture, and that the output and its parts may be written.
+
+    Raises:
+        StructGStreamError: the capture cannot be read, the groups do not fit it, or something is there already.
+    """
+    from structgstream.groups.boundaries import check_length
+    from structgstream.recorder import check_output
+    from structgstream.struct_gstream import stream_pipeline
+
+    source = open_selected_capture(options.scene, options.capture)
+    if options.groups is not None and not options.odd:
+        check_length(options.groups, key_interval=stream_pipeline(config).codec.key_interval(source.fps))
+    parts.check()
+    check_output(options.output, may_exist=options.overwrite or bool(parts.notes), resume=False)
 
 
 def parts_folder(output: Path) -> Path:
@@ -189,13 +225,10 @@ def _words(name: str, value: object) -> list[str]:
     return [] if value is None else [f"--{name}", str(value)]
 
 
-def _drive(job: "Job", parts: "Parts", executor: "TaskQueue", store: str | None, console: Console) -> None:
+def _drive(job: "Job", parts: "Parts", executor: "TaskQueue", exchange: "ObjectStore | None", console: Console) -> None:
     from structgstream.evaluation.run_log import read_log
     from structgstream.parallel.driver import drive
-    from structgstream.parallel.exchange import ObjectStore
-    from structgstream.parallel.object_folder import ObjectFolder
 
-    exchange = None if store is None else ObjectStore(ObjectFolder(store), parts, cut=job.unit.cut)
     with ParallelDisplay(console, lambda first, end: len(read_log(parts.segment(first, end)))) as display:
         try:
             drive(job, parts, executor, exchange=exchange, listener=display.show)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from torch import from_numpy
 
 from structgstream.cameras import Camera, CameraRig
+from structgstream.data.text_files import BROKEN, reason
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.similarity import rig_radius
 
@@ -38,9 +39,9 @@ def calibrated_camera(name: str, *, viewmat: ArrayLike, K: ArrayLike, width: int
         camera = Camera(from_numpy(extrinsics), from_numpy(intrinsics), width, height)
     except CalibrationError as error:
         raise CalibrationError(f"Camera {name!r} of {where}: {error}") from None
-    except (TypeError, ValueError) as error:
+    except BROKEN as error:
         raise CalibrationError(
-            f"Camera {name!r} of {where} has a matrix that cannot be read ({error}); "
+            f"Camera {name!r} of {where} has a matrix that cannot be read ({reason(error)}); "
             "expected rows of numbers, a 3x3 K and a 4x4 pose."
         ) from None
     across, down = intrinsics[0, 2] / width, intrinsics[1, 2] / height

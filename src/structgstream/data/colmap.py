@@ -5,6 +5,8 @@ The format is that of COLMAP's documentation, "Output Format". Poses are world t
 and the top-left pixel's centre is (0.5, 0.5): both as in this package.
 """
 
+import logging
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,9 +15,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential, finite
+from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential
 from structgstream.data.posed import Calibration, PosedCamera, intrinsics
+from structgstream.data.text_files import BROKEN, Unreadable, number, pixels, read_text, reason, whole
+from structgstream.data.timeline import natural
 from structgstream.errors import CalibrationError
+
+log = logging.getLogger(__name__)
 
 # Those of a pinhole or with a lens of lenses.py, and how many parameters each has.
 PARAMETERS = {
@@ -39,13 +45,44 @@ class ColmapCamera:
 
 
 def find_model(path: Path) -> Path | None:
-    """The folder of the model that belongs to a capture, or None."""
-    for folder in (path / "sparse" / "0", path / "sparse", path):
-        if any(
-            (folder / f"cameras{end}").is_file() and (folder / f"images{end}").is_file() for end in (".bin", ".txt")
-        ):
-            return folder
-    return None
+    """The folder of the model that belongs to a capture, or None; of several in ``sparse`` the one of most pictures.
+
+    4DGaussians' loaders of many videos have theirs in ``sparse_``.
+    """
+    sparse = path / "sparse"
+    numbered = [entry for entry in sparse.iterdir() if entry.is_dir()] if sparse.is_dir() else []
+    models = [folder for folder in sorted(numbered, key=lambda folder: natural(folder.name)) if is_model(folder)]
+    if models:
+        return max(models, key=_registered) if len(models) > 1 else models[0]
+    return next((folder for folder in (sparse, path, path / "sparse_") if is_model(folder)), None)
+
+
+def is_model(folder: Path) -> bool:
+    """Whether a folder holds the files of a model."""
+    return any((folder / f"cameras{end}").is_file() and (folder / f"images{end}").is_file() for end in (".bin", ".txt"))
+
+
+def _registered(folder: Path) -> int:
+    """How many pictures a model has."""
+    try:
+        if (folder / "images.bin").is_file():
+            with (folder / "images.bin").open("rb") as stream:
+                return struct.unpack("<Q", stream.read(8))[0]
+        return sum(1 for _ in _image_rows(folder / "images.txt"))
+    except (OSError, ValueError, struct.error):
+        return 0
+
+
+def tell_choice(folder: Path) -> None:
+    """Warns of the models beside the one in ``folder``, which are left out."""
+    others = [other for other in folder.parent.iterdir() if other != folder and is_model(other)]
+    if folder.parent.name == "sparse" and others:
+        rest = ", ".join(f"{other.name} of {_registered(other)}" for other in sorted(others))
+        log.warning(
+            "%s holds several models: %s of %d pictures is taken, %s left out; merge them (colmap model_merger) if "
+            "cameras lack",
+            folder.parent, folder.name, _registered(folder), rest,
+        )  # fmt: skip
 
 
 def read_model(folder: Path) -> Calibration:
@@ -54,6 +91,7 @@ def read_model(folder: Path) -> Calibration:
     Raises:
         CalibrationError: the files are cut or not a model, or a camera has a lens model that is not known here.
     """
+    tell_choice(folder)
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
     try:
         if binary:
@@ -65,25 +103,25 @@ def read_model(folder: Path) -> Calibration:
         points = _points(folder)
     except CalibrationError:
         raise
-    except (OSError, ValueError, KeyError, IndexError, TypeError, struct.error) as error:
+    except BROKEN as error:
         raise CalibrationError(
-            f"The COLMAP model in {folder} cannot be read ({type(error).__name__}: {error}); export it again."
+            f"The COLMAP model in {folder} cannot be read ({reason(error)}); export it again."
         ) from None
     ordered = tuple(sorted(images, key=lambda image: image.name))
     return Calibration(folder, ordered, points if len(points) else None)
 
 
 def _camera(model: str, width: int, height: int, params: tuple[float, ...], where: Path) -> ColmapCamera:
-    params = tuple(map(finite, params))
+    params = tuple(map(number, params))
     if len(params) != _parameters(model, where):
-        raise ValueError(f"{len(params)} parameters of a {model}")
+        raise Unreadable(f"{len(params)} parameters of a {model}")
     fx, fy, cx, cy, *coefficients = (params[0], *params) if model in ONE_FOCAL_LENGTH else params
     lens: Lens = Pinhole()
     if model.endswith("FISHEYE"):
         lens = Fisheye(*coefficients)
     elif "PINHOLE" not in model:
         lens = RadialTangential(*coefficients)
-    return ColmapCamera(intrinsics(fx, fy, cx, cy), (width, height), lens)
+    return ColmapCamera(intrinsics(fx, fy, cx, cy), pixels((width, height)), lens)
 
 
 def _parameters(model: str, where: Path) -> int:
@@ -98,7 +136,9 @@ def _parameters(model: str, where: Path) -> int:
 
 def _image(name: str, pose: tuple[float, ...], camera: ColmapCamera) -> PosedCamera:
     """From a quaternion (w, x, y, z) and a translation."""
-    w, x, y, z = np.array(pose[:4]) / np.linalg.norm(pose[:4])
+    if not 0 < (length := float(np.linalg.norm(pose[:4]))) < np.inf:
+        raise Unreadable("a rotation that is no quaternion")
+    w, x, y, z = np.array(pose[:4]) / length
     viewmat = np.eye(4)
     viewmat[:3, :3] = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -110,29 +150,53 @@ def _image(name: str, pose: tuple[float, ...], camera: ColmapCamera) -> PosedCam
 
 
 def _lines(file: Path) -> Iterator[str]:
-    return (line for line in file.read_text().splitlines() if not line.startswith("#"))
+    return (line for line in read_text(file).split("\n") if not line.startswith("#"))
 
 
 def _text_cameras(file: Path) -> dict[int, ColmapCamera]:
     cameras = {}
-    for line in _lines(file):
-        if words := line.split():
-            params = tuple(float(word) for word in words[4:])
-            cameras[int(words[0])] = _camera(words[1], int(words[2]), int(words[3]), params, file)
+    for words in filter(None, map(str.split, _lines(file))):
+        params = tuple(number(word) for word in words[4:])
+        cameras[whole(words[0])] = _camera(words[1], whole(words[2]), whole(words[3]), params, file)
     return cameras
+
+
+def _image_rows(file: Path) -> Iterator[str]:
+    """The lines of pictures: of each the first line of two, or every line of a list without 2D points."""
+    points_follow = False
+    for line in _lines(file):
+        if points_follow and _is_points(line):
+            points_follow = False
+        elif line.strip():
+            points_follow = True
+            yield line
+
+
+def _is_points(line: str) -> bool:
+    """Whether a line is empty or holds triples whose third is the number of a point, which no rotation or name is."""
+    words = line.split()
+    return not words or (len(words) % 3 == 0 and all(re.fullmatch(r"-?\d+", words[place]) for place in (2, -1)))
 
 
 def _text_images(file: Path, cameras: dict[int, ColmapCamera]) -> list[PosedCamera]:
     images = []
-    lines = _lines(file)
-    for line in lines:
+    for line in _image_rows(file):
         words = line.split(maxsplit=9)
-        if not words:
-            continue
-        next(lines, None)  # the picture's 2D points; the line may be empty
-        pose = tuple(float(word) for word in words[1:8])
-        images.append(_image(words[9].strip(), pose, cameras[int(words[8])]))
+        if len(words) < 10:
+            raise Unreadable(f"a picture's line of {file.name} has {len(words)} words; expected 10")
+        name = words[9].strip()
+        try:
+            pose = tuple(number(word) for word in words[1:8])
+            images.append(_image(name, pose, _of_image(cameras, whole(words[8]))))
+        except Unreadable as error:
+            raise Unreadable(f"picture {name!r}: {error}") from None
     return images
+
+
+def _of_image(cameras: dict[int, ColmapCamera], own: int) -> ColmapCamera:
+    if own not in cameras:
+        raise Unreadable(f"no camera {own} for a picture")
+    return cameras[own]
 
 
 def _binary_cameras(file: Path) -> dict[int, ColmapCamera]:
@@ -140,10 +204,10 @@ def _binary_cameras(file: Path) -> dict[int, ColmapCamera]:
     (count,) = struct.unpack_from("<Q", data)
     offset, cameras = 8, {}
     for _ in range(count):
-        number, model, width, height = struct.unpack_from("<iiQQ", data, offset)
+        own, model, width, height = struct.unpack_from("<iiQQ", data, offset)
         name = MODEL_NAMES[model] if 0 <= model < len(MODEL_NAMES) else f"number {model}"
         params = struct.unpack_from(f"<{_parameters(name, file)}d", data, offset + 24)
-        cameras[number] = _camera(name, width, height, params, file)
+        cameras[own] = _camera(name, width, height, params, file)
         offset += 24 + 8 * len(params)
     return cameras
 
@@ -155,7 +219,7 @@ def _binary_images(file: Path, cameras: dict[int, ColmapCamera]) -> list[PosedCa
     for _ in range(count):
         _, *pose, camera = struct.unpack_from("<i7di", data, offset)
         end = data.index(b"\0", offset + 64)
-        images.append(_image(data[offset + 64 : end].decode(), tuple(pose), cameras[camera]))
+        images.append(_image(data[offset + 64 : end].decode(), tuple(pose), _of_image(cameras, camera)))
         (observations,) = struct.unpack_from("<Q", data, end + 1)
         offset = end + 9 + 24 * observations
     _check_end(data, offset)
@@ -164,7 +228,7 @@ def _binary_images(file: Path, cameras: dict[int, ColmapCamera]) -> list[PosedCa
 
 def _check_end(data: bytes, offset: int) -> None:
     if offset > len(data):
-        raise ValueError(f"a file ends {offset - len(data)} bytes early")
+        raise Unreadable(f"a file ends {offset - len(data)} bytes early")
 
 
 def _points(folder: Path) -> NDArray[np.float64]:
@@ -180,6 +244,10 @@ def _points(folder: Path) -> NDArray[np.float64]:
             offset += 51 + 8 * observations
         _check_end(data, offset)
     elif (folder / "points3D.txt").is_file():
-        rows = (line.split(maxsplit=4) for line in _lines(folder / "points3D.txt"))
-        positions = [tuple(float(word) for word in row[1:4]) for row in rows if row]
-    return np.array(positions, dtype=np.float64).reshape(-1, 3)
+        positions = [
+            tuple(number(word) for word in line.split(maxsplit=4)[1:4])
+            for line in _lines(folder / "points3D.txt")
+            if line.strip()
+        ]
+    points = np.array(positions, dtype=np.float64).reshape(-1, 3)
+    return points[np.isfinite(points).all(1)]

@@ -9,7 +9,6 @@ Published results undistort to pinholes of the same size and principal point wit
 of that size (``--scale 0.5``, 1280x960); so does this reader, in one step. What the lens does not show is black.
 """
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,11 +17,12 @@ import numpy as np
 import torch
 
 from structgstream.cameras import Camera
-from structgstream.data.calibration_files.reading import each_camera, readable
+from structgstream.data.calibration_files.reading import calibration_of, readable
 from structgstream.data.lenses import LensCamera, fisheye_lens, from_integer_centers
 from structgstream.data.posed import Calibration, PosedCamera, intrinsics, rigid, rotation_matrix
 from structgstream.data.posed_capture import open_posed
 from structgstream.data.source import FrameSource
+from structgstream.data.text_files import number, pixels, read_json
 
 MODELS = "models.json"
 HELD_OUT = "camera_0001"
@@ -60,18 +60,18 @@ def read_models(file: Path) -> Calibration:
         CalibrationError: the file cannot be read.
     """
     with readable(file, EXPECTED):
-        entries = [(str(entry["name"]), entry) for entry in json.loads(file.read_text())]
-    return Calibration(file, each_camera(entries, _camera, file=file, expected=EXPECTED), held_out=(HELD_OUT,))
+        entries = [(str(entry["name"]), entry) for entry in read_json(file)]
+    return replace(calibration_of(entries, _camera, file=file, expected=EXPECTED), held_out=(HELD_OUT,))
 
 
 def _camera(name: str, entry: dict[str, Any]) -> PosedCamera:
-    focal, (cx, cy) = float(entry["focal_length"]), entry["principal_point"]
+    focal, (cx, cy) = number(entry["focal_length"]), entry["principal_point"]
     rotation = rotation_matrix(np.array(entry["orientation"], dtype=np.float64).reshape(3))
     viewmat = rigid(rotation, -rotation @ np.array(entry["position"], dtype=np.float64))
     return PosedCamera(
         name=name,
         viewmat=viewmat,
-        K=from_integer_centers(intrinsics(focal, focal * float(entry.get("pixel_aspect_ratio", 1)), cx, cy)),
-        size=(round(entry["width"]), round(entry["height"])),
+        K=from_integer_centers(intrinsics(focal, focal * number(entry.get("pixel_aspect_ratio", 1)), cx, cy)),
+        size=pixels((entry["width"], entry["height"])),
         lens=fisheye_lens(entry["radial_distortion"][:2]),
     )

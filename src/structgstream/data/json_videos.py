@@ -10,7 +10,6 @@ The shared-intrinsics one: ``{"w", "h", "fl_x", "fl_y", "cx", "cy", "cams": [4x4
 Both in OpenCV axes.
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,9 @@ import numpy as np
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_names
-from structgstream.data.calibration_files.reading import positive, reason
+from structgstream.data.calibration_files.reading import positive
 from structgstream.data.folder_files import by_stem, files_of
+from structgstream.data.text_files import BROKEN, mapping, pixels, read_json, reason, whole
 from structgstream.data.timeline import natural
 from structgstream.data.video import VideoSource, synchronised
 from structgstream.data.video_index import scan_videos
@@ -61,10 +61,10 @@ def read_cameras(file: Path) -> tuple[CameraRig, float | None, int]:
         CalibrationError: broken numbers.
     """
     try:
-        content: dict[str, Any] = json.loads(file.read_text())
+        content = mapping(read_json(file))
         rig = _own_rig(content, file) if "cameras" in content else _shared_intrinsics_rig(content, file)
-        return rig, positive(content, "fps") if "fps" in content else None, int(content.get("frames", 1))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        return rig, positive(content, "fps") if "fps" in content else None, whole(content.get("frames", 1))
+    except BROKEN as error:
         raise CaptureError(
             f"{file} cannot be read ({reason(error)}); expected width, height and cameras "
             "with K and viewmat, or w, h, fl_x, fl_y, cx, cy and cams."
@@ -72,10 +72,10 @@ def read_cameras(file: Path) -> tuple[CameraRig, float | None, int]:
 
 
 def _own_rig(content: dict[str, Any], file: Path) -> CameraRig:
-    width, height = int(content["width"]), int(content["height"])
+    width, height = pixels((content["width"], content["height"]))
     cameras = {
         name: calibrated_camera(name, viewmat=entry["viewmat"], K=entry["K"], width=width, height=height, where=file)
-        for name, entry in content["cameras"].items()
+        for name, entry in mapping(content["cameras"]).items()
     }
     near = positive(content, "near") if "near" in content else None
     return calibrated_rig(cameras, content.get("held_out", ()), where=file, near=near)
@@ -83,16 +83,15 @@ def _own_rig(content: dict[str, Any], file: Path) -> CameraRig:
 
 def _shared_intrinsics_rig(content: dict[str, Any], file: Path) -> CameraRig:
     K = [[content["fl_x"], 0, content["cx"]], [0, content["fl_y"], content["cy"]], [0, 0, 1]]
+    width, height = pixels((content["w"], content["h"]))
     cameras: dict[str, Camera] = {}
     for number, pose in enumerate(content["cams"]):
         name = f"cam{number:02d}"
         try:
             viewmat = np.linalg.inv(np.array(pose, dtype=np.float64).reshape(4, 4))
-        except (ValueError, np.linalg.LinAlgError) as error:
+        except BROKEN:
             raise CalibrationError(
-                f"Camera {name!r} of {file} has a pose that cannot be inverted ({error}); expected 4x4."
+                f"Camera {name!r} of {file} has a pose that cannot be inverted; expected 4x4 numbers."
             ) from None
-        cameras[name] = calibrated_camera(
-            name, viewmat=viewmat, K=K, width=int(content["w"]), height=int(content["h"]), where=file
-        )
+        cameras[name] = calibrated_camera(name, viewmat=viewmat, K=K, width=width, height=height, where=file)
     return calibrated_rig(cameras, ("cam00",), where=file)

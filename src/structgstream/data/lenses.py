@@ -14,7 +14,6 @@ converts those of tools that have it at (0, 0), such as OpenCV.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import SupportsFloat
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -22,6 +21,7 @@ from numpy.typing import ArrayLike
 
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
+from structgstream.data.text_files import Unreadable, number
 
 NEWTON_STEPS = 50
 CLOSE_ENOUGH = 1e-10
@@ -178,17 +178,6 @@ class LensCamera:
         return self.lens.undistort((pixels - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T)
 
 
-def finite(value: SupportsFloat) -> float:
-    """A coefficient.
-
-    Raises:
-        ValueError: it is not finite: a lens of it shows nothing, without a word.
-    """
-    if not math.isfinite(number := float(value)):
-        raise ValueError(f"a number that is not finite ({number:g})")
-    return number
-
-
 def from_integer_centers(K: ArrayLike) -> Floats:
     """Converts intrinsics ``[3, 3]`` with the top-left pixel's centre at (0, 0) to the package's convention."""
     moved = np.array(K, dtype=np.float64)
@@ -200,12 +189,12 @@ def opencv_lens(coefficients: Sequence[float]) -> Lens:
     """From OpenCV's vector ``k1, k2, p1, p2[, k3[, k4, k5, k6]]``, which may be empty.
 
     Raises:
-        ValueError: a vector of another length that is not padded with zeros: a model with more terms; or a number that
+        Unreadable: a vector of another length that is not padded with zeros: a model with more terms; or a number that
             is not finite.
     """
-    values = [finite(value) for value in coefficients]
+    values = [number(value) for value in coefficients]
     if any(values[8:]) or len(values) in (1, 2, 3):
-        raise ValueError(
+        raise Unreadable(
             f"{len(values)} distortion coefficients; expected 4, 5 or 8 (k1, k2, p1, p2, k3, k4, k5, k6): calibrate "
             "again without thin prism and tilted sensor"
         )
@@ -216,11 +205,11 @@ def fisheye_lens(coefficients: Sequence[float]) -> Fisheye:
     """From the vector ``k1, k2, k3, k4`` of OpenCV's fisheye module; missing ones are 0.
 
     Raises:
-        ValueError: more than four numbers that are not 0, or one that is not finite.
+        Unreadable: more than four numbers that are not 0, or one that is not finite.
     """
-    values = [finite(value) for value in coefficients]
+    values = [number(value) for value in coefficients]
     if any(values[4:]):
-        raise ValueError(f"{len(values)} fisheye coefficients; expected at most 4 (k1, k2, k3, k4)")
+        raise Unreadable(f"{len(values)} fisheye coefficients; expected at most 4 (k1, k2, k3, k4)")
     return Fisheye(*values[: len(fields(Fisheye))])
 
 

@@ -1,25 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
 """Opens a capture from a folder of any supported layout."""
 
+import logging
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
 from structgstream.cameras import CameraRig
-from structgstream.data.calibrated_capture import open_calibrated, recognizes_calibrated
 from structgstream.data.calibration import with_near
-from structgstream.data.colmap_capture import open_colmap, recognizes_colmap
+from structgstream.data.colmap import find_model
+from structgstream.data.found_calibrations import (
+    calibration_below,
+    has_calibration,
+    inner_folders,
+    read_calibration,
+    recognizes_calibrated,
+)
 from structgstream.data.held_out import best_surrounded
 from structgstream.data.immersive import open_immersive, recognizes_immersive
 from structgstream.data.json_videos import open_json_videos, recognizes_json_videos
 from structgstream.data.masks import FOLDER, with_masks
 from structgstream.data.n3dv import open_n3dv, recognizes_n3dv
 from structgstream.data.panoptic import open_panoptic, recognizes_panoptic
+from structgstream.data.posed_capture import open_posed
 from structgstream.data.prepared import open_prepared, recognizes_prepared
 from structgstream.data.source import FrameSource
 from structgstream.data.transforms_capture import open_transforms, recognizes_transforms
 from structgstream.data.wrappers import WithoutPoints, WithRig, resized, section
 from structgstream.errors import CaptureError, ConfigError
+
+log = logging.getLogger(__name__)
 
 LAYOUTS = """Supported layouts:
   prepared         capture.json, as structgstream prepare writes it: make one from videos without calibration
@@ -27,23 +38,35 @@ LAYOUTS = """Supported layouts:
   videos + JSON    cameras.json, CAMERA.mp4
   Neural 3D Video  poses_bounds.npy, camXX.mp4 (Meet Room: cam_X.mp4), with or without a COLMAP model
   Immersive        models.json, camera_NNNN.mp4, of fisheye lenses
-  COLMAP           sparse/0/cameras, images, points3D (.bin or .txt), with images/CAMERA/FRAME.ext,
+  COLMAP           sparse/N/cameras, images, points3D (.bin or .txt), with images/CAMERA/FRAME.ext,
                    frames/FRAME/CAMERA.ext, CAMERA.mp4, or images/CAMERA.ext for one frame
   transforms.json  of Blender, instant-ngp, nerfstudio, with pictures as COLMAP or with a time each
   other tools      calibration of aniposelib, EasyMocap, multical, Kalibr, CMU Panoptic, Qualisys, ZJU-MoCap or
-                   OpenCV, with pictures or videos as COLMAP"""
+                   OpenCV, with pictures or videos as COLMAP
+A calibration may lie one folder below, as calibration/ beside videos/; so may the whole capture, as COLMAP's dense/."""
 
 AUTO = "auto"
+DENSE = "dense"  # of COLMAP, which may have a folder for each model in it
 
-FORMATS = (
+
+def _open_posed(path: Path) -> FrameSource:
+    """Pictures or videos with the calibration in the same folder, or one folder below."""
+    folder = path if has_calibration(path) else calibration_below(path)
+    calibration = None if folder is None else read_calibration(folder)
+    assert calibration is not None, "it was recognised"
+    return open_posed(path, calibration)
+
+
+FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path], FrameSource]], ...] = (
     (recognizes_prepared, open_prepared),
     (recognizes_panoptic, open_panoptic),
     (recognizes_json_videos, open_json_videos),
     (recognizes_n3dv, open_n3dv),
     (recognizes_immersive, open_immersive),
-    (recognizes_colmap, open_colmap),
+    (lambda path: find_model(path) is not None, _open_posed),
     (recognizes_transforms, open_transforms),
-    (recognizes_calibrated, open_calibrated),
+    (recognizes_calibrated, _open_posed),
+    (lambda path: calibration_below(path) is not None, _open_posed),
 )
 
 
@@ -116,15 +139,28 @@ def _chosen(held_out: tuple[str, ...] | Literal["auto"], rig: CameraRig) -> froz
     return frozenset(held_out)
 
 
+def _opener(path: Path) -> Callable[[Path], FrameSource] | None:
+    """What opens the folder: that of the first layout that it has; None where it has none."""
+    return next((opens for recognises, opens in FORMATS if recognises(path)), None)
+
+
 def _recognized(path: Path) -> FrameSource:
     if not path.exists():
         raise CaptureError(f"The capture {path} does not exist; give the folder that holds it.")
     if not path.is_dir():
         raise CaptureError(f"The capture {path} is a file; give the folder that holds it.\n{LAYOUTS}")
     path = path.resolve()  # a name, even for "."
-    for recognises, opens in FORMATS:
-        if recognises(path):
-            return with_masks(opens(path), path / FOLDER)
+    if (opens := _opener(path)) is not None:
+        return with_masks(opens(path), path / FOLDER)
+    inner = [folder for folder in inner_folders(path) if _opener(folder) is not None]
+    if not inner and (path / DENSE).is_dir():
+        inner = [folder for folder in inner_folders(path / DENSE) if _opener(folder) is not None]
+    if len(inner) == 1:
+        log.warning("%s is no capture, but holds one, which is opened: %s", path, inner[0])
+        return _recognized(inner[0])
+    if inner:
+        names = ", ".join(folder.name for folder in inner[:4])
+        raise CaptureError(f"{path} holds several captures ({names}); give the folder of one.")
     content = sorted(entry.name for entry in path.iterdir())
     if not content:
         raise CaptureError(f"The capture {path} is an empty folder.\n{LAYOUTS}")

@@ -5,7 +5,6 @@
 world to camera), ``fn`` (file below ``ims/``) and ``cam_id``. The cameras of ``test_meta.json`` are held out.
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,8 @@ import numpy as np
 
 from structgstream.cameras import Camera
 from structgstream.data.calibration import calibrated_camera, calibrated_rig
-from structgstream.data.calibration_files.reading import reason
-from structgstream.data.images import ImageSource, common_pictures
+from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, common_pictures
+from structgstream.data.text_files import BROKEN, NamedFiles, mapping, path_parts, pixels, read_json, reason
 from structgstream.data.timeline import natural
 from structgstream.errors import CalibrationError, CaptureError
 
@@ -49,40 +48,46 @@ def open_panoptic(path: Path) -> ImageSource:
             held_out += found
     names = sorted(cameras, key=natural)
     rig = calibrated_rig({name: cameras[name] for name in names}, held_out, where=path)
-    present = _present(files)
-    common = common_pictures({name: present[name] for name in names}, where=path, training=rig.training)
+    common = common_pictures({name: files[name] for name in names}, where=path, training=rig.training)
     return ImageSource(path.name, rig, PANOPTIC_FPS, common.files, instants=common.instants)
 
 
 def _read_meta(meta: Path) -> tuple[dict[str, Camera], dict[str, dict[str, Path]]]:
-    """Cameras of one file, and the pictures of each by the name of the instant."""
+    """Cameras of one file, and those pictures of each that exist, by the name of the instant."""
     try:
-        content: dict[str, Any] = json.loads(meta.read_text())
-        width, height = int(content["w"]), int(content["h"])
+        content = mapping(read_json(meta))
+        width, height = pixels((content["w"], content["h"]))
+        pictures = NamedFiles(meta.parent / "ims", PICTURE_SUFFIXES)
         rows = [
-            (str(name), K, viewmat, file)
+            (str(name), K, viewmat, _picture(pictures, str(file)), file)
             for frame in zip(content["cam_id"], content["k"], content["w2c"], content["fn"], strict=True)
             for name, K, viewmat, file in zip(*frame, strict=True)
         ]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except BROKEN as error:
         raise CaptureError(
             f"{meta} cannot be read as PanopticSports metadata ({reason(error)}); "
             "expected the keys w, h, k, w2c, fn and cam_id, the last four as lists over frames and cameras."
         ) from None
     first: dict[str, tuple[Any, Any]] = {}
-    files: dict[str, dict[str, Path]] = {}
-    for name, K, viewmat, file in rows:
+    files: dict[str, dict[str, Path]] = {name: {} for name, *_ in rows}
+    for name, K, viewmat, picture, file in rows:
         known = first.setdefault(name, (K, viewmat))
         if known != (K, viewmat) and not _same(known, (K, viewmat)):
             raise CalibrationError(
                 f"Camera {name!r} of {meta} moves: its k or w2c changes at {file}; expected cameras that stand still."
             )
-        files.setdefault(name, {})[Path(file).stem] = meta.parent / "ims" / file
+        if picture is not None:
+            files[name][picture.stem] = picture
     cameras = {
         name: calibrated_camera(name, viewmat=viewmat, K=K, width=width, height=height, where=meta)
         for name, (K, viewmat) in first.items()
     }
     return cameras, files
+
+
+def _picture(pictures: NamedFiles, text: str) -> Path | None:
+    """The picture of a path below ``ims``, which may name that and what is above it."""
+    return pictures.find(text) or pictures.find("/".join(path_parts(text)[-2:]))
 
 
 def _same(a: tuple[Any, Any], b: tuple[Any, Any]) -> bool:
@@ -94,18 +99,3 @@ def _same(a: tuple[Any, Any], b: tuple[Any, Any]) -> bool:
         )
     except (TypeError, ValueError):
         return False
-
-
-def _present(files: dict[str, dict[str, Path]]) -> dict[str, dict[str, Path]]:
-    """The pictures that exist; one listing per folder is cheaper than one lookup per picture."""
-    listings: dict[Path, set[str]] = {}
-    present: dict[str, dict[str, Path]] = {}
-    for camera, pictures in files.items():
-        present[camera] = {}
-        for instant, file in pictures.items():
-            if file.parent not in listings:
-                entries = file.parent.iterdir() if file.parent.is_dir() else ()
-                listings[file.parent] = {entry.name for entry in entries}
-            if file.name in listings[file.parent]:
-                present[camera][instant] = file
-    return present

@@ -7,8 +7,10 @@ without the poses, and are inliers of some epipolar geometry, are tested against
 """
 
 import logging
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,6 +18,7 @@ from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.arrays import Floats
+from structgstream.data.calibration import listed
 from structgstream.data.matching import (
     Pair,
     angles,
@@ -28,6 +31,7 @@ from structgstream.data.matching import (
     viewing_distance,
 )
 from structgstream.data.pair_matches import MatchConfig, PairMatcher
+from structgstream.data.timeline import natural
 from structgstream.errors import CalibrationError
 from structgstream.frames import MultiViewFrame
 
@@ -46,6 +50,11 @@ class PoseCheckConfig:
         min_parallax_degrees: smallest angle between the rays at which a point behind a camera counts.
         max_share: poses are rejected if a larger share of the good matches violates them.
         min_matches: least number of good matches for a verdict.
+        pair_share: a pair contradicts the poses if a larger share of its matches violates them: of
+            right poses 0 to 0.14, of exchanged ones most.
+        empty_share: share of the pairs of neighbours without matches above which poses are suspicious: neighbours of
+            wrong poses see other things.
+        max_suspects: poses are rejected if a larger share of the cameras is suspicious.
     """
 
     matches: MatchConfig = MatchConfig()
@@ -54,6 +63,9 @@ class PoseCheckConfig:
     min_parallax_degrees: float = 0.3
     max_share: float = 0.6
     min_matches: int = 100
+    pair_share: float = 0.3
+    empty_share: float = 0.3
+    max_suspects: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -66,6 +78,8 @@ class PoseCheck:
         matches: number of good matches.
         pairs: number of pairs of cameras they come from.
         conclusive: whether ``min_matches`` is reached.
+        suspects: cameras without which no pair contradicts the poses; empty where all is right.
+        unmatched: cameras without a match to any neighbour, if these are so many that the poses are suspicious.
     """
 
     median_epipolar_error_pixels: float
@@ -73,20 +87,33 @@ class PoseCheck:
     matches: int
     pairs: int
     conclusive: bool
+    suspects: tuple[str, ...] = ()
+    unmatched: tuple[str, ...] = ()
 
 
 def check_poses(frame: MultiViewFrame, rig: CameraRig, *, config: PoseCheckConfig = PoseCheckConfig()) -> PoseCheck:
     """Test matches of neighbouring training cameras against the given poses; held-out pictures are never read.
 
+    Poses are right, or suspicious, which a warning reports with the cameras, or contradicted by the pictures.
+
     Raises:
-        CalibrationError: most good matches violate the epipolar geometry of the poses.
+        CalibrationError: most good matches violate the epipolar geometry of the poses, or those of most cameras do.
         MissingExtraError: cv2 is not installed.
     """
     given = {name: rig[name] for name in frame.showing(rig.training)}
     matcher = PairMatcher(frame.images, config.matches, masks=frame.masks)
     check = _judge(given, matcher.matches(_pairs(given, config)), config)
-    if check.conclusive and check.share_violating <= config.max_share:
+    doubted = check.suspects or check.unmatched
+    if check.conclusive and not doubted:
         return check
+    if check.conclusive and not _contradicted(check, len(given), config):
+        more = [
+            pair for pair in _pairs(given, replace(config, pairs=2 * config.pairs)) if {*doubted}.intersection(pair)
+        ]
+        check = _judge(given, matcher.matches([*dict.fromkeys([*_pairs(given, config), *more])]), config)
+        if not _contradicted(check, len(given), config):
+            _warn(check, len(given))
+            return check
     # Pairs chosen by wrong poses hardly match, so pairs chosen after undoing each common mistake are tested too.
     readings = {name: reinterpreted(given, change) for name, change in MISTAKES.items()}
     pairs = dict.fromkeys(pair for cameras in (given, *readings.values()) for pair in _pairs(cameras, config))
@@ -95,7 +122,8 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig, *, config: PoseCheckConfi
     if not check.conclusive:
         _log.warning("Too few good matches (%d) to check the camera poses against the pictures.", check.matches)
         return check
-    if check.share_violating <= config.max_share:
+    if not _contradicted(check, len(given), config):
+        _warn(check, len(given))
         return check
     shares = {name: _judge(cameras, matches, config).share_violating for name, cameras in readings.items()}
     likely = min(shares, key=lambda name: shares[name])
@@ -111,6 +139,33 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig, *, config: PoseCheckConfi
         "the epipolar geometry of the given poses (median distance "
         f"{check.median_epipolar_error_pixels:.1f} pixels). {advice}"
     )
+
+
+def _contradicted(check: PoseCheck, cameras: int, config: PoseCheckConfig) -> bool:
+    doubted = len({*check.suspects, *check.unmatched}) if check.suspects else 0
+    return check.share_violating > config.max_share or doubted > config.max_suspects * cameras
+
+
+def _warn(check: PoseCheck, cameras: int) -> None:
+    if check.suspects:
+        _log.warning(
+            "The poses or names of %s of %d look wrong: their pictures contradict the other cameras' (%.0f%% of %d "
+            "matches). Correct them, or leave these cameras out; structgstream prepare --check says more.",
+            listed(check.suspects, most=12), cameras, 100 * check.share_violating, check.matches,
+        )  # fmt: skip
+    if check.unmatched:
+        _log.warning(
+            "The pictures of %s of %d match those of no neighbour, so their poses and names are not confirmed; look at "
+            "structgstream prepare --check.",
+            listed(check.unmatched, most=12), cameras,
+        )  # fmt: skip
+
+
+def confirmed_share(cameras: Mapping[str, Camera], matcher: PairMatcher, config: PoseCheckConfig) -> float:
+    """The share of the pairs of neighbours whose pictures match and agree with the poses, to compare readings."""
+    verdicts = _verdicts(cameras, matcher.matches(_pairs(cameras, config)), config)
+    agree = [total > 0 and violating <= config.pair_share * total for total, violating, _ in verdicts.values()]
+    return sum(agree) / max(1, len(agree))
 
 
 def _inverted(viewmat: Tensor) -> Tensor:
@@ -141,15 +196,21 @@ def _pairs(cameras: Mapping[str, Camera], config: PoseCheckConfig) -> list[Pair]
     return [pairs[index] for index in chosen]
 
 
-def _judge(
-    cameras: Mapping[str, Camera],
-    matches: Mapping[Pair, tuple[Floats, Floats]],
-    config: PoseCheckConfig,
-) -> PoseCheck:
-    errors: list[Floats] = []
-    violating = 0
+class _Verdict(NamedTuple):
+    """Of a pair: how many matches it has, how many violate the poses, and their distances in pixels ``[S]``."""
+
+    total: int
+    violating: int
+    errors: Floats
+
+
+def _verdicts(
+    cameras: Mapping[str, Camera], matches: Mapping[Pair, tuple[Floats, Floats]], config: PoseCheckConfig
+) -> dict[Pair, _Verdict]:
+    verdicts = {}
     for (first, second), (pixels1, pixels2) in matches.items():
         if len(pixels1) == 0:
+            verdicts[first, second] = _Verdict(0, 0, np.empty(0))
             continue
         pair = cameras[first], cameras[second]
         error = epipolar_errors(fundamental_matrix(*pair), pixels1, pixels2)
@@ -157,15 +218,41 @@ def _judge(
         _, depths = triangulate(*pair, pixels1, pixels2)
         parallax = np.degrees(angles(rays(pair[0], pixels1), rays(pair[1], pixels2)))
         behind = (depths < 0).any(1) & (parallax > config.min_parallax_degrees)
-        violating += int(((error > config.violation_share * pair[0].width) | behind).sum())
-        errors.append(error)
-    total = sum(map(len, errors))
+        violating = int(((error > config.violation_share * pair[0].width) | behind).sum())
+        verdicts[first, second] = _Verdict(len(error), violating, error)
+    return verdicts
+
+
+def _judge(
+    cameras: Mapping[str, Camera], matches: Mapping[Pair, tuple[Floats, Floats]], config: PoseCheckConfig
+) -> PoseCheck:
+    verdicts = _verdicts(cameras, matches, config)
+    total = sum(verdict.total for verdict in verdicts.values())
     if total == 0:
         return PoseCheck(float("nan"), float("nan"), 0, 0, False)
+    judged = {pair: verdict for pair, verdict in verdicts.items() if verdict.total}
+    bad = {pair for pair, verdict in judged.items() if verdict.violating > config.pair_share * verdict.total}
+    matched = {name for pair in judged for name in pair}
+    empty = [pair for pair in verdicts if pair not in judged]
+    unmatched = {name for pair in empty for name in pair} - matched
     return PoseCheck(
-        float(np.median(np.concatenate(errors))),
-        violating / total,
+        float(np.median(np.concatenate([verdict.errors for verdict in judged.values()]))),
+        sum(verdict.violating for verdict in judged.values()) / total,
         total,
-        len(errors),
+        len(judged),
         total >= config.min_matches,
+        _suspects(bad, judged),
+        tuple(sorted(unmatched, key=natural)) if len(empty) > config.empty_share * len(verdicts) else (),
     )
+
+
+def _suspects(bad: Collection[Pair], judged: Collection[Pair]) -> tuple[str, ...]:
+    """The fewest cameras that explain the pairs that contradict the poses: greedily those with most of their pairs."""
+    found, left = list[str](), set(bad)
+    while left:
+        wrong = Counter(name for pair in left for name in pair)
+        among = Counter(name for pair in judged if not set(found).intersection(pair) for name in pair)
+        worst = max(sorted(wrong), key=lambda name: (wrong[name] / among[name], wrong[name]))
+        found.append(worst)
+        left = {pair for pair in left if worst not in pair}
+    return tuple(sorted(found, key=natural))

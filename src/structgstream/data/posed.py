@@ -4,11 +4,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from structgstream.data.lenses import Lens, Pinhole
+from structgstream.data.text_files import Unreadable, number
 
 
 @dataclass(frozen=True)
@@ -44,25 +46,27 @@ class Calibration:
         cameras: as :class:`PosedCamera`; several of one camera must agree.
         points: ``[P, 3]`` points of the scene, or None.
         held_out: names of cameras that are kept from training as published.
+        unposed: names of cameras that it has no pose of.
     """
 
     where: Path
     cameras: tuple[PosedCamera, ...]
     points: NDArray[np.float64] | None = None
     held_out: Sequence[str] = ()
+    unposed: Sequence[str] = ()
 
 
 def rigid(rotation: ArrayLike, translation: ArrayLike) -> NDArray[np.float64]:
     """The matrix ``[4, 4]`` of a rotation ``[3, 3]``, or a vector ``[3]`` in radians, and a translation ``[3]``.
 
     Raises:
-        ValueError: other shapes.
+        Unreadable: other shapes.
     """
     turned, moved = np.array(rotation, dtype=np.float64), np.array(translation, dtype=np.float64).reshape(-1)
     if turned.size == 3:
         turned = rotation_matrix(turned.reshape(3))
     if turned.shape != (3, 3) or moved.shape != (3,):
-        raise ValueError(f"a rotation of shape {turned.shape} and a translation of shape {moved.shape}")
+        raise Unreadable(f"a rotation of shape {turned.shape} and a translation of shape {moved.shape}")
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = turned, moved
     return matrix
@@ -78,6 +82,11 @@ def rotation_matrix(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
-def intrinsics(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
-    """The matrix ``[3, 3]`` of focal lengths and principal point, pixels."""
+def intrinsics(fx: Any, fy: Any, cx: Any, cy: Any) -> NDArray[np.float64]:
+    """The matrix ``[3, 3]`` of focal lengths and principal point, pixels.
+
+    Raises:
+        Unreadable: one is no finite number.
+    """
+    fx, fy, cx, cy = map(number, (fx, fy, cx, cy))
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)

@@ -8,7 +8,7 @@
     CAMERA.mp4                  one video per camera, in the folder itself or in videos/
     images/CAMERA.ext           one picture per camera: a capture of one frame
 
-Folders of pictures may lie in the capture itself, too. Which of the two layouts it is follows from the calibration: a
+and where else ``camera_files`` finds them. Which of the two layouts it is follows from the calibration: a
 camera is a name that stands for one pose. Pictures that are a uniform reduction of the size that was calibrated
 (``images_2``, ``images_4``, ``images_8``) are taken as that, and pictures of lenses are undistorted.
 """
@@ -16,6 +16,7 @@ camera is a name that stands for one pose. Pictures that are a uniform reduction
 import logging
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import chain
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
@@ -23,13 +24,15 @@ import numpy as np
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_names, listed
-from structgstream.data.folder_files import REPORT, by_stem, files_of
+from structgstream.data.camera_files import REDUCED, ROOTS, other_roots, pictures_in, videos_in
+from structgstream.data.folder_files import by_stem, files_of
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, common_pictures
 from structgstream.data.lenses import LensCamera
 from structgstream.data.picture_size import picture_size
 from structgstream.data.posed import Calibration, PosedCamera
 from structgstream.data.rectilinear import rectilinear
 from structgstream.data.source import FrameSource
+from structgstream.data.text_files import path_parts
 from structgstream.data.timeline import natural
 from structgstream.data.undistortion import undistort
 from structgstream.data.video import VideoSource, synchronised
@@ -40,10 +43,6 @@ log = logging.getLogger(__name__)
 
 PICTURE_FPS = 30.0  # folders of pictures do not state a rate
 STILL_FRACTION, STILL_DEGREES = 0.01, 0.5  # of the rig's extent; how far estimated poses of one camera may differ
-REDUCED = ("images_2", "images_4", "images_8")
-# In the order in which they are looked through; the last but one are those of the CMU Panoptic toolbox.
-ROOTS = ("frames", "images", "videos", "hdVideos", "hdImgs", "", *REDUCED)
-NO_CAMERAS = (*ROOTS, "masks", REPORT)  # of ``masks.py`` and of the check: no camera and no frame
 
 Of = TypeVar("Of")
 Pictures = Mapping[str, Mapping[str, Path]]  # camera, then instant
@@ -56,6 +55,7 @@ def open_posed(
     *,
     target: Callable[[LensCamera], Camera] = rectilinear,
     complete: bool = True,
+    fps: float | None = None,
 ) -> FrameSource:
     """The capture at ``path`` with these cameras; the calibration's points come along.
 
@@ -64,26 +64,32 @@ def open_posed(
         calibration: its cameras.
         target: chooses the pinhole to undistort a camera to, see :func:`~structgstream.data.rectilinear.rectilinear`.
         complete: whether every video must be calibrated; else the others are left out with a warning.
+        fps: frames a second of pictures; None for :data:`PICTURE_FPS`. Videos state theirs.
 
     Raises:
         CaptureError: no pictures or videos, or not of the calibrated cameras.
         CalibrationError: a camera without calibration, one that moves, or pictures of other proportions.
     """
-    for root in (path / name for name in ROOTS):
-        if videos := _videos(root):
-            videos = videos if complete else _posed(videos, calibration, root)
+    for root in chain((path / name for name in ROOTS), other_roots(path)):
+        if videos := videos_in(root):
+            partial = not complete or calibration.unposed
+            videos = _posed(videos, calibration, root) if partial else videos
             return undistort(*_of_videos(path, videos, root=root, calibration=calibration), target=target)
-        if folders := _folders(root):
+        if folders := pictures_in(root):
             files, poses = _layout(folders, calibration, root)
-            return undistort(*of_pictures(path, files, poses, root=root, calibration=calibration), target=target)
+            files = _posed(files, calibration, root) if calibration.unposed else files
+            filmed = of_pictures(path, files, poses, root=root, calibration=calibration, fps=fps)
+            return undistort(*filmed, target=target)
     for root in (path / name for name in ("images", *REDUCED, "")):
-        if stills := {name: {"0": file} for name, file in _files(root, PICTURE_SUFFIXES).items()}:
-            stills = _posed(stills, calibration, root)  # structure from motion often leaves out some photos
+        if root.is_dir() and (pictures := by_stem(files_of(root, PICTURE_SUFFIXES))):
+            # Structure from motion often leaves out some photos.
+            stills = _posed({name: {"0": file} for name, file in pictures.items()}, calibration, root)
             poses = _poses(calibration, stills)
-            return undistort(*of_pictures(path, stills, poses, root=root, calibration=calibration), target=target)
+            filmed = of_pictures(path, stills, poses, root=root, calibration=calibration, fps=fps)
+            return undistort(*filmed, target=target)
     raise CaptureError(
         f"{path} has the calibration {calibration.where} but no frames; expected images/CAMERA/FRAME.ext, "
-        "frames/FRAME/CAMERA.ext, images/CAMERA.ext or one video per camera."
+        "frames/FRAME/CAMERA.ext, images/CAMERA.ext, CAMERA.mp4 or CAMERA/anything.mp4."
     )
 
 
@@ -110,7 +116,13 @@ def _of_videos(
 
 
 def of_pictures(
-    path: Path, files: Pictures, poses: Mapping[str, PosedCamera], *, root: Path, calibration: Calibration
+    path: Path,
+    files: Pictures,
+    poses: Mapping[str, PosedCamera],
+    *,
+    root: Path,
+    calibration: Calibration,
+    fps: float | None = None,
 ) -> tuple[ImageSource, Mapping[str, LensCamera]]:
     """The pictures of the cameras of ``poses`` as they are, and these cameras with lenses.
 
@@ -127,30 +139,7 @@ def of_pictures(
     sizes = {name: picture_size(next(filter(None, pictures))) for name, pictures in common.files.items()}
     filmed = _filmed(poses, sizes, calibration)
     rig = _rig(filmed, calibration, path)
-    return ImageSource(path.name, rig, PICTURE_FPS, common.files, calibration.points, common.instants), filmed
-
-
-def _files(root: Path, suffixes: Collection[str]) -> dict[str, Path]:
-    """Files of these kinds in a folder, by stem.
-
-    Raises:
-        CaptureError: two have one.
-    """
-    if not root.is_dir():
-        return {}
-    return by_stem(files_of(root, suffixes))
-
-
-def _videos(root: Path) -> dict[str, Path]:
-    return _files(root, VIDEO_SUFFIXES)
-
-
-def _folders(root: Path) -> dict[str, dict[str, Path]]:
-    """Folders below ``root`` that hold pictures: folder name, then file stem."""
-    if not root.is_dir():
-        return {}
-    folders = (folder for folder in root.iterdir() if folder.is_dir() and folder.name not in NO_CAMERAS)
-    return {folder.name: pictures for folder in folders if (pictures := _files(folder, PICTURE_SUFFIXES))}
+    return ImageSource(path.name, rig, fps or PICTURE_FPS, common.files, calibration.points, common.instants), filmed
 
 
 def _layout(folders: Pictures, calibration: Calibration, root: Path) -> tuple[Pictures, dict[str, PosedCamera]]:
@@ -161,7 +150,9 @@ def _layout(folders: Pictures, calibration: Calibration, root: Path) -> tuple[Pi
             per_frame.setdefault(stem, {})[folder] = file
     found: list[tuple[Pictures, dict[str, PosedCamera]]] = []
     reasons: list[CalibrationError] = []
-    for files in (folders, per_frame):
+    names = [_parts(posed.name) for posed in calibration.cameras]
+    in_frames = any(len(parts) == 1 or not folders.keys().isdisjoint(parts[:-1]) for parts in names)
+    for files in (folders, per_frame) if in_frames else (folders,):
         try:
             found.append((files, _poses(calibration, files)))
         except CalibrationError as error:
@@ -181,16 +172,17 @@ def _poses(calibration: Calibration, cameras: Collection[str]) -> dict[str, Pose
     Raises:
         CalibrationError: pictures of one camera have different poses.
     """
-    parts = [_parts(posed.name) for posed in calibration.cameras]
+    names = [*(posed.name for posed in calibration.cameras), *calibration.unposed]
+    parts = [_parts(name) for name in names]
     found = [next((part for part in path if part in cameras), None) for path in parts]
-    if any(found) or any(_parts(posed.name) != (posed.name,) for posed in calibration.cameras):
-        return _still(calibration, found)
-    file_of = _by_word([posed.name for posed in calibration.cameras], cameras)
+    if any(found) or any(_parts(name) != (name,) for name in names):
+        return _still(calibration, found[: len(calibration.cameras)])
+    file_of = _by_word(names, cameras)
     if not file_of:
         numbered = {_number(name): name for name in cameras}
-        if None in numbered or len(numbered) != len(cameras) or {_number(name) for (name,) in parts} != set(numbered):
+        if None in numbered or len(numbered) != len(cameras) or not {_number(name) for name in names} >= set(numbered):
             return {}
-        file_of = {name: numbered[_number(name)] for (name,) in parts}
+        file_of = {name: numbered[_number(name)] for name in names if _number(name) in numbered}
     return _still(calibration, [file_of.get(posed.name) for posed in calibration.cameras])
 
 
@@ -203,8 +195,8 @@ def _by_word(names: Sequence[str], files: Collection[str]) -> dict[str, str]:
 
 def _parts(name: str) -> tuple[str, ...]:
     """The parts of a path, without the suffix of pictures and videos."""
-    path = PurePosixPath(name)
-    return (path.with_suffix("") if _is_file(name) else path).parts
+    *folders, last = path_parts(name) or (name,)
+    return (*folders, PurePosixPath(last).stem if _is_file(last) else last)
 
 
 def _is_file(name: str) -> bool:
@@ -226,8 +218,9 @@ def _still(calibration: Calibration, names: Sequence[str | None]) -> dict[str, P
         if name is None:
             continue
         first = found.setdefault(name, posed)
-        turn = np.trace(first.viewmat[:3, :3] @ posed.viewmat[:3, :3].T)
-        degrees = np.degrees(np.arccos(np.clip((turn - 1) / 2, -1, 1)))
+        # From the difference, which rounding in the file changes little; the trace's arc cosine turns 1e-4 into 0.6.
+        turn = float(np.linalg.norm(first.viewmat[:3, :3] - posed.viewmat[:3, :3])) / np.sqrt(8)
+        degrees = np.degrees(2 * np.arcsin(min(1.0, turn)))
         shift = float(np.linalg.norm(first.center - posed.center))
         if shift > STILL_FRACTION * extent or degrees > STILL_DEGREES:
             raise CalibrationError(
@@ -249,6 +242,10 @@ def _check(
         check_names(poses, sorted(pictured, key=natural), calibration=calibration.where, pictures=root)
         used = {posed.name for posed in poses.values()}
         idle = [posed.name for posed in calibration.cameras if posed.name not in used and not _is_file(posed.name)]
+        numbered = {name: posed.name for name, posed in poses.items() if name not in (*_parts(posed.name), posed.name)}
+        if numbered and not _by_word(list(numbered.values()), list(numbered)):
+            pairs = ", ".join(f"{name} is {own!r}" for name, own in sorted(numbered.items())[:3])
+            log.warning("%s: no names are the same, so cameras are told by their numbers alone: %s", root, pairs)
         if idle:
             log.warning("%s has no pictures of %s of %s; left out", root, listed(idle), calibration.where)
         return

@@ -7,7 +7,7 @@ calibrated again without touching what was filmed.
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import calibrated_camera, calibrated_rig
-from structgstream.data.calibration_files.reading import BROKEN, positive, readable
+from structgstream.data.calibration_files.reading import positive, readable
 from structgstream.data.folder_files import by_stem, files_of
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource
-from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential, finite
+from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
 from structgstream.data.picture_size import picture_size
 from structgstream.data.source import FrameSource
+from structgstream.data.text_files import BROKEN, Unreadable, mapping, number, pixels, read_json, reason
 from structgstream.data.timeline import Clock, common_slots, natural, picture_slots
 from structgstream.data.tone import ToneCurve, toned
 from structgstream.data.undistortion import UndistortedSource
@@ -116,15 +117,15 @@ def read_prepared(path: Path) -> PreparedCapture:
     """
     file = path / FILE
     with readable(file, EXPECTED):
-        content: dict[str, Any] = json.loads(file.read_text())
+        content: dict[str, Any] = read_json(file)
         if content["format"] != FORMAT or content["version"] != VERSION:
             raise CalibrationError(
                 f"{file} has format {content['format']!r}, version {content['version']}; this program reads "
                 f"{FORMAT!r}, version {VERSION}: prepare the capture again, or update structgstream."
             )
-        entries = dict(content["cameras"])
+        entries = mapping(content["cameras"])
         if content["unit"] not in ("metres", "arbitrary"):
-            raise ValueError(f"unit {content['unit']!r}")
+            raise Unreadable(f"unit {content['unit']!r}")
         return PreparedCapture(
             cameras={name: _read_camera(name, entry, file) for name, entry in entries.items()},
             fps=positive(content, "fps"),
@@ -183,7 +184,7 @@ def camera_of(viewmat: Any, K: Any, size: Sequence[int]) -> Camera:
         CalibrationError: invalid values.
         ValueError: values of other shapes.
     """
-    width, height = (int(side) for side in size)
+    width, height = pixels(size)
     pose = torch.from_numpy(np.array(viewmat, np.float64).reshape(4, 4))
     return Camera(pose, torch.from_numpy(np.array(K, np.float64).reshape(3, 3)), width, height)
 
@@ -235,7 +236,7 @@ def _read_points(path: Path, capture: PreparedCapture) -> NDArray[np.float64] | 
     with readable(file, "points as an array of shape [P, 3]"):
         points = np.asarray(np.load(file, allow_pickle=False), np.float64)
         if points.ndim != 2 or points.shape[1] != 3:
-            raise ValueError(f"an array of shape {points.shape}")
+            raise Unreadable(f"an array of shape {points.shape}")
     return points
 
 
@@ -255,20 +256,23 @@ def _camera_entry(camera: PreparedCamera) -> dict[str, Any]:
 
 def _read_camera(name: str, entry: dict[str, Any], file: Path) -> PreparedCamera:
     try:
-        width, height = (int(side) for side in entry["size"])
+        width, height = pixels(entry["size"])
         filmed = calibrated_camera(name, viewmat=entry["viewmat"], K=entry["K"], width=width, height=height, where=file)
-        parameters = {key: finite(value) for key, value in entry["lens"].items() if key != "model"}
-        lens = LENSES[entry["lens"]["model"]](**parameters)
+        parameters = {key: number(value) for key, value in entry["lens"].items() if key != "model"}
+        kind = LENSES[entry["lens"]["model"]]
+        if unknown := parameters.keys() - {own.name for own in fields(kind)}:  # type: ignore[arg-type]
+            raise Unreadable(f"a lens with {min(unknown)}")
+        lens = kind(**parameters)
         try:  # Its principal point may lie anywhere.
             pinhole = camera_of(entry["viewmat"], entry["pinhole"]["K"], entry["pinhole"]["size"])
         except CalibrationError as error:
             raise CalibrationError(f"The pinhole of camera {name!r} of {file}: {error}") from None
-        clock = Clock(finite(entry["clock"]["offset_seconds"]), positive(entry["clock"], "rate"))
+        clock = Clock(number(entry["clock"]["offset_seconds"]), positive(entry["clock"], "rate"))
         tone = None if entry["tone"] is None else ToneCurve(entry["tone"])
         return PreparedCamera(str(entry["files"]), LensCamera(filmed, lens), pinhole, clock, tone)
     except CalibrationError:
         raise
     except BROKEN as error:
         raise CalibrationError(
-            f"Camera {name!r} of {file} cannot be read ({type(error).__name__}: {error}); expected {EXPECTED}."
+            f"Camera {name!r} of {file} cannot be read ({reason(error)}); expected {EXPECTED}."
         ) from None

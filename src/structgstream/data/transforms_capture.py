@@ -5,13 +5,10 @@ Pictures of one pose are of one camera. Where each has a ``time``, the instants 
 videos are looked for by the cameras' names, as with other calibrations, so that a file of one instant serves for all.
 """
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
-from structgstream.data.calibration_files.reading import positive, readable
-from structgstream.data.calibration_files.transforms import WHOLE, Shot, find, read, read_shots
+from structgstream.data.calibration_files.transforms import WHOLE, Shot, find, read, read_shots, stated_fps
 from structgstream.data.posed import Calibration
 from structgstream.data.posed_capture import of_pictures, open_posed
 from structgstream.data.source import FrameSource
@@ -38,17 +35,13 @@ def open_transforms(path: Path) -> FrameSource:
     files = find(path)
     shots = read_shots(files)
     if files[0].name == WHOLE and any(shot.time is None for shot in shots):
-        return open_posed(path, read(files))
+        return open_posed(path, read(files), fps=stated_fps(files[0]))
     cameras = _by_pose(shots, files[0])
     pictures = {name: _instants(own) for name, own in cameras.items()}
     poses = {name: own[0].camera for name, own in cameras.items()}
     held_out = [name for name, own in cameras.items() if own[0].held_out]
     calibration = Calibration(files[0], tuple(poses.values()), held_out=held_out)
-    source, filmed = of_pictures(path, pictures, poses, root=path, calibration=calibration)
-    with readable(files[0], "fps as a number of frames a second"):
-        content = json.loads(files[0].read_text())
-        if content.get("fps") is not None:
-            source = replace(source, fps=positive(content, "fps"))
+    source, filmed = of_pictures(path, pictures, poses, root=path, calibration=calibration, fps=stated_fps(files[0]))
     return undistort(source, filmed)
 
 

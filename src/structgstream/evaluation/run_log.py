@@ -2,7 +2,8 @@
 """The log of a reconstruction: seconds and memory by stage, PSNR on training views.
 
 ``OUT.log.jsonl`` beside ``OUT.sgs`` has one JSON object per line, written after each frame, so that a crash loses none
-and a resumed run appends. ``peak_memory_bytes`` is the frame's largest peak; ``peak_memory_kind`` states whether peaks
+and a resumed run appends. ``stream`` is the stream's name: ``OUT`` and ``OUT.sgs`` would share a log, so the second is
+refused. ``peak_memory_bytes`` is the frame's largest peak; ``peak_memory_kind`` states whether peaks
 are of each stage (``stage``) or of the process since its start (``process``).
 """
 
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from structgstream.errors import StorageError
-from structgstream.whole_files import write_whole
+from structgstream.whole_files import side_path, write_whole
 
 if TYPE_CHECKING:
     from structgstream.frame_report import FrameReport
@@ -22,17 +23,35 @@ if TYPE_CHECKING:
 
 def log_path(stream: Path) -> Path:
     """The path of a stream's log."""
-    return stream.with_suffix(".log.jsonl")
+    return side_path(stream, ".log.jsonl")
 
 
 def begin_log(stream: Path, *, frames: int = 0) -> None:
     """Removes the entries from frame ``frames`` on: all for a new run, those of unstored frames for a resumed one.
 
     Raises:
-        StorageError: the file cannot be written.
+        StorageError: the file cannot be written, or it, or the metrics, are of another stream.
     """
+    check_side_files(stream)
     kept = [entry for index, entry in sorted(read_log(stream).items()) if index < frames]
     write_whole(log_path(stream), _lines(kept), called="The log")
+
+
+def check_side_files(stream: Path) -> None:
+    """Check that the log and the metrics beside a stream are not those of another one.
+
+    Raises:
+        StorageError: they are; nothing was changed.
+    """
+    metrics = side_path(stream, ".metrics.json")
+    for path, entries in ((log_path(stream), read_log(stream).values()), (metrics, _metrics_in(metrics))):
+        for name in {str(entry.get("stream", stream.name)) for entry in entries} - {stream.name}:
+            if side_path(Path(name), "") != side_path(Path(stream.name), ""):
+                continue  # A stream that was renamed, with its files.
+            raise StorageError(
+                f"{path} belongs to the stream {name}, and {stream.name} would need a file of the same name; choose "
+                "another name for this stream, or move that file to another place."
+            )
 
 
 def append_log(stream: Path, entry: Mapping[str, Any]) -> None:
@@ -44,7 +63,7 @@ def append_log(stream: Path, entry: Mapping[str, Any]) -> None:
     path = log_path(stream)
     try:
         with path.open("ab") as file:
-            file.write(_lines([entry]))
+            file.write(_lines([{**entry, "stream": stream.name}]))
     except OSError as error:
         raise StorageError(f"The log {path} cannot be written ({error.strerror}).") from None
 
@@ -74,16 +93,24 @@ def read_log(stream: Path) -> dict[int, dict[str, Any]]:
     """Frame number to entry; of two entries the later one, without lines truncated by a crash."""
     try:
         lines = log_path(stream).read_text().splitlines()
-    except OSError:
+    except (OSError, UnicodeDecodeError):
         return {}
     entries = {}
     for line in lines:
         try:
             entry = json.loads(line)
             entries[int(entry["index"])] = entry
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
             continue
     return entries
+
+
+def _metrics_in(path: Path) -> list[dict[str, Any]]:
+    try:
+        found = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return []
+    return [found] if isinstance(found, dict) else []
 
 
 def _lines(entries: Iterable[Mapping[str, Any]]) -> bytes:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Segments put together to one stream file, with or without a hand-over at their borders."""
 
-import shutil
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from itertools import accumulate
@@ -18,10 +18,13 @@ from structgstream.groups.handing import Border, Handing
 from structgstream.groups.handing_run import HandedRun, header_of, run_task, runs_of
 from structgstream.groups.segment_file import Segment, open_segment
 from structgstream.kernels.backend import Backend
+from structgstream.owned_folders import own_folder, remove_own
 from structgstream.training.patching import BIRTHS_PER_FRAME
 from structgstream.whole_files import whole_file
 
 POLL_SECONDS = 0.2
+PURPOSE = "hand-over of a join"
+RUNS = re.compile(r"run-\d+(\.partial)?")
 
 
 def join_segments(
@@ -43,7 +46,7 @@ def join_segments(
     Args:
         paths: of finished segments, in any order.
         output: the stream file.
-        check: decode every frame of the result, and check the births of free Gaussians.
+        check: decode every frame of the result, and check the births of free Gaussians, before it gets its name.
         backend: the compute back-end of the hand-over, which draws the frames around borders; None for a plain copy.
         workers: processes that hand over, each with one thread; one of this process. A GPU has one.
         on_border: called for each hand-over, in order.
@@ -59,7 +62,10 @@ def join_segments(
     segments = _in_order(paths)
     ordered = [path for path, _, _ in segments]
     runs = runs_of([frames for _, _, frames in segments], workers=workers)
-    with whole_file(output) as file:
+    # Free Gaussians that stand still outlive their group when they are handed over.
+    ends = accumulate(frames for _, _, frames in segments)
+    firsts = [0, *ends][:-1] if backend is None else [0]
+    with whole_file(output, check=(lambda path: check_births(path, firsts)) if check else None) as file:
         written = _Written(file)
         written.add(segments[0][1])
         if backend is not None and workers > 1 and len(runs) > 1:
@@ -72,10 +78,6 @@ def join_segments(
             for path in ordered:
                 written.segment(path, handing)
         file.write(pack_index(written.entries, file.tell()))
-    if check:
-        # Free Gaussians that stand still outlive their group when they are handed over.
-        ends = accumulate(frames for _, _, frames in segments)
-        check_births(output, [0, *ends][:-1] if backend is None else [0])
     return len(written.entries)
 
 
@@ -83,12 +85,12 @@ def join_segments(
 def _folder_of_runs(output: Path) -> Iterator[Path]:
     """A folder beside ``output`` while runs are handed over; what a killed join has left there is removed."""
     folder = output.with_name(f"{output.name}.runs")
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
+    remove_own(folder, PURPOSE, RUNS)
+    own_folder(folder, PURPOSE)
     try:
         yield folder
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        remove_own(folder, PURPOSE, RUNS, whole=True)
 
 
 def _handed(

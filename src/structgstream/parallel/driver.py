@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 
-from structgstream.errors import TaskError
+from structgstream.errors import StorageError, TaskError
 from structgstream.executors.executor import Executor, TaskQueue
 from structgstream.executors.local import LocalEngine
 from structgstream.executors.places import Place
@@ -19,6 +19,7 @@ from structgstream.whole_files import write_whole
 
 POLL_SECONDS = 0.5
 LINES_TOLD = 6
+END_CHARACTERS = 500  # by which the output of an attempt is found in a log
 
 
 class State(StrEnum):
@@ -66,6 +67,11 @@ class Job:
     unit: Unit
     output: Path
     gpus: int = 0
+
+    @property
+    def key(self) -> str:
+        """Hash of the plan."""
+        return key_of(self.plan)
 
     @property
     def plan(self) -> dict[str, object]:
@@ -202,9 +208,12 @@ class _Drive:
     def _keep_words(self, ending: Ending) -> None:
         """What a task on another machine has printed is kept here."""
         log = self._parts.log(ending.name)
-        if ending.output and not log.exists():
-            log.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(log, ending.output.encode())
+        try:
+            there = log.read_bytes() if log.exists() else b""
+            if ending.output.strip()[-END_CHARACTERS:] not in there.decode(errors="replace"):
+                write_whole(log, [there, ending.output.encode()], new_folder=True)
+        except OSError as error:
+            raise StorageError(f"{log} cannot be read ({error.strerror}).") from error
 
     def _show_running(self) -> None:
         self._mark({name: State.RUNNING for name in self._executor.running if name in self._index})

@@ -7,10 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
+from structgstream.errors import StorageError
+from structgstream.evaluation.run_log import log_path
 from structgstream.executors.task import PYTHON, Task
 from structgstream.groups.group_list import groups_path
+from structgstream.owned_folders import MARKER, Owner
 from structgstream.parallel.object_folder import ObjectFolder
-from structgstream.parallel.parts import Parts
+from structgstream.parallel.parts import OURS, Parts
 from structgstream.parallel.pieces import last_pieces
 from structgstream.parallel.staged import HERE
 from structgstream.parallel.unit import CutsTrack
@@ -98,7 +101,7 @@ class ObjectStore:
         if first:
             self._store.write(partial, self._cut(self._parts.track, first))
         segment = Path(task.result)
-        log = segment.with_suffix(".log.jsonl")
+        log = log_path(segment)
         files = ["--needs", self._name(self._parts.header), "--needs", partial]
         # The segment last: who finds it in the store finds its log.
         files += ["--gives", self._name(log), "--gives", self._name(segment)]
@@ -126,11 +129,36 @@ class ObjectStore:
             with partial.open("ab") as file:
                 file.write(pieces.read(self._store, have=file.tell()))
 
+    def claim(self, key: str) -> Owner | None:
+        """Check that the store may be used for the parts; whose it is, None if it is empty.
+
+        Args:
+            key: hash of what the run is asked for. A run of the same key whose folder of parts was lost is continued.
+
+        Raises:
+            StorageError: it holds what is not of these parts.
+        """
+        here, there = self._parts.check(), self._store.owner()
+        if there is None or (there.identity == here.identity if here is not None else there.key == key):
+            return there
+        raise StorageError(
+            f"{self._store.url} holds the parts of another run than {self._parts.folder}; nothing there was changed. "
+            "Choose another --store, or go on with the output and the options of that run."
+        )
+
+    def mark(self, owner: Owner) -> None:
+        """Marks the store as that of the parts."""
+        self._store.write(MARKER, owner.content)
+
+    def clear(self) -> None:
+        """Removes all parts in the store, and nothing else."""
+        self._store.remove(OURS)
+
     def _name(self, path: Path) -> str:
         return str(path.relative_to(self._parts.folder))
 
     def _staged(self, task: Task, files: Sequence[str]) -> Task:
         folder = str(self._parts.folder)
         inner = (word.replace(folder, HERE) for word in task.command)
-        outer = (*STAGED, "--store", self._store.url, "--name", task.name, *files, "--")
+        outer = (*STAGED, "--store", self._store.url, "--name", task.name, "--run", self._parts.run, *files, "--")
         return replace(task, command=(*outer, *inner))

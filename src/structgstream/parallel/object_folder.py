@@ -2,12 +2,14 @@
 """Files under a URL, such as a folder of an object store, that all machines of a run see."""
 
 import hashlib
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
 from structgstream.errors import StorageError
+from structgstream.owned_folders import MARKER, Owner, parse_owner
 from structgstream.remote_folders import open_url, reason_of
 
 T = TypeVar("T")
@@ -86,19 +88,50 @@ class ObjectFolder:
 
         return self._tried(listed, f"list {folder}")
 
-    def clear(self) -> None:
-        """Removes all objects.
+    def owner(self) -> Owner | None:
+        """Whose the folder is; None if there is nothing in it.
 
         Raises:
-            StorageError: they cannot be removed.
+            StorageError: it holds objects and no marker, or cannot be listed.
         """
+        names = self._all()
+        if not names:
+            return None
+        data = self.read(MARKER) if MARKER in names else None
+        found = None if data is None else parse_owner(data)
+        if found is None:
+            raise StorageError(
+                f"{self.url} holds objects and no marker of structgstream ({MARKER}), so they may be somebody else's; "
+                "nothing there was changed. Choose a --store that is empty."
+            )
+        return found
+
+    def remove(self, names: re.Pattern[str]) -> None:
+        """Removes the objects of a marked folder whose names match in full; others stay.
+
+        Raises:
+            StorageError: the folder is not marked, or they cannot be removed.
+        """
+        if self.owner() is None:
+            return
 
         def removed() -> None:
-            self._files.invalidate_cache()
-            if self._files.exists(self._root):
-                self._files.rm(self._root, recursive=True)
+            if found := [f"{self._root}/{name}" for name in self._all() if names.fullmatch(name)]:
+                self._files.rm(found)
 
         self._tried(removed, "remove what is")
+
+    def _all(self) -> list[str]:
+        """Names of all objects, also of those in folders."""
+
+        def listed() -> list[str]:
+            self._files.invalidate_cache()
+            try:
+                return [str(path).removeprefix(f"{self._root}/") for path in self._files.find(self._root)]
+            except FileNotFoundError:
+                return []
+
+        return self._tried(listed, "list the content of")
 
     def _tried(self, action: Callable[[], T], what: str) -> T:
         delay = FIRST_DELAY_SECONDS

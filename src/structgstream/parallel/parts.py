@@ -8,7 +8,8 @@ from it what it can.
 
 import hashlib
 import json
-import shutil
+import re
+import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -17,11 +18,20 @@ from typing import Any
 
 from structgstream.errors import ConfigError, StorageError
 from structgstream.executors.task import Ending
-from structgstream.file_locks import lock_file
+from structgstream.file_locks import lock_file, open_lockable
+from structgstream.owned_folders import Owner, check_owned, own_folder, remove_own
 from structgstream.whole_files import write_whole
 
 PLAN = "plan.json"
 NOTES = "done.jsonl"
+PURPOSE = "parts of a parallel run"
+OURS = re.compile(
+    r"(plan\.json|done\.jsonl|header\.(sgs|log\.jsonl|metrics\.json)|track\.sgt(\.groups)?|start-\d{6,}\.sgt"
+    r"|segments/group-\d{6,}-\d{6,}\.(sgs|log\.jsonl|metrics\.json)|logs/(header|track|join|group-\d{6,}-\d{6,})\.txt"
+    r")(\.partial)?|track\.sgt\.pieces/[0-9a-f-]+"
+)
+"""Names that parts have, here and in a store; nothing else is removed."""
+_RUN = "run"  # of the plan: what tells scratch files of one beginning from those of another
 _LOCK = ".driver"
 _PIECE_BYTES = 2**20
 
@@ -76,16 +86,28 @@ class Parts:
         """What the task prints."""
         return self.folder / "logs" / f"{name}.txt"
 
-    @contextmanager
-    def held(self) -> Iterator[None]:
-        """Keeps other drivers from this folder within the block.
+    def check(self) -> Owner | None:
+        """The owner of the folder; None if it is missing or empty.
 
         Raises:
-            StorageError: another process drives here, or the folder cannot be made.
+            StorageError: it is not one of parts.
+        """
+        return check_owned(self.folder, PURPOSE)
+
+    @contextmanager
+    def held(self, *, owner: Owner | None = None) -> Iterator[None]:
+        """Makes and marks the folder, and keeps other drivers from it within the block.
+
+        Args:
+            owner: of a folder that is made; None for a new one.
+
+        Raises:
+            StorageError: another process drives here, or the folder is not one of parts, or cannot be made.
         """
         try:
-            (self.folder / "segments").mkdir(parents=True, exist_ok=True)
-            file = (self.folder / _LOCK).open("w")
+            own_folder(self.folder, PURPOSE, owner=owner)
+            (self.folder / "segments").mkdir(exist_ok=True)
+            file = open_lockable(self.folder / _LOCK)
         except OSError as error:
             raise StorageError(f"The folder {self.folder} cannot be made ({error.strerror}).") from error
         with file:
@@ -96,23 +118,20 @@ class Parts:
             yield
 
     def clear(self) -> None:
-        """Removes all parts and notes.
+        """Removes all parts and notes, and nothing else.
 
         Raises:
             StorageError: they cannot be removed.
         """
         # Killed before its end, what is left is still parts of the old plan, and none of them is believed.
-        order = {NOTES: 0, PLAN: 2}
-        try:
-            for path in sorted(self.folder.iterdir(), key=lambda path: order.get(path.name, 1)):
-                if path.is_dir():
-                    shutil.rmtree(path)
-                elif path.name != _LOCK:
-                    path.unlink()
-            (self.folder / "segments").mkdir()
-        except OSError as error:
-            raise StorageError(f"The parts in {self.folder} cannot be removed ({error.strerror}).") from error
+        remove_own(self.folder, PURPOSE, OURS, order={NOTES: 0, PLAN: 2})
+        (self.folder / "segments").mkdir(exist_ok=True)
         self.notes.clear()
+
+    @property
+    def run(self) -> str:
+        """A name that is another one after every beginning anew."""
+        return str((_json_of(self.folder / PLAN) or {}).get(_RUN, ""))
 
     def keep_to(self, plan: Mapping[str, Any]) -> None:
         """Notes what the parts are of, or checks it.
@@ -124,14 +143,16 @@ class Parts:
         path, wanted = self.folder / PLAN, json.loads(json.dumps(plan))
         found = _json_of(path)
         if found is None:
-            write_whole(path, json.dumps(wanted, indent=1).encode() + b"\n")
-        elif found != wanted:
-            differing = sorted(key for key in {*found, *wanted} if found.get(key) != wanted.get(key))
-            first = differing[0]
-            raise ConfigError(
-                f"{self.folder} has parts of another run ({first}: {found.get(first)!r} there, {wanted.get(first)!r} "
-                "asked for); choose another output, or give --overwrite to begin anew."
-            )
+            write_whole(path, json.dumps({**wanted, _RUN: uuid.uuid4().hex}, indent=1).encode() + b"\n")
+            return
+        found.pop(_RUN, None)
+        if found == wanted:
+            return
+        first = min(key for key in {*found, *wanted} if found.get(key) != wanted.get(key))
+        raise ConfigError(
+            f"{self.folder} has parts of another run ({first}: {found.get(first)!r} there, {wanted.get(first)!r} "
+            "asked for); choose another output, or give --overwrite to begin anew."
+        )
 
     def is_whole(self, name: str, key: str, part: Path) -> bool:
         """Whether the part is there as it was when its task ended."""

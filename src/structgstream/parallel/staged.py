@@ -3,12 +3,14 @@
 
 What the command needs is brought into a folder of this machine, and what it makes is taken to the store: a file that
 grows (``--grows``) piece by piece while the command runs, others when it has ended well. The folder stays when the
-command is killed, so that the next attempt on this machine goes on there.
+command is killed, so that the next attempt of the same run on this machine goes on there; a run that was begun anew
+(``--run``) has another folder, and removes that of before.
 """
 
 import argparse
+import hashlib
 import os
-import shutil
+import re
 import subprocess
 import sys
 import tempfile
@@ -17,6 +19,7 @@ from pathlib import Path
 
 from structgstream.errors import StructGStreamError
 from structgstream.executors.task import words
+from structgstream.owned_folders import MARKER, own_folder, owner_of, remove_own
 from structgstream.parallel.object_folder import ObjectFolder
 from structgstream.parallel.pieces import GrowingCopy, last_pieces
 from structgstream.whole_files import partial_path, write_whole
@@ -25,7 +28,11 @@ HERE = "{here}"
 """In a word of the command: the folder of this machine."""
 SCRATCH = "STRUCTGSTREAM_SCRATCH"
 """The variable that names a folder for files of this machine; without it, that of temporary files."""
+PURPOSE = "scratch files of a task"
+ANY = re.compile(f"(?!{re.escape(MARKER)}$).*", re.DOTALL)
 LOOK_SECONDS = 1.0
+SIGNALLED = 128
+"""Statuses from here on are those of a signal."""
 
 
 class Staging:
@@ -34,11 +41,11 @@ class Staging:
     def __init__(self, store: ObjectFolder, folder: Path) -> None:
         self.store, self.folder = store, folder
 
-    def bring(self, name: str) -> None:
-        """Takes a file from the store, unless it is not there or an earlier attempt has left it here."""
+    def bring(self, name: str, *, anew: bool = False) -> None:
+        """Takes a file from the store, unless it is not there, or, if not ``anew``, an earlier attempt has left it."""
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        if not path.exists() and (data := self.store.read(name)) is not None:
+        if (anew or not path.exists()) and (data := self.store.read(name)) is not None:
             write_whole(path, data)
 
     def bring_growing(self, name: str) -> None:
@@ -58,12 +65,9 @@ class Staging:
 
 def run(options: argparse.Namespace) -> int:
     """Brings, runs, and takes; returns the status of the command."""
-    scratch = os.environ.get(SCRATCH) or tempfile.gettempdir()
-    # Tasks of two runs may have one name, those of one run may not.
-    unique = "".join(character if character.isalnum() else "-" for character in f"{options.store}-{options.name}")
-    staging = Staging(ObjectFolder(options.store), Path(scratch) / f"structgstream-{unique}")
+    staging = Staging(ObjectFolder(options.store), scratch_folder(options))
     for name in options.needs:
-        staging.bring(name)
+        staging.bring(name, anew=True)
     for name in options.gives:
         staging.bring(name)
     for name in options.grows:
@@ -85,10 +89,28 @@ def run(options: argparse.Namespace) -> int:
     if status == 0:
         for name in (*options.grows, *options.gives):
             staging.take(name)
-        shutil.rmtree(staging.folder, ignore_errors=True)
+    if 0 <= status < SIGNALLED:  # What ended by itself would end so again.
+        remove_own(staging.folder, PURPOSE, ANY, whole=True)
     if status < 0:  # As the command ended, so that the task counts as killed.
         os.kill(os.getpid(), -status)
     return status
+
+
+def scratch_folder(options: argparse.Namespace) -> Path:
+    """The marked folder of a task on this machine, where those of earlier runs of it are removed.
+
+    Raises:
+        StorageError: it is somebody else's, or cannot be made.
+    """
+    above = Path(os.environ.get(SCRATCH) or tempfile.gettempdir())
+    # Tasks of two runs may have one name, those of one run may not.
+    task = hashlib.sha256(f"{options.store}\n{options.name}".encode()).hexdigest()[:16]
+    folder = above / f"structgstream-{task}-{options.run}"
+    for earlier in above.glob(f"structgstream-{task}-*"):
+        if earlier != folder and (owner := owner_of(earlier)) is not None and owner.purpose == PURPOSE:
+            remove_own(earlier, PURPOSE, ANY, whole=True)
+    own_folder(folder, PURPOSE)
+    return folder
 
 
 def parsed(arguments: Sequence[str]) -> argparse.Namespace:
@@ -96,6 +118,7 @@ def parsed(arguments: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--store", required=True, metavar="URL")
     parser.add_argument("--name", required=True, help="of the task")
+    parser.add_argument("--run", default="", help="what tells one beginning of the run from the next")
     for flag, text in (
         ("needs", "file to bring"),
         ("gives", "file to take when the command has ended well, and to bring before if it is there"),

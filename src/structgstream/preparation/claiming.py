@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from structgstream.errors import CaptureError, StorageError
-from structgstream.file_locks import lock_file
+from structgstream.file_locks import lock_file, open_lockable
 from structgstream.preparation.steps import FOLDER
 from structgstream.whole_files import partial_path, replacing
 
@@ -38,9 +38,7 @@ def claim(capture: Path, videos: Path) -> None:
             )
         return
     if any(entry not in _CLAIMS for entry in _below(capture)):
-        raise CaptureError(
-            f"The folder {capture} is not empty and was not made by prepare; choose another with -o, or empty it."
-        )
+        raise CaptureError(f"The folder {capture} is not empty and was not made by prepare; choose another with -o.")
     try:
         marker.parent.mkdir(parents=True, exist_ok=True)
         with replacing(marker) as file:
@@ -60,7 +58,7 @@ def alone(capture: Path) -> Iterator[None]:
         StorageError: another one does, or the folder cannot be written.
     """
     try:
-        file = (capture / FOLDER / LOCK).open("wb")
+        file = open_lockable(capture / FOLDER / LOCK)
     except OSError as error:
         raise StorageError(f"The folder {capture} cannot be written ({error.strerror}).") from None
     with file:

@@ -10,6 +10,7 @@
 """
 
 import logging
+import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -20,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.audio import read_audio
-from structgstream.data.folder_files import REPORT, files_of, is_hidden
+from structgstream.data.camera_files import NO_CAMERAS, ROOTS, filmed_folder, other_roots
+from structgstream.data.folder_files import files_of, is_hidden
 from structgstream.data.images import PICTURE_SUFFIXES, read_picture
 from structgstream.data.picture_size import picture_size
 from structgstream.data.prepared import pictures_of
@@ -34,12 +36,11 @@ _log = logging.getLogger(__name__)
 
 PICTURE_FPS = 30.0  # folders of pictures state no rate
 WORTH_SEEKING = 60  # frames; closer ones are decoded in one pass
-SUBFOLDERS = ("", "videos", "images")
-NO_CAMERAS = (*SUBFOLDERS, "masks", "board", REPORT)
 FILMED = VIDEO_SUFFIXES | PICTURE_SUFFIXES | {
     ".360", ".3gp", ".avi", ".dng", ".heic", ".insv", ".m2ts", ".mpeg", ".mpg", ".mts", ".mxf", ".wmv",
 }  # fmt: skip
 """What a camera may have written, also in ways that are not read here."""
+CHAPTER = re.compile(r"(G[HLPSX]\d\d|GOPR)", re.IGNORECASE)  # of a GoPro, GX010001 and GX020001
 LAYOUTS = "CAMERA.mp4, CAMERA/anything.mp4, CAMERA/FRAME.jpg or CAMERA.jpg"
 
 
@@ -171,10 +172,20 @@ def find_footage(where: Path, *, picture_fps: float | None = None) -> Footage:
     if not where.is_dir():
         kind = "a file" if where.exists() else "missing"
         raise CaptureError(f"{where} is {kind}; give the folder that holds the cameras' videos ({LAYOUTS}).")
-    for root in (where / name for name in SUBFOLDERS):
-        if root.is_dir() and (files := _found(root)):
-            ordered = {name: files[name] for name in sorted(files, key=natural)}
-            return _footage(where, ordered, picture_fps or PICTURE_FPS)
+    found = {root: _found(root) for root in (where / name for name in ("", *ROOTS)) if root.is_dir()}
+    # A stray picture or preview beside the folder of the videos is no take: two cameras come before one.
+    root = next((root for least in (2, 1) for root, files in found.items() if len(files) >= least), None)
+    if root is None or len(found[root]) < 2:
+        root = next(other_roots(where), root)
+    if root is not None:
+        files = found.get(root) or _found(root)
+        if root != where:
+            _log.info("The cameras are those of %s", root)
+        for stray in found[where] if root != where else ():
+            _log.warning("%s is left out: the cameras are those of %s", found[where][stray], root)
+        _check_left(root, files)
+        ordered = {name: files[name] for name in sorted(files, key=natural)}
+        return _footage(where, ordered, picture_fps or PICTURE_FPS)
     held = ", ".join(sorted(entry.name for entry in where.iterdir())[:6])
     found = f"holds no videos and no pictures, but {held}" if held else "is empty"
     raise CaptureError(f"{where} {found}; expected {LAYOUTS}.")
@@ -225,10 +236,17 @@ def _found(root: Path) -> dict[str, Path]:
     entries = sorted(entry for entry in root.iterdir() if not is_hidden(entry))
     for suffixes in (VIDEO_SUFFIXES, PICTURE_SUFFIXES):
         found: dict[str, Path] = {}
+        several: list[tuple[Path, list[Path]]] = []
         for entry in entries:
             file = entry if entry.is_file() and entry.suffix.lower() in suffixes else None
             if entry.is_dir() and entry.name not in NO_CAMERAS:
-                file = _of_folder(entry, suffixes)
+                file = filmed_folder(entry, suffixes)
+                if file is not None and suffixes is VIDEO_SUFFIXES:
+                    files = files_of(file, suffixes)
+                    file = files[0]
+                    if len(files) > 1:
+                        several.append((entry, files))
+                        continue
             if file is None:
                 continue
             name = entry.stem if entry.is_file() else entry.name
@@ -238,20 +256,28 @@ def _found(root: Path) -> dict[str, Path]:
                     "camera: join them or move one out of the folder."
                 )
             found[name] = file
+        for folder, files in several:
+            if {file.resolve() for file in files} <= {file.resolve() for file in found.values()}:
+                continue  # what the links in root lead to
+            if found or all(CHAPTER.match(file.stem) for file in files):
+                raise CaptureError(
+                    f"The folder {folder} of camera {folder.name!r} holds {len(files)} videos ({files[0].name}, "
+                    f"{files[1].name}, ...); expected one per camera: join the chapters of the take to one file, "
+                    "or move the folder away if it is no camera's."
+                )
         if found:
-            _check_left(root, entries, found)
             return found
     return {}
 
 
-def _check_left(root: Path, entries: Sequence[Path], found: Mapping[str, Path]) -> None:
+def _check_left(root: Path, found: Mapping[str, Path]) -> None:
     """What is no camera, told, so that none is lost unnoticed.
 
     Raises:
         CaptureError: an empty folder beside those of cameras.
     """
     taken = next(iter(found.values()))
-    for entry in entries:
+    for entry in sorted(entry for entry in root.iterdir() if not is_hidden(entry)):
         if entry.is_file() and entry.suffix.lower() in FILMED and entry not in found.values():
             _log.warning(
                 "The file %s is left out: it is not of the kind of %s. If it is a camera's, convert it, keeping the "
@@ -269,18 +295,3 @@ def _check_left(root: Path, entries: Sequence[Path], found: Mapping[str, Path]) 
             "The folder %s is left out: it holds no %s, as %s does. If it is a camera, give all of one kind.",
             entry, "video" if taken.suffix.lower() in VIDEO_SUFFIXES else "picture", taken,
         )  # fmt: skip
-
-
-def _of_folder(folder: Path, suffixes: Collection[str]) -> Path | None:
-    """The one video in a camera's folder, or the folder itself when it holds pictures."""
-    files = files_of(folder, suffixes)
-    if not files:
-        return None
-    if suffixes is PICTURE_SUFFIXES:
-        return folder
-    if len(files) > 1:
-        raise CaptureError(
-            f"The folder {folder} of camera {folder.name!r} holds {len(files)} videos ({files[0].name}, "
-            f"{files[1].name}, ...); expected one per camera: join the chapters of the take to one file."
-        )
-    return files[0]

@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibrations that are there already: of other tools, or of another capture of the same cameras."""
 
-from collections.abc import Callable
 from pathlib import Path
 
-from structgstream.data.calibrated_capture import read_calibrated
-from structgstream.data.calibration_files import transforms
-from structgstream.data.colmap import find_model, read_model
+from structgstream.data.found_calibrations import calibration_below, read_calibration
 from structgstream.data.immersive import MODELS, read_models
 from structgstream.data.json_videos import FILE as CAMERAS
 from structgstream.data.json_videos import read_cameras
@@ -18,7 +15,7 @@ from structgstream.errors import CalibrationError
 
 
 def find_calibration(where: Path) -> Calibration | None:
-    """The calibration in a folder, or that a file holds; None when there is none that is known.
+    """The calibration in a folder or one folder below, or that a file holds; None when there is none that is known.
 
     Raises:
         CalibrationError: it is broken, or a pickle.
@@ -34,12 +31,10 @@ def find_calibration(where: Path) -> Calibration | None:
         return _of_cameras(folder / CAMERAS)
     if meant(MODELS):
         return read_models(folder / MODELS)
-    readers: tuple[Callable[[], Calibration | None], ...] = (
-        lambda: _of_colmap(folder, file),
-        lambda: _of_transforms(folder, file),
-        lambda: read_calibrated(folder, file),
-    )
-    return next((found for read in readers if (found := read()) is not None), None)
+    if (found := read_calibration(folder, file)) is not None or file is not None:
+        return found
+    below = calibration_below(folder)
+    return None if below is None else read_calibration(below)
 
 
 def demand_calibration(where: Path) -> Calibration:
@@ -76,15 +71,3 @@ def _of_cameras(file: Path) -> Calibration:
         for name, camera in rig.cameras.items()
     )
     return Calibration(file, cameras, held_out=rig.testing)
-
-
-def _of_colmap(folder: Path, file: Path | None) -> Calibration | None:
-    model = find_model(folder)
-    if model is None or (file is not None and file.parent != model):
-        return None
-    return read_model(model)
-
-
-def _of_transforms(folder: Path, file: Path | None) -> Calibration | None:
-    files = transforms.find(folder)
-    return transforms.read(files) if files and (file is None or file in files) else None

@@ -16,6 +16,7 @@ from structgstream.codec.segments.quality_list import MOST_LIST_BYTES, QUALITIES
 from structgstream.errors import PlayerError, StreamError
 from structgstream.server.files import OpenedFile, open_below
 from structgstream.server.names import MANIFEST, STREAM_SUFFIX, is_stream_name
+from structgstream.whole_files import side_path
 
 LOOK_AGAIN_SECONDS: Final = 1.0
 MOST_ENTRIES: Final = 10_000
@@ -75,13 +76,13 @@ class ServedStream:
         return open_below(self.root, self.name)
 
     def open_beside(self, suffix: str) -> OpenedFile | None:
-        """The file beside the stream that is named after it, with another suffix; None without one. Blocks.
+        """The file beside the stream that is named after it, with this ending; None without one. Blocks.
 
         Raises:
             OSError: the system cannot open files now.
         """
         *folders, own = self.name.split("/")
-        return open_below(self.root, *folders, Path(own).with_suffix(suffix).name)
+        return open_below(self.root, *folders, side_path(Path(own), suffix).name)
 
 
 class Catalog:

@@ -181,7 +181,7 @@ class _Rounds:
             current, self.views, self.changes, config=config.motion, backend=fit.backend, floor=self.floor
         )
         away = (current.anchors.positions != self.first.anchors.positions).any(1)
-        return Partition.of(current, replace(found, anchors=found.anchors | away, free=~found.unseen))
+        return Partition.of(current, replace(found, anchors=found.anchors | away, free=torch.ones_like(found.free)))
 
     def _recalled(self, partition: Partition, views: list[View]) -> tuple[Partition, int]:
         """``partition`` with its stragglers where their neighbours are; how many they are."""

@@ -68,8 +68,6 @@ class MotionConfig:
     carried_share: float = 0.0
     """An anchor that fewer than ``least_views`` views show is trained if at least this share of its nearest shown ones
     is: it lies in or behind what moves. 0: none."""
-    unseen_pixels: float = 0.0
-    """Free Gaussians that cover fewer pixels than this in every view, by blending weight, are removed. 0: none."""
     picture_scale: float = 0.25
     """Scale of width and height, relative to the reference size, of the pictures on which coverage is computed."""
     margin_pixels: int = 8
@@ -103,7 +101,6 @@ class MotionSegmentation:
     Args:
         anchors: mask ``[M]`` of moving anchors.
         free: mask ``[F]`` of moving free Gaussians.
-        unseen: mask ``[F]`` of free Gaussians, not in ``free``, that no view shows.
         visible: by index of each trusted view, mask ``[M * K + F]`` (Note [Ids]) of the visible Gaussians.
         trusted: positions of the views that are no outliers (``trust``); only their votes count.
         scene_cut: whether most pictures changed everywhere, so that motion cannot be segmented.
@@ -117,7 +114,6 @@ class MotionSegmentation:
 
     anchors: Tensor
     free: Tensor
-    unseen: Tensor
     visible: dict[int, Tensor]
     trusted: tuple[int, ...] = ()
     scene_cut: bool = False
@@ -212,13 +208,11 @@ def segment_motion(
     seen, votes = (torch.stack([getattr(view_evidence[n], name) for n in trusted]).sum(0) for name in ("seen", "votes"))
     coverage = torch.stack([view_evidence[n].coverage for n in trusted])
     enough = (votes >= config.least_views) & (votes >= config.least_views_share * ease * seen)
-    unseen = coverage[:, coverage.shape[1] - free :].amax(0) < config.unseen_pixels
     shown = seen[:anchors] >= config.least_views
     carried = carried_anchors(scene.anchors.positions, enough[:anchors], shown, share=config.carried_share)
     found = MotionSegmentation(
         enough[:anchors] | carried,
-        enough[anchors:] & ~unseen,
-        unseen,
+        enough[anchors:],
         visible={views[n].index: view_evidence[n].coverage > config.least_pixels for n in trusted},
         trusted=tuple(trusted),
         scene_cut=is_scene_cut(view_changes),

@@ -328,7 +328,7 @@ def _fit_moving_part(
     return replace(
         result,
         scene=partition.merge(result.scene),
-        pruned=result.pruned + int(segmentation.unseen.sum()) + new.counts["blamed"],
+        pruned=result.pruned + new.counts["blamed"],
         spawned=result.spawned + len(new.new_free),
         counts={
             **result.counts,

@@ -31,7 +31,7 @@ class Partition:
         whole: the scene.
         segmentation: the motion segmentation.
         moving: the moving part.
-        still: the still part, without free Gaussians that no view shows.
+        still: the static part.
     """
 
     whole: Scene
@@ -47,7 +47,7 @@ class Partition:
             return replace(scene, anchors=scene.anchors.select(anchors), free=scene.free.select(free))
 
         moving = part(segmentation.anchors, segmentation.free)
-        return cls(scene, segmentation, moving, part(~segmentation.anchors, ~(segmentation.free | segmentation.unseen)))
+        return cls(scene, segmentation, moving, part(~segmentation.anchors, ~segmentation.free))
 
     def merge(self, moved: Scene) -> Scene:
         """The whole scene with its moving part replaced by ``moved``; the still part keeps its bits.

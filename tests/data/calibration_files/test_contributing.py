@@ -12,9 +12,11 @@ import pytest
 
 from calibrations import POINTS, pixels, truths
 from captures import HEIGHT, WIDTH
-from structgstream.data.calibration_files.reading import each_camera, readable
+from structgstream.data.calibration_files.reading import calibration_of, readable
 from structgstream.data.lenses import from_integer_centers
 from structgstream.data.posed import Calibration, PosedCamera, intrinsics, rigid
+from structgstream.data.text_files import number, read_text
+from structgstream.data.text_files import pixels as picture_pixels
 from structgstream.errors import CalibrationError
 
 ROOT = Path(__file__).parents[3]
@@ -25,9 +27,10 @@ def converter() -> dict[str, Any]:
     section = (ROOT / "CONTRIBUTING.md").read_text().split("### A capture format")[1].split("\n##")[0]
     (code,) = re.findall(r" *```python\n(.*?)```", section, re.DOTALL)
     known: dict[str, Any] = {
-        "csv": csv, "Path": Path, "readable": readable, "each_camera": each_camera, "EXPECTED": "a row a camera",
+        "csv": csv, "Path": Path, "readable": readable, "calibration_of": calibration_of, "EXPECTED": "a row a camera",
         "Calibration": Calibration, "PosedCamera": PosedCamera, "intrinsics": intrinsics, "rigid": rigid,
-        "from_integer_centers": from_integer_centers,
+        "from_integer_centers": from_integer_centers, "read_text": read_text, "number": number,
+        "pixels": picture_pixels,
     }  # fmt: skip
     exec(compile(textwrap.dedent(code), "CONTRIBUTING.md", "exec"), known)
     return known

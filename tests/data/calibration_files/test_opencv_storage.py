@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from structgstream.data.calibration_files.opencv_storage import is_storage, read_storage
+from structgstream.data.text_files import Unreadable
 
 MATRIX = np.arange(6.0).reshape(2, 3)
 
@@ -38,9 +39,8 @@ def test_every_kind_of_value_comes_back(tmp_path: Path, name: str) -> None:
     assert set(found) == {"K", "count", "error", "name", "list", "inner"}
     np.testing.assert_array_equal(found["K"], MATRIX)
     np.testing.assert_array_equal(found["inner"]["T"], MATRIX.T)
-    assert (found["count"], found["error"], found["name"], found["list"]) == (3, 0.25, "cam 1", ["a", "b"])
-    assert isinstance(found["count"], int)
-    assert found["inner"]["rows"] == 7  # a number of that name makes no matrix
+    assert (found["count"], found["error"], found["name"], found["list"]) == ("3", "0.25", "cam 1", ["a", "b"])
+    assert found["inner"]["rows"] == "7"  # a number of that name makes no matrix
 
 
 def test_other_files(tmp_path: Path) -> None:
@@ -48,7 +48,28 @@ def test_other_files(tmp_path: Path) -> None:
         (tmp_path / "x.yml").write_bytes(content)
         assert not is_storage(tmp_path / "x.yml")
     (tmp_path / "x.yml").write_text("%YAML:1.0\n---\nK: !!opencv-matrix\n   rows: 3\n   cols: [\n")
-    with pytest.raises(ValueError, match="OpenCV cannot parse it"):
+    with pytest.raises(Unreadable, match="it is not YAML at line 6"):
         read_storage(tmp_path / "x.yml")
     with pytest.raises(FileNotFoundError):
         read_storage(tmp_path / "none.yml")
+
+
+@pytest.mark.parametrize(
+    ("size", "told"), [((3, 3), "3x3 with 6 numbers"), ((9999, 9999), "9999x9999"), ((-2, -3), "-2x-3")]
+)
+def test_matrices_of_another_size_than_stated(tmp_path: Path, size: tuple[int, int], told: str) -> None:
+    """OpenCV writes beyond its memory here."""
+    file = written(tmp_path / "rig.yml")
+    text = file.read_text().replace("rows: 2", f"rows: {size[0]}", 1).replace("cols: 3", f"cols: {size[1]}", 1)
+    file.write_text(text)
+    with pytest.raises(Unreadable, match=f"a matrix of {told}"):
+        read_storage(file)
+
+
+def test_decimal_commas_of_xml(tmp_path: Path) -> None:
+    file = tmp_path / "rig.xml"
+    file.write_text(
+        '<?xml version="1.0"?>\n<opencv_storage><K type_id="opencv-matrix"><rows>1</rows><cols>2</cols><dt>d</dt>'
+        "<data>\n 0,5 -1,25e1</data></K></opencv_storage>"
+    )
+    np.testing.assert_array_equal(read_storage(file)["K"], [[0.5, -12.5]])

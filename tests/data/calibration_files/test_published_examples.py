@@ -133,13 +133,15 @@ def test_zju_names_cameras_by_folder(tmp_path: Path) -> None:
         zju_mocap.read(next(zju_mocap.find(tmp_path)))
 
 
-def test_opencv_files_without_a_pose(tmp_path: Path) -> None:
+def test_opencv_files_without_a_pose(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """What cv2.calibrateCamera's sample writes has intrinsics alone."""
     write_opencv(tmp_path, truths())
     file = tmp_path / "cam01.yml"
     file.write_text(file.read_text().replace("R: !!", "unknown: !!"))
-    with pytest.raises(CalibrationError, match=r"Camera 'cam01' of .* cannot be read \(no 'R or rvec or rotation'\)"):
-        opencv_cameras.read(next(opencv_cameras.find(tmp_path)))
-    file.write_text("%YAML:1.0\n---\na: [\n")
-    with pytest.raises(CalibrationError, match=r"Camera 'cam01' of .* cannot be read"):
+    found = opencv_cameras.read(next(opencv_cameras.find(tmp_path)))
+    assert [camera.name for camera in found.cameras] == ["cam00", "cam02"]
+    assert found.unposed == ("cam01",)
+    assert "has no pose of camera 'cam01'; left out" in caplog.text
+    file.write_text("%YAML:1.0\n---\nK: !!opencv-matrix\n  rows: [\n")
+    with pytest.raises(CalibrationError, match=r"Camera 'cam01' of .* cannot be read \(it is not YAML at line \d\)"):
         opencv_cameras.read(next(opencv_cameras.find(tmp_path)))

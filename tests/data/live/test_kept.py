@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.data.live.kept import LAST, KeptFrames, kept_folder
-from structgstream.errors import CaptureError
+from structgstream.errors import CaptureError, StorageError
 from structgstream.frames import MultiViewFrame
 from test_picture_file import some_frame
 
@@ -19,14 +19,14 @@ def kept(folder: Path, *, resume: bool = False) -> KeptFrames:
 
 
 def test_the_folder_lies_beside_the_stream() -> None:
-    assert kept_folder(Path("takes/one.sgs")) == Path("takes/one.live")
+    assert kept_folder(Path("takes/one.27")) == Path("takes/one.27.live")
 
 
 def test_frame_0_and_the_last_frames_are_kept_and_no_more(tmp_path: Path) -> None:
     frames = kept(tmp_path / "x.live")
     for index in range(20):
         frames.keep(frame(index), origin_seconds=100.0)
-        assert len(list((tmp_path / "x.live").iterdir())) <= 1 + LAST
+        assert len(list((tmp_path / "x.live").glob("frame-*"))) <= 1 + LAST
     again = kept(tmp_path / "x.live", resume=True)
     assert [one.index for one in again.following(18)] == [18, 19]
     first = next(again.following(0))
@@ -42,7 +42,7 @@ def test_what_a_period_needs_is_kept_instead(tmp_path: Path) -> None:
         frames.keep(frame(index), origin_seconds=0.0)
         if index == 12:
             frames.need(11, last=4)
-    found = sorted(int(file.name[6:14]) for file in (tmp_path / "x.live").iterdir())
+    found = sorted(int(file.name[6:14]) for file in (tmp_path / "x.live").glob("frame-*"))
     assert found == [11, *range(14, 20)]
 
 
@@ -53,7 +53,7 @@ def test_several_periods_keep_a_first_frame_each(tmp_path: Path) -> None:
         frames.keep(frame(index), origin_seconds=0.0)
         if index == 6:
             frames.need(4, 6, last=0)
-    found = sorted(int(file.name[6:14]) for file in (tmp_path / "x.live").iterdir())
+    found = sorted(int(file.name[6:14]) for file in (tmp_path / "x.live").glob("frame-*"))
     assert found == [4, 6, 17, 18, 19]
 
 
@@ -67,7 +67,23 @@ def test_frames_of_a_run_that_was_resumed_earlier_are_removed(tmp_path: Path) ->
 
 def test_another_stream_begins_without_them(tmp_path: Path) -> None:
     kept(tmp_path / "x.live").keep(frame(0), origin_seconds=0.0)
-    assert list(kept(tmp_path / "x.live").following(0)) == []
+    kept(tmp_path / "x.live").keep(replace(frame(0), pts_seconds=9.0), origin_seconds=0.0)
+    assert [one.pts_seconds for one in kept(tmp_path / "x.live", resume=True).following(0)] == [9.0]
+
+
+def test_what_may_be_removed_stays_until_the_first_frame_is_kept(tmp_path: Path) -> None:
+    """Until then the stream that it belongs to is there, too."""
+    kept(tmp_path / "x.live").keep(frame(0), origin_seconds=0.0)
+    kept(tmp_path / "x.live")
+    assert [one.index for one in kept(tmp_path / "x.live", resume=True).following(0)] == [0]
+
+
+def test_a_folder_of_others_is_refused_and_stays(tmp_path: Path) -> None:
+    (tmp_path / "frame-00000000.pictures").write_bytes(b"mine")
+    for resume in (False, True):
+        with pytest.raises(StorageError, match="somebody else's; nothing in it was changed"):
+            kept(tmp_path, resume=resume)
+    assert [file.read_bytes() for file in tmp_path.iterdir()] == [b"mine"]
 
 
 def test_without_the_pictures_a_stream_cannot_go_on(tmp_path: Path) -> None:
@@ -75,7 +91,7 @@ def test_without_the_pictures_a_stream_cannot_go_on(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="frame 5 are not in .* cannot be resumed"):
         list(frames.following(5))
     frames.keep(frame(5), origin_seconds=0.0)
-    (file,) = (tmp_path / "x.live").iterdir()
+    (file,) = (tmp_path / "x.live").glob("frame-*")
     file.write_bytes(file.read_bytes()[:-5])
     with pytest.raises(CaptureError, match="damaged.*begin another"):
         list(frames.following(5))

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from structgstream.data.live.matching import LivePicture, PictureSet
-from structgstream.data.live.outlets import MOST_UNWRITTEN, DiskQueue, Latest
+from structgstream.data.live.outlets import MOST_UNWRITTEN, PURPOSE, DiskQueue, Latest
 from structgstream.errors import StorageError
 from structgstream.frames import MultiViewFrame
+from structgstream.owned_folders import own_folder
 
 WAIT = 10.0
 
@@ -154,10 +155,21 @@ def test_a_full_disk_is_an_error_for_who_takes(tmp_path: Path) -> None:
 
 
 def test_what_an_earlier_run_left_is_removed(tmp_path: Path) -> None:
-    (tmp_path / "set-00000099").write_bytes(b"old")
+    own_folder(tmp_path, PURPOSE)
+    others = [tmp_path / name for name in ("set-list.txt", "set-00000099.jpg")]
+    for file in (*others, tmp_path / "set-00000099", tmp_path / "set-00000100.partial"):
+        file.write_bytes(b"old")
     outlet = DiskQueue(tmp_path, most_bytes=10**6, convert=convert)
-    assert list(tmp_path.iterdir()) == []
+    assert sorted(tmp_path.glob("set-*")) == sorted(others)
     outlet.close()
+    assert sorted(tmp_path.glob("set-*")) == sorted(others)
+
+
+def test_a_folder_of_others_is_refused_and_stays(tmp_path: Path) -> None:
+    (tmp_path / "set-00000099").write_bytes(b"mine")
+    with pytest.raises(StorageError, match="somebody else's"):
+        DiskQueue(tmp_path, most_bytes=10**6, convert=convert)
+    assert (tmp_path / "set-00000099").read_bytes() == b"mine"
 
 
 def test_a_set_that_a_power_failure_has_damaged_is_skipped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -42,6 +42,12 @@ def test_spaces_and_a_byte_order_mark_are_read(tmp_path: Path) -> None:
     assert read_timestamps(file, STAMPS)["right"].clock.offset_seconds == 2
 
 
+def test_a_spreadsheet_with_decimal_commas(tmp_path: Path) -> None:
+    file = tmp_path / "timestamps.csv"
+    file.write_bytes("camera;frame;seconds\r\nleft;0;1,5\r\nright;0;2,25\r\n".encode("utf-16"))
+    assert read_timestamps(file, STAMPS)["right"].clock.offset_seconds == 2.25
+
+
 @pytest.mark.parametrize(
     ("rows", "header", "message"),
     [

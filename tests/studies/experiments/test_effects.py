@@ -64,7 +64,6 @@ def test_what_the_switches_are() -> None:
     assert online["compact-without-residuals"].motion.residual_threshold == 0.0 < whole.motion.residual_threshold
     assert whole.rounding.free_priced
     assert not online["compact-free-unpriced"].rounding.free_priced
-    assert online["compact-unseen-kept"].motion.unseen_pixels == 0.0 < whole.motion.unseen_pixels
     paced = online["compact-more-iterations"]  # The key is from when the whole had fewer, not more.
     assert (
         (paced.iterations, paced.patching.iteration)

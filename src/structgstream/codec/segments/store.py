@@ -9,7 +9,7 @@ from typing import Protocol
 
 from structgstream.codec.container.disk_room import free_bytes
 from structgstream.errors import StorageError, StreamError
-from structgstream.file_locks import lock_file
+from structgstream.file_locks import lock_file, open_lockable
 from structgstream.whole_files import replacing
 
 _TEMPORARY = ".new-"
@@ -106,11 +106,11 @@ class FolderStore:
         """Keep other processes from writing here, until this one ends or forgets the store.
 
         Raises:
-            StorageError: another process writes here.
+            StorageError: another process writes here, or the lock's file cannot be opened, or is a link.
         """
         path = self.folder / _LOCK
         try:
-            file = path.open("w")
+            file = open_lockable(path)
         except OSError as error:
             raise StorageError(f"{self.folder} cannot be written ({error.strerror}).") from error
         if not lock_file(file, holder="process"):

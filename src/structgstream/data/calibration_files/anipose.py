@@ -5,16 +5,16 @@ A table per camera with ``name``, ``size`` (width, height), ``matrix``, ``distor
 (vector, or matrix, world to camera), ``translation`` and ``fisheye``. The unit is that of the board that was filmed.
 """
 
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from structgstream.data.calibration_files.reading import each_camera, readable
+from structgstream.data.calibration_files.reading import NoPose, calibration_of, readable
 from structgstream.data.lenses import fisheye_lens, from_integer_centers, opencv_lens
 from structgstream.data.posed import Calibration, PosedCamera, rigid
+from structgstream.data.text_files import pixels, read_toml
 
 EXPECTED = "a table per camera with name, size, matrix, distortions, rotation and translation, as aniposelib writes it"
 
@@ -23,7 +23,7 @@ def find(folder: Path) -> Iterator[tuple[Path, ...]]:
     """The TOML files that have tables of cameras, or are named as if they had."""
     for file in sorted(folder.glob("*.toml")):
         try:
-            if _tables(tomllib.loads(file.read_text())):
+            if _tables(read_toml(file)):
                 yield (file,)
         except (OSError, ValueError):
             if "calib" in file.stem.lower():
@@ -38,8 +38,8 @@ def read(files: tuple[Path, ...]) -> Calibration:
     """
     (file,) = files
     with readable(file, EXPECTED):
-        tables = _tables(tomllib.loads(file.read_text()))
-    return Calibration(file, each_camera(tables.items(), _camera, file=file, expected=EXPECTED))
+        tables = _tables(read_toml(file))
+    return calibration_of(tables.items(), _camera, file=file, expected=EXPECTED)
 
 
 def _tables(content: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -52,12 +52,13 @@ def _tables(content: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def _camera(name: str, table: dict[str, Any]) -> PosedCamera:
-    width, height = table["size"]
+    if "rotation" not in table and "translation" not in table:
+        raise NoPose
     coefficients = np.ravel(table["distortions"]).tolist()
     return PosedCamera(
         name=name,
         viewmat=rigid(table["rotation"], table["translation"]),
         K=from_integer_centers(table["matrix"]),
-        size=(round(width), round(height)),
+        size=pixels(table["size"]),
         lens=(fisheye_lens if table.get("fisheye") else opencv_lens)(coefficients),
     )

@@ -6,16 +6,16 @@
 ``hdImgs/00_00/00_00_00000000.jpg``.
 """
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from structgstream.data.calibration_files.reading import each_camera, json_files_with, readable
+from structgstream.data.calibration_files.reading import calibration_of, json_files_with, readable
 from structgstream.data.lenses import from_integer_centers, opencv_lens
 from structgstream.data.posed import Calibration, PosedCamera, rigid
+from structgstream.data.text_files import pixels, read_json
 
 EXPECTED = "a list of cameras with name, type, resolution, K, distCoef, R and t, as the Panoptic Studio has it"
 METRES = 0.01
@@ -34,16 +34,15 @@ def read(files: tuple[Path, ...]) -> Calibration:
     """
     (file,) = files
     with readable(file, EXPECTED):
-        entries = [(str(entry["name"]), entry) for entry in json.loads(file.read_text())["cameras"]]
-    return Calibration(file, each_camera(entries, _camera, file=file, expected=EXPECTED))
+        entries = [(str(entry["name"]), entry) for entry in read_json(file)["cameras"]]
+    return calibration_of(entries, _camera, file=file, expected=EXPECTED)
 
 
 def _camera(name: str, entry: dict[str, Any]) -> PosedCamera:
-    width, height = entry["resolution"]
     return PosedCamera(
         name=f"{entry['type']}_{name}/{name}",  # of a video, or of a folder
         viewmat=rigid(entry["R"], METRES * np.array(entry["t"], dtype=np.float64)),
         K=from_integer_centers(entry["K"]),
-        size=(round(width), round(height)),
+        size=pixels(entry["resolution"]),
         lens=opencv_lens(np.ravel(entry["distCoef"]).tolist()),
     )

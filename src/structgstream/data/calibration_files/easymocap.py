@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from structgstream.data.calibration_files.opencv_storage import read_storage
-from structgstream.data.calibration_files.reading import each_camera, readable
+from structgstream.data.calibration_files.reading import calibration_of, readable
 from structgstream.data.lenses import from_integer_centers, opencv_lens
 from structgstream.data.posed import Calibration, PosedCamera, rigid
+from structgstream.data.text_files import number, pixels
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
 EXPECTED = "names, K_NAME and D_NAME in intri.yml, and R_NAME or Rot_NAME and T_NAME in extri.yml"
@@ -37,19 +38,20 @@ def read(files: tuple[Path, ...]) -> Calibration:
     for file in files:
         with readable(file, EXPECTED):
             content |= read_storage(file)
-    names = [str(name) for name in content.get("names", ())]
-    cameras = each_camera(((name, name) for name in names), partial(_camera, content), file=files[0], expected=EXPECTED)
-    return Calibration(files[0], cameras)
+        names = [str(name) for name in content.get("names") or ()]
+    if not all(f"K_{name}" in content for name in names):  # YAML reads 00 as a number
+        names = [key.removeprefix("K_") for key in content if key.startswith("K_")]
+    return calibration_of(((name, name) for name in names), partial(_camera, content), file=files[0], expected=EXPECTED)
 
 
 def _camera(content: dict[str, Any], name: str, _: str) -> PosedCamera:
     coefficients = content.get(f"D_{name}", content.get(f"dist_{name}"))
     turned = content[f"Rot_{name}"] if f"Rot_{name}" in content else content[f"R_{name}"]
-    width, height = content.get(f"W_{name}", 0), content.get(f"H_{name}", 0)
+    size = (content.get(f"W_{name}", -1), content.get(f"H_{name}", -1))
     return PosedCamera(
         name=name,
         viewmat=rigid(turned, content[f"T_{name}"]),
         K=from_integer_centers(content[f"K_{name}"]),
-        size=(round(width), round(height)) if width > 0 and height > 0 else None,
+        size=pixels(size) if min(map(number, size)) > 0 else None,
         lens=opencv_lens([] if coefficients is None else np.ravel(coefficients).tolist()),
     )

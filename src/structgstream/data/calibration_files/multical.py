@@ -5,7 +5,6 @@
 ``NAME_to_OTHER``. Poses map the rig, or the other camera's axes, to the camera's: despite the name of the second form.
 """
 
-import json
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
@@ -14,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.calibration_files.reading import each_camera, json_files_with, readable
+from structgstream.data.calibration_files.reading import NoPose, calibration_of, json_files_with, readable
 from structgstream.data.lenses import from_integer_centers, opencv_lens
 from structgstream.data.posed import Calibration, PosedCamera, rigid
+from structgstream.data.text_files import Unreadable, mapping, pixels, read_json
 
 EXPECTED = "cameras with image_size, K and dist, and camera_poses with R and T, as multical writes it"
 
@@ -34,33 +34,34 @@ def read(files: tuple[Path, ...]) -> Calibration:
     """
     (file,) = files
     with readable(file, EXPECTED):
-        content = json.loads(file.read_text())
+        content = read_json(file)
         poses = _absolute(content["camera_poses"])
-        entries = [(name, entry) for name, entry in content["cameras"].items() if name in poses]
-    return Calibration(file, each_camera(entries, partial(_camera, poses), file=file, expected=EXPECTED))
+        entries = [(name, entry) for name, entry in mapping(content["cameras"]).items()]
+    return calibration_of(entries, partial(_camera, poses), file=file, expected=EXPECTED)
 
 
 def _absolute(entries: Mapping[str, Any]) -> dict[str, NDArray[np.float64]]:
     """World to camera by name; each relative pose after the one that it refers to."""
     poses: dict[str, NDArray[np.float64]] = {}
-    waiting = dict(entries)
+    waiting = mapping(entries)
     while waiting:
         ready = {key: key.split("_to_") for key in waiting if "_to_" not in key or key.split("_to_")[1] in poses}
         if not ready:
-            raise ValueError(f"the poses {', '.join(waiting)} refer to no camera that has one")
+            raise Unreadable(f"the poses {', '.join(waiting)} refer to no camera that has one")
         for key, (name, *other) in ready.items():
-            pose = waiting.pop(key)
+            pose = mapping(waiting.pop(key))
             viewmat = rigid(pose["R"], pose["T"])
             poses[name] = viewmat @ poses[other[0]] if other else viewmat
     return poses
 
 
 def _camera(poses: Mapping[str, NDArray[np.float64]], name: str, entry: dict[str, Any]) -> PosedCamera:
-    width, height = entry["image_size"]
+    if name not in poses:
+        raise NoPose
     return PosedCamera(
         name=name,
         viewmat=poses[name],
         K=from_integer_centers(entry["K"]),
-        size=(round(width), round(height)),
+        size=pixels(entry["image_size"]),
         lens=opencv_lens(np.ravel(entry["dist"]).tolist()),
     )

@@ -1,69 +1,149 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One file of OpenCV's ``FileStorage`` a camera, XML or YAML, named after it: OpenPose's and one's own.
+"""OpenCV's ``FileStorage``, XML or YAML: a file a camera, named after it or in its folder, or one file of all.
 
-OpenPose: ``CameraMatrix`` (3x4, world to camera), ``Intrinsics``, ``Distortion``. Others: ``camera_matrix`` or ``K``,
-``distortion_coefficients`` or ``D``, ``R`` or ``rvec``, ``T`` or ``tvec``, ``image_width``, ``image_height``,
-``fisheye_model``.
+OpenPose: ``CameraMatrix`` (3x4, world to camera), ``Intrinsics``, ``Distortion``. MC-Calib: ``camera_0`` and so on with
+``camera_matrix`` and ``camera_pose_matrix`` (camera to world). Others spell what they hold as :data:`SPELLINGS` has it.
 """
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from structgstream.data.calibration_files.easymocap import EXTRINSICS, INTRINSICS
 from structgstream.data.calibration_files.opencv_storage import is_storage, read_storage
-from structgstream.data.calibration_files.reading import each_camera
+from structgstream.data.calibration_files.reading import LARGEST_BYTES, NoPose, calibration_of
 from structgstream.data.lenses import fisheye_lens, from_integer_centers, opencv_lens
 from structgstream.data.posed import Calibration, PosedCamera, rigid
+from structgstream.data.text_files import Unreadable, number, pixels, read_text, reason
+from structgstream.errors import CalibrationError
 
 EXPECTED = (
     "camera_matrix, distortion_coefficients, image_width, image_height and the camera's pose, R and T, or "
     "Intrinsics, Distortion and CameraMatrix (3x4)"
 )
-MATRIX = ("Intrinsics", "camera_matrix", "cameraMatrix", "K")
-DISTORTION = ("Distortion", "distortion_coefficients", "dist_coeffs", "distCoeffs", "D")
-ROTATION, TRANSLATION = ("R", "rvec", "rotation"), ("T", "t", "tvec", "translation")
+SPELLINGS: Mapping[str, tuple[str, ...]] = {
+    "K": ("intrinsics", "intrinsic", "intrinsicmatrix", "cameramatrix", "cammatrix", "kmatrix", "matrix", "mtx", "k"),
+    "distortion": (
+        "distortion", "distortioncoefficients", "distortioncoeffs", "distortionvector", "distcoeffs", "distcoefs",
+        "distcoef", "dist", "d",
+    ),
+    "rotation": ("rotation", "rotationmatrix", "rotationvector", "rmatrix", "rmat", "rot", "rvec", "r"),
+    "translation": ("translation", "translationvector", "tvector", "trans", "tvec", "t"),
+    "pose": ("cameramatrix", "extrinsics", "extrinsic", "extrinsicmatrix", "viewmatrix", "viewmat", "w2c", "rt"),
+    "inverse pose": ("cameraposematrix",),
+    "width": ("imagewidth", "imgwidth", "framewidth", "width", "w"),
+    "height": ("imageheight", "imgheight", "frameheight", "height", "h"),
+    "size": ("imagesize", "imgsize", "size", "resolution"),
+    "fisheye": ("fisheyemodel", "fisheye", "distortiontype"),
+}  # fmt: skip
+"""Keys without marks between words and in lower case; of several the first counts."""
+SHAPES = {"K": ((3, 3),), "pose": ((3, 4), (4, 4)), "inverse pose": ((3, 4), (4, 4))}
+SUFFIXES = (".xml", ".yml", ".yaml")
 
 
 def find(folder: Path) -> Iterator[tuple[Path, ...]]:
-    """Every such file of the folder, together."""
-    files = (file for file in sorted(folder.iterdir()) if file.suffix.lower() in (".xml", ".yml", ".yaml"))
-    if found := tuple(file for file in files if file.is_file() and is_storage(file)):
+    """The files of a folder that hold cameras, together; else those of its folders, one in each."""
+    if found := _files(folder):
         yield found
+        return
+    folders = sorted(entry for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith("."))
+    inside = [files[0] for files in map(_files, folders) if len(files) == 1]
+    if len(inside) > 1:
+        yield tuple(inside)
+
+
+def _files(folder: Path) -> tuple[Path, ...]:
+    """The files with cameras; where there is none, those that cannot be parsed."""
+    try:
+        files = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in SUFFIXES and file.is_file()]
+    except OSError:
+        return ()
+    holding, broken = [], []
+    for file in files:
+        if file.name in (INTRINSICS, EXTRINSICS) or file.stat().st_size > LARGEST_BYTES or not is_storage(file):
+            continue
+        try:
+            if _tables(file):
+                holding.append(file)
+        except OSError:
+            continue
+        except Unreadable:  # YAML of others is no camera's
+            if re.search("opencv[-_](matrix|storage)", read_text(file)):
+                broken.append(file)
+    return tuple(holding + broken if holding else broken)
 
 
 def read(files: tuple[Path, ...]) -> Calibration:
-    """A camera for each file.
+    """A camera for each file, or for each map of the one file.
 
     Raises:
         CalibrationError: one is broken, or has no pose.
     """
-    folder = files[0].parent
-    cameras = each_camera(((file.stem, file) for file in files), _camera, file=folder, expected=EXPECTED)
-    return Calibration(folder, cameras)
+    shared = len({file.parent for file in files}) == 1
+    where = files[0].parent if shared else files[0].parent.parent
+    entries: list[tuple[str, Any]] = []
+    for file in files:
+        name = file.stem if shared else file.parent.name
+        try:
+            tables = _tables(file)
+        except (OSError, Unreadable) as error:
+            raise CalibrationError(
+                f"Camera {name!r} of {where} cannot be read ({reason(error)}); expected {EXPECTED}."
+            ) from None
+        entries += [(own or name, content) for own, content in tables.items()] or [(name, {})]
+    return calibration_of(entries, _camera, file=files[0] if len(files) == 1 else where, expected=EXPECTED)
 
 
-def _camera(name: str, file: Path) -> PosedCamera:
+def _tables(file: Path) -> dict[str, dict[str, Any]]:
+    """What a file holds of each camera by its name, which is empty for the one of the whole file."""
     content = read_storage(file)
-    coefficients = _first(content, DISTORTION, ())
-    if "Intrinsics" in content:
-        pose = np.array(content["CameraMatrix"], dtype=np.float64).reshape(3, 4)
-        viewmat = rigid(pose[:, :3], pose[:, 3])
-    else:
-        viewmat = rigid(_first(content, ROTATION), _first(content, TRANSLATION))
-    width, height = content.get("image_width", 0), content.get("image_height", 0)
+    if _value(content, "K") is not None:
+        return {"": content}
+    return {key: value for key, value in content.items() if isinstance(value, dict) and _value(value, "K") is not None}
+
+
+def _camera(name: str, content: dict[str, Any]) -> PosedCamera:
+    K = _value(content, "K")
+    if K is None:
+        raise KeyError(" or ".join(SPELLINGS["K"][:4]))
+    width, height, size = (_value(content, key) for key in ("width", "height", "size"))
+    if size is None and width is not None and height is not None and number(width) > 0 and number(height) > 0:
+        size = (width, height)
+    coefficients = _value(content, "distortion")
     return PosedCamera(
         name=name,
-        viewmat=viewmat,
-        K=from_integer_centers(_first(content, MATRIX)),
-        size=(round(width), round(height)) if width and height else None,
-        lens=(fisheye_lens if content.get("fisheye_model") else opencv_lens)(np.ravel(coefficients).tolist()),
+        viewmat=_pose(content),
+        K=from_integer_centers(K),
+        size=None if size is None else pixels(np.ravel(size).tolist()),
+        lens=(fisheye_lens if str(_value(content, "fisheye") or 0) not in ("0", "false") else opencv_lens)(
+            [] if coefficients is None else np.ravel(coefficients).tolist()
+        ),
     )
 
 
-def _first(content: dict[str, Any], keys: tuple[str, ...], default: Any = None) -> Any:
-    found = next((content[key] for key in keys if content.get(key) is not None), default)
-    if found is None:
-        raise KeyError(" or ".join(keys))
-    return found
+def _pose(content: dict[str, Any]) -> np.ndarray:
+    """World to camera, ``[4, 4]``.
+
+    Raises:
+        NoPose: there is none.
+    """
+    for key in ("pose", "inverse pose"):
+        if (matrix := _value(content, key)) is not None:
+            viewmat = rigid(matrix[:3, :3], matrix[:3, 3])
+            return np.linalg.inv(viewmat) if key == "inverse pose" else viewmat
+    rotation, translation = _value(content, "rotation"), _value(content, "translation")
+    if rotation is None or translation is None:
+        raise NoPose
+    return rigid(rotation, translation)
+
+
+def _value(content: dict[str, Any], key: str) -> Any:
+    """The first value that is spelled as ``key`` and has its shape; None where there is none."""
+    plain = {re.sub(r"[^a-z0-9]", "", name.lower()): value for name, value in content.items()}
+    for spelling in SPELLINGS[key]:
+        if (value := plain.get(spelling)) is not None and (key not in SHAPES or np.shape(value) in SHAPES[key]):
+            return value
+    return None

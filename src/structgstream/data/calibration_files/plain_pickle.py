@@ -14,7 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from structgstream.data.text_files import Unreadable
 from structgstream.errors import CalibrationError
+
+
+class _Refused(pickle.UnpicklingError):
+    """It asks for what is not known."""
 
 
 class _Arrays(pickle.Unpickler):
@@ -27,7 +32,7 @@ class _Arrays(pickle.Unpickler):
             UnpicklingError: another one is asked for.
         """
         if (known := KNOWN.get((module.replace("numpy._core", "numpy.core"), name))) is None:
-            raise pickle.UnpicklingError(f"it asks for {module}.{name}")
+            raise _Refused(f"it asks for {module}.{name}")
         return known
 
 
@@ -42,13 +47,13 @@ def _empty_array(kind: Any, shape: Any, code: Any) -> np.ndarray:
 
 def _number(kind: np.dtype, data: bytes) -> Any:
     if kind.hasobject:
-        raise pickle.UnpicklingError("it has a number that is an object")
+        raise _Refused("it has a number that is an object")
     return np.frombuffer(data, kind, count=1)[0]
 
 
 def _text(text: str, coding: str) -> bytes:
     if coding != "latin1":
-        raise pickle.UnpicklingError(f"it has text of the coding {coding}")
+        raise _Refused(f"it has text of the coding {coding}")
     return text.encode(coding)
 
 
@@ -66,7 +71,7 @@ def load_plain(file: Path) -> Any:
 
     Raises:
         CalibrationError: it holds anything else.
-        ValueError: it is not such a file, or is cut.
+        Unreadable: it is not such a file, or is cut.
         OSError: it cannot be read.
     """
     with file.open("rb") as stream:
@@ -74,14 +79,14 @@ def load_plain(file: Path) -> Any:
             version = np.lib.format.read_magic(stream)
             header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
             if not header(stream)[2].hasobject:
-                raise ValueError("it is an array of numbers")
+                raise Unreadable("it is an array of numbers")
             return _Arrays(stream, encoding="latin1").load()
-        except pickle.UnpicklingError as error:
+        except _Refused as error:
             raise CalibrationError(
                 f"{file} is a pickle that holds more than arrays ({error}), and opening it could run any program; "
                 "it is refused. Convert it, with a program that you trust, to one of the formats of docs/captures.md."
             ) from None
-        except ValueError:
+        except Unreadable:
             raise
-        except Exception as error:  # a cut or forged one can raise anything
-            raise ValueError(f"{type(error).__name__}: {error}") from None
+        except Exception:  # a cut or forged one can raise anything
+            raise Unreadable("it is cut or damaged") from None

@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from structgstream.data.calibration_files.reading import each_camera, readable
+from structgstream.data.calibration_files.reading import calibration_of, readable
 from structgstream.data.lenses import opencv_lens
 from structgstream.data.posed import Calibration, PosedCamera, intrinsics
+from structgstream.data.text_files import Unreadable, number, pixels
 from structgstream.errors import CalibrationError
 
 EXPECTED = "cameras of video with fov_video, transform and intrinsic, as Qualisys Track Manager exports it"
@@ -39,7 +40,7 @@ def read(files: tuple[Path, ...]) -> Calibration:
         try:
             found = ET.fromstring(file.read_bytes()).iter("camera")
         except ET.ParseError as error:
-            raise ValueError(str(error)) from None
+            raise Unreadable(f"it is not XML at line {error.position[0]}") from None
         video = [tag for tag in found if any(word in tag.get("model", "none").lower() for word in VIDEO_MODELS)]
         entries = [(tag.attrib["serial"], tag) for tag in video]
     for serial, tag in entries:
@@ -48,7 +49,7 @@ def read(files: tuple[Path, ...]) -> Calibration:
                 f"Camera {serial!r} of {file} has pictures that are turned by {turned} degrees, and its calibration is "
                 "for those that are not; set the view rotation to 0 and export again."
             )
-    return Calibration(file, each_camera(entries, _camera, file=file, expected=EXPECTED))
+    return calibration_of(entries, _camera, file=file, expected=EXPECTED)
 
 
 def _camera(name: str, tag: ET.Element) -> PosedCamera:
@@ -67,7 +68,7 @@ def _camera(name: str, tag: ET.Element) -> PosedCamera:
         name=name,
         viewmat=viewmat,
         K=intrinsics(fx, fy, cx - view["left"], cy - view["top"]),
-        size=(round(view["right"] - view["left"] + 1), round(view["bottom"] - view["top"] + 1)),
+        size=pixels((view["right"] - view["left"] + 1, view["bottom"] - view["top"] + 1)),
         lens=opencv_lens([*radial, *tangential, optics.get("radialDistortion3", 0.0)]),
     )
 
@@ -76,4 +77,4 @@ def _attributes(tag: ET.Element, child: str) -> dict[str, float]:
     found = tag.find(child)
     if found is None:
         raise KeyError(child)
-    return {key: float(value) for key, value in found.attrib.items()}
+    return {key: number(value) for key, value in found.attrib.items()}

@@ -1,25 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
 """Broken files become one sentence that names file, camera and remedy."""
 
-import math
+import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from structgstream.data.posed import PosedCamera
+from structgstream.data.calibration import listed
+from structgstream.data.posed import Calibration, PosedCamera
+from structgstream.data.text_files import BROKEN, Unreadable, number, read_text, reason
 from structgstream.errors import CalibrationError
 
 Entry = TypeVar("Entry")
+log = logging.getLogger(__name__)
+
 LARGEST_BYTES = 50_000_000  # of a file that is searched to recognise it
-BROKEN = (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError)
 
 
 def json_files_with(folder: Path, key: str) -> Iterator[tuple[Path]]:
     """The JSON files of ``folder`` that contain the quoted ``key``, each alone."""
     for file in sorted(folder.glob("*.json")):
-        if file.stat().st_size < LARGEST_BYTES and f'"{key}"'.encode() in file.read_bytes():
-            yield (file,)
+        try:
+            if file.stat().st_size < LARGEST_BYTES and f'"{key}"' in read_text(file):
+                yield (file,)
+        except (OSError, Unreadable):
+            continue  # no file of these
+
+
+class NoPose(Unreadable):
+    """A camera of which a file says no pose, since it was not calibrated with the others."""
 
 
 @contextmanager
@@ -37,43 +47,44 @@ def readable(file: Path, expected: str) -> Iterator[None]:
         raise CalibrationError(f"{file} cannot be read ({reason(error)}); expected {expected}.") from None
 
 
-def each_camera(
+def calibration_of(
     entries: Iterable[tuple[str, Entry]], read: Callable[[str, Entry], PosedCamera], *, file: Path, expected: str
-) -> tuple[PosedCamera, ...]:
-    """The cameras of a file, in its order.
+) -> Calibration:
+    """The cameras of a file, in its order; those without a pose are left out with a warning.
 
     Raises:
-        CalibrationError: an entry is broken, naming its camera; or there is none.
+        CalibrationError: an entry is broken, naming its camera; or there is none, or none with a pose.
     """
-    cameras = []
+    cameras, unposed = [], []
     for name, entry in entries:
         try:
             cameras.append(read(name, entry))
         except CalibrationError:
             raise
+        except NoPose:
+            unposed.append(name)
         except BROKEN as error:
             raise CalibrationError(
                 f"Camera {name!r} of {file} cannot be read ({reason(error)}); expected {expected}."
             ) from None
     if not cameras:
-        raise CalibrationError(f"{file} holds no cameras; expected {expected}.")
-    return tuple(cameras)
+        found = f"no pose of {listed(unposed)}" if unposed else "no cameras"
+        raise CalibrationError(f"{file} holds {found}; expected {expected}.")
+    if unposed:
+        log.warning("%s has no pose of %s; left out", file, listed(unposed))
+    return Calibration(file, tuple(cameras), unposed=tuple(unposed))
 
 
 def positive(content: Mapping[str, Any], key: str) -> float:
     """The number of a key.
 
     Raises:
-        ValueError: it is not positive, or not finite.
+        Unreadable: it is not positive, or not finite.
     """
-    number = float(content[key])
-    if not 0 < number < math.inf:
-        raise ValueError(f"{key} {number:g}")
-    return number
-
-
-def reason(error: Exception) -> str:
-    """What was wrong with a file, as a clause of a message."""
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
-    return f"no {error}" if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
+    try:
+        found = number(content[key])
+    except Unreadable as error:
+        raise Unreadable(f"{key}: {error}") from None
+    if found <= 0:
+        raise Unreadable(f"{key} {found:g}")
+    return found

@@ -6,7 +6,6 @@ Intrinsics stand at the top or with a frame: ``fl_x``, ``fl_y``, ``cx``, ``cy``,
 ``transforms_test.json`` is held out.
 """
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,16 +13,19 @@ from typing import Any
 
 import numpy as np
 
-from structgstream.data.calibration_files.reading import each_camera, readable
+from structgstream.data.calibration_files.reading import calibration_of, positive, readable
 from structgstream.data.images import PICTURE_SUFFIXES
-from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential, finite
+from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential
 from structgstream.data.picture_size import picture_size
 from structgstream.data.posed import Calibration, PosedCamera, intrinsics
+from structgstream.data.text_files import NamedFiles, Unreadable, mapping, number, path_parts, pixels, read_json
 from structgstream.errors import CalibrationError
 
 WHOLE, TRAIN, TEST = "transforms.json", "transforms_train.json", "transforms_test.json"
 EXPECTED = "frames with file_path and transform_matrix, and fl_x, cx, cy, w and h or camera_angle_x"
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
+OPENCVS = ("OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
+FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 
 @dataclass(frozen=True)
@@ -63,55 +65,79 @@ def read_shots(files: tuple[Path, ...]) -> list[Shot]:
     shots = []
     for file in files:
         with readable(file, EXPECTED):
-            content = json.loads(file.read_text())
-            frames = [{**content, **frame} for frame in content["frames"]]
+            content = mapping(read_json(file))
+            frames = [{**content, **mapping(frame)} for frame in content["frames"]]
             entries = [(str(frame["file_path"]), frame) for frame in frames]
-        paths = {name: _picture(file.parent, name) for name, _ in entries}
+        pictures = NamedFiles(file.parent, PICTURE_SUFFIXES)
+        found: list[tuple[Path, float | None]] = []
 
-        def camera(name: str, frame: dict[str, Any], paths: dict[str, Path] = paths, file: Path = file) -> PosedCamera:
-            return _camera(name, frame, paths[name], file)
+        def camera(
+            name: str,
+            frame: dict[str, Any],
+            pictures: NamedFiles = pictures,
+            found: list[tuple[Path, float | None]] = found,
+            file: Path = file,
+        ) -> PosedCamera:
+            picture = pictures.find(name) or file.parent.joinpath(*path_parts(name))
+            found.append((picture, None if frame.get("time") is None else number(frame["time"])))
+            return _camera(name, frame, picture, file)
 
-        cameras = each_camera(entries, camera, file=file, expected=EXPECTED)
-        for posed, (name, frame) in zip(cameras, entries, strict=True):
-            time = float(frame["time"]) if "time" in frame else None
-            shots.append(Shot(posed, paths[name], time, file.name == TEST))
+        cameras = calibration_of(entries, camera, file=file, expected=EXPECTED).cameras
+        shots += [
+            Shot(posed, picture, time, file.name == TEST) for posed, (picture, time) in zip(cameras, found, strict=True)
+        ]
     return shots
 
 
-def _picture(folder: Path, name: str) -> Path:
-    """The file of a ``file_path``, which Blender's leave without a suffix."""
-    path = folder / name
-    return path if path.suffix.lower() in PICTURE_SUFFIXES or path.is_file() else path.with_name(f"{path.name}.png")
+def stated_fps(file: Path) -> float | None:
+    """The frames a second that a file states, or None.
+
+    Raises:
+        CalibrationError: a rate that is not positive.
+    """
+    with readable(file, "fps as a number of frames a second"):
+        content = mapping(read_json(file))
+        return None if content.get("fps") is None else positive(content, "fps")
 
 
 def _camera(name: str, frame: dict[str, Any], picture: Path, where: Path) -> PosedCamera:
-    if "w" in frame and "h" in frame:
-        width, height = round(frame["w"]), round(frame["h"])
+    if frame.get("w") is not None and frame.get("h") is not None:
+        width, height = pixels((frame["w"], frame["h"]))
     elif picture.is_file():
         width, height = picture_size(picture)
     else:
         raise KeyError("w and h")
-    fx = float(frame["fl_x"]) if "fl_x" in frame else width / 2 / math.tan(float(frame["camera_angle_x"]) / 2)
-    fy = float(frame.get("fl_y", fx))
-    K = intrinsics(fx, fy, float(frame.get("cx", width / 2)), float(frame.get("cy", height / 2)))
+    if frame.get("fl_x") is not None:
+        fx = number(frame["fl_x"])
+    elif not 0 < (angle := number(frame["camera_angle_x"])) < math.pi:
+        raise Unreadable(f"camera_angle_x of {angle:g} radians")
+    else:
+        fx = width / 2 / math.tan(angle / 2)
+    stated = {key: frame[key] for key in ("fl_y", "cx", "cy") if frame.get(key) is not None}
+    K = intrinsics(fx, stated.get("fl_y", fx), stated.get("cx", width / 2), stated.get("cy", height / 2))
     pose = np.array(frame["transform_matrix"], dtype=np.float64)
     pose = np.vstack([pose, [0, 0, 0, 1]]) if pose.shape == (3, 4) else pose.reshape(4, 4)
     viewmat = np.linalg.inv(pose @ np.diag([1.0, -1.0, -1.0, 1.0])).astype(np.float64)
-    return PosedCamera(
-        picture.relative_to(where.parent).as_posix(), viewmat, K, (width, height), _lens(name, frame, where)
-    )
+    inside = picture.relative_to(where.parent).as_posix()
+    return PosedCamera(inside, viewmat, K, (width, height), _lens(name, frame, where))
 
 
 def _lens(name: str, frame: dict[str, Any], where: Path) -> Lens:
-    model = "OPENCV_FISHEYE" if frame.get("is_fisheye") else str(frame.get("camera_model", "OPENCV"))
-    k1, k2, k3, k4, p1, p2 = (finite(frame.get(key) or 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    if model == "OPENCV_FISHEYE":
+    """The lens of a picture, whose model may be one of COLMAP's names.
+
+    Raises:
+        CalibrationError: it is not known here.
+    """
+    model = "OPENCV_FISHEYE" if frame.get("is_fisheye") else str(frame.get("camera_model") or "OPENCV").upper()
+    k1, k2, k3, k4, p1, p2 = (number(frame.get(key) or 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    if model in FISHEYES:
         return Fisheye(k1, k2, k3, k4)
-    if model in PINHOLES or (model == "OPENCV" and not any((k1, k2, k3, k4, p1, p2))):
+    if model in PINHOLES or (model in OPENCVS and not any((k1, k2, k3, k4, p1, p2))):
         return Pinhole()
-    if model != "OPENCV" or k4:
+    if model not in OPENCVS or (k4 and model != "FULL_OPENCV"):
         raise CalibrationError(
             f"The camera of {name!r} of {where} is of the model {model}{' with k4' if k4 else ''}, which is not known "
-            "here; expected PINHOLE, OPENCV (k1, k2, k3, p1, p2) or OPENCV_FISHEYE."
+            f"here; expected {', '.join((*PINHOLES, *OPENCVS, *FISHEYES))} (k1, k2, k3, p1, p2)."
         )
-    return RadialTangential(k1, k2, p1, p2, k3)
+    k5, k6 = (number(frame.get(key) or 0.0) for key in ("k5", "k6"))
+    return RadialTangential(k1, k2, p1, p2, k3, k4, k5, k6)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from structgstream.data.calibration_files.plain_pickle import load_plain
-from structgstream.data.calibration_files.reading import each_camera, readable
+from structgstream.data.calibration_files.reading import calibration_of, readable
 from structgstream.data.lenses import from_integer_centers, opencv_lens
 from structgstream.data.posed import Calibration, PosedCamera, rigid
 
@@ -40,7 +40,7 @@ def read(files: tuple[Path, ...]) -> Calibration:
         cams = content["cams"]
         rows = zip(content["ims"][0]["ims"], cams["K"], cams["D"], cams["R"], cams["T"], strict=True)
         entries = [(str(picture), row) for picture, *row in rows]
-    return Calibration(file, each_camera(entries, _camera, file=file, expected=EXPECTED))
+    return calibration_of(entries, _camera, file=file, expected=EXPECTED)
 
 
 def _camera(name: str, row: list[Any]) -> PosedCamera:

@@ -14,15 +14,17 @@ from pathlib import Path
 from structgstream.data.live.picture_file import read_pictures, write_pictures
 from structgstream.errors import CaptureError, StorageError
 from structgstream.frames import MultiViewFrame
+from structgstream.owned_folders import check_owned, own_folder
 
 LAST = 3
 """Frames besides the period's first: one that is fitted, the one before it, and one that may have been read ahead."""
+PURPOSE = "pictures that a live stream needs to be resumed"
 NAME = re.compile(r"frame-(\d{8})\.pictures")
 
 
 def kept_folder(stream: Path) -> Path:
     """The folder beside a stream."""
-    return stream.with_suffix(".live")
+    return stream.with_name(f"{stream.name}.live")
 
 
 class KeptFrames:
@@ -31,17 +33,17 @@ class KeptFrames:
     Args:
         folder: is made when the first frame is kept.
         cameras: those whose pictures are kept: of held-out ones none is needed.
-        resume: whether what is there is of this stream; else it is removed.
+        resume: whether what is there is of this stream; else it is removed when the first frame is kept.
 
     Raises:
-        StorageError: the folder cannot be used.
+        StorageError: the folder cannot be used, or holds files of others.
     """
 
     def __init__(self, folder: Path, *, cameras: tuple[str, ...], resume: bool) -> None:
         self._folder, self._cameras = folder, cameras
         self._first, self._last = frozenset({0}), LAST
-        if not resume:
-            self._remove(self._files())
+        self._resume = resume
+        check_owned(folder, PURPOSE)
 
     def need(self, *first: int, last: int) -> None:
         """From now on the frames ``first`` are kept, and so are ``last`` frames before the one that is fitted."""
@@ -59,10 +61,10 @@ class KeptFrames:
         """
         images = {name: image for name, image in frame.images.items() if name in self._cameras}
         masks = {name: mask for name, mask in frame.masks.items() if name in self._cameras}
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise StorageError(f"The folder {self._folder} cannot be made ({error.strerror}).") from None
+        own_folder(self._folder, PURPOSE)
+        if not self._resume:
+            self._remove(self._files())
+            self._resume = True
         kept = replace(frame, images=images, masks=masks)
         write_pictures(self._path(frame.index), kept, sync=True, origin_seconds=origin_seconds)
         oldest = frame.index - self._last + 1

@@ -2,6 +2,7 @@
 """Where complete sets wait for the trainer: the newest one in memory, or all of them in a queue on the disk."""
 
 import logging
+import re
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -13,12 +14,15 @@ from structgstream.data.live.matching import PictureSet, SetTimes
 from structgstream.data.live.picture_file import read_pictures, write_pictures
 from structgstream.errors import CaptureError, StorageError
 from structgstream.frames import MultiViewFrame
+from structgstream.owned_folders import own_folder, remove_own
 
 log = logging.getLogger(__name__)
 
 Convert = Callable[[PictureSet], MultiViewFrame]
 """Pictures of a set as sRGB; the presentation time is the common clock's."""
 GIGABYTE = 10**9
+PURPOSE = "queue of a live stream"
+SETS = re.compile(r"set-\d{8,}(\.partial)?")
 MOST_UNWRITTEN = 8  # sets whose pictures wait in memory
 ROOM_AGAIN = 0.5  # of the queue must be empty before sets are taken again, so that gaps are few
 
@@ -135,8 +139,8 @@ class DiskQueue:
         self._failed: BaseException | None = None
         self._changed = threading.Condition()
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            for file in sorted(folder.glob("set-*")):
+            own_folder(folder, PURPOSE)
+            for file in sorted(path for path in folder.iterdir() if SETS.fullmatch(path.name)):
                 if resume and not file.suffix:  # Another name is that of a file that was being written.
                     self._files.append((file, file.stat().st_size, None))
                 else:
@@ -212,10 +216,7 @@ class DiskQueue:
             self._closed = True
             self._changed.notify_all()
         self._writer.join()
-        for path in self._folder.glob("set-*"):
-            path.unlink(missing_ok=True)
-        if self._folder.is_dir() and not any(self._folder.iterdir()):
-            self._folder.rmdir()
+        remove_own(self._folder, PURPOSE, SETS, whole=True)
 
     def _write(self) -> None:
         while True:

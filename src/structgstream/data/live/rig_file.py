@@ -3,13 +3,13 @@
 
 import math
 import re
-import tomllib
 from collections.abc import Collection, Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, TypeVar
 
+from structgstream.data.text_files import Unreadable, read_toml, reason
 from structgstream.errors import CaptureError
 
 Made = TypeVar("Made")
@@ -107,10 +107,9 @@ def read_rig(path: Path) -> LiveRig:
         CaptureError: it is missing or not TOML, has a key that is not known, lacks one, or has a value of another kind.
     """
     try:
-        content = tomllib.loads(path.read_text())
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise CaptureError(f"The rig file {path} cannot be read ({reason}); docs/live.md shows one.") from None
+        content = read_toml(path)
+    except (OSError, Unreadable) as error:
+        raise CaptureError(f"The rig file {path} cannot be read ({reason(error)}); docs/live.md shows one.") from None
     entries = content.pop("cameras", None)
     if not isinstance(entries, dict) or not entries:
         raise CaptureError(f"The rig file {path} has no cameras; give each a table [cameras.NAME] with its url.")

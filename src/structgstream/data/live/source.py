@@ -321,7 +321,7 @@ class LiveSource:
         if self._options.policy == "latest":
             return Latest(self._converted())
         most = round(self._options.queue_gigabytes * GIGABYTE)
-        folder = self._stream.with_suffix(".queue")
+        folder = self._stream.with_name(f"{self._stream.name}.queue")
         return DiskQueue(folder, most_bytes=most, convert=self._converted(), resume=self._options.resume)
 
     def _converted(self) -> Convert:

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from structgstream.data.arrays import Floats
+from structgstream.data.text_files import Unreadable, number, read_text, reason, whole
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.streams import period_seconds
@@ -60,11 +61,14 @@ def read_timestamps(file: Path, stamps: Mapping[str, Floats]) -> dict[str, State
 
 def _rows(file: Path) -> dict[str, dict[int, float]]:
     try:
-        lines = file.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or type(error).__name__
-        raise CaptureError(f"{file} cannot be read ({reason}); expected a text with {','.join(COLUMNS)}.") from None
-    reader = csv.DictReader(lines, skipinitialspace=True)
+        lines = read_text(file).splitlines()
+    except (OSError, Unreadable) as error:
+        raise CaptureError(
+            f"{file} cannot be read ({reason(error)}); expected a text with {','.join(COLUMNS)}."
+        ) from None
+    header = lines[0] if lines else ""
+    separator = next((mark for mark in ";\t" if mark in header), ",")  # semicolons, where commas are decimal
+    reader = csv.DictReader(lines, skipinitialspace=True, delimiter=separator)
     missing = [column for column in COLUMNS if column not in (reader.fieldnames or ())]
     if missing:
         raise CaptureError(
@@ -73,10 +77,8 @@ def _rows(file: Path) -> dict[str, dict[int, float]]:
     rows: dict[str, dict[int, float]] = {}
     for row in reader:
         try:
-            name, frame, seconds = str(row["camera"]).strip(), int(row["frame"]), float(row["seconds"])
-            if not np.isfinite(seconds):
-                raise ValueError
-        except (TypeError, ValueError):
+            name, frame, seconds = str(row["camera"]).strip(), whole(row["frame"]), number(row["seconds"])
+        except Unreadable:
             raise CaptureError(
                 f"Line {reader.line_num} of {file} is not a camera, a frame number and seconds; correct or remove it."
             ) from None

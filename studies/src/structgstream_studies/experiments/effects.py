@@ -187,8 +187,6 @@ def _of_free_gaussians(rows: _Rows) -> None:
         "without-thin-births", "w/o births of thin content", replace(whole, births=large), "births.thin.enabled"
     )
     rows.priced("free-unpriced", "free 3DGs not priced", replace(whole.rounding, free_priced=False), "free_priced")
-    kept = replace(whole.motion, unseen_pixels=0.0)
-    rows.gated("unseen-kept", "unseen free 3DGs are kept", kept, "unseen_pixels")
 
 
 def _of_the_light(rows: _Rows) -> None:

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the files of each camera lie in a folder, with or without a calibration beside them.
+
+::
+
+    CAMERA.mp4               one video per camera
+    CAMERA/anything.mp4      a folder per camera with its one video, as cards are copied (CAMERA/DCIM/100GOPRO/...)
+    CAMERA/FRAME.jpg         a folder of pictures per camera (CAMERA/data/FRAME.png of EuRoC, CAMERA/images/FRAME.png)
+    FRAME/CAMERA.jpg         a folder of pictures per frame (frame000000/images/CAMERA.png of 3DGStream)
+    CAMERA.jpg               one picture per camera
+
+in the folder itself or in one below it: of a name of :data:`ROOTS`, or the only one that holds videos.
+"""
+
+import logging
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+from structgstream.data.folder_files import REPORT, by_stem, files_of, is_hidden
+from structgstream.data.images import PICTURE_SUFFIXES
+from structgstream.data.timeline import natural
+from structgstream.data.video_index import VIDEO_SUFFIXES
+from structgstream.errors import CaptureError
+
+log = logging.getLogger(__name__)
+
+REDUCED = ("images_2", "images_4", "images_8")
+# In the order in which they are looked through; hdVideos and hdImgs are the CMU Panoptic toolbox's, the synchronized
+# ones FreeMoCap's.
+ROOTS = ("frames", "images", "videos", "hdVideos", "hdImgs", "synchronized_videos", "", *REDUCED)
+NO_CAMERAS = (*ROOTS, "masks", "board", "recordings", "calibration", "annotated_videos", "work", REPORT)
+"""Folders that are no camera's and no frame's: of ``masks.py``, of the check, and of the tools that calibrate."""
+INSIDE = ("images", "data", "DCIM")
+"""What lies between the folder of a camera or a frame and its files."""
+RECORDINGS = "recordings"
+"""Where caliscope has a folder for each take."""
+
+
+def folders_of(root: Path) -> list[Path]:
+    """The folders in ``root`` that may be of cameras or frames, in natural order of their names."""
+    if not root.is_dir():
+        return []
+    found = (entry for entry in root.iterdir() if not is_hidden(entry) and entry.name not in NO_CAMERAS)
+    return sorted((entry for entry in found if entry.is_dir()), key=lambda entry: natural(entry.name))
+
+
+def filmed_folder(folder: Path, suffixes: Collection[str]) -> Path | None:
+    """The folder with files of these kinds: ``folder``, or that within it of a name of :data:`INSIDE` or of a card."""
+    if files_of(folder, suffixes):
+        return folder
+    inner = [folder / name for name in INSIDE if (folder / name).is_dir()]
+    if folder.name == "DCIM":
+        inner = [entry for entry in sorted(folder.iterdir()) if entry.is_dir() and not is_hidden(entry)]
+    return next((found for entry in inner if (found := filmed_folder(entry, suffixes)) is not None), None)
+
+
+def videos_in(root: Path) -> dict[str, Path]:
+    """The video of each camera by its name: ``CAMERA.mp4``, else ``CAMERA/anything.mp4``; nothing where there is none.
+
+    Raises:
+        CaptureError: several of one camera.
+    """
+    if not root.is_dir():
+        return {}
+    if found := by_stem(files_of(root, VIDEO_SUFFIXES)):
+        return found
+    filmed = {folder.name: filmed_folder(folder, VIDEO_SUFFIXES) for folder in folders_of(root)}
+    files = {name: files_of(folder, VIDEO_SUFFIXES) for name, folder in filmed.items() if folder is not None}
+    if any(len(own) > 1 for own in files.values()):
+        return {}
+    return {name: own[0] for name, own in files.items()}
+
+
+def pictures_in(root: Path) -> dict[str, dict[str, Path]]:
+    """The pictures of each folder of ``root``, of a camera or of a frame, by their names without suffix."""
+    filmed = {folder.name: filmed_folder(folder, PICTURE_SUFFIXES) for folder in folders_of(root)}
+    return {name: by_stem(files_of(own, PICTURE_SUFFIXES)) for name, own in filmed.items() if own is not None}
+
+
+def other_roots(where: Path) -> Iterator[Path]:
+    """Folders of videos below ``where`` that have no name of :data:`ROOTS`: takes.
+
+    Raises:
+        CaptureError: there are several, and none says which is meant.
+    """
+    takes = [folder for parent in (where, where / RECORDINGS) for folder in folders_of(parent)]
+    takes = [folder for folder in takes if len(files_of(folder, VIDEO_SUFFIXES)) > 1]
+    if len(takes) > 1:
+        names = ", ".join(str(take.relative_to(where)) for take in takes[:4])
+        raise CaptureError(
+            f"{where} has videos in several folders ({names}); expected those of one take, a video per camera. Give "
+            "the folder of one take; if these are cameras, join the chapters of each to one file."
+        )
+    yield from takes

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The calibration of a project folder, as COLMAP, transforms.json or a file of another tool, in it or one folder below.
+
+Tools keep calibration and videos apart: Pose2Sim has ``calibration/Calib.toml`` beside ``videos/``, caliscope
+``camera_array.toml`` above ``recordings/TAKE/``, 3DGStream the model of COLMAP in the folder of the first frame.
+"""
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from structgstream.data.calibration_files import (
+    anipose,
+    cmu_panoptic,
+    easymocap,
+    kalibr,
+    multical,
+    opencv_cameras,
+    qualisys,
+    transforms,
+    zju_mocap,
+)
+from structgstream.data.camera_files import NO_CAMERAS, ROOTS, pictures_in, videos_in
+from structgstream.data.colmap import find_model, read_model
+from structgstream.data.folder_files import files_of, is_hidden
+from structgstream.data.images import PICTURE_SUFFIXES
+from structgstream.data.posed import Calibration, PosedCamera
+from structgstream.data.timeline import natural
+from structgstream.errors import CalibrationError
+
+log = logging.getLogger(__name__)
+
+PICKLES = (".pickle", ".pkl")
+SAME_ROTATION, SAME_SHARE, SAME_PIXELS = 1e-3, 0.01, 1.0
+"""How far two files of one calibration differ: entries of rotations, shares of the rig's extent, pixels of K."""
+
+
+class Converter(NamedTuple):
+    """``find`` gives the sets of files in a folder that are a tool's calibrations, ``read`` the cameras of one."""
+
+    find: Callable[[Path], Iterator[tuple[Path, ...]]]
+    read: Callable[[tuple[Path, ...]], Calibration]
+
+
+CONVERTERS = tuple(
+    Converter(tool.find, tool.read)
+    for tool in (anipose, easymocap, multical, kalibr, cmu_panoptic, qualisys, zju_mocap, opencv_cameras)
+)
+
+
+def recognizes_calibrated(path: Path) -> bool:
+    """Whether the folder has a calibration file of another tool that is known here, or one that is refused."""
+    return any(True for converter in CONVERTERS for _ in converter.find(path)) or bool(_pickles(path))
+
+
+def read_calibrated(path: Path, file: Path | None = None) -> Calibration | None:
+    """The cameras of the other tools' calibration file in the folder ``path``; None when there is none.
+
+    Args:
+        path: the folder.
+        file: the only file to consider; None for any.
+
+    Raises:
+        CalibrationError: a broken file, one that only running it could read, or several that differ.
+    """
+    found = [(converter, files) for converter in CONVERTERS for files in converter.find(path)]
+    read = [converter.read(files) for converter, files in found if file is None or file in files]
+    if different := [other for other in read[1:] if not _agree(read[0], other)]:
+        raise CalibrationError(
+            f"{path} has several calibrations that differ, {read[0].where.name} and "
+            f"{', '.join(other.where.name for other in different[:3])}; expected that of this take alone: move the "
+            "others out of the folder (prepare takes one by --calibration FILE)."
+        )
+    if read:
+        return read[0]
+    if pickles := [pickle for pickle in _pickles(path) if file in (None, pickle)]:
+        raise CalibrationError(
+            f"{pickles[0]} is a pickle, and opening it could run any program; it is refused. "
+            "Convert it, with a program that you trust, to one of the formats of docs/captures.md."
+        )
+    return None
+
+
+def read_calibration(folder: Path, file: Path | None = None) -> Calibration | None:
+    """The calibration in a folder, of COLMAP, transforms.json or another tool, in this order; None when there is none.
+
+    Raises:
+        CalibrationError: it is broken, refused, or there are several that differ.
+    """
+    model, files = find_model(folder), transforms.find(folder)
+    if model is not None and (file is None or file.parent == model):
+        return read_model(model)
+    if files and (file is None or file in files):
+        return transforms.read(files)
+    return read_calibrated(folder, file)
+
+
+def has_calibration(folder: Path) -> bool:
+    """Whether :func:`read_calibration` finds or refuses one."""
+    return find_model(folder) is not None or bool(transforms.find(folder)) or recognizes_calibrated(folder)
+
+
+def calibration_below(path: Path) -> Path | None:
+    """The one folder in ``path`` that holds the calibration of what was filmed elsewhere in ``path``; None for none.
+
+    Raises:
+        CalibrationError: there are several.
+    """
+    found = [folder for folder in inner_folders(path) if has_calibration(folder) and not _is_capture(folder)]
+    frames = pictures_in(path)
+    if found and all(folder.name in frames for folder in found):
+        return found[0]  # of the first frame, as 3DGStream has it
+    if len(found) > 1:
+        names = ", ".join(folder.name for folder in found[:4])
+        raise CalibrationError(
+            f"{path} has calibrations in several folders ({names}); expected one: move the others out of it."
+        )
+    return found[0] if found else None
+
+
+def inner_folders(path: Path) -> list[Path]:
+    """The folders in ``path`` that may hold calibrations, in natural order."""
+    skipped = {*NO_CAMERAS, *ROOTS, "sparse", "sparse_"} - {"calibration"}
+    entries = (entry for entry in path.iterdir() if not is_hidden(entry) and entry.name not in skipped)
+    return sorted((entry for entry in entries if entry.is_dir()), key=lambda entry: natural(entry.name))
+
+
+def _is_capture(folder: Path) -> bool:
+    """Whether a folder with a calibration holds frames, and not what the calibration was made from."""
+    if "calib" in folder.name.lower():
+        return False
+    roots = [folder / root for root in ROOTS]
+    stills = [folder / root for root in ("images", "") if (folder / root).is_dir()]
+    if any(len(videos_in(root)) > 1 or len(pictures_in(root)) > 1 for root in roots):
+        return True
+    beside = pictures_in(folder.parent)
+    is_frame = folder.name in beside and len(beside) > 1
+    return not is_frame and any(files_of(root, PICTURE_SUFFIXES) for root in stills)
+
+
+def _pickles(path: Path) -> list[Path]:
+    return sorted(file for file in path.iterdir() if file.suffix.lower() in PICKLES)
+
+
+def _agree(a: Calibration, b: Calibration) -> bool:
+    """Whether two calibrations have the same cameras up to a motion of the world and its unit of length."""
+    first, second = ({camera.name: camera for camera in own.cameras} for own in (a, b))
+    if first.keys() != second.keys():
+        return False
+    names = sorted(first)
+    rotations, offsets = zip(*(_relative([own[name] for name in names]) for own in (first, second)))
+    K = [np.array([own[name].K for name in names]) for own in (first, second)]
+    return bool(
+        np.abs(rotations[0] - rotations[1]).max() < SAME_ROTATION
+        and np.abs(offsets[0] - offsets[1]).max() < SAME_SHARE
+        and np.abs(K[0] - K[1]).max() < SAME_PIXELS
+    )
+
+
+def _relative(cameras: Sequence[PosedCamera]) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations ``[V, 3, 3]`` and positions ``[V, 3]`` in the axes of the first camera, in extents of the rig."""
+    first = cameras[0].viewmat[:3, :3]
+    centers = np.array([camera.center for camera in cameras])
+    extent = float(np.linalg.norm(np.ptp(centers, axis=0))) or 1.0
+    return np.array([camera.viewmat[:3, :3] @ first.T for camera in cameras]), (centers - centers[0]) @ first.T / extent

@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Text that people and other programs wrote: its encoding, its numbers, the paths in it, and what is wrong with it.
+
+Editors of Windows put a byte order mark before UTF-8, its shells write UTF-16, locales write decimal commas, and paths
+are those of the machine that wrote the file. Every reader of calibrations and lists takes these functions.
+"""
+
+import json
+import math
+import os
+import re
+import struct
+import tomllib
+import zipfile
+from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE, BOM_UTF32_BE, BOM_UTF32_LE
+from collections.abc import Collection
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+# Longer marks first: UTF-32's begins as UTF-16's.
+ENCODINGS = (
+    (BOM_UTF32_LE, "utf-32-le"), (BOM_UTF32_BE, "utf-32-be"), (BOM_UTF8, "utf-8"), (BOM_UTF16_LE, "utf-16-le"),
+    (BOM_UTF16_BE, "utf-16-be"),
+)  # fmt: skip
+UNMARKED = {(False, True): "utf-16-le", (True, False): "utf-16-be"}
+"""By whether the first and the second byte are zero, which a character of a calibration's beginning is not."""
+
+
+MOST_PIXELS = 65_535  # of a side of a picture
+
+
+class Unreadable(ValueError):
+    """What is wrong with a file, in words for its user; :func:`reason` repeats them."""
+
+
+BROKEN = (
+    OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, ArithmeticError, EOFError, RecursionError,
+    struct.error, zipfile.BadZipFile,
+)  # fmt: skip
+"""What reading a broken file raises."""
+
+
+def read_text(file: Path) -> str:
+    """The text of a file in UTF-8, UTF-16 or UTF-32, with or without a byte order mark; lines end with ``\\n``.
+
+    Raises:
+        Unreadable: it is in another encoding.
+        OSError: it cannot be read.
+    """
+    data = file.read_bytes()
+    mark, encoding = next(((mark, name) for mark, name in ENCODINGS if data.startswith(mark)), (b"", "utf-8"))
+    if not mark and len(data) > 1:
+        encoding = UNMARKED.get((data[0] == 0, data[1] == 0), encoding)
+    try:
+        text = data[len(mark) :].decode(encoding)
+    except UnicodeDecodeError as error:
+        place = f"byte {error.start + len(mark)}"
+        raise Unreadable(f"it is no Unicode text from {place} on; save it as UTF-8") from None
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def read_json(file: Path) -> Any:
+    """The content of a JSON file.
+
+    Raises:
+        Unreadable: it is not JSON.
+        OSError: it cannot be read.
+    """
+    try:
+        return json.loads(read_text(file))
+    except json.JSONDecodeError as error:
+        raise Unreadable(f"it is not JSON from line {error.lineno}, column {error.colno} on") from None
+    except (RecursionError, ValueError) as error:
+        raise error if isinstance(error, Unreadable) else Unreadable("it is not JSON of a calibration") from None
+
+
+def read_toml(file: Path) -> dict[str, Any]:
+    """The content of a TOML file.
+
+    Raises:
+        Unreadable: it is not TOML.
+        OSError: it cannot be read.
+    """
+    try:
+        return tomllib.loads(read_text(file))
+    except tomllib.TOMLDecodeError as error:
+        place = re.search(r"at (line \d+, column \d+|end of document)", str(error))
+        raise Unreadable(f"it is not TOML at {place[1] if place else 'some place'}") from None
+    except (RecursionError, ValueError) as error:
+        raise error if isinstance(error, Unreadable) else Unreadable("it is not TOML of a calibration") from None
+
+
+def number(value: Any) -> float:
+    """A finite number, also one that was written as text, with a decimal point or comma.
+
+    Raises:
+        Unreadable: it is something else.
+    """
+    try:
+        found = float(value.strip().replace(",", ".") if isinstance(value, str) else value)
+    except (TypeError, ValueError, OverflowError):
+        raise Unreadable(f"{_shown(value)} in place of a number") from None
+    if not math.isfinite(found):
+        raise Unreadable(f"a number that is not finite ({found:g})")
+    return found
+
+
+def whole(value: Any) -> int:
+    """A whole number, as :func:`number`; ``320.0`` is one, too.
+
+    Raises:
+        Unreadable: it is something else.
+    """
+    if not (found := number(value)).is_integer():
+        raise Unreadable(f"{_shown(value)} in place of a whole number")
+    return int(found)
+
+
+def pixels(size: Any) -> tuple[int, int]:
+    """Width and height of a picture.
+
+    Raises:
+        Unreadable: other than two numbers of at least one pixel.
+    """
+    if isinstance(size, str) or not hasattr(size, "__len__") or len(size) != 2:
+        raise Unreadable(f"{_shown(size)} in place of width and height")
+    width, height = (round(number(side)) for side in size)
+    if not 1 <= min(width, height) <= max(width, height) <= MOST_PIXELS:
+        raise Unreadable(f"a picture of {width}x{height} pixels")
+    return width, height
+
+
+def mapping(value: Any) -> dict[str, Any]:
+    """Named values.
+
+    Raises:
+        Unreadable: it is something else.
+    """
+    if not isinstance(value, dict):
+        raise Unreadable(f"{_shown(value)} in place of names with values")
+    return value
+
+
+def _shown(value: Any) -> str:
+    text = "nothing" if value is None else repr(value)
+    return text if len(text) <= 40 else f"{text[:40]}..."
+
+
+def reason(error: Exception) -> str:
+    """What was wrong with a file, as a clause of a message, without the words of the language it is read with."""
+    if isinstance(error, Unreadable):
+        return str(error)
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    if isinstance(error, KeyError) and error.args and isinstance(error.args[0], str | int):
+        return f"no {error.args[0]!r}"
+    if isinstance(error, struct.error | EOFError):
+        return "it is cut"
+    return "values are missing, or of another form"
+
+
+def path_parts(text: str) -> tuple[str, ...]:
+    """The parts of a path of any system: of ``C:\\data\\cam0\\1.png`` they are ``data``, ``cam0`` and ``1.png``."""
+    plain = re.sub(r"^(file://|[A-Za-z]:(?=[\\/]))", "", text.strip()).replace("\\", "/")
+    return tuple(part for part in PurePosixPath(plain).parts if part not in ("/", "//"))
+
+
+class NamedFiles:
+    """Finds the files of a capture by the paths that another program wrote, perhaps on another machine.
+
+    A path may have backslashes, a drive, folders that are not here, no suffix, or that of the pictures from which those
+    here were converted. Folders are listed once each.
+
+    Args:
+        folder: that the paths are relative to.
+        suffixes: of files that a path without suffix, or with another of these, stands for; lower case.
+    """
+
+    def __init__(self, folder: Path, suffixes: Collection[str]) -> None:
+        self._folder = folder
+        self._suffixes = suffixes
+        self._listings: dict[Path, dict[str, list[Path]]] = {}
+        self._texts: dict[Path, str] = {}
+
+    def find(self, text: str) -> Path | None:
+        """The file that a path means; None where there is none.
+
+        Raises:
+            Unreadable: it is the file of another path, too.
+        """
+        parts = path_parts(text)
+        absolute = re.match(r"\s*(/|\\|file:|[A-Za-z]:[\\/])", text) is not None
+        tails = [parts[first:] for first in range(len(parts) if absolute else 1)]
+        file = next((file for tail in tails if (file := self._listed(self._folder.joinpath(*tail))) is not None), None)
+        if file is not None and self._texts.setdefault(file, text) != text:
+            raise Unreadable(f"{self._texts[file]!r} and {text!r} both mean {file.name}")
+        return file
+
+    def _listed(self, path: Path) -> Path | None:
+        path = Path(os.path.normpath(path))
+        if path.parent not in self._listings:
+            found = self._listings[path.parent] = {}
+            for entry in path.parent.iterdir() if path.parent.is_dir() else ():
+                found.setdefault(_stem(entry, self._suffixes), []).append(entry)
+        same = self._listings[path.parent].get(_stem(path, self._suffixes), [])
+        exact = next((entry for entry in same if entry.name == path.name), None)
+        others = [entry for entry in same if entry.suffix.lower() in self._suffixes]
+        return exact or (others[0] if len(others) == 1 else None)
+
+
+def _stem(path: Path, suffixes: Collection[str]) -> str:
+    return path.stem if path.suffix.lower() in suffixes else path.name

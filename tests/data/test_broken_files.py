@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cut and changed calibration files give cameras or one sentence of the package's own: nothing else, in no reader."""
+
+import re
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibrations import WRITERS, truths
+from captures import (
+    HEIGHT,
+    WIDTH,
+    small_rig,
+    write_clip,
+    write_immersive,
+    write_n3dv,
+    write_panoptic,
+    write_shared_intrinsics,
+    write_text_model,
+)
+from properties import THOROUGH
+from structgstream.data.colmap import read_model
+from structgstream.data.found_calibrations import read_calibration
+from structgstream.data.open import open_capture
+from structgstream.data.posed_capture import filmed_by
+from structgstream.errors import StructGStreamError
+
+PYTHONS_WORDS = re.compile(
+    r"\b\w+Error\b|\b(NoneType|int|float|str|dict|tuple|object|dtype|literal|codec|subscript\w*|unpack|argument|"
+    r"keyword|iterable|hashable|inhomogeneous|broadcast|buffer|BadZipFile|pickle data|opcode)\b"
+)
+TOKENS = (b"null", b"-1", b"1e400", b"nan", b"{}", b"[]", b'"x"', b"true", b"\xff\xfe", b"\0", b"[[", b"0", b"\n", b",")
+
+
+def mutated(data: bytes, seed: int) -> bytes:
+    """Cut, with a piece removed or doubled, with other bytes, or with a number replaced by what is none."""
+    rng = np.random.default_rng(seed)
+    at, other = sorted(int(place) for place in rng.integers(0, len(data), 2))
+    token = TOKENS[int(rng.integers(len(TOKENS)))]
+    match seed % 6:
+        case 0:
+            return data[:at]
+        case 1:
+            return data[:at] + data[min(other, at + 40) :]
+        case 2:
+            changed = bytearray(data)
+            for place in rng.integers(0, len(data), 3):
+                changed[place] = int(rng.integers(256))
+            return bytes(changed)
+        case 3:
+            return data[:at] + token + data[at:]
+        case 4:
+            return data[:other] + data[at:]
+    numbers = list(re.finditer(rb"-?\d+(\.\d+)?(e-?\d+)?|\"\w+\"", data)) or [re.match(b"", data)]
+    found = numbers[int(rng.integers(len(numbers)))]
+    assert found is not None
+    return data[: found.start()] + token + data[found.end() :]
+
+
+def check_mutants(folder: Path, files: Sequence[Path], read: Callable[[], object], *, count: int) -> None:
+    whole = {file: file.read_bytes() for file in files}
+    refused = 0
+    for seed in range(count):
+        file = files[seed % len(files)]
+        file.write_bytes(mutated(whole[file], seed))
+        try:
+            read()
+        except StructGStreamError as error:
+            refused += 1
+            told = str(error).replace(str(folder), "FOLDER").replace(str(folder.parent), "FOLDER")
+            assert not PYTHONS_WORDS.search(told), f"mutant {seed} of {file.name}: {told}"
+        except BaseException as error:
+            raise AssertionError(f"mutant {seed} of {file.name}") from error
+        finally:
+            file.write_bytes(whole[file])
+    assert refused > count // 10  # what is cut is noticed
+
+
+@pytest.mark.parametrize("tool", WRITERS)
+def test_files_of_tools(tool: str, tmp_path: Path) -> None:
+    WRITERS[tool](tmp_path, truths())
+    names = {"kalibr": ("cam0", "cam1", "cam2"), "cmu_panoptic": ("00_00", "00_01", "00_02")}
+    sizes = dict.fromkeys(names.get(tool, ("cam00", "cam01", "cam02")), (WIDTH, HEIGHT))
+
+    def read() -> None:
+        if (calibration := read_calibration(tmp_path)) is not None:
+            filmed_by(calibration, sizes, root=tmp_path)
+
+    check_mutants(tmp_path, sorted(tmp_path.glob("*.*")), read, count=1000 if THOROUGH else 36)
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_models_of_colmap(binary: bool, tmp_path: Path) -> None:
+    rig = small_rig(3)
+    pictures = [(f"{name}.png", name) for name in rig]
+    write_text_model(tmp_path, rig, pictures, points=np.eye(3))
+    if binary:
+        write_binary(tmp_path)
+    sizes = dict.fromkeys(rig, (WIDTH, HEIGHT))
+    files = sorted(tmp_path.glob("*.bin" if binary else "*.txt"))
+    read = lambda: filmed_by(read_model(tmp_path), sizes, root=tmp_path)  # noqa: E731
+    check_mutants(tmp_path, files, read, count=1000 if THOROUGH else 60)
+
+
+def write_binary(folder: Path) -> None:
+    """The model in ``folder`` as binary files in place of text."""
+    import struct
+
+    rows = {name: (folder / f"{name}.txt").read_text().splitlines() for name in ("cameras", "images", "points3D")}
+    lines = {name: [row for row in own if row and not row.startswith("#")] for name, own in rows.items()}
+    cameras, images = [line.split() for line in lines["cameras"]], [line.split() for line in lines["images"]]
+    images = [words for words in images if words[-1].endswith(".png")]
+    data = struct.pack("<Q", len(cameras))
+    for number, _, width, height, *params in cameras:
+        data += struct.pack("<iiQQ4d", int(number), 1, int(width), int(height), *map(float, params))
+    (folder / "cameras.bin").write_bytes(data)
+    data = struct.pack("<Q", len(images))
+    for words in images:
+        data += struct.pack("<i7di", int(words[0]), *map(float, words[1:8]), int(words[8]))
+        data += words[9].encode() + b"\0" + struct.pack("<Q", 0)
+    (folder / "images.bin").write_bytes(data)
+    data = struct.pack("<Q", len(lines["points3D"]))
+    for number, line in enumerate(lines["points3D"]):
+        data += struct.pack("<Q3d3BdQ", number, *map(float, line.split()[1:4]), 0, 0, 0, 0.1, 0)
+    (folder / "points3D.bin").write_bytes(data)
+
+
+CAPTURES: dict[str, tuple[Callable[..., object], Sequence[str]]] = {
+    "panoptic": (write_panoptic, ("train_meta.json", "test_meta.json")),
+    "clip": (write_clip, ("cameras.json",)),
+    "shared": (write_shared_intrinsics, ("cameras.json",)),
+    "n3dv": (write_n3dv, ("poses_bounds.npy",)),
+    "immersive": (write_immersive, ("models.json",)),
+}
+
+
+@pytest.mark.parametrize("layout", CAPTURES)
+def test_captures(layout: str, tmp_path: Path) -> None:
+    write, names = CAPTURES[layout]
+    write(tmp_path)
+    files = [tmp_path / name for name in names]
+    check_mutants(tmp_path, files, lambda: open_capture(tmp_path), count=1000 if THOROUGH else 24)
+    shutil.rmtree(tmp_path)

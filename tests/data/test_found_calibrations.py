@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibrations and frames where tools leave them: which are found, together, and with which cameras."""
+
+import logging
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibrations import NAMES, WRITERS, Truth, opencv_matrix, truths, write_anipose, write_kalibr, write_opencv
+from captures import HEIGHT, WIDTH, numbers, picture, small_rig, write_picture, write_text_model, write_videos
+from structgstream.data.found_calibrations import read_calibrated
+from structgstream.data.open import open_capture
+from structgstream.errors import CalibrationError, CaptureError
+
+RIG = small_rig(3)
+
+
+def check_opens(folder: Path, *, frames: int = 2, names: tuple[str, ...] = NAMES) -> None:
+    source = open_capture(folder)
+    assert list(source.rig) == list(names)
+    assert len(source) == frames
+    shown = next(iter(source.frames())).images
+    assert [numbers(shown[name])[0] for name in names] == list(range(len(names)))
+
+
+def pictures(folder: Path, pattern: str) -> None:
+    for camera, name in enumerate(NAMES):
+        for frame in range(2):
+            write_picture(
+                folder / pattern.replace("CAM", name).replace("FRAME", f"{frame:06d}"), picture(camera, frame)
+            )
+
+
+def model(folder: Path) -> None:
+    write_text_model(folder, RIG, [(f"{name}.png", name) for name in RIG])
+
+
+@pytest.mark.parametrize(
+    ("pattern", "calibrate"),
+    [
+        pytest.param("CAM/frame_FRAME.png", lambda path: model(path / "sparse_"), id="4dgaussians"),
+        pytest.param("frameFRAME/images/CAM.png", lambda path: model(path / "frame000000/sparse/0"), id="3dgstream"),
+        pytest.param("frames/frameFRAME/images/CAM.png", lambda path: model(path / "sparse/0"), id="3dgstream-model"),
+        pytest.param("CAM/data/FRAME.png", lambda path: model(path / "sparse/1"), id="euroc"),
+        pytest.param("dense/images/CAM/FRAME.png", lambda path: model(path / "dense/sparse"), id="dense"),
+        pytest.param("dense/0/images/CAM/FRAME.png", lambda path: model(path / "dense/0/sparse"), id="dense-0"),
+        pytest.param("images/CAM/FRAME.png", lambda path: calibrated(path / "calibration"), id="one-folder-apart"),
+    ],
+)
+def test_folders_of_pictures(tmp_path: Path, pattern: str, calibrate: Callable[[Path], None]) -> None:
+    pictures(tmp_path, pattern)
+    calibrate(tmp_path)
+    check_opens(tmp_path)
+
+
+def calibrated(folder: Path, cameras: list[Truth] | None = None) -> None:
+    folder.mkdir(exist_ok=True)
+    write_anipose(folder, cameras or truths(dist=(0, 0, 0, 0)))
+
+
+@pytest.mark.parametrize(
+    ("videos", "calibration"),
+    [
+        pytest.param("synchronized_videos", "", id="freemocap"),
+        pytest.param("videos", "calibration", id="pose2sim"),
+        pytest.param("recordings/walk", "", id="caliscope"),
+        pytest.param("take1", "calib_2026", id="a-take"),
+    ],
+)
+def test_projects_given_whole(tmp_path: Path, videos: str, calibration: str) -> None:
+    write_videos(tmp_path / videos, NAMES, frames=2)
+    calibrated(tmp_path / calibration)
+    if calibration == "calibration":  # Pose2Sim calibrates from pictures that are no capture
+        for camera, name in enumerate(NAMES):
+            write_picture(tmp_path / f"calibration/extrinsics/ext_{name}_img/{name}.png", picture(camera + 4, 7))
+    check_opens(tmp_path)
+    shutil.copytree(tmp_path / videos, (tmp_path / videos).with_name("another"))
+    if videos not in ("videos", "synchronized_videos"):
+        with pytest.raises(CaptureError, match=r"videos in several folders .*Give the folder of one take"):
+            open_capture(tmp_path)
+
+
+def test_a_folder_per_camera_with_its_own_file(tmp_path: Path) -> None:
+    write_videos(tmp_path, NAMES, frames=2)
+    write_opencv(tmp_path, truths(dist=(0, 0, 0, 0)))
+    for name in NAMES:
+        (tmp_path / name / "DCIM/100GOPRO").mkdir(parents=True)
+        (tmp_path / f"{name}.mp4").rename(tmp_path / name / "DCIM/100GOPRO/GX010001.MP4")
+        (tmp_path / f"{name}.yml").rename(tmp_path / name / "config.yml")
+    check_opens(tmp_path)
+
+
+def test_calibrations_that_differ_are_refused(tmp_path: Path) -> None:
+    cameras = truths()
+    write_anipose(tmp_path, cameras).rename(tmp_path / "monday.toml")
+    write_anipose(tmp_path, cameras).rename(tmp_path / "copy.toml")
+    found = read_calibrated(tmp_path)
+    assert found is not None
+    assert found.where.name == "copy.toml"
+    moved = [*cameras[:2], Truth("cam02", cameras[2].K, cameras[2].dist, cameras[2].R, cameras[2].T + 0.5)]
+    write_anipose(tmp_path, moved).rename(tmp_path / "tuesday.toml")
+    with pytest.raises(CalibrationError, match=r"several calibrations that differ, copy\.toml and tuesday\.toml"):
+        read_calibrated(tmp_path)
+    assert read_calibrated(tmp_path, tmp_path / "tuesday.toml") is not None
+
+
+def test_the_largest_model_is_taken(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    pictures(tmp_path, "images/CAM/FRAME.png")
+    model(tmp_path / "sparse/1")
+    write_text_model(tmp_path / "sparse/0", RIG, [("cam00.png", "cam00"), ("cam01.png", "cam01")])
+    check_opens(tmp_path)
+    assert "several models: 1 of 3 pictures is taken, 0 of 2 left out" in caplog.text
+    caplog.clear()
+
+
+@pytest.mark.parametrize("tool", ["anipose", "easymocap", "multical", "cmu_panoptic", "opencv_cameras", "openpose"])
+def test_files_of_windows_editors(tool: str, tmp_path: Path) -> None:
+    """A byte order mark and carriage returns change nothing."""
+    WRITERS[tool](tmp_path, truths())
+    plain = read_calibrated(tmp_path)
+    for file in tmp_path.iterdir():
+        file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes().replace(b"\n", b"\r\n"))
+    marked = read_calibrated(tmp_path)
+    assert plain is not None
+    assert marked is not None
+    for one, other in zip(plain.cameras, marked.cameras, strict=True):
+        np.testing.assert_array_equal(one.viewmat, other.viewmat)
+        assert (one.name, one.lens, one.size) == (other.name, other.lens, other.size)
+
+
+def test_kalibr_with_an_imu(tmp_path: Path) -> None:
+    file = write_kalibr(tmp_path, truths())
+    plain = read_calibrated(tmp_path)
+    file.write_text(f"%YAML:1.0\n---\n{file.read_text()}\nT_imu_body:\n  [1.0, 0.0, 0.0]\n")
+    (tmp_path / "a_imu_chain.yaml").write_text("imu0:\n  update_rate: 200.0\n")
+    found = read_calibrated(tmp_path)
+    assert plain is not None
+    assert found is not None
+    assert [camera.name for camera in found.cameras] == ["cam0", "cam1", "cam2"]
+    np.testing.assert_array_equal(found.cameras[2].viewmat, plain.cameras[2].viewmat)
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        ("K", "D", "R", "T"),
+        ("CameraMatrix", "DistortionCoeffs", "Rotation", "Translation"),
+        ("intrinsic_matrix", "dist_coeffs", "rvec", "tvec"),
+        ("mtx", "dist", "rotation_vector", "translation_vector"),
+    ],
+)
+def test_spellings_of_opencvs_keys(keys: tuple[str, ...], tmp_path: Path) -> None:
+    for truth in truths():
+        turned = truth.rvec if "vec" in keys[2] or keys[2] == "Rotation" else truth.R
+        values = zip(keys, (truth.K, truth.dist, turned, truth.T), strict=True)
+        text = "%YAML:1.0\n---\n" + "".join(
+            opencv_matrix(key, np.array(value)[:, None] if np.ndim(value) == 1 else value) for key, value in values
+        )
+        (tmp_path / f"{truth.name}.yaml").write_text(text + f"image_Width: {WIDTH}\nImageHeight: {HEIGHT}\n")
+    (tmp_path / "settings.yaml").write_text("%YAML:1.0\nCamera.fx: 500\n")
+    found = read_calibrated(tmp_path)
+    assert found is not None
+    for truth, camera in zip(truths(), found.cameras, strict=True):
+        np.testing.assert_allclose(camera.viewmat[:3, :3], truth.R, atol=1e-9)
+        np.testing.assert_allclose(camera.viewmat[:3, 3], truth.T)
+        assert camera.size == (WIDTH, HEIGHT)
+
+
+def test_mc_calib_has_all_cameras_in_one_file(tmp_path: Path) -> None:
+    text = "%YAML:1.0\n---\nnb_camera: 3\n"
+    for number, truth in enumerate(truths()):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = truth.R, truth.T
+        own = opencv_matrix("camera_matrix", truth.K) + opencv_matrix("distortion_vector", truth.dist)
+        own += f"distortion_type: 0\nimg_width: {WIDTH}\nimg_height: {HEIGHT}\n"
+        own += opencv_matrix("camera_pose_matrix", np.linalg.inv(pose))
+        text += f"camera_{number}:\n" + "".join(f"  {line}\n" for line in own.splitlines())
+    (tmp_path / "calibrated_cameras_data.yml").write_text(text)
+    found = read_calibrated(tmp_path)
+    assert found is not None
+    assert [camera.name for camera in found.cameras] == ["camera_0", "camera_1", "camera_2"]
+    for truth, camera in zip(truths(), found.cameras, strict=True):
+        np.testing.assert_allclose(camera.viewmat[:3, 3], truth.T, atol=1e-9)
+
+
+def test_a_camera_without_a_pose_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_videos(tmp_path, NAMES, frames=2)
+    file = write_anipose(tmp_path, truths(dist=(0, 0, 0, 0)))
+    tables = file.read_text().split("\n\n")
+    tables[2] = "\n".join(line for line in tables[2].split("\n") if not line.startswith(("rotation", "translation")))
+    file.write_text("\n\n".join(tables))
+    with caplog.at_level(logging.WARNING):
+        check_opens(tmp_path, names=NAMES[:2])
+    assert "has no pose of camera 'cam02'; left out" in caplog.text
+    caplog.clear()
+
+
+def test_numbers_alone_are_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_videos(tmp_path, ["right_0", "right_1", "right_2"], frames=2)
+    calibrated(tmp_path, truths(names=("left_2", "left_1", "left_0"), dist=(0, 0, 0, 0)))
+    assert list(open_capture(tmp_path).rig) == ["right_0", "right_1", "right_2"]
+    assert "cameras are told by their numbers alone: right_0 is 'left_0'" in caplog.text
+    caplog.clear()
