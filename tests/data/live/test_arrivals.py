@@ -21,8 +21,6 @@ PERIOD = 1 / 30
 class Taken:
     """An outlet that keeps sets, and may fail."""
 
-    newest_only = True
-
     def __init__(self, *, fails: Exception | None = None) -> None:
         self.sets: list[PictureSet] = []
         self.waiting, self._fails = 0, fails

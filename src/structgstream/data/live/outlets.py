@@ -45,8 +45,6 @@ class QueueStatus:
 class Outlet(Protocol):
     """Takes complete sets from the cameras' side and gives frames to the trainer's."""
 
-    newest_only: bool
-
     def put(self, found: PictureSet) -> None:
         """Takes a set."""
         ...
@@ -77,8 +75,6 @@ class Outlet(Protocol):
 
 class Latest:
     """Holds the newest set; who asks gets that, and the ones before are skipped."""
-
-    newest_only = True
 
     def __init__(self, convert: Convert) -> None:
         self._convert = convert
@@ -132,8 +128,6 @@ class DiskQueue:
     Raises:
         StorageError: the folder cannot be used.
     """
-
-    newest_only = False
 
     def __init__(self, folder: Path, *, most_bytes: int, convert: Convert, resume: bool = False) -> None:
         self._folder, self._most, self._convert = folder, most_bytes, convert
