@@ -1,11 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 import json
-from dataclasses import fields, is_dataclass
+import math
+import re
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
 
 import pytest
 
 from structgstream.errors import ConfigError
-from structgstream.presets import DEFAULT_PRESET, DEMO_PRESET, PAPER_METHOD_PRESET, PRESETS, from_json, to_json
+from structgstream.presets import (
+    DEFAULT_PRESET,
+    DEMO_PRESET,
+    PAPER_METHOD_PRESET,
+    PRESETS,
+    StreamConfig,
+    completed,
+    from_json,
+    to_json,
+)
 from structgstream.training.initial import InitialRates
 
 
@@ -54,9 +66,52 @@ def test_a_configuration_comes_back_from_a_header(name: str) -> None:
     assert from_json(json.loads(json.dumps(to_json(PRESETS[name])))) == PRESETS[name]
 
 
-def test_configurations_of_other_versions_are_refused() -> None:
+def test_a_configuration_of_an_older_version_has_the_defaults_of_what_it_lacks() -> None:
     values = to_json(PRESETS["compact"])
-    lacking = {name: value for name, value in values.items() if name != "rate"}
-    for other in (values | {"later": 1}, lacking, {"seed": 0}, {"method": "another"}):
-        with pytest.raises(ConfigError, match="another version"):
-            from_json(other)
+    del values["rate"], values["online"]["motion_prior"], values["initial"]["rates"]
+    found = from_json(values)
+    assert (found.rate, found.online.motion_prior) == (StreamConfig().rate, StreamConfig().online.motion_prior)
+    assert found.initial.rates == InitialRates()
+    assert found.points == PRESETS["compact"].points
+    assert completed(values) == to_json(found)
+    other = {"method": "another", "seed": 1}
+    assert completed(other) == other
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        ({"later": 1}, "the field later, which this version of structgstream does not have"),
+        ({"online": {"births": {"later": 1}}}, "the field online.births.later"),
+        ({"seed": "0"}, "seed is '0'; expected a whole number"),
+        ({"seed": True}, "seed is True; expected a whole number"),
+        ({"online": 5}, "of another kind than its field"),
+        ({"online": {"iterations": None}}, "iterations is None; expected a whole number"),
+    ],
+)
+def test_what_no_field_can_have_is_refused_by_its_reason(edit: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        from_json(to_json(PRESETS["compact"]) | edit)
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("online.iterations", -5),
+        ("online.mean_of_last", 2.0),
+        ("online.motion_prior", math.nan),
+        ("online.motion.picture_scale", 0.0),
+        ("initial.rates.offsets.initial", -1e-3),
+        ("key_interval_seconds", math.inf),
+        ("normalised_radius", 0.0),
+        ("rate.target_mbits", -1.0),
+        ("seed", -1),
+    ],
+)
+def test_values_out_of_range_are_refused_by_the_path_of_the_field(path: str, value: float) -> None:
+    def edited(config: Any, names: list[str]) -> Any:
+        first, *others = names
+        return replace(config, **{first: edited(getattr(config, first), others) if others else value})
+
+    with pytest.raises(ConfigError, match=re.escape(path) if path != "seed" else "seed"):
+        edited(PRESETS["compact"], path.split("."))

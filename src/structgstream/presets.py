@@ -2,8 +2,8 @@
 """Configurations as values. Paper mode is a preset; the paper's ablations are edits of a preset."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, is_dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -31,6 +31,13 @@ from structgstream.training.perturbation import PerturbationConfig
 from structgstream.training.regularizers import RegularizerConfig
 from structgstream.training.rounding import RoundingConfig
 
+SIGNED = frozenset({"quality", "tiles_around"})
+"""Fields that may be negative."""
+SHARES = frozenset({"mean_of_last", "motion_prior", "picture_scale", "dropped_share", "until_share", "carried_share"})
+"""Fields that are at most 1."""
+POSITIVE = frozenset({"picture_scale", "normalised_radius", "key_interval_seconds"})
+"""Fields that must not be 0."""
+_KINDS: Mapping[Any, tuple[type, ...]] = {int: (int,), float: (int, float), bool: (bool,)}
 MOST_QUALITY = 6.0  # steps 64 times as small, or as large
 
 
@@ -61,6 +68,7 @@ class StreamConfig:
     """Random seed, from 0 on."""
 
     def __post_init__(self) -> None:
+        check_numbers(self)
         if self.seed < 0:
             raise ConfigError(f"A random seed is a whole number from 0 on, got {self.seed}.")
 
@@ -86,19 +94,77 @@ def to_json(config: StreamConfig) -> dict[str, Any]:
 def from_json(values: Mapping[str, Any]) -> StreamConfig:
     """The configuration that :func:`to_json` turned into ``values``, such as a stream's header has.
 
+    Fields that ``values`` lacks, as those of an older version do, have their defaults.
+
     Raises:
-        ConfigError: they are of another version of this program, or no configuration of a stream.
+        ConfigError: there is a field that this version does not have, or a value that no field can have.
     """
+    if unknown := [*_unknown(StreamConfig, values)]:
+        raise ConfigError(
+            f"The header's configuration has the field {unknown[0]}, which this version of structgstream does not "
+            "have; continue the stream with the version that began it."
+        )
     try:
         config = _read(StreamConfig, values)
-        if to_json(config) == dict(values):
+        if _holds(to_json(config), dict(values)):
             return config
-    except (TypeError, ValueError, KeyError):
-        pass
-    raise ConfigError(
-        "The header's configuration is of another version of structgstream, or another method's; reconstruct its "
-        "stream again with this version."
-    )
+    except (TypeError, ValueError, KeyError, AttributeError) as error:
+        raise ConfigError("The header's configuration has a value of another kind than its field.") from error
+    raise ConfigError("The header's configuration has a value of another kind than its field.")
+
+
+def completed(values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """``values`` with the defaults of the fields that they lack; another method's as they are."""
+    try:
+        return to_json(from_json(values)) if values else values
+    except ConfigError:
+        return values
+
+
+def _holds(found: Any, given: Any) -> bool:
+    """Whether ``found`` has all that is ``given``."""
+    if isinstance(given, dict) and isinstance(found, dict):
+        return all(
+            (key == "period" and key not in found) or _holds(found.get(key), item) for key, item in given.items()
+        )
+    return (type(found) is type(given) and found == given) or (_is_number(found, given) and found == given)
+
+
+def _is_number(*values: Any) -> bool:
+    return all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
+
+
+def _unknown(kind: Any, values: Any, path: str = "") -> Iterator[str]:
+    """Paths in ``values`` of fields that the dataclass ``kind`` lacks."""
+    hints = get_type_hints(kind) if isinstance(kind, type) and is_dataclass(kind) else {}
+    for name, item in values.items() if hints and isinstance(values, Mapping) else ():
+        if name not in hints:
+            yield f"{path}{name}"
+        else:
+            yield from _unknown(hints[name], item, f"{path}{name}.")
+
+
+def check_numbers(config: Any, path: str = "") -> None:
+    """Check every number of a configuration and of those in it: finite, not negative, and within its bounds.
+
+    Raises:
+        ConfigError: naming the field by its path.
+    """
+    hints = get_type_hints(type(config))
+    for item in fields(config):
+        value, where = getattr(config, item.name), f"{path}{item.name}"
+        if is_dataclass(value):
+            check_numbers(value, f"{where}.")
+        elif hints[item.name] in _KINDS and type(value) not in _KINDS[hints[item.name]]:
+            expected = {int: "a whole number", float: "a number", bool: "true or false"}[hints[item.name]]
+            raise ConfigError(f"{where} is {value!r}; expected {expected}.")
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            shares = item.name in SHARES
+            least, most = (-math.inf if item.name in SIGNED else 0.0), (1.0 if shares else math.inf)
+            positive = item.name in POSITIVE
+            if not math.isfinite(value) or not least <= value <= most or (positive and value == 0):
+                start = "more than 0" if positive else "a finite number" if item.name in SIGNED else "0 or more"
+                raise ConfigError(f"{where} is {value!r}; expected {start}{', and at most 1' if shares else ''}.")
 
 
 def _read(kind: Any, value: Any) -> Any:

@@ -7,6 +7,7 @@ from structgstream.cameras import CameraRig
 from structgstream.codec.packets import StreamHeader
 from structgstream.errors import ConfigError
 from structgstream.pipeline import StreamFacts
+from structgstream.presets import completed
 
 
 def check_resumable(header: StreamHeader, facts: StreamFacts) -> None:
@@ -20,7 +21,7 @@ def check_resumable(header: StreamHeader, facts: StreamFacts) -> None:
             f"The stream was made by another method or codec, {header.codec!r} instead of {facts.codec!r}. "
             "Resume with the same, or start again with --overwrite."
         )
-    differing = list(_differences(dict(header.config), dict(facts.config)))
+    differing = list(_differences(dict(completed(header.config)), dict(completed(facts.config))))
     if differing:
         raise ConfigError(
             f"The stream was made with another configuration: {', '.join(differing[:5])} differ. "

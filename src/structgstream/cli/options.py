@@ -66,15 +66,15 @@ def resolve_config(
     with usage_errors():
         default = preset_named(name)
     description = f"Fields of the configuration, with the values of the preset {name!r} as defaults."
-    config = tyro.cli(
-        StreamConfig,
-        prog=f"structgstream {command}",
-        description=description,
-        default=default,
-        args=overrides,
-        config=(tyro.conf.FlagConversionOff,),
-    )
     with usage_errors():
+        config = tyro.cli(
+            StreamConfig,
+            prog=f"structgstream {command}",
+            description=description,
+            default=default,
+            args=overrides,
+            config=(tyro.conf.FlagConversionOff,),
+        )
         return (config if seed is None else replace(config, seed=seed)), name
 
 
