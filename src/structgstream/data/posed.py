@@ -44,12 +44,15 @@ class Calibration:
         cameras: as :class:`PosedCamera`; several of one camera must agree.
         points: ``[P, 3]`` points of the scene, or None.
         held_out: names of cameras that are kept from training as published.
+        turned_by_exif: whether it is for pictures turned as their EXIF orientation says, as OpenCV reads them; None
+            where that depends on how it was made.
     """
 
     where: Path
     cameras: tuple[PosedCamera, ...]
     points: NDArray[np.float64] | None = None
     held_out: Sequence[str] = ()
+    turned_by_exif: bool | None = None
 
 
 def rigid(rotation: ArrayLike, translation: ArrayLike) -> NDArray[np.float64]:
