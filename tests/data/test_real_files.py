@@ -11,15 +11,18 @@ import av
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from captures import small_rig
 from structgstream.data.folder_files import files_of
-from structgstream.data.images import ImageSource, common_pictures, read_picture
+from structgstream.data.images import ImageSource, common_pictures, read_picture, turned
+from structgstream.data.posed import Calibration, PosedCamera
+from structgstream.data.posed_capture import _orientation
 from structgstream.data.timeline import picture_slots
 from structgstream.data.transfer import HLG, PQ, high_range_to_srgb
 from structgstream.data.video import synchronised
 from structgstream.data.video_index import scan_videos
-from structgstream.errors import CaptureError, StructGStreamError
+from structgstream.errors import CalibrationError, CaptureError, StructGStreamError
 from structgstream.preparation.footage import find_footage
 
 RIG = small_rig(3)
@@ -105,6 +108,36 @@ def picture_source(folder: Path, content: np.ndarray[Any, Any]) -> ImageSource:
 def test_values_of_10_12_and_14_bits_in_16_are_read_at_their_scale(tmp_path: Path, bits: int) -> None:
     stored = np.full((48, 64, 3), 200 << (bits - 8), np.uint16)
     assert (next(picture_source(tmp_path, stored).frames()).images["cam00"] == 200).all()
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pictures_are_turned_as_opencv_turns_them(tmp_path: Path, orientation: int) -> None:
+    stored = np.random.default_rng(0).integers(0, 255, (6, 8, 3), np.uint8)
+    exif = Image.Exif()
+    exif[0x112] = orientation
+    Image.fromarray(stored).save(tmp_path / "a.jpg", exif=exif, quality=100)
+    shown = cv2.imread(str(tmp_path / "a.jpg"))[..., ::-1]
+    np.testing.assert_array_equal(turned(read_picture(tmp_path / "a.jpg"), orientation), shown)
+
+
+@pytest.mark.parametrize(
+    ("orientation", "size", "by_exif", "expected"),
+    [(1, (8, 6), None, 1), (6, (6, 8), None, 6), (6, (8, 6), None, 1), (3, (8, 6), True, 3), (3, (8, 6), False, 1),
+     (3, (8, 6), None, None)],
+)  # fmt: skip
+def test_the_calibration_decides_whether_pictures_are_turned(
+    tmp_path: Path, orientation: int, size: tuple[int, int], by_exif: bool | None, expected: int | None
+) -> None:
+    exif = Image.Exif()
+    exif[0x112] = orientation
+    Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "a.jpg", exif=exif)
+    posed = PosedCamera("a", np.eye(4), np.eye(3), size)
+    calibration = Calibration(tmp_path / "intri.yml", (posed,), turned_by_exif=by_exif)
+    if expected is None:
+        with pytest.raises(CalibrationError, match="EXIF orientation 3.*upright"):
+            _orientation(tmp_path / "a.jpg", posed, calibration)
+    else:
+        assert _orientation(tmp_path / "a.jpg", posed, calibration) == expected
 
 
 def test_what_alpha_hides_does_not_count(tmp_path: Path) -> None:

@@ -108,7 +108,7 @@ def read_model(folder: Path) -> Calibration:
             f"The COLMAP model in {folder} cannot be read ({reason(error)}); export it again."
         ) from None
     ordered = tuple(sorted(images, key=lambda image: image.name))
-    return Calibration(folder, ordered, points if len(points) else None)
+    return Calibration(folder, ordered, points if len(points) else None, turned_by_exif=False)
 
 
 def _camera(model: str, width: int, height: int, params: tuple[float, ...], where: Path) -> ColmapCamera:

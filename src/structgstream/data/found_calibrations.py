@@ -7,6 +7,7 @@ Tools keep calibration and videos apart: Pose2Sim has ``calibration/Calib.toml``
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,14 +40,24 @@ SAME_ROTATION, SAME_SHARE, SAME_PIXELS = 1e-3, 0.01, 1.0
 
 
 class Converter(NamedTuple):
-    """``find`` gives the sets of files in a folder that are a tool's calibrations, ``read`` the cameras of one."""
+    """``find`` gives the sets of files in a folder that are a tool's calibrations, ``parse`` the cameras of one.
+
+    ``turned_by_exif`` is of :class:`~structgstream.data.posed.Calibration`.
+    """
 
     find: Callable[[Path], Iterator[tuple[Path, ...]]]
-    read: Callable[[tuple[Path, ...]], Calibration]
+    parse: Callable[[tuple[Path, ...]], Calibration]
+    turned_by_exif: bool | None = None
+
+    def read(self, files: tuple[Path, ...]) -> Calibration:
+        """The cameras of a set of files."""
+        return replace(self.parse(files), turned_by_exif=self.turned_by_exif)
 
 
+OF_OPENCV = (anipose, easymocap, multical, opencv_cameras)
+"""Tools that read pictures with OpenCV, which turns them as their EXIF orientation says."""
 CONVERTERS = tuple(
-    Converter(tool.find, tool.read)
+    Converter(tool.find, tool.read, True if tool in OF_OPENCV else None)
     for tool in (anipose, easymocap, multical, kalibr, cmu_panoptic, qualisys, zju_mocap, opencv_cameras)
 )
 

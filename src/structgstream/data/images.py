@@ -7,9 +7,10 @@ import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from itertools import repeat
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,8 @@ OPAQUE = 0.98
 
 log = logging.getLogger(__name__)
 
+Pixel = TypeVar("Pixel", np.uint8, np.bool_)
+
 
 @dataclass(frozen=True)
 class ImageSource:
@@ -40,6 +43,7 @@ class ImageSource:
         instants: name of each frame in the files; empty if frames have no names.
         apart_seconds: camera name to how long after its instant its picture of each frame was taken, ``[N]``; empty
             where that is not known.
+        turns: camera name to the EXIF orientation, 1 to 8, by which its pictures are turned; 1 where it is missing.
     """
 
     name: str
@@ -49,6 +53,7 @@ class ImageSource:
     points: NDArray[np.float64] | None = None
     instants: tuple[str, ...] = ()
     apart_seconds: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    turns: Mapping[str, int] = field(default_factory=dict)
     _bits: dict[int, int] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __len__(self) -> int:
@@ -67,7 +72,13 @@ class ImageSource:
         with ThreadPoolExecutor(min(len(self.rig), os.cpu_count() or 1), "pictures") as pool:
             for index in range(start, len(self)):
                 paths = {name: path for name in self.rig if (path := self.files[name][index]) is not None}
-                found = pool.map(_picture, paths.values(), [self.rig[name] for name in paths], [bits] * len(paths))
+                found = pool.map(
+                    _picture,
+                    paths.values(),
+                    [self.rig[name] for name in paths],
+                    repeat(bits),
+                    [self.turns.get(name, 1) for name in paths],
+                )
                 pictures = dict(zip(paths, found, strict=True))
                 masks = {name: mask for name, (_, mask) in pictures.items() if mask is not None}
                 images = {name: picture for name, (picture, _) in pictures.items()}
@@ -274,9 +285,10 @@ def _converted_heif(path: Path, data: bytes) -> bytes:
     return bytes(opencv().imencode(".png", np.asarray(image)[..., ::-1])[1])
 
 
-def _picture(path: Path, camera: Camera, bits: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+def _picture(path: Path, camera: Camera, bits: int, turn: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
     """One picture and where it is opaque, checked against the size of its camera."""
     picture, mask = read_picture_and_mask(path, bits=bits)
+    picture, mask = turned(picture, turn), None if mask is None else turned(mask, turn)
     height, width = picture.shape[:2]
     if (width, height) != (camera.width, camera.height):
         raise CalibrationError(
@@ -284,6 +296,14 @@ def _picture(path: Path, camera: Camera, bits: int) -> tuple[NDArray[np.uint8], 
             f"{camera.width}x{camera.height}; scale the intrinsics, or use the pictures that were calibrated."
         )
     return picture, mask
+
+
+def turned(picture: NDArray[Pixel], orientation: int) -> NDArray[Pixel]:
+    """A picture ``[H, W, ...]`` as it is shown by its EXIF orientation, 1 to 8."""
+    if orientation >= 5:
+        picture = picture.swapaxes(0, 1)
+    across, down = orientation in (2, 3, 6, 7), orientation in (3, 4, 7, 8)
+    return np.ascontiguousarray(picture[:: -1 if down else 1, :: -1 if across else 1])
 
 
 def reduced_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:

@@ -47,6 +47,8 @@ class Calibration:
         points: ``[P, 3]`` points of the scene, or None.
         held_out: names of cameras that are kept from training as published.
         unposed: names of cameras that it has no pose of.
+        turned_by_exif: whether it is for pictures turned as their EXIF orientation says, as OpenCV reads them; None
+            where that depends on how it was made.
     """
 
     where: Path
@@ -54,6 +56,7 @@ class Calibration:
     points: NDArray[np.float64] | None = None
     held_out: Sequence[str] = ()
     unposed: Sequence[str] = ()
+    turned_by_exif: bool | None = None
 
 
 def rigid(rotation: ArrayLike, translation: ArrayLike) -> NDArray[np.float64]:

@@ -25,6 +25,7 @@ import numpy as np
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_names, listed
 from structgstream.data.camera_files import REDUCED, ROOTS, other_roots, pictures_in, videos_in
+from structgstream.data.exif import read_exif
 from structgstream.data.folder_files import by_stem, files_of
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, common_pictures
 from structgstream.data.lenses import LensCamera
@@ -153,10 +154,39 @@ def of_pictures(
     common = common_pictures(
         {name: files[name] for name in names}, where=path, training=[name for name in names if name not in held_out]
     )
-    sizes = {name: picture_size(next(filter(None, pictures))) for name, pictures in common.files.items()}
+    firsts = {name: next(filter(None, pictures)) for name, pictures in common.files.items()}
+    turns = {name: _orientation(file, poses[name], calibration) for name, file in firsts.items()}
+    sizes = {name: picture_size(file)[:: -1 if turns[name] >= 5 else 1] for name, file in firsts.items()}
     filmed = _filmed(poses, sizes, calibration)
     rig = _rig(filmed, calibration, path)
-    return ImageSource(path.name, rig, fps or PICTURE_FPS, common.files, calibration.points, common.instants), filmed
+    source = ImageSource(
+        path.name, rig, fps or PICTURE_FPS, common.files, calibration.points, common.instants, turns=turns
+    )
+    return source, filmed
+
+
+def _orientation(file: Path, posed: PosedCamera, calibration: Calibration) -> int:
+    """The EXIF orientation by which a camera's pictures are turned: that of the pictures that were calibrated.
+
+    Raises:
+        CalibrationError: neither the calibration nor the size of the pictures decides.
+    """
+    orientation = read_exif(file).orientation
+    if orientation == 1:
+        return 1
+    stored = picture_size(file)
+    shown = stored[::-1] if orientation >= 5 else stored
+    if posed.size is not None and stored != shown:
+        fits = [abs(size[1] - posed.size[1] * size[0] / posed.size[0]) <= 1 for size in (stored, shown)]
+        if fits[0] != fits[1]:
+            return orientation if fits[1] else 1
+    if calibration.turned_by_exif is None:
+        raise CalibrationError(
+            f"The picture {file} has the EXIF orientation {orientation}, and {calibration.where} does not say whether "
+            "it is for the stored or for the turned pictures; export the pictures of all cameras upright, without that "
+            "tag, as they were when they were calibrated."
+        )
+    return orientation if calibration.turned_by_exif else 1
 
 
 def _layout(folders: Pictures, calibration: Calibration, root: Path) -> tuple[Pictures, dict[str, PosedCamera]]:

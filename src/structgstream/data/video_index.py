@@ -50,6 +50,7 @@ class VideoTrack:
         quarter_turns: counterclockwise quarter turns of the stored picture to the shown one, 0 to 3.
         keyframes: presentation times, ascending, in ticks, of the frames that decode alone.
         colors: what the file states of its colours, in words.
+        origin: ticks of time 0. AVI states no presentation times; its first frame is at 0, whatever the decoder's delay.
     """
 
     path: Path
@@ -60,11 +61,12 @@ class VideoTrack:
     quarter_turns: int = 0
     keyframes: tuple[int, ...] = ()
     colors: str = ""
+    origin: int = 0
 
     @property
     def seconds(self) -> NDArray[np.float64]:
         """The time stamps in seconds."""
-        return np.array(self.stamps, dtype=np.float64) * self.tick_seconds
+        return (np.array(self.stamps, dtype=np.float64) - self.origin) * self.tick_seconds
 
 
 def scan_videos(paths: Mapping[str, Path]) -> dict[str, VideoTrack]:
@@ -171,11 +173,12 @@ def _scan(path: Path) -> VideoTrack:
         seconds = float(stream.time_base)
         if not started:  # Some recorders mark no key frame, or write none.
             first = _first_of(path)
+        origin = stamps[0] if stamps and container.format.name == "avi" else 0
         stamps = _decodable(path, stamps, first, seconds)
         turns = _quarter_turns(path, stream, first)
         size = (stream.height, stream.width) if turns % 2 else (stream.width, stream.height)
         colors = stated_colors(path, first)
-        return VideoTrack(path, tuple(stamps), seconds, *size, turns, tuple(sorted(keys)), colors)
+        return VideoTrack(path, tuple(stamps), seconds, *size, turns, tuple(sorted(keys)), colors, origin)
 
 
 def _decodable(path: Path, stamps: list[int], first: "VideoFrame | None", seconds: float) -> list[int]:
