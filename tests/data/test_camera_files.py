@@ -31,7 +31,5 @@ def test_one_take_is_found_and_several_are_asked_about(tmp_path: Path) -> None:
     write_videos(tmp_path / "recordings/walk", ["a", "b"], frames=2)
     assert list(other_roots(tmp_path)) == [tmp_path / "recordings/walk"]
     write_videos(tmp_path / "run", ["a", "b"], frames=2)
-    with pytest.raises(
-        CaptureError, match=r"in several folders \(run, recordings/walk\); .*Give the folder"
-    ):
+    with pytest.raises(CaptureError, match=r"in several folders \(run, recordings/walk\); .*Give the folder"):
         list(other_roots(tmp_path))
