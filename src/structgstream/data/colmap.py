@@ -73,7 +73,7 @@ def _registered(folder: Path) -> int:
         return 0
 
 
-def tell_choice(folder: Path) -> None:
+def warn_of_other_models(folder: Path) -> None:
     """Warns of the models beside the one in ``folder``, which are left out."""
     others = [other for other in folder.parent.iterdir() if other != folder and is_model(other)]
     if folder.parent.name == "sparse" and others:
@@ -91,7 +91,7 @@ def read_model(folder: Path) -> Calibration:
     Raises:
         CalibrationError: the files are cut or not a model, or a camera has a lens model that is not known here.
     """
-    tell_choice(folder)
+    warn_of_other_models(folder)
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
     try:
         if binary:
