@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from structgstream.cli.app import UsageError
-from structgstream.cli.options import check_ending, (
+from structgstream.cli.options import (
     CaptureOptions,
+    check_ending,
     open_selected_capture,
     parse_known_options,
     parse_options,
