@@ -2,12 +2,12 @@
 """Configurations as values. Paper mode is a preset; the paper's ablations are edits of a preset."""
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
-from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal
 
 from structgstream.cameras import CameraRig
+from structgstream.config_fields import check_numbers, holds, read_value, unknown_fields
 from structgstream.data.denoising import DenoisingConfig
 from structgstream.data.points import PointsConfig
 from structgstream.errors import ConfigError
@@ -31,13 +31,6 @@ from structgstream.training.perturbation import PerturbationConfig
 from structgstream.training.regularizers import RegularizerConfig
 from structgstream.training.rounding import RoundingConfig
 
-SIGNED = frozenset({"quality", "tiles_around"})
-"""Fields that may be negative."""
-SHARES = frozenset({"mean_of_last", "motion_prior", "picture_scale", "dropped_share", "until_share", "carried_share"})
-"""Fields that are at most 1."""
-POSITIVE = frozenset({"picture_scale", "normalised_radius", "key_interval_seconds"})
-"""Fields that must not be 0."""
-_KINDS: Mapping[Any, tuple[type, ...]] = {int: (int,), float: (int, float), bool: (bool,)}
 MOST_QUALITY = 6.0  # steps 64 times as small, or as large
 
 
@@ -99,14 +92,14 @@ def from_json(values: Mapping[str, Any]) -> StreamConfig:
     Raises:
         ConfigError: there is a field that this version does not have, or a value that no field can have.
     """
-    if unknown := [*_unknown(StreamConfig, values)]:
+    if unknown := [*unknown_fields(StreamConfig, values)]:
         raise ConfigError(
             f"The header's configuration has the field {unknown[0]}, which this version of structgstream does not "
             "have; continue the stream with the version that began it."
         )
     try:
-        config = _read(StreamConfig, values)
-        if _holds(to_json(config), dict(values)):
+        config = read_value(StreamConfig, values)
+        if holds(to_json(config), dict(values)):
             return config
     except (TypeError, ValueError, KeyError, AttributeError) as error:
         raise ConfigError("The header's configuration has a value of another kind than its field.") from error
@@ -119,66 +112,6 @@ def completed(values: Mapping[str, Any]) -> Mapping[str, Any]:
         return to_json(from_json(values)) if values else values
     except ConfigError:
         return values
-
-
-def _holds(found: Any, given: Any) -> bool:
-    """Whether ``found`` has all that is ``given``."""
-    if isinstance(given, dict) and isinstance(found, dict):
-        return all(
-            (key == "period" and key not in found) or _holds(found.get(key), item) for key, item in given.items()
-        )
-    return (type(found) is type(given) and found == given) or (_is_number(found, given) and found == given)
-
-
-def _is_number(*values: Any) -> bool:
-    return all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
-
-
-def _unknown(kind: Any, values: Any, path: str = "") -> Iterator[str]:
-    """Paths in ``values`` of fields that the dataclass ``kind`` lacks."""
-    hints = get_type_hints(kind) if isinstance(kind, type) and is_dataclass(kind) else {}
-    for name, item in values.items() if hints and isinstance(values, Mapping) else ():
-        if name not in hints:
-            yield f"{path}{name}"
-        else:
-            yield from _unknown(hints[name], item, f"{path}{name}.")
-
-
-def check_numbers(config: Any, path: str = "") -> None:
-    """Check every number of a configuration and of those in it: finite, not negative, and within its bounds.
-
-    Raises:
-        ConfigError: naming the field by its path.
-    """
-    hints = get_type_hints(type(config))
-    for item in fields(config):
-        value, where = getattr(config, item.name), f"{path}{item.name}"
-        if is_dataclass(value):
-            check_numbers(value, f"{where}.")
-        elif hints[item.name] in _KINDS and type(value) not in _KINDS[hints[item.name]]:
-            expected = {int: "a whole number", float: "a number", bool: "true or false"}[hints[item.name]]
-            raise ConfigError(f"{where} is {value!r}; expected {expected}.")
-        elif isinstance(value, int | float) and not isinstance(value, bool):
-            shares = item.name in SHARES
-            least, most = (-math.inf if item.name in SIGNED else 0.0), (1.0 if shares else math.inf)
-            positive = item.name in POSITIVE
-            if not math.isfinite(value) or not least <= value <= most or (positive and value == 0):
-                start = "more than 0" if positive else "a finite number" if item.name in SIGNED else "0 or more"
-                raise ConfigError(f"{where} is {value!r}; expected {start}{', and at most 1' if shares else ''}.")
-
-
-def _read(kind: Any, value: Any) -> Any:
-    """``value``, plain JSON, as a ``kind``: a dataclass, a container, or what JSON has itself."""
-    if isinstance(kind, type) and is_dataclass(kind):
-        hints = get_type_hints(kind)
-        return kind(**{name: _read(hints[name], item) for name, item in value.items()})
-    origin, arguments = get_origin(kind), get_args(kind)
-    if origin in (Union, UnionType):
-        (kind,) = (of for of in arguments if of is not type(None))
-        return None if value is None else _read(kind, value)
-    if origin is tuple:
-        return tuple(_read(arguments[0], item) for item in value)
-    return origin(value) if origin in (frozenset, dict) else value
 
 
 def preset_named(name: str) -> StreamConfig:

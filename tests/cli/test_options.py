@@ -8,6 +8,7 @@ import pytest
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import (
     CaptureOptions,
+    check_ending,
     open_selected_capture,
     parse_known_options,
     parse_options,
@@ -72,3 +73,14 @@ def test_a_field_that_there_is_not_ends_the_command_with_its_name(capsys: pytest
         resolve_config("tiny", ["--online.iteratons", "7"], command="reconstruct", seed=None)
     assert caught.value.code == 2
     assert "--online.iteratons" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["a.mov", "a.WEBM", "b/a.gif", "a.jpg", "-", "~/a", "a.ply"])
+def test_an_output_of_a_kind_that_is_not_written_is_refused(name: str) -> None:
+    with pytest.raises(UsageError, match="-o"):
+        check_ending(Path(name), ".mp4", ".png", command="render")
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.PNG", "folder", "take.2026-11-27"])
+def test_an_output_that_is_written_is_not(name: str) -> None:
+    check_ending(Path(name), ".mp4", ".png", command="render")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import tyro
 
-from structgstream.cli.app import usage_errors
+from structgstream.cli.app import UsageError, usage_errors
 
 if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
@@ -40,6 +40,30 @@ class CaptureOptions:
     """Use every N-th frame, from the first; the frames a second are divided by N."""
     near: Annotated[float | None, tyro.conf.arg(help_behavior_hint="")] = None
     """Distance of the near plane, in units of the capture. Default: the capture's own, else 0.12 rig radii."""
+
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif")
+VIDEOS = (".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".mpg", ".ts")
+OTHER_MEDIA = frozenset({*PICTURES, *VIDEOS, ".html", ".ply", ".splat", ".spz"})
+"""Endings of pictures, videos and exports, of which a command writes some."""
+
+
+def check_ending(output: Path, *endings: str, command: str) -> None:
+    """Check that a name does not ask for a kind of file that the command does not write.
+
+    Args:
+        output: the file or folder to write.
+        endings: of :data:`OTHER_MEDIA`, those that the command writes.
+        command: for the message.
+
+    Raises:
+        UsageError: it does, or it is "-" or begins with "~", which only a shell resolves.
+    """
+    if str(output) == "-" or (output.parts[:1] and output.parts[0].startswith("~")):
+        raise UsageError(f"-o {output} would be a file or folder of that very name; give a path.")
+    if (ending := output.suffix.lower()) in OTHER_MEDIA.difference(endings):
+        written = f"it writes {', '.join(endings)}, or" if endings else "it writes a stream, .sgs, or"
+        raise UsageError(f"{command} writes no {ending}, got -o {output}; {written} a folder for another name.")
 
 
 def parse_options(kind: type[Options], command: str, *, arguments: list[str]) -> Options:

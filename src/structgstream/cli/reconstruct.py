@@ -17,6 +17,7 @@ from structgstream.cli.options import (
     CaptureOptions,
     Device,
     Folder,
+    check_ending,
     open_selected_capture,
     parse_known_options,
     resolve_config,
@@ -106,6 +107,7 @@ def main(arguments: list[str]) -> None:
     if "--help-config" in arguments:
         _print_config(arguments)
     options, rest = parse_known_options(Reconstruct, "reconstruct", arguments=arguments)
+    check_ending(options.output, command="reconstruct")
     if options.resume and options.overwrite:
         raise UsageError("--resume keeps the file and --overwrite replaces it: choose one.")
     config, preset = resolve_config(options.preset, rest, command="reconstruct", seed=options.seed)

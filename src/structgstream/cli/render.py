@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import UsageError
-from structgstream.cli.options import Device, StreamFile, parse_options
+from structgstream.cli.options import Device, StreamFile, check_ending, parse_options
 from structgstream.cli.plain_text import say
 
 if TYPE_CHECKING:
@@ -64,6 +64,8 @@ class Render:
 def main(arguments: list[str]) -> None:
     """Renders and prints the path of the result."""
     options = parse_options(Render, "render", arguments=arguments)
+    if options.output is not None:
+        check_ending(options.output, ".mp4", ".png", command="render")
     if options.compare and (options.scene is None or options.path is not None):
         raise UsageError("--compare needs the capture's folder after the stream, and a camera, not a --path.")
     if options.scene is not None and not options.compare:

@@ -50,3 +50,10 @@ def test_what_is_no_description(data: bytes) -> None:
 def test_a_payload_that_is_cut(cut: int) -> None:
     with pytest.raises(StreamError, match="The init record"):
         first_block(pack_init({"a": 1}, BLOCKS)[:cut])
+
+
+@pytest.mark.parametrize("text", [b'{"fps": NaN}', b'{"fps": Infinity}', b'{"fps": -Infinity}'])
+def test_numbers_that_json_does_not_have_are_refused(text: bytes) -> None:
+    packed = zstandard.ZstdCompressor().compress(text)
+    with pytest.raises(ValueError, match="is no number of JSON"):
+        read_description(struct.pack("<I", len(packed)) + packed)
