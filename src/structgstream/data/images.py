@@ -164,8 +164,8 @@ def read_picture_and_mask(path: Path, *, bits: int = 16) -> tuple[NDArray[np.uin
     if stored.dtype == np.uint16:
         if bits < 16 and stored.max() >> bits:
             raise CaptureError(
-                f"The picture {path} has values up to {stored.max()}, others of its capture are of {bits} bits; expected "
-                "one depth: export all pictures again with 8 or 16 bits."
+                f"The picture {path} has values up to {stored.max()}, others of its capture are of {bits} "
+                "bits; expected one depth: export all pictures again with 8 or 16 bits."
             )
         stored = (stored >> (bits - 8)).astype(np.uint8)
     return cv2.cvtColor(stored, cv2.COLOR_GRAY2RGB if stored.ndim == 2 else cv2.COLOR_BGR2RGB), mask
