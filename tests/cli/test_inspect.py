@@ -3,16 +3,20 @@
 
 import json
 import math
+import shutil
 from pathlib import Path
 
 import pytest
 
+import structgstream
 from drawn import pixels_of
 from rigs import random_scene
 from streams import compact_header, header_for, moved, write_stream
 from structgstream.cli import main
+from structgstream.cli.capture_table import describe_capture
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
+from structgstream.errors import CaptureError
 from structgstream.evaluation.run_log import append_log, begin_log
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName
@@ -31,6 +35,9 @@ def streams(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     for codec, header in headers.items():
         write_stream(FileSink(folder / f"{codec}.sgs"), scenes, header=header)
     return {codec: folder / f"{codec}.sgs" for codec in headers}
+
+
+CLIP = Path(structgstream.__file__).parent / "data/clip"
 
 
 def shown(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> list[list[str]]:
@@ -177,3 +184,16 @@ def test_inspect_of_a_cut_file_says_so(stream: Path, tmp_path: Path, capsys: pyt
     cut.write_bytes(stream.read_bytes()[: last.offset + last.bytes // 2])
     assert main(["inspect", str(cut)]) == 0
     assert "not finished" in capsys.readouterr().out
+
+
+def test_a_capture_is_described_without_training(tmp_path: Path) -> None:
+    content = describe_capture(CLIP)
+    assert (content["layout"], content["frames"], content["fps"]) == ("json videos", 12, 30)
+    own = content["cameras"]["cam03"]
+    assert (own["size"], own["lens"], own["frames"], own["first_seconds"]) == ((320, 240), "pinhole", 12, 0)
+    assert own["last_seconds"] == pytest.approx(11 / 30, abs=1e-3)
+    assert "BT.709" in own["colors"]
+    shutil.copytree(CLIP, tmp_path / "clip")
+    (tmp_path / "clip" / "cam03.mp4").unlink()
+    with pytest.raises(CaptureError, match="cam03"):
+        describe_capture(tmp_path / "clip")

@@ -30,13 +30,17 @@ PICTURES = (".png", ".svg", ".pdf")
 class Inspect:
     """Shows the content of a stream file: header and packets, bytes by field, whether it is complete.
 
+    Of the folder of a capture: what was understood of it, before anything is trained.
+
     Example: structgstream inspect ball.sgs --plot ball-bytes.png
 
     Example: structgstream inspect ball.sgs --json ball-inspect.json
+
+    Example: structgstream inspect captures/take1
     """
 
     stream: tyro.conf.Positional[StreamFile]
-    """The stream file."""
+    """The stream file, or the folder of a capture."""
     plot: Annotated[Path | None, tyro.conf.arg(metavar="PATH.png", help_behavior_hint="")] = None
     """Plot the bytes of every packet by field, and the composition of header, key and delta packets."""
     json: JsonPath = None
@@ -53,6 +57,9 @@ def main(arguments: list[str]) -> None:
     plot = options.plot
     if plot is not None and plot.suffix.lower() not in PICTURES:
         raise UsageError(f"{plot} is no name for a picture; its ending must be one of {', '.join(PICTURES)}.")
+    if options.stream.is_dir() and not (options.stream / "manifest.json").exists():
+        _print_capture(options)
+        return
     from structgstream.codec.reader import open_stream
     from structgstream.evaluation.byte_count import packet_rows
     from structgstream.evaluation.report import write_json
@@ -82,6 +89,20 @@ def main(arguments: list[str]) -> None:
         console.print()
     if plot is not None:
         say(console, f"Wrote {plot}")
+
+
+def _print_capture(options: Inspect) -> None:
+    from structgstream.cli.capture_table import capture_tables, describe_capture
+    from structgstream.evaluation.report import write_json
+
+    if options.plot is not None or options.config or options.all_packets:
+        raise UsageError("--plot, --config and --all-packets are of streams; of a capture only --json can be given.")
+    content = describe_capture(options.stream)
+    if options.json is not None:
+        write_json(options.json, content)
+    console = Console()
+    for table in capture_tables(options.stream.resolve().name, content):
+        console.print(table)
 
 
 def draw_byte_plot(path: Path, reader: "StreamReader", rows: "Sequence[Row]", *, name: str) -> None:

@@ -156,13 +156,18 @@ def of_pictures(
     )
     firsts = {name: next(filter(None, pictures)) for name, pictures in common.files.items()}
     turns = {name: _orientation(file, poses[name], calibration) for name, file in firsts.items()}
-    sizes = {name: picture_size(file)[:: -1 if turns[name] >= 5 else 1] for name, file in firsts.items()}
+    sizes = {name: _shown_size(file, turns[name]) for name, file in firsts.items()}
     filmed = _filmed(poses, sizes, calibration)
     rig = _rig(filmed, calibration, path)
     source = ImageSource(
         path.name, rig, fps or PICTURE_FPS, common.files, calibration.points, common.instants, turns=turns
     )
     return source, filmed
+
+
+def _shown_size(file: Path, orientation: int) -> tuple[int, int]:
+    width, height = picture_size(file)
+    return (height, width) if orientation >= 5 else (width, height)
 
 
 def _orientation(file: Path, posed: PosedCamera, calibration: Calibration) -> int:
@@ -175,7 +180,7 @@ def _orientation(file: Path, posed: PosedCamera, calibration: Calibration) -> in
     if orientation == 1:
         return 1
     stored = picture_size(file)
-    shown = stored[::-1] if orientation >= 5 else stored
+    shown = _shown_size(file, orientation)
     if posed.size is not None and stored != shown:
         fits = [abs(size[1] - posed.size[1] * size[0] / posed.size[0]) <= 1 for size in (stored, shown)]
         if fits[0] != fits[1]:

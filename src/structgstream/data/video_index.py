@@ -50,7 +50,7 @@ class VideoTrack:
         quarter_turns: counterclockwise quarter turns of the stored picture to the shown one, 0 to 3.
         keyframes: presentation times, ascending, in ticks, of the frames that decode alone.
         colors: what the file states of its colours, in words.
-        origin: ticks of time 0. AVI states no presentation times; its first frame is at 0, whatever the decoder's delay.
+        origin: ticks of time 0. AVI states no presentation times; its first frame is at 0.
     """
 
     path: Path
