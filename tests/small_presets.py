@@ -17,7 +17,7 @@ TINY_RIG = replace(
         seed_voxels=1,
         losses=RIG.initial.losses,
         disturbance=RIG.initial.disturbance,
-        regularizers=RIG.initial.regularizers,
+        solidity=RIG.initial.solidity,
         free_space=RIG.initial.free_space,
         random_background=False,
     ),

@@ -28,8 +28,8 @@ from structgstream.training.online_config import OnlineConfig
 from structgstream.training.optim import LearningRate
 from structgstream.training.patching import PatchingConfig
 from structgstream.training.perturbation import PerturbationConfig
-from structgstream.training.regularizers import RegularizerConfig
 from structgstream.training.rounding import RoundingConfig
+from structgstream.training.solidity import SolidityConfig
 
 MOST_QUALITY = 6.0  # steps 64 times as small, or as large
 
@@ -280,7 +280,7 @@ COMPACT = replace(
         ),
         losses=replace(MOTION.initial.losses, l1=0.6, ssim=0.45),
         disturbance=PerturbationConfig(dropped_share=0.2, noise_scales=0.5, until_share=0.7),
-        regularizers=RegularizerConfig(depth_spread=0.05),
+        solidity=SolidityConfig(weight=0.05, every=4),
         free_space=FreeSpaceConfig(enabled=True),
         random_background=True,
         sampling_filter=True,

@@ -16,8 +16,8 @@ from structgstream.training.free_space import FreeSpaceConfig, in_free_space
 from structgstream.training.growth import GrowthConfig
 from structgstream.training.initial import InitialConfig, InitialRates, fit_first_frame, rates_at
 from structgstream.training.perturbation import PerturbationConfig
-from structgstream.training.regularizers import RegularizerConfig
 from structgstream.training.seeding import voxel_centers
+from structgstream.training.solidity import SolidityConfig
 from worlds import moving_world, psnr, rendered
 
 QUICK = InitialConfig(
@@ -97,7 +97,7 @@ def test_solid_surfaces_and_few_anchors() -> None:
     config = replace(
         QUICK,
         disturbance=PerturbationConfig(view_noise=0.1),
-        regularizers=RegularizerConfig(depth_spread=0.05, color_spread=1.0, feature_difference=0.05),
+        solidity=SolidityConfig(weight=0.05),
         growth=replace(QUICK.growth, least_contribution=0.3, contribution_at=(60,)),
     )
     result = fit(world, config=config)

@@ -23,9 +23,9 @@ from structgstream.training.optim import Adam, LearningRate, constant
 from structgstream.training.optimize import Hooks, Schedule, optimize
 from structgstream.training.parameters import CAMERA_ROWS, Parameters, detached
 from structgstream.training.perturbation import PerturbationConfig, RandomNumbers, perturbation_at, perturbed_center
-from structgstream.training.regularizers import RegularizerConfig, Regularizers
 from structgstream.training.result import FitResult, StepListener
 from structgstream.training.seeding import seeded_scene
+from structgstream.training.solidity import SolidityConfig, depth_spread
 from structgstream.training.step import SceneLoss, view_loss, with_term
 from structgstream.training.stopwatch import Stopwatch
 from structgstream.training.views import View, coarse_to_fine, training_views
@@ -94,7 +94,7 @@ class InitialConfig:
     """Train through the low-pass with which players draw (``scene/sampling.py``, Note [Drawn as it was trained]), also
     on reduced pictures (paper: no, 0.3 square pixels of each picture)."""
     disturbance: PerturbationConfig = field(default_factory=PerturbationConfig)
-    regularizers: RegularizerConfig = RegularizerConfig()
+    solidity: SolidityConfig = field(default_factory=SolidityConfig)
     free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
     losses: LossWeights = LossWeights(offset_distance=0.005)
     rates: InitialRates = field(default_factory=InitialRates)
@@ -134,7 +134,6 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
     parameters: Parameters
     adam: Adam[ParameterName]
     densifier: Densifier
-    regularizers: Regularizers
     views: list[View]
     extent: float
     generator: torch.Generator
@@ -170,10 +169,12 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
                 generator,
             ),
         )
-        with self.watch.stage("rasterise"):
-            terms = self.regularizers.terms(iteration, loss.unperturbed, scene.anchors, sample.camera)
-        for name, (weight, value) in terms.items():
-            loss = with_term(loss, name, value, weight=weight)
+        if weight := config.solidity.weight_at(iteration, config.iterations):
+            with self.watch.stage("rasterise"):
+                spread = depth_spread(
+                    loss.unperturbed, sample.camera, scale=config.solidity.scale, backend=self.backend
+                )
+                loss = with_term(loss, "depth_spread", spread, weight=weight)
         self.last_pass.add(iteration, loss, sample)
         return loss
 
@@ -275,19 +276,7 @@ def _fit(
     last_pass = LastPass(config.iterations - len(views))
     numbers = RandomNumbers(generator, backend.device)
     hooks = _FirstFrameHooks(
-        config=config,
-        backend=backend,
-        template=template,
-        parameters=parameters,
-        adam=adam,
-        densifier=densifier,
-        regularizers=Regularizers(config.regularizers, config.iterations, backend),
-        views=views,
-        extent=extent,
-        generator=generator,
-        numbers=numbers,
-        watch=watch,
-        last_pass=last_pass,
+        config, backend, template, parameters, adam, densifier, views, extent, generator, numbers, watch, last_pass
     )
     samples = coarse_to_fine(views, config.stages(done=done), generator=generator)
     schedule = Schedule(config.iterations, lambda iteration: rates_at(iteration, config, extent=extent), done=done)
