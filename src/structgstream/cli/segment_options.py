@@ -115,7 +115,8 @@ class SegmentOptions:
         At the end of the block what is to be published is waited for, and ``tell`` gets a sentence if it is not done.
 
         Raises:
-            StorageError: it exists and may not be replaced, or cannot be written.
+            StorageError: it exists and may not be replaced, or cannot be written, or what is to be published would
+                replace another stream.
             MissingExtraError: a package is missing that the URL needs.
         """
         from structgstream.codec.segments.retention import SegmentsOptions
@@ -129,11 +130,18 @@ class SegmentOptions:
             yield partial(_storage, segments_folder(output, may_exist=may_exist), options)
         else:
             from structgstream.codec.segments.cloud_store import CloudStore
-            from structgstream.codec.segments.mirror import MirroredStore, MirrorOptions
+            from structgstream.codec.segments.mirror import AnotherStreamError, MirroredStore, MirrorOptions
+            from structgstream.errors import StorageError, StreamError
 
             remote = CloudStore(self.publish)
             folder = segments_folder(output, may_exist=may_exist)
             mirror = MirroredStore(folder, remote, options=MirrorOptions(self.keep, tell))
+            try:
+                mirror.claim()
+            except AnotherStreamError:
+                raise
+            except (StorageError, StreamError):
+                pass  # It cannot be reached now; it is claimed as soon as it can be.
             mirror.copy_all()  # What an earlier run has left, also if there is nothing to do now.
             try:
                 yield partial(_storage, mirror, options)

@@ -11,13 +11,14 @@ import pytest
 from segment_streams import Hands, as_file, folder, header, packets, written
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.manifest_json import manifest_from_json
-from structgstream.codec.segments.mirror import MirroredStore, MirrorOptions
+from structgstream.codec.segments.mirror import AnotherStreamError, MirroredStore, MirrorOptions
 from structgstream.codec.segments.recovery import stale_files
 from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.sink import SegmentsSink
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest
 from structgstream.errors import StorageError
+from structgstream.owned_folders import MARKER
 
 SENT = packets(9)
 
@@ -110,6 +111,51 @@ def test_what_was_not_copied_is_told_and_copied_by_the_next_run(tmp_path: Path) 
     assert (remote.folder / "notes.txt").read_text() == "mine"
 
 
+@pytest.mark.parametrize("marked", [True, False])
+def test_another_stream_is_never_replaced(tmp_path: Path, marked: bool) -> None:
+    remote = Remote(tmp_path / "remote")
+    first = MirroredStore(folder(tmp_path / "first"), remote)
+    written(first, packets(4))
+    assert first.finish(wait_seconds=60) == 0
+    if not marked:
+        (remote.folder / MARKER).unlink()
+    before = contents(remote)
+    with pytest.raises(AnotherStreamError, match="did not send"):
+        MirroredStore(folder(tmp_path / "second"), remote).claim()
+    assert contents(remote) == before
+
+
+def test_another_stream_that_is_found_after_an_outage_is_not_replaced(tmp_path: Path) -> None:
+    remote, told = Remote(tmp_path / "remote"), list[str]()
+    first = MirroredStore(folder(tmp_path / "first"), remote)
+    written(first, packets(4))
+    assert first.finish(wait_seconds=60) == 0
+    before = contents(remote)
+    options = MirrorOptions(grace_seconds=0.0, tell=told.append)
+    second = MirroredStore(folder(tmp_path / "second"), remote, options=options)
+    written(second, SENT)
+    assert second.finish(wait_seconds=1.0) > 0
+    assert contents(remote) == before
+    assert len(told) == 1
+    assert "did not send" in told[0]
+
+
+def contents(store: FolderStore) -> dict[str, bytes]:
+    """All files, by name."""
+    return {path.name: path.read_bytes() for path in store.folder.iterdir()}
+
+
+def test_a_copy_without_a_marker_is_known_by_its_first_record(tmp_path: Path) -> None:
+    here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+    mirror = MirroredStore(here, remote)
+    written(mirror, SENT)
+    assert mirror.finish(wait_seconds=60) == 0
+    for store in (here, remote):
+        (store.folder / MARKER).unlink()
+    MirroredStore(here, remote).claim()
+    assert (here.folder / MARKER).read_bytes() == (remote.folder / MARKER).read_bytes()
+
+
 def test_a_file_that_leaves_the_folder_leaves_the_other_store_after_its_grace(tmp_path: Path) -> None:
     hands = Hands()
     here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
@@ -153,8 +199,9 @@ def test_a_file_that_is_to_go_while_it_is_copied_goes_when_its_manifest_is_there
     told: list[str] = []
 
     def before(name: str) -> None:
-        inside.set()
-        assert done.wait(60)
+        if name != MARKER:
+            inside.set()
+            assert done.wait(60)
 
     remote.before = before
     mirror = MirroredStore(here, remote, options=MirrorOptions(tell=told.append))
@@ -286,6 +333,7 @@ def test_what_comes_again_while_its_removal_waits_for_a_round_stays(tmp_path: Pa
 def test_what_an_earlier_run_has_left_is_removed_little_by_little(tmp_path: Path) -> None:
     hands = Hands()
     here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
+    MirroredStore(here, remote).claim()
     for frame in range(100):
         FolderStore.put(remote, f"part-{frame:08d}-{frame:016x}.sgs", b"")
     options = MirrorOptions(grace_seconds=2.0, elapsed=lambda: hands.elapsed)

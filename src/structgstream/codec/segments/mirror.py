@@ -29,11 +29,17 @@ from structgstream.codec.segments.manifest_json import manifest_from_json
 from structgstream.codec.segments.recovery import stale_files
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.errors import StorageError, StreamError
+from structgstream.owned_folders import MARKER, Owner, parse_owner
 
+PURPOSE = "published copy of a stream"
 _FIRST_WAIT_SECONDS = 0.5
 _LONGEST_WAIT_SECONDS = 30.0
 _MORE_REMOVED = 8
 """So many files more than it copies may a round remove: what an earlier run has left must not hold up a live one."""
+
+
+class AnotherStreamError(StorageError):
+    """The other store holds files that this folder did not send."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +77,7 @@ class MirroredStore:
         self._held: list[str] = []  # of them, what leaves the folder when it is over
         self._gone: dict[str, float | None] = {}  # names to remove, and since when the remote manifest lacks them
         self._ending = False
+        self._claimed = False
         self._known = False  # whether the remote's files have been compared with the folder's
         self._busy = False
         self._failures = 0
@@ -126,6 +133,29 @@ class MirroredStore:
     def free_bytes(self) -> int | None:
         """Of the folder."""
         return self._folder.free_bytes()
+
+    def claim(self) -> None:
+        """Mark the other store as this folder's copy (``owned_folders``, Note [Ownership]).
+
+        Raises:
+            AnotherStreamError: it holds files and another marker, or none; nothing in it was changed.
+            StorageError, StreamError: it cannot be reached.
+        """
+        there, mine = self._remote.names(), _owner(self._folder)
+        if mine is None:
+            mine = Owner.new(PURPOSE)
+            self._folder.put(MARKER, mine.content)
+        theirs = _owner(self._remote)
+        # Copies of before there were markers are known by the stream's first record, whose name is its hash.
+        sent = any(name.startswith("init-") for name in there & self._folder.names())
+        if (theirs is None and there and not sent) or (theirs is not None and theirs.identity != mine.identity):
+            raise AnotherStreamError(
+                f"{self._remote.name} holds a stream that {self._folder.name} did not send, so it may be somebody "
+                "else's; nothing in it was changed. Publish to another folder, or move that stream to another place."
+            )
+        if theirs is None:
+            self._remote.put(MARKER, mine.content)
+        self._claimed = True
 
     def copy_all(self) -> None:
         """Copy what an earlier run has left, if there is anything, also if nothing is written now."""
@@ -193,7 +223,10 @@ class MirroredStore:
         except (StorageError, StreamError) as error:
             self._failures += 1
             self._known = False
-            if self._failures == 2:  # A single failure is nothing to be told of.
+            if isinstance(error, AnotherStreamError):
+                if self._failures == 1:
+                    self._options.tell(f"{error} The stream goes on in {self._folder.name}.")
+            elif self._failures == 2:  # A single failure is nothing to be told of.
                 self._options.tell(
                     f"{self._remote.name} cannot be reached ({error}); the stream goes on in {self._folder.name}, and "
                     "is copied when it can be again."
@@ -206,6 +239,8 @@ class MirroredStore:
 
     def _compare(self) -> None:
         """Find what the remote has not got, and what is there and no longer here."""
+        if not self._claimed:
+            self.claim()
         there = self._remote.names()
         with self._changed:
             here = self._folder.names()
@@ -255,3 +290,11 @@ class MirroredStore:
             self._remote.delete(name)
             with self._changed:
                 self._gone.pop(name, None)
+
+
+def _owner(store: Store) -> Owner | None:
+    """As the marker of a store has it; None if there is none."""
+    try:
+        return parse_owner(store.get(MARKER, most_bytes=4096))
+    except StreamError:
+        return None
