@@ -225,19 +225,17 @@ def stored_picture(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
     if not data or is_cut_jpeg(data):
         raise _undecodable(path, data)
     # Calibrations are made on the stored pixels, so a rotation tag must not turn them.
-    content = np.frombuffer(data, np.uint8)
+    jpeg = data[:2] == b"\xff\xd8"
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION if jpeg else cv2.IMREAD_UNCHANGED
     try:
-        picture = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
-        if picture is not None and (picture.dtype not in (np.uint8, np.uint16) or data[:2] == b"\xff\xd8"):
-            deep = picture.dtype not in (np.uint8, np.uint16)
-            picture = None if deep else cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-            if deep:
-                raise CaptureError(
-                    f"The picture {path} has values that are no whole numbers of 8 or 16 bits; expected sRGB of 8 or "
-                    "16 bits: convert it, with the transfer function of sRGB if its values are linear."
-                )
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         picture = None
+    if picture is not None and picture.dtype not in (np.uint8, np.uint16):
+        raise CaptureError(
+            f"The picture {path} has values that are no whole numbers of 8 or 16 bits; expected sRGB of 8 or 16 bits: "
+            "convert it, with the transfer function of sRGB if its values are linear."
+        )
     if picture is None:
         raise _undecodable(path, data)
     return picture

@@ -18,7 +18,7 @@ from structgstream.data.live.faults import Fault, FaultLog
 from structgstream.data.live.matching import LivePicture
 from structgstream.data.live.rig_file import LiveCamera, TimeBase
 from structgstream.data.live.stamps import StampReader
-from structgstream.data.video_index import load_av
+from structgstream.data.video_index import load_av, video_stream
 from structgstream.remote_folders import without_secrets
 
 if TYPE_CHECKING:
@@ -166,7 +166,7 @@ class CameraFeed:
     def _read(self, container: Any) -> None:
         if not container.streams.video:
             raise ValueError("there is no video in it")
-        stream = container.streams.video[0]
+        stream = video_stream(container)
         if stream.codec_context is None:
             raise ValueError("its coding is unknown to the installed PyAV")
         stream.codec_context.thread_count = 1  # the cameras are the parallelism
