@@ -116,8 +116,9 @@ def test_pictures_are_turned_as_opencv_turns_them(tmp_path: Path, orientation: i
     exif = Image.Exif()
     exif[0x112] = orientation
     Image.fromarray(stored).save(tmp_path / "a.jpg", exif=exif, quality=100)
-    shown = cv2.imread(str(tmp_path / "a.jpg"))[..., ::-1]
-    np.testing.assert_array_equal(turned(read_picture(tmp_path / "a.jpg"), orientation), shown)
+    shown = cv2.imread(str(tmp_path / "a.jpg"))
+    assert shown is not None
+    np.testing.assert_array_equal(turned(read_picture(tmp_path / "a.jpg"), orientation), shown[..., ::-1])
 
 
 @pytest.mark.parametrize(
