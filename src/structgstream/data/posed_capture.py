@@ -235,10 +235,6 @@ def _poses(calibration: Calibration, cameras: Collection[str]) -> dict[str, Pose
         if None in numbered or len(numbered) != len(cameras) or not {_number(name) for name in names} >= set(numbered):
             return {}
         file_of = {name: numbered[_number(name)] for name in names if _number(name) in numbered}
-        pairs = ", ".join(f"{name!r} is {file!r}" for name, file in list(file_of.items())[:4])
-        log.warning(
-            "The cameras of %s have other names than the files and are matched by number: %s", calibration.where, pairs
-        )
     return _still(calibration, [file_of.get(posed.name) for posed in calibration.cameras])
 
 
