@@ -62,8 +62,6 @@ class StreamConfig:
 
     def __post_init__(self) -> None:
         check_numbers(self)
-        if self.seed < 0:
-            raise ConfigError(f"A random seed is a whole number from 0 on, got {self.seed}.")
 
 
 def to_json(config: StreamConfig) -> dict[str, Any]:

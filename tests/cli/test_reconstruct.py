@@ -111,7 +111,7 @@ def test_every_second_frame_is_resumed_and_scored_against_the_same_frames(
     [
         (["--preset", "tny"], 2, "there is no preset 'tny'; there are paper-n3dv"),
         (["--resume", "--overwrite"], 2, "choose one"),
-        (["--seed", "-1"], 2, "A random seed is a whole number from 0 on, got -1."),
+        (["--seed", "-1"], 2, "seed is -1; expected 0 or more."),
         (["--near", "inf"], 1, "The near plane must be positive, got inf"),
         (["--preset", "tiny", "--online.iteration", "5"], 2, "--online.iterations"),
         (["--preset", "tiny", "--online.iterations", "many"], 2, "many"),

@@ -65,8 +65,8 @@ def test_any_set_of_dynamic_fields(dynamic: frozenset) -> None:
 EDITS: dict[str, Callable[[dict[str, Any]], object]] = {
     "'fps'": lambda d: d.pop("fps"),
     "0 where a positive": lambda d: d.update(fps=0),
-    "inf where a finite": lambda d: d.update(fps=float("inf")),
-    "nan where a finite": lambda d: d["cameras"][0]["viewmat"].__setitem__(3, float("nan")),
+    "Infinity is no number of JSON": lambda d: d.update(fps=float("inf")),
+    "NaN is no number of JSON": lambda d: d["cameras"][0]["viewmat"].__setitem__(3, float("nan")),
     "True where a finite": lambda d: d["similarity"]["center"].__setitem__(0, True),
     "'1' where a finite": lambda d: d["similarity"].update(scale="1"),
     "too many values": lambda d: d["similarity"]["center"].append(0),

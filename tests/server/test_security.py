@@ -230,7 +230,7 @@ def test_nothing_can_be_changed(server: Served, method: str) -> None:
 
 def test_what_is_allowed_is_named(server: Served) -> None:
     answer = server.ask("/streams/studio/manifest.json", method="OPTIONS")
-    assert (answer.status, answer.headers["allow"]) == (405, "GET, HEAD")
+    assert (answer.status, {*answer.headers["allow"].split(", ")}) == (405, {"GET", "HEAD"})
 
 
 def test_a_request_has_no_body(server: Served) -> None:

@@ -100,9 +100,9 @@ class Parallel:
 
 def main(arguments: list[str]) -> None:
     """Runs with a display of all groups."""
-    from structgstream.presets import with_budget
-
     options, rest = parse_known_options(Parallel, "parallel", arguments=arguments)
+    from structgstream.presets import with_budget  # after --help, which needs no torch
+
     config, preset = resolve_config(options.preset, rest, command="parallel", seed=options.seed)
     with usage_errors():
         config = with_budget(config, name=preset, quality=options.quality, mbits=None)
