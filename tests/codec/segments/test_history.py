@@ -75,8 +75,8 @@ def grown(store: Memory, segments: int, frames: int) -> tuple[tuple[HistoryEntry
 def manifest(history: tuple[HistoryEntry, ...], listed: tuple[SegmentEntry, ...], frames: int) -> Manifest:
     first = listed[-1].first_frame + frames
     parts = tuple(
-        PartEntry(part_name(first + i, SHA), first + i, 0, PacketKind.DELTA, (first + i) / 30, 45_678, SHA)
-        for i in range(frames)
+        PartEntry(part_name(first + i, SHA), first + i, 0, kind, (first + i) / 30, 45_678, SHA)
+        for i, kind in enumerate((PacketKind.KEY, *[PacketKind.DELTA] * (frames - 1)))
     )
     edge = Edge(first + frames - 1, parts[-1].pts_seconds, 1.7e9, 1.7e9)
     period = PeriodEntry(0, init_name(0, SHA), 800_000, SHA, 0, 0)
