@@ -62,7 +62,7 @@ def join_segments(
     segments = _in_order(paths)
     ordered = [path for path, _, _ in segments]
     runs = runs_of([frames for _, _, frames in segments], workers=workers)
-    # Free Gaussians that stand still outlive their group when they are handed over.
+    # Free Gaussians that stand still outlive their group when a join links them.
     ends = accumulate(frames for _, _, frames in segments)
     firsts = [0, *ends][:-1] if backend is None else [0]
     with whole_file(output, check=(lambda path: check_births(path, firsts)) if check else None) as file:

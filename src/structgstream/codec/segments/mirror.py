@@ -226,7 +226,7 @@ class MirroredStore:
             if isinstance(error, AnotherStreamError):
                 if self._failures == 1:
                     self._options.tell(f"{error} The stream goes on in {self._folder.name}.")
-            elif self._failures == 2:  # A single failure is nothing to be told of.
+            elif self._failures == 2:  # A single failure is not reported.
                 self._options.tell(
                     f"{self._remote.name} cannot be reached ({error}); the stream goes on in {self._folder.name}, and "
                     "is copied when it can be again."
