@@ -88,13 +88,28 @@ def test_window_and_grace_arrive(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_is_there_is_asked_for(tmp_path: Path) -> None:
-    (tmp_path / "now").mkdir()
-    (tmp_path / "now" / MANIFEST).touch()
-    options = SegmentOptions(sink="segments")
-    with pytest.raises(StorageError, match="--resume"), options.storage(tmp_path / "now", may_exist=False, tell=print):
-        pass
-    with options.storage(tmp_path / "now", may_exist=True, tell=print) as storage:
+    options, output = SegmentOptions(sink="segments"), tmp_path / "now"
+    with options.storage(output, may_exist=False, tell=print) as storage:
         assert storage is not None
+        sink, _ = storage(None)(False)
+        sink.open(header())
+        sink.write(packets(1)[0])
+        sink.close()
+    with pytest.raises(StorageError, match="--resume"), options.storage(output, may_exist=False, tell=print):
+        pass
+    with options.storage(output, may_exist=True, tell=print) as storage:
+        assert storage is not None
+
+
+def test_another_programs_manifest_is_never_replaced(tmp_path: Path) -> None:
+    output = tmp_path / "site"
+    output.mkdir()
+    (output / MANIFEST).write_text("{}")
+    options = SegmentOptions(sink="segments")
+    for_another = pytest.raises(StorageError, match="of another program")
+    with for_another, options.storage(output, may_exist=True, tell=print):
+        pass
+    assert (output / MANIFEST).read_text() == "{}"
 
 
 def test_each_quality_has_a_folder_of_its_own(tmp_path: Path) -> None:

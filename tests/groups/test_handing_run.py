@@ -18,9 +18,10 @@ from structgstream.groups.base import GroupBase
 from structgstream.groups.hand_over import OWN_FRAMES
 from structgstream.groups.handing import Border
 from structgstream.groups.handing_run import MOST_GROUPS, HandedRun, main, runs_of
-from structgstream.groups.join import join_segments
+from structgstream.groups.join import PURPOSE, join_segments
 from structgstream.groups.pictures import open_for
 from structgstream.groups.track_pass import track_capture
+from structgstream.owned_folders import own_folder
 
 FRAMES = 12
 BORDERS = (2, 2 + OWN_FRAMES)
@@ -46,7 +47,7 @@ def long_groups() -> list[Path]:
 def test_workers_give_the_bytes_of_one(tmp_path: Path) -> None:
     found = []
     left = tmp_path / "2.sgs.runs" / "run-0"  # By one that was killed.
-    left.parent.mkdir()
+    own_folder(left.parent, PURPOSE)
     left.write_bytes(b"half")
     for workers in (1, 2, 5):
         path, borders = tmp_path / f"{workers}.sgs", list[Border]()

@@ -66,7 +66,7 @@ class GroupBase:
         """The configuration of the stream, which is that of every group.
 
         Raises:
-            ConfigError: it is of another version, has no motion start, without which no group begins, or has periods.
+            ConfigError: it cannot be read, has no motion start, without which no group begins, or has periods.
         """
         config = from_json(self.header.config)
         if config.codec != "compact" or not (config.online.motion.enabled and config.online.start.enabled):
