@@ -15,7 +15,7 @@ from structgstream.data.wrappers import resized
 from structgstream.kernels.backend import Backend, cpu_backend
 from structgstream.presets import FAST, TINY
 from structgstream.similarity import normalizing_similarity
-from structgstream.training.initial import fit_first_frame
+from structgstream.training.frame0.fit import fit_first_frame
 from structgstream.training.result import FitResult
 
 

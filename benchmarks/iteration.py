@@ -18,8 +18,8 @@ from benchmarks.stages import staged
 from benchmarks.world import World, wall_world
 from structgstream.kernels.backend import Backend, cpu_backend
 from structgstream.presets import PAPER
-from structgstream.training.online import fit_next_frame
-from structgstream.training.online_config import OnlineConfig
+from structgstream.training.online.config import OnlineConfig
+from structgstream.training.online.fit import fit_next_frame
 
 STAGE_NAMES = {"rasterize": "raster", "l1_ssim": "ssim", "generate_structured": "decode", "adam_step": "optimise"}
 

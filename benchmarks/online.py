@@ -17,9 +17,9 @@ from benchmarks.contest import Contestant, Quantity, Results
 from benchmarks.world import World, held_out_psnr, wall_world
 from structgstream.kernels.backend import Backend, cpu_backend
 from structgstream.presets import MOTION, PAPER
-from structgstream.training.online import fit_next_frame
-from structgstream.training.online_config import OnlineConfig
-from structgstream.training.pictures import pictures_of
+from structgstream.training.online.config import OnlineConfig
+from structgstream.training.online.fit import fit_next_frame
+from structgstream.training.online.preprocess import preprocess
 from structgstream.training.result import FitResult
 
 NOISE = 1.0  # Levels of 255: what a good camera leaves after denoising.
@@ -48,7 +48,7 @@ def _fitting(
     fits: list[FitResult] = []
 
     def run() -> Results:
-        pictures = pictures_of(
+        pictures = preprocess(
             world.frame,
             world.rig,
             before=world.previous,

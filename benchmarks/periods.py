@@ -37,7 +37,7 @@ from structgstream.recorder import record
 from structgstream.scene.scene import Scene
 from structgstream.similarity import normalizing_similarity
 from structgstream.struct_gstream import stream_pipeline
-from structgstream.training.initial import fit_first_frame
+from structgstream.training.frame0.fit import fit_first_frame
 from structgstream.training.result import FitResult
 
 FRAMES, CHANGE, KEY_EVERY = 12, 5, 4

@@ -12,11 +12,11 @@ from small_presets import QUICK
 from structgstream.api import reconstruct
 from structgstream.data.clip import bundled_clip_path
 from structgstream.groups.base import GroupBase
+from structgstream.groups.first_frame import GroupStartConfig
 from structgstream.groups.pictures import open_for
 from structgstream.groups.track_pass import TrackOptions, track_capture
+from structgstream.groups.tracking import TrackConfig
 from structgstream.groups.unit import SegmentTask, fit_segment
-from structgstream.training.group_start import GroupStartConfig
-from structgstream.training.tracking import TrackConfig
 
 FRAMES, LENGTH = 6, 2
 START = GroupStartConfig(iterations=6, rounds=2, births=50)

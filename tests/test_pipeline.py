@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from backends import quickest_backend
 from structgstream.pipeline import MAX_INTERVALS, FrameTask, Past
-from structgstream.training.pictures import FramePictures
+from structgstream.training.online.preprocess import FramePictures
 from worlds import moving_world
 
 WORLD = moving_world(1, speed=0.0, movers=4, cameras=6)

@@ -18,7 +18,7 @@ from structgstream.presets import (
     from_json,
     to_json,
 )
-from structgstream.training.initial import InitialRates
+from structgstream.training.frame0.fit import InitialRates
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -50,7 +50,6 @@ def test_schedules_fit_their_length(name: str) -> None:
     assert initial.coarse_iterations + initial.medium_iterations < initial.iterations
     assert initial.growth.collect_from <= initial.growth.start < initial.growth.last(initial.iterations)
     assert initial.growth.room_until <= initial.growth.last(initial.iterations)
-    assert all(at < initial.iterations for at in initial.growth.contribution_at)
     assert online.patching.iteration < online.iterations
 
 

@@ -9,7 +9,7 @@ from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError
 from structgstream.key_frames import LEAST_FRAMES, KeyFrames
 from structgstream.rate_control import LEAST, MOST, RateConfig, RateController, with_rate_control
-from structgstream.training.online_config import OnlineConfig
+from structgstream.training.online.config import OnlineConfig
 
 FPS, KEY_EVERY = 30.0, 30
 
@@ -138,7 +138,7 @@ def test_a_target_that_is_missed_again_is_said_again(caplog: pytest.LogCaptureFi
         for size in (4000, 8000, 2000, 8000):
             for _ in range(30):
                 run.add(size)
-    assert [record.getMessage().partition(":")[0] for record in caplog.records] == ["Frame 34", "Frame 102"]
+    assert [record.getMessage().split(":")[0] for record in caplog.records] == ["Frame 34", "Frame 102"]
     assert "more is saved from now on" in caplog.records[1].getMessage()
 
 
@@ -203,6 +203,6 @@ def test_the_rate_and_the_warning_are_those_of_media_time(caplog: pytest.LogCapt
         for _ in range(20):
             run.add(100_000)  # 1.6 Mbit/s
     assert run.controller.rate_mbits == pytest.approx(1.6)
-    assert [record.getMessage().partition(";")[0] for record in caplog.records] == [
+    assert [record.getMessage().split(";")[0] for record in caplog.records] == [
         "Frame 4: the last 5 frames take 1.6 Mbit/s, the target is 1"
     ]

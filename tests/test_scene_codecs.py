@@ -18,7 +18,7 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import state_of
 from structgstream.scene_codecs import scene_codec
 from structgstream.similarity import Similarity
-from structgstream.training.pictures import FramePictures
+from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.views import training_views
 from worlds import moving_world
 

@@ -25,9 +25,9 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, parameters_of, state_of
 from structgstream.session import FrameReport, Session
 from structgstream.struct_gstream import stream_pipeline
-from structgstream.training.environment import EnvironmentConfig
-from structgstream.training.motion import MotionConfig
-from structgstream.training.rounding import RoundingConfig, pixel_size
+from structgstream.training.frame0.seeding import EnvironmentConfig
+from structgstream.training.online.config import MotionConfig
+from structgstream.training.parameters import RoundingConfig, pixel_size
 from worlds import moving_world
 
 FRAMES = 4

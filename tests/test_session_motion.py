@@ -13,7 +13,7 @@ from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
 from structgstream.session import FrameReport, Session
 from structgstream.struct_gstream import stream_pipeline
-from structgstream.training.motion import MotionConfig
+from structgstream.training.online.config import MotionConfig
 from worlds import moving_world
 
 WORLD = moving_world(4, speed=0.06, movers=20)

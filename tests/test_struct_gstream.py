@@ -12,7 +12,7 @@ from structgstream.errors import ConfigError
 from structgstream.pipeline import FrameTask
 from structgstream.presets import COMPACT, PAPER, StreamConfig
 from structgstream.scene.scene import Scene
-from structgstream.struct_gstream import FirstFrame, StructGStream, stream_pipeline
+from structgstream.struct_gstream import FrameZeroContext, StructGStream, stream_pipeline
 from structgstream.training.result import FitResult
 from worlds import moving_world
 
@@ -37,7 +37,7 @@ def never() -> FrameTask:
 
 
 def test_a_first_frame_leaves_what_later_ones_use() -> None:
-    def prepared(*, residuals: bool, light: bool) -> FirstFrame:
+    def prepared(*, residuals: bool, light: bool) -> FrameZeroContext:
         method = StructGStream(with_parts(residuals=residuals, light=light))
         return method.prepare(WORLD.scene, lambda: task(method))
 
@@ -55,7 +55,7 @@ def test_a_first_frame_leaves_what_later_ones_use() -> None:
 def test_pictures_of_a_first_frame_are_not_read_where_nothing_is_kept() -> None:
     """A stream that resumes need not have them."""
     method = StructGStream(with_parts(residuals=False, light=False))
-    assert method.prepare(WORLD.scene, never) == FirstFrame()
+    assert method.prepare(WORLD.scene, never) == FrameZeroContext()
 
 
 def test_earlier_pictures_and_frames_are_asked_for_where_they_are_used() -> None:
@@ -65,8 +65,8 @@ def test_earlier_pictures_and_frames_are_asked_for_where_they_are_used() -> None
 
     def of(*, motion: bool, prior: float, ease: float) -> StreamConfig:
         online = COMPACT.online
-        segmentation = replace(online.motion, enabled=motion, moved_ease=ease)
-        return replace(COMPACT, online=replace(online, motion=segmentation, motion_prior=prior))
+        selection = replace(online.motion, enabled=motion, moved_ease=ease)
+        return replace(COMPACT, online=replace(online, motion=selection, motion_prior=prior))
 
     assert asks(PAPER) == (False, False)
     assert asks(of(motion=True, prior=0.0, ease=1.0)) == (True, False)

@@ -14,7 +14,10 @@ from structgstream.gaussians import Gaussians, concatenate
 from structgstream.kernels.backend import Backend, reference_backend
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
-from structgstream.training.motion import MotionConfig, MotionSegmentation, detect_changes, segment_motion
+from structgstream.training.online.config import MotionConfig
+from structgstream.training.online.measure import measure
+from structgstream.training.online.preprocess import detect_changes
+from structgstream.training.online.select import DynamicSelection, select_dynamic
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.views import View
 
@@ -92,7 +95,8 @@ def moved_since(
     flow_from: Collection[int] = (),
     older: Scene | None = None,
     floor: ResidualFloor | None = None,
-) -> MotionSegmentation:
+) -> DynamicSelection:
     """What may move in ``scene`` between the pictures ``before`` and those of ``views``."""
     changes = detect_changes(views, before, config=config, backend=backend, flow_from=flow_from)
-    return segment_motion(scene, views, changes, config=config, backend=backend, older=older, floor=floor)
+    measured = measure(scene, views, changes, config=config, backend=backend, floor=floor)
+    return select_dynamic(scene, measured, config=config, backend=backend, older=older)

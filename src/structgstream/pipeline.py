@@ -26,7 +26,7 @@ from structgstream.periods import PeriodConfig
 from structgstream.rate_control import RateConfig
 from structgstream.scene.render import Drawable
 from structgstream.similarity import Similarity
-from structgstream.training.pictures import FramePictures
+from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.result import FitResult, StepListener
 
 State = TypeVar("State", bound=Drawable)

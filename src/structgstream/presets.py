@@ -13,23 +13,24 @@ from structgstream.data.points import PointsConfig
 from structgstream.errors import ConfigError
 from structgstream.periods import PeriodConfig
 from structgstream.rate_control import RateConfig
-from structgstream.training.births import BirthConfig, ThinBirthConfig
-from structgstream.training.coherence import CoherenceConfig
-from structgstream.training.environment import EnvironmentConfig
-from structgstream.training.flow_maps import FlowConfig
-from structgstream.training.free_space import FreeSpaceConfig
-from structgstream.training.growth import GrowthConfig
-from structgstream.training.initial import InitialConfig, InitialRates
-from structgstream.training.light import LightConfig
+from structgstream.training.frame0.densify import GrowthConfig
+from structgstream.training.frame0.fit import InitialConfig, InitialRates
+from structgstream.training.frame0.regularizers import DepthDistortionConfig, FreeSpaceConfig, PerturbationConfig
+from structgstream.training.frame0.seeding import EnvironmentConfig
 from structgstream.training.losses import LossWeights
-from structgstream.training.motion import MotionConfig
-from structgstream.training.motion_start import MotionStartConfig
-from structgstream.training.online_config import OnlineConfig
+from structgstream.training.online.config import (
+    ExposureConfig,
+    FlowConfig,
+    MotionConfig,
+    OnlineConfig,
+    PatchingConfig,
+    SceneFlowConfig,
+    SmoothnessConfig,
+    SpawnConfig,
+    ThinSpawnConfig,
+)
 from structgstream.training.optim import LearningRate
-from structgstream.training.patching import PatchingConfig
-from structgstream.training.perturbation import PerturbationConfig
-from structgstream.training.rounding import RoundingConfig
-from structgstream.training.solidity import SolidityConfig
+from structgstream.training.parameters import RoundingConfig
 
 MOST_QUALITY = 6.0  # steps 64 times as small, or as large
 
@@ -278,7 +279,7 @@ COMPACT = replace(
         ),
         losses=replace(MOTION.initial.losses, l1=0.6, ssim=0.45),
         disturbance=PerturbationConfig(dropped_share=0.2, noise_scales=0.5, until_share=0.7),
-        solidity=SolidityConfig(weight=0.05, every=4),
+        solidity=DepthDistortionConfig(weight=0.05, every=4),
         free_space=FreeSpaceConfig(enabled=True),
         random_background=True,
         sampling_filter=True,
@@ -297,7 +298,7 @@ COMPACT = replace(
         ),
         patching=replace(MOTION.online.patching, spawn="off"),
         dynamic=MOTION.online.dynamic.difference(["covariance_mlp"]).union(["base_scales", "appearance", "color_mlp"]),
-        light=LightConfig(enabled=True),
+        light=ExposureConfig(enabled=True),
         motion=replace(
             MOTION.online.motion,
             moved_ease=0.5,
@@ -307,11 +308,11 @@ COMPACT = replace(
             tiles_around=1,
             rest_every=3,
         ),
-        start=MotionStartConfig(enabled=True, flow=FlowConfig(apart=True, far=True)),
-        births=BirthConfig(enabled=True, changed_floor_medians=1.0, thin=ThinBirthConfig(enabled=True)),
+        start=SceneFlowConfig(enabled=True, flow=FlowConfig(apart=True, far=True)),
+        births=SpawnConfig(enabled=True, changed_floor_medians=1.0, thin=ThinSpawnConfig(enabled=True)),
         motion_prior=0.7,
         sampling_filter=True,
-        coherence=CoherenceConfig(weight=8e-4),
+        coherence=SmoothnessConfig(weight=8e-4),
         rounding=RoundingConfig(free_priced=True),
     ),
 )

@@ -35,7 +35,7 @@ from itertools import takewhile
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError
 from structgstream.key_frames import KeyFrames
-from structgstream.training.online_config import OnlineConfig
+from structgstream.training.online.config import OnlineConfig
 
 _log = logging.getLogger(__name__)
 

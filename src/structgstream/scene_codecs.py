@@ -21,8 +21,8 @@ from structgstream.scene.appearance import with_appearance
 from structgstream.scene.order import in_morton_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, fields_of, parameters_of, scene_of, state_of, with_dynamic_fields
-from structgstream.training.first_quantization import estimate_sensitivity, float32, quantize_first_frame, regauge
-from structgstream.training.rounding import pixel_size
+from structgstream.training.frame0.quantization import estimate_sensitivity, float32, quantize_first_frame, regauge
+from structgstream.training.parameters import pixel_size
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class RawCodec(SceneCodec):
 
 @dataclass(frozen=True)
 class CompactCodec(SceneCodec):
-    """All values are quantized (``training/rounding.py``, Note [Bins]); anchors are in Z-order."""
+    """All values are quantized (``training/parameters.py``, Note [Bins]); anchors are in Z-order."""
 
     def _initialize_stream(self, scene: Scene, task: FrameTask) -> tuple[Scene, QuantizationSteps]:
         dynamic, rounding = self.config.online.dynamic, self.config.online.rounding

@@ -30,7 +30,7 @@ from structgstream.pipeline import FrameCoder, FrameTask, Memory, Past, Pipeline
 from structgstream.rate_control import RateController
 from structgstream.resuming import check_resumable
 from structgstream.similarity import normalizing_similarity
-from structgstream.training.pictures import FramePictures
+from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.result import StepListener
 
 

@@ -15,17 +15,17 @@ from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
 from structgstream.scene_codecs import scene_codec
-from structgstream.training.environment import fit_environment
-from structgstream.training.initial import fit_first_frame, fit_first_frame_again
-from structgstream.training.light import LightReference, light_reference
-from structgstream.training.online import fit_next_frame, needs_older
-from structgstream.training.pictures import FramePictures, pictures_of
+from structgstream.training.frame0.fit import fit_first_frame, fit_first_frame_again
+from structgstream.training.frame0.seeding import fit_environment
+from structgstream.training.online.exposure import ExposureReference, exposure_reference
+from structgstream.training.online.fit import fit_next_frame, needs_older
+from structgstream.training.online.preprocess import FramePictures, preprocess
 from structgstream.training.residuals import ResidualFloor, mean_residual, residual_floor
 from structgstream.training.result import FitResult
 
 
 @dataclass(frozen=True)
-class FirstFrame:
+class FrameZeroContext:
     """What later frames need of a period's first frame besides its scene, if they use it.
 
     Args:
@@ -34,12 +34,12 @@ class FirstFrame:
     """
 
     floor: ResidualFloor | None = None
-    light: LightReference | None = None
+    light: ExposureReference | None = None
 
 
 @dataclass(frozen=True)
 class StructGStream:
-    """The method. Its memory is :class:`FirstFrame`.
+    """The method. Its memory is :class:`FrameZeroContext`.
 
     Args:
         config: of the stream.
@@ -65,7 +65,7 @@ class StructGStream:
     ) -> FramePictures:
         """The training pictures and their changes."""
         online = self.config.online
-        return pictures_of(frame, rig, before=before, motion=online.motion, start=online.start, backend=backend)
+        return preprocess(frame, rig, before=before, motion=online.motion, start=online.start, backend=backend)
 
     def first(self, task: FrameTask) -> FitResult[Scene]:
         """Fit frame 0, with its environment if enabled."""
@@ -92,19 +92,19 @@ class StructGStream:
         found = fit_environment(fit.scene, views, config=config.environment, backend=backend)
         return replace(fit, scene=replace(fit.scene, environment=found))
 
-    def prepare(self, state: Scene, task: Callable[[], FrameTask]) -> FirstFrame:
+    def prepare(self, state: Scene, task: Callable[[], FrameTask]) -> FrameZeroContext:
         """The residual floor of frame 0, if residuals are used, and its light, if that is followed."""
         motion, light = self.config.online.motion, self.config.online.light
         if motion.residual_threshold <= 0.0 and not light.enabled:
-            return FirstFrame()
+            return FrameZeroContext()
         first = task()
         scene, views, backend = self._filtered(state, first), first.pictures.views, first.backend
         floor = None
         if motion.residual_threshold > 0.0:
             floor = residual_floor(scene, views, scale=motion.picture_scale, backend=backend)
-        return FirstFrame(floor, light_reference(scene, views, config=light) if light.enabled else None)
+        return FrameZeroContext(floor, exposure_reference(scene, views, config=light) if light.enabled else None)
 
-    def next(self, past: Past[Scene, FirstFrame], task: FrameTask) -> FitResult[Scene]:
+    def next(self, past: Past[Scene, FrameZeroContext], task: FrameTask) -> FitResult[Scene]:
         """Fit a later frame."""
         if task.begins is not None:
             return self._anew(past.state, task)
@@ -155,7 +155,7 @@ class StructGStream:
 
 def stream_pipeline(
     config: StreamConfig, *, fitted: Callable[[], FitResult[Scene]] | None = None
-) -> Pipeline[Scene, FirstFrame]:
+) -> Pipeline[Scene, FrameZeroContext]:
     """The pipeline of a configuration; see :class:`StructGStream`.
 
     Raises:

@@ -14,11 +14,10 @@ from structgstream.kernels.backend import reference_backend
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, state_of, with_dynamic_fields
-from structgstream.training.motion import changed_movers
-from structgstream.training.online_config import OnlineConfig, online_rates
+from structgstream.training.online.config import OnlineConfig, online_rates
+from structgstream.training.online.select import changed_movers
 from structgstream.training.optim import Adam
-from structgstream.training.parameters import Parameters, detached, parameters_of_fields
-from structgstream.training.rounding import RoundingConfig
+from structgstream.training.parameters import Parameters, RoundingConfig, detached, parameters_of_fields
 
 NAME = cast(Any, "brightness")
 DYNAMIC = PAPER_DYNAMIC | {NAME}

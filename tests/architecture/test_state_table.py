@@ -10,9 +10,9 @@ from dataclasses import fields
 from pathlib import Path
 
 from structgstream.scene.state import PARAMETERS, STATE_TABLE
-from structgstream.training.initial import InitialRates
-from structgstream.training.online_config import OnlineRates
-from structgstream.training.rounding import RoundingConfig
+from structgstream.training.frame0.fit import InitialRates
+from structgstream.training.online.config import OnlineRates
+from structgstream.training.parameters import RoundingConfig
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "src" / "structgstream"

@@ -14,7 +14,7 @@ from quick_streams import CLIP, error_of
 from streams import small_stream
 from structgstream.cli import group_run, main
 from structgstream.groups import unit
-from structgstream.training.group_start import GroupStartConfig
+from structgstream.groups.first_frame import GroupStartConfig
 
 
 @pytest.fixture

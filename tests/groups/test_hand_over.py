@@ -13,7 +13,7 @@ from structgstream.codec.scene.bins import dequantize, quantize
 from structgstream.groups.hand_over import FADE_FRAMES, NEIGHBOURS, HandOver
 from structgstream.kernels.anchor_types import HeadWeights
 from structgstream.scene.scene import Scene
-from structgstream.training.patching import BIRTHS_PER_FRAME
+from structgstream.training.online.patching import IDS_PER_FRAME
 
 SIDE = 2 * NEIGHBOURS
 """Anchors of each of two heaps far apart, so that each is a neighbourhood of its own."""
@@ -44,7 +44,7 @@ def shifted(scene: Scene, rows: Tensor, bins: int) -> Scene:
 
 
 def born_in(scene: Scene, frame: int) -> Scene:
-    births = frame * BIRTHS_PER_FRAME + torch.arange(len(scene.free))
+    births = frame * IDS_PER_FRAME + torch.arange(len(scene.free))
     return replace(scene, free=replace(scene.free, births=births))
 
 

@@ -15,7 +15,7 @@ from structgstream.errors import ConfigError, StorageError, StreamError
 from structgstream.groups import join
 from structgstream.groups.join import check_births, join_segments
 from structgstream.owned_folders import MARKER
-from structgstream.training.patching import BIRTHS_PER_FRAME
+from structgstream.training.online.patching import IDS_PER_FRAME
 
 
 def test_the_result_is_an_ordinary_stream(tmp_path: Path) -> None:
@@ -28,7 +28,7 @@ def test_the_result_is_an_ordinary_stream(tmp_path: Path) -> None:
         keys = [info.index for info in by_scan.packets if info.kind is PacketKind.KEY]
         assert keys == [*range(0, FRAMES, LENGTH)]
         births = [int(b) for _, scene in by_scan.scenes() for b in scene.free.births]
-        assert all(b // BIRTHS_PER_FRAME < FRAMES for b in births)
+        assert all(b // IDS_PER_FRAME < FRAMES for b in births)
     assert [*tmp_path.iterdir()] == [path]
 
 

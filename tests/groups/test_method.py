@@ -11,6 +11,7 @@ import torch
 from rigs import random_scene
 from structgstream.errors import ConfigError, OutOfMemoryError
 from structgstream.groups import method
+from structgstream.groups.first_frame import GroupStartConfig
 from structgstream.groups.method import (
     CATCH_UP_FRAMES,
     GroupEntry,
@@ -21,8 +22,7 @@ from structgstream.groups.method import (
 )
 from structgstream.pipeline import Past
 from structgstream.presets import TINY
-from structgstream.struct_gstream import FirstFrame
-from structgstream.training.group_start import GroupStartConfig
+from structgstream.struct_gstream import FrameZeroContext
 from structgstream.training.result import FitResult
 
 FIRST = 6
@@ -65,7 +65,7 @@ def usual(monkeypatch: pytest.MonkeyPatch) -> Usual:
     made = Usual()
     monkeypatch.setattr(method, "StructGStream", made)
     monkeypatch.setattr(method, "fit_group_start", made.start)
-    monkeypatch.setattr(method, "pictures_of", lambda frame, rig, **options: options)
+    monkeypatch.setattr(method, "preprocess", lambda frame, rig, **options: options)
     return made
 
 
@@ -90,7 +90,7 @@ def test_frame_0_is_the_headers() -> None:
 
 
 def test_the_first_frame_begins_where_tracking_has_followed_things(usual: Usual) -> None:
-    found = group().next(Past(SCENE, FirstFrame()), task(FIRST))
+    found = group().next(Past(SCENE, FrameZeroContext()), task(FIRST))
     ((kind, given),) = usual.asked
     assert (kind, given.frame_index, given.seed, given.start) == ("start", FIRST, 3, START)
     assert torch.equal(given.displacements, torch.arange(21, dtype=torch.float32).reshape(7, 3))
@@ -101,7 +101,7 @@ def test_the_first_frame_begins_where_tracking_has_followed_things(usual: Usual)
 def test_the_second_frame_knows_how_things_have_moved_and_later_ones_are_usual(usual: Usual) -> None:
     made = group()
     for index in (FIRST + 1, FIRST + 2):
-        made.next(Past(SCENE, FirstFrame()), task(index))
+        made.next(Past(SCENE, FrameZeroContext()), task(index))
     (_, second), (_, third) = usual.asked
     assert third.older is None
     moved = SCENE.anchors.positions - second.older.anchors.positions
@@ -112,7 +112,7 @@ def test_the_second_frame_knows_how_things_have_moved_and_later_ones_are_usual(u
 
 def test_the_group_of_frame_0_is_as_any_stream(usual: Usual) -> None:
     made = group(first=None)
-    past: Past[Any, Any] = Past(SCENE, FirstFrame())
+    past: Past[Any, Any] = Past(SCENE, FrameZeroContext())
     for index in (1, 2):
         made.next(past, task(index))
     assert usual.asked == [("next", past)] * 2
@@ -122,7 +122,7 @@ def test_the_group_of_frame_0_is_as_any_stream(usual: Usual) -> None:
 def test_the_first_frames_catch_up(usual: Usual) -> None:
     made = group()
     for index in range(FIRST, FIRST + CATCH_UP_FRAMES + 2):
-        made.next(Past(SCENE, FirstFrame()), task(index))
+        made.next(Past(SCENE, FrameZeroContext()), task(index))
     assert usual.asked[0][1].config.births.thin.crowded == "small-clusters"
     assert usual.thin == ["small-clusters"] * (CATCH_UP_FRAMES - 1) + ["none"] * 2
 
@@ -131,7 +131,7 @@ def test_the_first_frame_is_compared_with_frame_0_and_others_with_the_one_before
     made, before = group(), object()
     options: Any = {"rig": None, "backend": None}
     found: Any = made.observe(task(FIRST).frame, before, **options)  # type: ignore[arg-type]
-    assert (found["before"], found["start"].enabled, found["motion"].full_every_frames) == ("frame 0", False, 0)
+    assert (found["before"], found["start"].enabled) == ("frame 0", False)
     assert made.observe(task(FIRST + 1).frame, before, **options) == "as usual"  # type: ignore[arg-type]
     assert usual.asked == [("observe", before)]
 
@@ -141,14 +141,14 @@ def test_short_memory_lowers_the_budget_once_and_is_told(
     usual: Usual, index: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     made, usual.fails = group(), 1
-    found = made.next(Past(SCENE, FirstFrame()), task(index))
+    found = made.next(Past(SCENE, FrameZeroContext()), task(index))
     assert found.counts == {"jumps": 2, "lowered budgets": 1}
     assert (made.lowered, made.start, made.config.online) == (True, lowered_start(START), lowered_budget(TINY.online))
     assert f"Frame {index}: not enough memory." in caplog.text
-    assert made.next(Past(SCENE, FirstFrame()), task(index)).counts == {"jumps": 2}
+    assert made.next(Past(SCENE, FrameZeroContext()), task(index)).counts == {"jumps": 2}
     usual.fails = 1
     with pytest.raises(OutOfMemoryError):
-        made.next(Past(SCENE, FirstFrame()), task(index))
+        made.next(Past(SCENE, FrameZeroContext()), task(index))
     assert made.start == lowered_start(START)
 
 

@@ -23,7 +23,7 @@ def test_a_track_has_a_start_for_each_group() -> None:
     assert found.groups == [(0, 2), (2, 4), (4, 6)]
     assert groups_path(made().track).read_text() == "0:2\n2:4\n4:6\n"
     start = found.start(4)
-    assert len(start.movers) > 10
+    assert len(start.primitives) > 10
     assert len(start.changed) == LENGTH
     assert ((start.displacements != 0) | (start.velocities != 0)).any(1).all()
 
@@ -87,7 +87,7 @@ def test_after_a_finished_group_it_begins_where_that_has_fitted_things(tmp_path:
     start = found.start(3)
     z = base.scene().anchors.positions
     moved = z.clone()
-    moved[torch.from_numpy(start.movers).long()] += torch.from_numpy(start.displacements) * base.position_step
+    moved[torch.from_numpy(start.primitives).long()] += torch.from_numpy(start.displacements) * base.position_step
     torch.testing.assert_close(moved, fitted.anchors.positions, atol=1e-6, rtol=0)
     whole = path.read_bytes()
     path.unlink()

@@ -12,12 +12,9 @@ from recorders import Repeater
 from structgstream.kernels.backend import cuda_backend
 from structgstream.kernels.cuda_graph import GraphMemory
 from structgstream.scene.state import state_of
-from structgstream.training.coherence import CoherenceConfig
-from structgstream.training.motion import MotionConfig
-from structgstream.training.online import fit_next_frame
-from structgstream.training.online_config import OnlineConfig
-from structgstream.training.patching import PatchingConfig
-from structgstream.training.pictures import pictures_of
+from structgstream.training.online.config import MotionConfig, OnlineConfig, PatchingConfig, SmoothnessConfig
+from structgstream.training.online.fit import fit_next_frame
+from structgstream.training.online.preprocess import preprocess
 from worlds import moving_world
 
 
@@ -72,7 +69,7 @@ def test_a_frame_of_recorded_iterations_is_that_of_single_ones(device: str) -> N
         iterations=60,
         patching=PatchingConfig(spawn="off", iteration=30),
         motion=MotionConfig(enabled=True, rest_every=3),
-        coherence=CoherenceConfig(weight=1e-4),
+        coherence=SmoothnessConfig(weight=1e-4),
         mean_of_last=0.25,
     )
     single = quickest_backend() if device == "cpu" else replace(cuda_backend(), recorder=None)
@@ -85,7 +82,7 @@ def test_a_frame_of_recorded_iterations_is_that_of_single_ones(device: str) -> N
             config=config,
             backend=backend,
             seed=0,
-            pictures=pictures_of(
+            pictures=preprocess(
                 world.frames[1],
                 world.rig,
                 before=world.frames[0],

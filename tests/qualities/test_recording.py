@@ -151,7 +151,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
         return call
 
-    for name in ("fit_first_frame", "pictures_of"):
+    for name in ("fit_first_frame", "preprocess"):
         monkeypatch.setattr(struct_gstream, name, counting(name, getattr(struct_gstream, name)))
     return counts
 
@@ -163,7 +163,7 @@ def test_a_period_that_begins_from_points_is_fitted_once(tmp_path: Path, monkeyp
     found = alone(tmp_path / "high.sgs", "high", config)
     counts = counted(monkeypatch)
     list(begun(tmp_path / "out", Recorded(), config).reports)
-    assert counts == {"fit_first_frame": 2, "pictures_of": FRAMES}
+    assert counts == {"fit_first_frame": 2, "preprocess": FRAMES}
     assert archived(tmp_path / "out", "high") == found
 
 
@@ -174,7 +174,7 @@ def test_each_frame_is_read_and_prepared_once_and_frame_0_fitted_once(
     source = Recorded(count=3)
     reports = list(begun(tmp_path / "out", source).reports)
     assert source.read == [0, 1, 2, 1, 2], "once more to denoise frame 0"
-    assert counts == {"fit_first_frame": 1, "pictures_of": 3}
+    assert counts == {"fit_first_frame": 1, "preprocess": 3}
     assert [(one.quality, one.report.index, one.whole) for one in reports] == [
         (name, index, name == "high") for index in range(3) for name in NAMES
     ]

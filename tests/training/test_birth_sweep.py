@@ -8,27 +8,26 @@ import torch
 
 from structgstream.kernels.backend import reference_backend
 from structgstream.kernels.raster_types import RasterOutput
-from structgstream.training.birth_sweep import Sweep, missing_share
-from structgstream.training.births import BirthConfig
-from structgstream.training.motion import MotionConfig
-from structgstream.training.partition import Partition, focus_views
+from structgstream.training.online.config import MotionConfig, SpawnConfig
+from structgstream.training.online.spawn import Sweep, missing_share
+from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.residuals import residual_floor
 from structgstream.training.views import training_views
 from worlds import emerging_ball, moved_since, moving_world
 
 CPU = torch.device("cpu")
 WORLD = moving_world(2, cameras=6, emerges_at=1, movers=0, width=96, height=64)
-CONFIG = BirthConfig(enabled=True, least_hits=2)
+CONFIG = SpawnConfig(enabled=True, least_hits=2)
 
 
-def sweep(config: BirthConfig = CONFIG) -> Sweep:
+def sweep(config: SpawnConfig = CONFIG) -> Sweep:
     """Over the frame in which a ball emerges."""
     backend, motion = reference_backend(), MotionConfig(enabled=True, picture_scale=1.0)
     first, views = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (0, 1))
-    partition = Partition.of(WORLD.scene, moved_since(WORLD.scene, views, first, config=motion, backend=backend))
-    focuses = focus_views(partition, views, config=motion, backend=backend)
+    split = DynamicSplit.of(WORLD.scene, moved_since(WORLD.scene, views, first, config=motion, backend=backend))
+    active_tiles = find_active_tiles(split, views, config=motion, backend=backend)
     floor = residual_floor(WORLD.scene, first, scale=1.0, backend=backend)
-    return Sweep(partition.moving, partition.still, views, focuses, floor, config, backend)
+    return Sweep(split.dynamic, split.static, views, active_tiles, floor, config, backend)
 
 
 def test_missing_is_the_ball_in_the_views_that_show_it() -> None:

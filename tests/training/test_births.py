@@ -9,19 +9,13 @@ import torch
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.color import CameraColor
 from structgstream.scene.render import draw
-from structgstream.training.births import (
-    BirthConfig,
-    ViewResidual,
-    _merge_points,
-    blamed_mask,
-    sweep_births,
-    view_residual,
-)
+from structgstream.training.online.config import SpawnConfig
+from structgstream.training.online.spawn import ViewResidual, _merge_points, outlier_mask, spawn_by_sweep, view_residual
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.views import View, training_views
 from worlds import moving_world
 
-CONFIG = BirthConfig(enabled=True)
+CONFIG = SpawnConfig(enabled=True)
 WORLD = moving_world(1, width=96, height=64)
 VIEWS = training_views(WORLD.frames[0], WORLD.rig, torch.device("cpu"))
 
@@ -29,10 +23,10 @@ VIEWS = training_views(WORLD.frames[0], WORLD.rig, torch.device("cpu"))
 def test_blame_takes_two_views_and_half_of_those_that_see() -> None:
     coverage = torch.tensor([[10.0, 10, 10, 10], [10, 10, 10, 0.1], [10, 10, 10, 0.1], [10, 0, 10, 0.1]])
     wrong = torch.tensor([[6.0, 6, 6, 6], [6, 0, 6, 0.1], [0, 0, 6, 0.1], [0, 0, 0, 0.1]])
-    found = blamed_mask(coverage, wrong, least_pixels=0.3, config=CONFIG)
+    found = outlier_mask(coverage, wrong, least_pixels=0.3, config=CONFIG)
     # Two of four; one of three; three of four; one, since the others do not see it.
     assert found.tolist() == [True, False, True, False]
-    assert not blamed_mask(coverage, 0.5 * coverage, least_pixels=0.3, config=CONFIG).any(), (
+    assert not outlier_mask(coverage, 0.5 * coverage, least_pixels=0.3, config=CONFIG).any(), (
         "half is not more than half"
     )
 
@@ -44,7 +38,7 @@ def spoiled(view: View) -> torch.Tensor:
     return picture
 
 
-def compared(picture: torch.Tensor, view: View, *, config: BirthConfig, floor: ResidualFloor | None) -> ViewResidual:
+def compared(picture: torch.Tensor, view: View, *, config: SpawnConfig, floor: ResidualFloor | None) -> ViewResidual:
     color = CameraColor.identity(view.index + 1)
     return view_residual(picture, view, color, floor=floor, config=config, backend=reference_backend())
 
@@ -72,7 +66,7 @@ def test_without_anything_missing_nothing_is_born() -> None:
     views = [ViewResidual(v, torch.zeros(64, 96, dtype=torch.bool), torch.zeros(64, 96)) for v in VIEWS]
     depths = {v.index: torch.full((64, 96), 5.0) for v in VIEWS}
     color = CameraColor.identity(len(VIEWS))
-    found = sweep_births(views, depths, color, first_birth=7, config=CONFIG, backend=reference_backend())
+    found = spawn_by_sweep(views, depths, color, first_birth=7, config=CONFIG, backend=reference_backend())
     assert (len(found.free), found.refused_count) == (0, 0)
 
 
@@ -89,7 +83,7 @@ def test_a_view_of_which_nothing_counts_neither_supports_nor_contradicts() -> No
 
     def born(last: ViewResidual) -> int:
         found = [compared(without[v.index].clamp(0, 1), v, floor=floor, config=config) for v in views[:-1]]
-        return len(sweep_births([*found, last], depths, color, first_birth=0, config=config, backend=backend).free)
+        return len(spawn_by_sweep([*found, last], depths, color, first_birth=0, config=config, backend=backend).free)
 
     last = views[-1]
     silent = ViewResidual(last, torch.zeros(64, 96, dtype=torch.bool), torch.zeros(64, 96))

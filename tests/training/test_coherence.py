@@ -11,11 +11,12 @@ from structgstream.cameras import Camera
 from structgstream.errors import ConfigError
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.scene import Scene
-from structgstream.training.coherence import CoherenceConfig, MotionCoherence
-from structgstream.training.rounding import pixel_size
+from structgstream.training.online.config import SmoothnessConfig
+from structgstream.training.online.smoothness import MotionSmoothness
+from structgstream.training.parameters import pixel_size
 
 BACKEND = reference_backend()
-CONFIG = CoherenceConfig(weight=1.0, neighbours=4, feature_bandwidth=0.0)
+CONFIG = SmoothnessConfig(weight=1.0, neighbours=4, feature_bandwidth=0.0)
 
 
 def _cameras() -> list[Camera]:
@@ -32,8 +33,8 @@ def _grid(features: torch.Tensor | None = None) -> Scene:
     return replace(scene, anchors=anchors if features is None else replace(anchors, features=features))
 
 
-def _price(scene: Scene, config: CoherenceConfig = CONFIG) -> MotionCoherence:
-    found = MotionCoherence.of(scene, _cameras(), config=config)
+def _price(scene: Scene, config: SmoothnessConfig = CONFIG) -> MotionSmoothness:
+    found = MotionSmoothness.of(scene, _cameras(), config=config)
     assert found is not None
     return found
 
@@ -85,10 +86,10 @@ def test_what_looks_different_does_not_count() -> None:
 
 def test_there_is_no_price_without_weight_company_or_view() -> None:
     scene = _grid()
-    assert MotionCoherence.of(scene, _cameras(), config=replace(CONFIG, weight=0.0)) is None
+    assert MotionSmoothness.of(scene, _cameras(), config=replace(CONFIG, weight=0.0)) is None
     alone = replace(scene, anchors=scene.anchors.select(torch.arange(1)))
-    assert MotionCoherence.of(alone, _cameras(), config=CONFIG) is None
-    assert MotionCoherence.of(scene, [], config=CONFIG) is None
+    assert MotionSmoothness.of(alone, _cameras(), config=CONFIG) is None
+    assert MotionSmoothness.of(scene, [], config=CONFIG) is None
 
 
 def test_two_anchors_are_each_others_neighbours() -> None:
@@ -103,4 +104,4 @@ def test_two_anchors_are_each_others_neighbours() -> None:
 )
 def test_wrong_values_are_refused(wrong: dict) -> None:
     with pytest.raises(ConfigError, match=r"online\.coherence"):
-        CoherenceConfig(**wrong)
+        SmoothnessConfig(**wrong)

@@ -1,5 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-from dataclasses import replace
 
 import torch
 
@@ -7,8 +6,7 @@ from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import ParameterName
-from structgstream.training.densify import Densifier
-from structgstream.training.growth import GrowthConfig
+from structgstream.training.frame0.densify import Densifier, GrowthConfig
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import ANCHOR_ROWS, Parameters
 
@@ -86,20 +84,3 @@ def test_statistics_follow_renderings() -> None:
     assert densifier.opacities.visits[structured.anchors].eq(1.0).all()
     expected = torch.zeros(30).index_add_(0, structured.gaussians.ids // 5, structured.gaussians.opacities)
     assert torch.allclose(densifier.opacities.opacity, expected, atol=1e-6)
-
-
-def test_who_hardly_contributes_goes_from_every_table() -> None:
-    _, parameters, densifier, adam = prepared()
-    config = replace(CONFIG, least_contribution=0.2, contribution_at=(7,))
-    densifier = replace(densifier, config=config)
-    assert [i for i in range(20) if densifier.prunes_by_contribution(i)] == [7]
-    assert not replace(densifier, config=CONFIG).prunes_by_contribution(7)
-    shares = torch.ones(30)
-    shares[:6] = 0.1
-    assert densifier.prune_by_contribution(shares, adam) == densifier.pruned == 6
-    assert densifier.grown == 0
-    for name in ANCHOR_ROWS:
-        assert len(parameters.values[name]) == len(adam.first[name]) == 24
-        assert parameters.values[name].requires_grad
-    assert densifier.opacities.visits.shape == (24,)
-    assert densifier.gradients.count.shape == (120,)

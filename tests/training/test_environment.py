@@ -11,8 +11,8 @@ from structgstream.kernels.backend import reference_backend
 from structgstream.scene.color import CameraColor
 from structgstream.scene.environment import environment, pixel_directions
 from structgstream.scene.render import render
-from structgstream.training.environment import EnvironmentConfig, fit_environment
-from structgstream.training.initial import InitialConfig, fit_first_frame
+from structgstream.training.frame0.fit import InitialConfig, fit_first_frame
+from structgstream.training.frame0.seeding import EnvironmentConfig, fit_environment
 from structgstream.training.views import training_views
 from worlds import moving_world
 

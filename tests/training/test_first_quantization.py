@@ -14,7 +14,7 @@ from structgstream.scene.appearance import with_appearance
 from structgstream.scene.render import render
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, scene_of, state_of
-from structgstream.training.first_quantization import (
+from structgstream.training.frame0.quantization import (
     COARSEST,
     FINEST,
     SENSITIVITY_FIELDS,
@@ -23,7 +23,7 @@ from structgstream.training.first_quantization import (
     quantize_first_frame,
     regauge,
 )
-from structgstream.training.rounding import RoundingConfig
+from structgstream.training.parameters import RoundingConfig
 
 BACKEND = reference_backend()
 RIG = arc_rig(7, width=40, height=32)

@@ -11,7 +11,8 @@ from hypothesis.extra.numpy import arrays
 
 from structgstream.errors import ConfigError
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.flow_maps import FlowConfig, FlowMaps, _parts, flow_map
+from structgstream.training.online.config import FlowConfig
+from structgstream.training.online.preprocess import FlowMaps, _parts, flow_map
 
 
 def one_box(*given) -> torch.Tensor:

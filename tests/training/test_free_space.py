@@ -14,7 +14,7 @@ from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
-from structgstream.training.free_space import FreeSpaceConfig, in_free_space
+from structgstream.training.frame0.regularizers import FreeSpaceConfig, in_free_space
 
 CONFIG = FreeSpaceConfig(least_views=4, scale=1.0)
 RIG = arc_rig(9, width=64, height=48)

@@ -6,16 +6,21 @@ from dataclasses import replace
 import torch
 
 from backends import quickest_backend
+from structgstream.groups.first_frame import GroupStartConfig, fit_group_start
 from structgstream.scene.state import state_of
-from structgstream.training.births import BirthConfig
-from structgstream.training.coherence import CoherenceConfig
-from structgstream.training.group_start import GroupStartConfig, fit_group_start
-from structgstream.training.motion import MotionConfig, detect_changes
-from structgstream.training.motion_start import MotionStartConfig
-from structgstream.training.online_config import OnlineConfig, OnlineRates
-from structgstream.training.patching import BIRTHS_PER_FRAME, PatchingConfig
+from structgstream.training.online.config import (
+    MotionConfig,
+    OnlineConfig,
+    OnlineRates,
+    PatchingConfig,
+    SceneFlowConfig,
+    SmoothnessConfig,
+    SpawnConfig,
+)
+from structgstream.training.online.patching import IDS_PER_FRAME
+from structgstream.training.online.preprocess import detect_changes
+from structgstream.training.parameters import RoundingConfig
 from structgstream.training.residuals import residual_floor
-from structgstream.training.rounding import RoundingConfig
 from structgstream.training.views import training_views
 from worlds import World, moving_world, psnr, rendered
 
@@ -24,8 +29,8 @@ MOTION = MotionConfig(enabled=True, picture_scale=0.5, residual_threshold=0.05)
 CONFIG = OnlineConfig(
     rates=OnlineRates(anchor_positions=1e-3),
     motion=MOTION,
-    start=MotionStartConfig(enabled=True),
-    births=BirthConfig(enabled=True, picture_width=128),
+    start=SceneFlowConfig(enabled=True),
+    births=SpawnConfig(enabled=True, picture_width=128),
     patching=PatchingConfig(spawn="off", iteration=4),
 )
 START = GroupStartConfig(iterations=16, rounds=2, births=40)
@@ -107,7 +112,7 @@ def test_motion_is_coherent_since_frame_0_and_not_since_the_round_began() -> Non
     noisy[:60] += 0.01 * torch.randn(60, 3, generator=torch.Generator().manual_seed(3))
 
     def spread(weight: float) -> float:
-        found = fit(world, noisy, config=replace(CONFIG, coherence=CoherenceConfig(weight)))
+        found = fit(world, noisy, config=replace(CONFIG, coherence=SmoothnessConfig(weight)))
         return float((found.scene.anchors.positions - world.scene.anchors.positions)[:60].std(0).norm())
 
     assert spread(4.0) < 0.8 * spread(0.0)
@@ -117,12 +122,12 @@ def test_births_of_several_rounds_have_identities_of_their_own() -> None:
     world = moving_world(FRAME + 1, cameras=6, emerges_at=1, movers=0, width=96, height=64)
     none = torch.zeros(len(world.scene.anchors) + len(world.scene.free), 3)
     motion = MotionConfig(enabled=True, picture_scale=1.0)
-    config = replace(CONFIG, motion=motion, births=BirthConfig(enabled=True, least_hits=2))
+    config = replace(CONFIG, motion=motion, births=SpawnConfig(enabled=True, least_hits=2))
     found = fit(world, none, start=replace(START, flow_rounds=0), config=config)
     births = found.scene.free.births
     assert len(births) > 0
     assert len(births.unique()) == len(births)
-    assert (births // BIRTHS_PER_FRAME == FRAME).all()
+    assert (births // IDS_PER_FRAME == FRAME).all()
 
 
 def test_it_is_repeatable() -> None:

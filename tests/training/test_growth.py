@@ -6,7 +6,7 @@ import torch
 from rigs import random_scene
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.anchor_types import StructuredGaussians
-from structgstream.training.growth import GrowthConfig, OpacityStatistics, grow, prunable_mask
+from structgstream.training.frame0.densify import GrowthConfig, OpacityStatistics, grow, prunable_mask
 
 VOXEL = 0.01
 

@@ -12,12 +12,14 @@ from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend, reference_backend
 from structgstream.presets import PRESETS
 from structgstream.scene.state import state_of
-from structgstream.training.free_space import FreeSpaceConfig, in_free_space
-from structgstream.training.growth import GrowthConfig
-from structgstream.training.initial import InitialConfig, InitialRates, fit_first_frame, rates_at
-from structgstream.training.perturbation import PerturbationConfig
-from structgstream.training.seeding import voxel_centers
-from structgstream.training.solidity import SolidityConfig
+from structgstream.training.frame0.densify import GrowthConfig
+from structgstream.training.frame0.fit import InitialConfig, InitialRates, fit_first_frame, rates_at
+from structgstream.training.frame0.regularizers import (
+    DepthDistortionConfig,
+    FreeSpaceConfig,
+    in_free_space,
+)
+from structgstream.training.frame0.seeding import voxel_centers
 from worlds import moving_world, psnr, rendered
 
 QUICK = InitialConfig(
@@ -92,18 +94,15 @@ def test_stages_of_a_fit_that_begins_late() -> None:
         assert config.stages(done=done) == [(counts[0], 0.5), (counts[1], 0.7)]
 
 
-def test_solid_surfaces_and_few_anchors() -> None:
+def test_solid_surfaces() -> None:
     world = moving_world(1)
     config = replace(
         QUICK,
-        disturbance=PerturbationConfig(view_noise=0.1),
-        solidity=SolidityConfig(weight=0.05),
-        growth=replace(QUICK.growth, least_contribution=0.3, contribution_at=(60,)),
+        solidity=DepthDistortionConfig(weight=0.05),
     )
     result = fit(world, config=config)
     assert result.train_psnr > 15.0
-    assert result.removed > 0
-    assert result.losses["depth_spread"] > 0.0
+    assert result.losses["depth_distortion"] > 0.0
     assert len(result.scene.anchors) == len(voxel_centers(world.scene.anchors.positions, 0.05)) + (
         result.grown - result.removed
     )

@@ -7,10 +7,9 @@ import torch
 from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.color import CameraColor
-from structgstream.training.last_pass import LastPass
-from structgstream.training.losses import LossWeights
-from structgstream.training.step import ViewLoss, picture_loss
-from structgstream.training.stopwatch import Stopwatch
+from structgstream.training.losses import LossWeights, ViewLoss, picture_loss
+from structgstream.training.optim import LastPass
+from structgstream.training.result import Stopwatch
 from structgstream.training.views import View
 
 CPU = torch.device("cpu")

@@ -6,8 +6,9 @@ from dataclasses import replace
 import torch
 
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.lifting import LiftConfig, lift_motion
-from structgstream.training.observation import MotionEvidence
+from structgstream.training.online.config import LiftConfig
+from structgstream.training.online.measure import FlowEvidence
+from structgstream.training.online.scene_flow import lift_flow
 from structgstream.training.views import training_views
 from worlds import World, moving_world
 
@@ -19,8 +20,8 @@ def world() -> World:
     return moving_world(2, cameras=6, width=128, height=96)
 
 
-def evidence_of(colors: torch.Tensor, flows: torch.Tensor, views: int) -> MotionEvidence:
-    return MotionEvidence(torch.full((views, len(colors)), 5.0), flows.expand(views, -1, 2), colors)
+def evidence_of(colors: torch.Tensor, flows: torch.Tensor, views: int) -> FlowEvidence:
+    return FlowEvidence(torch.full((views, len(colors)), 5.0), flows.expand(views, -1, 2), colors)
 
 
 def test_neighbours_of_another_colour_do_not_share_a_motion() -> None:
@@ -36,7 +37,7 @@ def test_neighbours_of_another_colour_do_not_share_a_motion() -> None:
 
     def lengths(bandwidth: float) -> tuple[float, float]:
         config = LiftConfig(color_bandwidth=bandwidth)
-        found = lift_motion(
+        found = lift_flow(
             evidence_of(colors, flows, len(views)), centers, torch.zeros(40, 3), views, config=config, backend=BACKEND
         ).displacements.norm(dim=1)
         return float(found[ball].mean()), float(found[~ball].mean())
@@ -58,8 +59,8 @@ def test_the_same_motion_is_lifted_alike_at_the_sizes_at_which_people_film() -> 
     def lifted_at(width: int) -> tuple[torch.Tensor, torch.Tensor]:
         sized = [replace(view, camera=view.camera.resized(width, width * 3 // 4)) for view in views]
         seen = (flows + 0.85 * errors) * (width / 640)
-        evidence = MotionEvidence(torch.full((len(views), 60), 5.0), seen, torch.full((60, 3), 0.5))
-        found = lift_motion(evidence, centers, torch.zeros(60, 3), sized, config=LiftConfig(), backend=BACKEND)
+        evidence = FlowEvidence(torch.full((len(views), 60), 5.0), seen, torch.full((60, 3), 0.5))
+        found = lift_flow(evidence, centers, torch.zeros(60, 3), sized, config=LiftConfig(), backend=BACKEND)
         return found.displacements, found.lifted
 
     small, lifted = lifted_at(640)
@@ -73,8 +74,8 @@ def test_the_same_motion_is_lifted_alike_at_the_sizes_at_which_people_film() -> 
 def test_without_evidence_movers_follow_their_priors() -> None:
     scenery = world()
     views = training_views(scenery.frames[1], scenery.rig, CPU)
-    nothing = MotionEvidence(torch.zeros(len(views), 4), torch.zeros(len(views), 4, 2), torch.zeros(4, 3))
+    nothing = FlowEvidence(torch.zeros(len(views), 4), torch.zeros(len(views), 4, 2), torch.zeros(4, 3))
     priors = torch.rand(4, 3)
-    found = lift_motion(nothing, torch.zeros(4, 3), priors, views, config=LiftConfig(), backend=BACKEND)
+    found = lift_flow(nothing, torch.zeros(4, 3), priors, views, config=LiftConfig(), backend=BACKEND)
     assert torch.equal(found.displacements, priors)
     assert not found.lifted.any()

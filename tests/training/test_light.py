@@ -11,12 +11,12 @@ from structgstream.errors import ConfigError
 from structgstream.kernels.anchor_types import HeadWeights
 from structgstream.presets import COMPACT
 from structgstream.scene.scene import Scene
-from structgstream.training.light import LightConfig, light_reference, with_light_of
-from structgstream.training.online_config import OnlineConfig
+from structgstream.training.online.config import ExposureConfig, OnlineConfig
+from structgstream.training.online.exposure import exposure_reference, with_exposure_of
 from structgstream.training.views import View, training_views
 from worlds import World, moving_world
 
-CONFIG = LightConfig(enabled=True, picture_scale=1.0)
+CONFIG = ExposureConfig(enabled=True, picture_scale=1.0)
 WORLD = moving_world(1, cameras=6)  # Five of them train.
 
 
@@ -45,9 +45,9 @@ def on_grid(scene: Scene, step: float = 1 / 1024) -> Scene:
     return replace(scene, mlps=scene.mlps._replace(color=HeadWeights(head.w1, head.b1, head.w2, biases)))
 
 
-def followed(scene: Scene, views: list[View], *, config: LightConfig = CONFIG, step: float | None = None) -> Scene:
-    reference = light_reference(WORLD.scene, views_of(WORLD, np.zeros(3)), config=config)
-    return with_light_of(scene, views, reference, config=config, step=step)
+def followed(scene: Scene, views: list[View], *, config: ExposureConfig = CONFIG, step: float | None = None) -> Scene:
+    reference = exposure_reference(WORLD.scene, views_of(WORLD, np.zeros(3)), config=config)
+    return with_exposure_of(scene, views, reference, config=config, step=step)
 
 
 @given(st.tuples(*[st.floats(-0.1, 0.1)] * 3).filter(lambda c: min(map(abs, c)) > 0.02))
@@ -61,7 +61,7 @@ def test_a_change_of_light_is_found_in_each_channel(change: tuple[float, float, 
 
 def test_the_same_light_keeps_every_bit() -> None:
     assert followed(WORLD.scene, views_of(WORLD, np.zeros(3))) is WORLD.scene
-    faint = LightConfig(enabled=True, picture_scale=1.0, least_change=0.05)
+    faint = ExposureConfig(enabled=True, picture_scale=1.0, least_change=0.05)
     assert followed(WORLD.scene, views_of(WORLD, np.full(3, 0.03)), config=faint) is WORLD.scene
 
 
@@ -69,10 +69,10 @@ def test_light_that_has_changed_is_followed_in_small_steps() -> None:
     """What is too little to begin with is followed afterwards."""
     first = on_grid(WORLD.scene)
     config = replace(CONFIG, least_change=0.04, least_further_change=0.015)
-    reference = light_reference(first, views_of(WORLD, np.zeros(3)), config=config)
+    reference = exposure_reference(first, views_of(WORLD, np.zeros(3)), config=config)
 
     def light(scene: Scene, change: float, step: float = 1 / 1024) -> Scene:
-        return with_light_of(scene, views_of(WORLD, np.full(3, change)), reference, config=config, step=step)
+        return with_exposure_of(scene, views_of(WORLD, np.full(3, change)), reference, config=config, step=step)
 
     assert light(first, -0.03) is first
     dark = light(first, -0.06)
@@ -84,25 +84,25 @@ def test_light_that_has_changed_is_followed_in_small_steps() -> None:
 
 def test_a_change_of_less_than_half_a_step_changes_nothing() -> None:
     first, config = on_grid(WORLD.scene, step=1 / 16), replace(CONFIG, least_change=0.005)
-    reference = light_reference(first, views_of(WORLD, np.zeros(3)), config=config)
+    reference = exposure_reference(first, views_of(WORLD, np.zeros(3)), config=config)
     faint = views_of(WORLD, np.full(3, -0.02))
-    assert with_light_of(first, faint, reference, config=config, step=1 / 1024) is not first
-    assert with_light_of(first, faint, reference, config=config, step=1 / 16) is first
+    assert with_exposure_of(first, faint, reference, config=config, step=1 / 1024) is not first
+    assert with_exposure_of(first, faint, reference, config=config, step=1 / 16) is first
 
 
 def test_light_that_returns_to_frame_0s_returns_its_bits() -> None:
     first, same = on_grid(WORLD.scene), views_of(WORLD, np.zeros(3))
-    reference = light_reference(first, same, config=CONFIG)
-    dark = with_light_of(first, views_of(WORLD, np.full(3, -0.06)), reference, config=CONFIG, step=1 / 1024)
+    reference = exposure_reference(first, same, config=CONFIG)
+    dark = with_exposure_of(first, views_of(WORLD, np.full(3, -0.06)), reference, config=CONFIG, step=1 / 1024)
     assert float(change_of(dark, first).max()) < -0.04
-    back = with_light_of(dark, same, reference, config=CONFIG, step=1 / 1024)
+    back = with_exposure_of(dark, same, reference, config=CONFIG, step=1 / 1024)
     assert torch.equal(back.mlps.color.b2, first.mlps.color.b2)
 
 
 def test_biases_lie_on_the_grid_and_nothing_else_changes() -> None:
     scene = on_grid(WORLD.scene)
-    reference = light_reference(scene, views_of(WORLD, np.zeros(3)), config=CONFIG)
-    found = with_light_of(scene, views_of(WORLD, np.full(3, 0.05)), reference, config=CONFIG, step=1 / 1024)
+    reference = exposure_reference(scene, views_of(WORLD, np.zeros(3)), config=CONFIG)
+    found = with_exposure_of(scene, views_of(WORLD, np.full(3, 0.05)), reference, config=CONFIG, step=1 / 1024)
     bins = found.mlps.color.b2 * 1024
     assert torch.equal(bins, bins.round())
     pairs = zip(found.mlps.color[:3], scene.mlps.color[:3], strict=True)
@@ -135,8 +135,8 @@ def test_masked_pixels_say_nothing() -> None:
 
 def test_light_needs_the_color_mlp_in_packets() -> None:
     with pytest.raises(ConfigError, match="color_mlp"):
-        OnlineConfig(light=LightConfig(enabled=True))
+        OnlineConfig(light=ExposureConfig(enabled=True))
     online = COMPACT.online
     assert online.light.enabled
     assert "color_mlp" not in online.trained
-    assert replace(online, light=LightConfig()).trained == online.dynamic
+    assert replace(online, light=ExposureConfig()).trained == online.dynamic

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.scene.state import ParameterName
-from structgstream.training.mean_of_steps import MeanOfSteps
+from structgstream.training.optim import MeanOfSteps
 
 Leaves = dict[ParameterName, torch.Tensor]
 

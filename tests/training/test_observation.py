@@ -8,13 +8,13 @@ import torch
 from rigs import arc_rig, random_scene
 from structgstream.gaussians import Gaussians, concatenate
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.observation import (
+from structgstream.training.online.measure import (
+    accumulate,
     flow_evidence,
-    mover_centers,
-    movers_of,
+    primitive_centers,
+    primitive_of,
     slot_count,
-    sum_by_mover,
-    weigh_maps,
+    sum_by_primitive,
 )
 from worlds import emerging_ball
 
@@ -34,7 +34,7 @@ def test_movers_are_anchors_then_free_gaussians() -> None:
     k = scene.anchors.offsets_per_anchor
     assert slot_count(scene) == 4 * k + 2
     drawn = gaussians_with_ids([*range(4 * k), 4 * k, 4 * k + 1])
-    found = sum_by_mover(drawn.ids[:, None].float(), movers_of(drawn, scene), scene)[:, 0]
+    found = sum_by_primitive(drawn.ids[:, None].float(), primitive_of(drawn, scene), scene)[:, 0]
     assert found.tolist() == [sum(range(i * k, i * k + k)) for i in range(4)] + [4 * k, 4 * k + 1]
 
 
@@ -42,7 +42,7 @@ def test_movers_that_are_not_drawn_get_nothing() -> None:
     scene = random_scene(4, free=2)
     k = scene.anchors.offsets_per_anchor
     drawn = gaussians_with_ids([k, 2 * k - 1, 4 * k + 1])
-    found = sum_by_mover(torch.tensor([[1.0], [2.0], [4.0]]), movers_of(drawn, scene), scene)
+    found = sum_by_primitive(torch.tensor([[1.0], [2.0], [4.0]]), primitive_of(drawn, scene), scene)
     assert found[:, 0].tolist() == [0.0, 3.0, 0.0, 0.0, 0.0, 4.0]
 
 
@@ -50,19 +50,19 @@ def test_all_movers_may_be_free_gaussians() -> None:
     """A scene without anchors is what moves where only free Gaussians do."""
     scene = random_scene(0, free=2)
     drawn, sums = gaussians_with_ids([0, 1]), torch.tensor([[1.0, 2.0], [3.0, 4.0]])
-    assert sum_by_mover(sums, movers_of(drawn, scene), scene).tolist() == sums.tolist()
-    assert torch.equal(mover_centers(scene, torch.ones(2)), scene.free.means)
+    assert sum_by_primitive(sums, primitive_of(drawn, scene), scene).tolist() == sums.tolist()
+    assert torch.equal(primitive_centers(scene, torch.ones(2)), scene.free.means)
 
 
 def test_weighed_ones_are_what_a_gaussian_covers_and_what_is_in_front_takes_from_it() -> None:
     scene = random_scene(30, free=3)
     gaussians = scene.gaussians(CAMERA, BACKEND)
     maps = torch.ones(32, 48, 1)
-    alone = weigh_maps(gaussians, CAMERA, maps, BACKEND)
+    alone = accumulate(gaussians, CAMERA, maps, BACKEND)
     assert alone.shape == (len(gaussians), 1)
     ball = emerging_ball(0.99)
     before = replace(ball, means=torch.tensor([[0.0, 0.0, -1.5]]), scales=torch.full((1, 3), 0.4))
-    covered = weigh_maps(gaussians, CAMERA, maps, BACKEND, still=before)
+    covered = accumulate(gaussians, CAMERA, maps, BACKEND, static=before)
     assert covered.shape == alone.shape, "what hides is not told of"
     assert float(covered.sum()) < 0.8 * float(alone.sum())
     assert (covered <= alone + 1e-4).all()
@@ -75,7 +75,7 @@ def test_evidence_is_a_mean_with_bounds() -> None:
     sums = torch.tensor(
         [[4.0, 8.0, -4.0, 8.0, 4.0, 2.0, 0.0], [0.1, 1.0, 1.0, 1.0, 1, 1, 1], [90.0, 90, 0, 90, 0, 0, 9]]
     )
-    found = flow_evidence([sums, torch.zeros_like(sums)], least_pixels=0.3, most_pixels=20.0)
+    found = flow_evidence([sums, torch.zeros_like(sums)])
     assert found.weights[0].tolist() == [4.0, 0.0, 20.0]
     assert found.flows[0, 0].tolist() == [2.0, -1.0]
     assert not found.weights[1].any()
@@ -88,7 +88,7 @@ def test_a_mover_is_where_its_gaussians_are_seen() -> None:
     anchors, k = scene.anchors, scene.anchors.offsets_per_anchor
     coverage = torch.zeros(2 * k + 1)
     coverage[3] = 5.0  # of the first anchor only its fourth Gaussian shows, of the second none
-    found = mover_centers(scene, coverage)
+    found = primitive_centers(scene, coverage)
     fourth = anchors.positions[0] + anchors.offsets[0, 3] * anchors.log_offset_scales[0].exp()
     torch.testing.assert_close(found[0], fourth)
     torch.testing.assert_close(found[1], anchors.positions[1])

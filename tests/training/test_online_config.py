@@ -7,8 +7,7 @@ import pytest
 
 from structgstream.errors import ConfigError
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE
-from structgstream.training.light import LightConfig
-from structgstream.training.online_config import OnlineConfig, OnlineRates, online_rates
+from structgstream.training.online.config import ExposureConfig, OnlineConfig, OnlineRates, online_rates
 
 
 def test_rates_of_anchors_and_mlps_fall_within_a_frame_and_those_of_free_gaussians_stay() -> None:
@@ -26,7 +25,7 @@ def test_the_papers_rates_are_constant() -> None:
 
 
 def test_following_the_light_needs_its_field_and_takes_it_from_the_optimiser() -> None:
-    light = LightConfig(enabled=True)
+    light = ExposureConfig(enabled=True)
     with pytest.raises(ConfigError, match=r"add color_mlp to online\.dynamic"):
         OnlineConfig(light=light)
     config = OnlineConfig(light=light, dynamic=PAPER_DYNAMIC.union(["color_mlp"]))

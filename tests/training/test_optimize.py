@@ -12,13 +12,10 @@ from recorders import Repeater
 from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.state import PAPER_DYNAMIC
-from structgstream.training.losses import LossWeights
-from structgstream.training.optim import Adam, leaves
-from structgstream.training.optimize import Hooks, Schedule, gradients_of, optimize
+from structgstream.training.losses import Loss, LossWeights, view_loss
+from structgstream.training.optim import Adam, Hooks, Schedule, gradients_of, leaves, minimize
 from structgstream.training.parameters import FREE_ROWS, Parameters, parameters_of_fields
-from structgstream.training.result import Step
-from structgstream.training.step import Loss, view_loss
-from structgstream.training.stopwatch import Stopwatch
+from structgstream.training.result import Step, Stopwatch
 from structgstream.training.views import View
 
 CPU = torch.device("cpu")
@@ -72,7 +69,7 @@ def run(iterations: int, until: int = 10**9, **stages: int) -> tuple[int, Parabo
     adam = Adam(reference_backend(), leaves({"x": torch.zeros(1)}))
     hooks, steps = Parabola(adam, until), []
     schedule = Schedule(iterations, lambda iteration: {"x": 0.1 * iteration}, **stages)
-    done = optimize(adam, cycle([1.0, 2.0]), schedule, hooks, watch=Stopwatch(), on_step=steps.append)
+    done = minimize(adam, cycle([1.0, 2.0]), schedule, hooks, watch=Stopwatch(), on_step=steps.append)
     return done, hooks, steps
 
 
@@ -95,7 +92,7 @@ def test_iterations_that_are_recorded_take_the_steps_of_their_time() -> None:
         adam = Adam(reference_backend(), {**leaves({"x": torch.zeros(1)}), "fixed": torch.ones(1)})
         hooks = Repeating(adam)
         schedule: Schedule[str] = Schedule(9, lambda iteration: {"x": 0.1 * iteration, "fixed": 0.0})
-        optimize(adam, cycle([1.0, 2.0]), schedule, hooks, watch=Stopwatch(), recorder=recorder)
+        minimize(adam, cycle([1.0, 2.0]), schedule, hooks, watch=Stopwatch(), recorder=recorder)
         found.append([x for what, _, x in hooks.seen if what == "after"])
         if recorder is not None:
             assert recorder.keys == [2.0, 1.0, 2.0, 1.0, 2.0, 1.0]  # The first iteration is not recorded.

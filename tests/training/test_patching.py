@@ -7,9 +7,9 @@ from rigs import arc_rig, random_scene
 from structgstream.gaussians import Gaussians
 from structgstream.geometry import quaternion_matrices
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.patching import (
-    BIRTHS_PER_FRAME,
-    PatchingConfig,
+from structgstream.training.online.config import PatchingConfig
+from structgstream.training.online.patching import (
+    IDS_PER_FRAME,
     choose_parents,
     gaussians_by_id,
     spawn_children,
@@ -38,9 +38,7 @@ def parents(count: int) -> Gaussians:
 def test_children_are_drawn_from_two_sigma() -> None:
     source = parents(200_000)
     config = PatchingConfig()
-    means = spawn_children(
-        source, first_birth=1 * BIRTHS_PER_FRAME, config=config, generator=generator()
-    ).means.double()
+    means = spawn_children(source, first_birth=1 * IDS_PER_FRAME, config=config, generator=generator()).means.double()
     rotation = quaternion_matrices(source.quats[:1].double())[0]
     sigma = rotation @ torch.diag(source.scales[0].double() ** 2) @ rotation.T
     assert torch.allclose(means.mean(0), source.means[0].double(), atol=5e-3)
@@ -49,12 +47,12 @@ def test_children_are_drawn_from_two_sigma() -> None:
 
 def test_a_childs_other_attributes() -> None:
     source = parents(3)
-    children = spawn_children(source, first_birth=7 * BIRTHS_PER_FRAME, config=PatchingConfig(), generator=generator())
+    children = spawn_children(source, first_birth=7 * IDS_PER_FRAME, config=PatchingConfig(), generator=generator())
     assert torch.allclose(children.log_scales.exp(), source.scales)
     assert torch.equal(children.colors, source.colors)
     assert torch.equal(children.quats, torch.tensor([[1.0, 0, 0, 0]]).expand(3, 4))
     assert torch.allclose(children.logit_opacities.sigmoid(), torch.full((3,), 0.1))
-    assert children.births.tolist() == [7 * BIRTHS_PER_FRAME + n for n in range(3)]
+    assert children.births.tolist() == [7 * IDS_PER_FRAME + n for n in range(3)]
 
 
 def test_the_threshold_chooses_parents_structured_or_free() -> None:

@@ -5,12 +5,11 @@ import pytest
 import torch
 
 from structgstream.gaussians import Gaussians
-from structgstream.training.perturbation import (
+from structgstream.training.frame0.regularizers import (
     Perturbation,
     PerturbationConfig,
     RandomNumbers,
     perturbation_at,
-    perturbed_center,
 )
 
 COUNT = 20_000
@@ -100,23 +99,3 @@ def test_it_fades_and_ends() -> None:
     assert shares == pytest.approx([0.4 * 0.98, 0.4 * 0.5, 0.4 * 0.02], abs=0.01)
     assert perturbation_at(50, 100, config, numbers()) is None
     assert perturbation_at(1, 100, PerturbationConfig(), numbers()) is None
-
-
-def centers(config: PerturbationConfig, *, iteration: int) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(0)
-    origin = torch.tensor([1.0, 2.0, 3.0])
-    found = [perturbed_center(origin, 2.0, iteration, 100, config, generator) for _ in range(2_000)]
-    return torch.stack([one for one in found if one is not None])
-
-
-def test_anchors_look_as_from_beside_the_camera() -> None:
-    found = centers(PerturbationConfig(view_noise=0.3), iteration=50)
-    assert found.mean(0).tolist() == pytest.approx([1.0, 2.0, 3.0], abs=0.05)
-    assert found.std(0).tolist() == pytest.approx([0.6] * 3, rel=0.06)
-
-
-def test_the_noise_of_the_view_may_fade() -> None:
-    config = PerturbationConfig(view_noise=0.3, view_noise_left=0.5)
-    assert centers(config, iteration=1).std().item() > 0.9
-    assert centers(config, iteration=100).std(0).tolist() == pytest.approx([0.3] * 3, rel=0.06)
-    assert perturbed_center(torch.zeros(3), 1.0, 1, 100, PerturbationConfig(), torch.Generator()) is None

@@ -10,7 +10,8 @@ import torch
 from rigs import arc_rig
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.picture_change import detect_picture_changes
+from structgstream.training.online.config import MotionConfig
+from structgstream.training.online.preprocess import detect_changes
 from structgstream.training.views import View, blackened, training_views
 
 RIG = arc_rig(3)
@@ -28,12 +29,10 @@ def views(*, square_at: int | None = None) -> list[View]:
 def changes(
     now: list[View], before: list[View], *, reach_pixels: int = 0, flow_from: tuple[int, ...] = ()
 ) -> list[Any]:
-    return detect_picture_changes(
+    return detect_changes(
         now,
         before,
-        threshold=0.1,
-        reach_pixels=reach_pixels,
-        scale=0.5,
+        config=MotionConfig(change_threshold=0.1, reach_pixels=reach_pixels, picture_scale=0.5),
         backend=reference_backend(),
         flow_from=flow_from,
     )

@@ -13,14 +13,17 @@ from structgstream import cameras
 from structgstream.cameras import Camera, CameraRig, enlargement
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.raster_types import TILE_PIXELS
-from structgstream.training.coherence import CoherenceConfig, MotionCoherence
-from structgstream.training.growth import MOST_ANCHORS, GrowthConfig
-from structgstream.training.light import LightConfig, light_reference
-from structgstream.training.motion import MotionConfig, MotionSegmentation, detect_changes, segment_motion
-from structgstream.training.online import rest_every
-from structgstream.training.partition import Partition, focus_views
+from structgstream.training.frame0.densify import MOST_ANCHORS, GrowthConfig
+from structgstream.training.online.config import ExposureConfig, MotionConfig, SmoothnessConfig
+from structgstream.training.online.exposure import exposure_reference
+from structgstream.training.online.measure import measure
+from structgstream.training.online.optimize import rest_every
+from structgstream.training.online.preprocess import detect_changes
+from structgstream.training.online.select import DynamicSelection, select_dynamic
+from structgstream.training.online.smoothness import MotionSmoothness
+from structgstream.training.online.split import DynamicSplit, find_active_tiles
+from structgstream.training.parameters import pixel_size
 from structgstream.training.residuals import residual_floor
-from structgstream.training.rounding import pixel_size
 from structgstream.training.views import View, training_views
 from worlds import moving_world
 
@@ -48,11 +51,12 @@ def views(number: int, times: int) -> list[View]:
     return training_views(MultiViewFrame(number, 0.0, images), rig(times), CPU)
 
 
-def segmented(times: int, *, flow: bool = False) -> MotionSegmentation:
+def segmented(times: int, *, flow: bool = False) -> DynamicSelection:
     now, before, backend = views(1, times), views(0, times), quickest_backend()
     chosen = [view.index for view in now] if flow else []
     changes = detect_changes(now, before, config=CONFIG, backend=backend, flow_from=chosen)
-    return segment_motion(WORLD.scene, now, changes, config=CONFIG, backend=backend)
+    measured = measure(WORLD.scene, now, changes, config=CONFIG, backend=backend)
+    return select_dynamic(WORLD.scene, measured, config=CONFIG, backend=backend)
 
 
 def test_lengths_grow_above_the_reference_size_only() -> None:
@@ -98,10 +102,10 @@ def test_the_tiles_that_are_drawn_reach_as_far() -> None:
             mask[12:16, 24:28] = True
         all_seen = {view.index: torch.ones(300, dtype=torch.bool) for view in now}
         every = torch.ones(60, dtype=torch.bool)
-        segmentation = replace(segmented(times), anchors=every, changed=changed, visible=all_seen)
-        partition = Partition.of(WORLD.scene, segmentation)
-        focuses = focus_views(partition, now, config=CONFIG, backend=quickest_backend())
-        widths.append([int(focus.tiles.mask.any(0).sum()) * TILE_PIXELS / times for focus in focuses.values()])
+        selection = replace(segmented(times), anchors=every, changed=changed, visible=all_seen)
+        split = DynamicSplit.of(WORLD.scene, selection)
+        active_tiles = find_active_tiles(split, now, config=CONFIG, backend=quickest_backend())
+        widths.append([int(active.tiles.mask.any(0).sum()) * TILE_PIXELS / times for active in active_tiles.values()])
     # One tile on each side of the one that changed at the reference size, two at twice the size.
     assert widths == [[3 * TILE_PIXELS] * 4, [2.5 * TILE_PIXELS] * 4]
 
@@ -109,7 +113,7 @@ def test_the_tiles_that_are_drawn_reach_as_far() -> None:
 def test_floors_and_light_are_compared_at_one_size() -> None:
     backend = quickest_backend()
     floors = [residual_floor(WORLD.scene, views(0, n), scale=0.5, backend=backend).maps for n in SIZES]
-    lights = [light_reference(WORLD.scene, views(0, n), config=LightConfig()).views for n in SIZES]
+    lights = [exposure_reference(WORLD.scene, views(0, n), config=ExposureConfig()).views for n in SIZES]
     for index in floors[0]:
         torch.testing.assert_close(floors[0][index], floors[1][index], atol=1e-3, rtol=0.0)
         assert torch.equal(lights[0][index].image, lights[1][index].image)
@@ -120,7 +124,7 @@ def test_steps_and_slack_are_the_same_length_in_the_scene() -> None:
     rigs = [[rig(n)[name] for name in WORLD.rig.training] for n in SIZES]
     small, large = (pixel_size(scene.anchors.positions, cameras_of) for cameras_of in rigs)
     assert small == pytest.approx(large, rel=1e-6)
-    priced = [MotionCoherence.of(scene, cameras_of, config=CoherenceConfig(weight=1.0)) for cameras_of in rigs]
+    priced = [MotionSmoothness.of(scene, cameras_of, config=SmoothnessConfig(weight=1.0)) for cameras_of in rigs]
     moved = scene.anchors.positions.clone()
     moved[0, 0] += 0.05
     costs = [float(price.difference(moved, quickest_backend())) for price in priced if price is not None]
@@ -149,7 +153,8 @@ def test_cameras_of_several_sizes_have_each_their_own() -> None:
     before[1] = views(0, 2)[1]
     backend = quickest_backend()
     changes = detect_changes(mixed, before, config=CONFIG, backend=backend)
-    found = segment_motion(WORLD.scene, mixed, changes, config=CONFIG, backend=backend)
+    measured = measure(WORLD.scene, mixed, changes, config=CONFIG, backend=backend)
+    found = select_dynamic(WORLD.scene, measured, config=CONFIG, backend=backend)
     assert int((found.anchors != segmented(1).anchors).sum()) <= 4
 
 

@@ -4,21 +4,19 @@ from dataclasses import replace
 import torch
 
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.motion import MotionConfig
-from structgstream.training.motion_start import MotionStartConfig
-from structgstream.training.picture_change import PictureChange
-from structgstream.training.pictures import FramePictures, pictures_of
+from structgstream.training.online.config import MotionConfig, SceneFlowConfig
+from structgstream.training.online.preprocess import FramePictures, PictureChange, preprocess
 from worlds import moving_world
 
 WORLD = moving_world(2, cameras=6, movers=60, speed=0.08, width=128, height=96)
 MOTION = MotionConfig(enabled=True, picture_scale=0.5)
-START = MotionStartConfig(enabled=True, views=3)
+START = SceneFlowConfig(enabled=True, views=3)
 
 
-def pictures(*, motion: MotionConfig = MOTION, start: MotionStartConfig = START, first: bool = False) -> FramePictures:
+def pictures(*, motion: MotionConfig = MOTION, start: SceneFlowConfig = START, first: bool = False) -> FramePictures:
     before = None if first else WORLD.frames[0]
     backend = reference_backend()
-    return pictures_of(WORLD.frames[1], WORLD.rig, before=before, motion=motion, start=start, backend=backend)
+    return preprocess(WORLD.frames[1], WORLD.rig, before=before, motion=motion, start=start, backend=backend)
 
 
 def known(found: FramePictures) -> list[PictureChange]:
@@ -49,7 +47,7 @@ def test_what_moves_changes_and_flow_is_looked_for_in_some_views() -> None:
 def test_equal_pictures_are_the_same() -> None:
     backend = reference_backend()
     frozen = replace(WORLD.frames[0], index=1)
-    found = pictures_of(frozen, WORLD.rig, before=WORLD.frames[0], motion=MOTION, start=START, backend=backend)
+    found = preprocess(frozen, WORLD.rig, before=WORLD.frames[0], motion=MOTION, start=START, backend=backend)
     changes = known(found)
     assert all(change.repeated and not change.changed.any() for change in changes)
     assert all(change.flow is None or not change.flow[..., :3].any() for change in changes)
@@ -58,8 +56,6 @@ def test_equal_pictures_are_the_same() -> None:
 def test_everything_may_move_without_a_frame_before_without_a_gate_and_in_full_frames() -> None:
     assert pictures(first=True).changes is None
     assert pictures(motion=replace(MOTION, enabled=False)).changes is None
-    assert pictures(motion=replace(MOTION, full_every_frames=1)).changes is None
-    assert pictures(motion=replace(MOTION, full_every_frames=2)).changes is not None
 
 
 def test_without_a_motion_start_nobody_looks_for_flow() -> None:

@@ -8,11 +8,11 @@ import torch
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.state import ParameterName
+from structgstream.training.losses import GradientStatistics
+from structgstream.training.online.config import PatchingConfig
+from structgstream.training.online.patching import IDS_PER_FRAME, FreeSet
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import FREE_ROWS, Parameters, parameters_of_fields
-from structgstream.training.patching import BIRTHS_PER_FRAME, PatchingConfig
-from structgstream.training.population import Population
-from structgstream.training.statistics import GradientStatistics
 from structgstream.training.views import training_views
 from worlds import moving_world
 
@@ -37,7 +37,7 @@ def ones(parameters: Parameters) -> dict[ParameterName, torch.Tensor]:
     return {name: torch.ones_like(parameters.values[name]) for name in FREE_ROWS}
 
 
-def patch(*, room: int, dying_gradient: float = 0.0) -> tuple[Population, torch.Tensor]:
+def patch(*, room: int, dying_gradient: float = 0.0) -> tuple[FreeSet, torch.Tensor]:
     parameters = Parameters.of(SCENE, trained=parameters_of_fields({"free"}))
     adam = Adam(BACKEND, parameters.values)
     adam.step(ones(parameters), dict.fromkeys(FREE_ROWS, 0.0))
@@ -47,7 +47,7 @@ def patch(*, room: int, dying_gradient: float = 0.0) -> tuple[Population, torch.
     statistics.total[SLOTS + 2] = 2.0  # ... the last the largest.
     statistics.count[SLOTS:] = 1.0
     views = training_views(WORLD.frames[0], WORLD.rig, CPU)
-    population = Population(
+    population = FreeSet(
         config=PatchingConfig(),
         template=SCENE,
         parameters=parameters,
@@ -67,7 +67,7 @@ def test_the_faint_die_and_children_follow_those_that_stay() -> None:
     parameters = population.parameters
     assert keep.tolist() == [True, False, True]
     assert (population.spawned, population.pruned) == (2, 1)
-    assert parameters.births.tolist() == [4, 6, 7 * BIRTHS_PER_FRAME, 7 * BIRTHS_PER_FRAME + 1]
+    assert parameters.births.tolist() == [4, 6, 7 * IDS_PER_FRAME, 7 * IDS_PER_FRAME + 1]
     assert all(len(parameters.values[name]) == 4 for name in FREE_ROWS)
     assert torch.equal(parameters.values["free_logit_opacities"][:2], torch.tensor([2.0, 1.0]))
     torch.testing.assert_close(parameters.values["free_colors"][2:], torch.tensor([[0.2, 0.4, 0.6]] * 2))

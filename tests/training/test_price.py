@@ -6,8 +6,7 @@ import torch
 
 from rigs import random_scene
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.parameters import Parameters, parameters_of_fields
-from structgstream.training.price import BitPrice
+from structgstream.training.parameters import Parameters, RateTerm, parameters_of_fields
 
 BACKEND = reference_backend()
 
@@ -15,16 +14,16 @@ BACKEND = reference_backend()
 def test_leaving_a_bin_has_a_price() -> None:
     parameters = Parameters.of(random_scene(10), trained=parameters_of_fields({"anchor_positions", "offset_scales"}))
     steps = {"anchor_positions": 0.5, "offset_scales": 0.25, "covariance_mlp": 0.1}
-    bit_price = BitPrice.of(parameters, steps, weight=0.5, free=False)  # type: ignore[arg-type]
-    assert bit_price is not None
-    assert bit_price.price(parameters.values, BACKEND).item() == 0.0
+    rate_term = RateTerm.of(parameters, steps, weight=0.5, free=False)  # type: ignore[arg-type]
+    assert rate_term is not None
+    assert rate_term.value(parameters.values, BACKEND).item() == 0.0
     values = dict(parameters.values)
     values["anchor_positions"] = values["anchor_positions"].detach().clone()
     values["anchor_positions"][2, 1] -= 0.5
     values["offset_scales"] = values["offset_scales"].detach().clone()
     values["offset_scales"][7, 0] += 0.75
-    assert bit_price.price(values, BACKEND).item() == pytest.approx(0.5 * (1.0 + 2.0) / 8000, rel=1e-4)
-    price = bit_price.price(
+    assert rate_term.value(values, BACKEND).item() == pytest.approx(0.5 * (1.0 + 2.0) / 8000, rel=1e-4)
+    price = rate_term.value(
         {**parameters.values, "anchor_positions": parameters.values["anchor_positions"] + 0.1}, BACKEND
     )
     (gradient,) = torch.autograd.grad(price, [parameters.values["anchor_positions"]])
@@ -35,17 +34,17 @@ def test_what_was_there_is_charged_and_what_is_born_is_not() -> None:
     scene = random_scene(10, free=6)
     parameters = Parameters.of(scene, trained=parameters_of_fields({"free"}))
     steps: dict = {"free_means": 0.5, "free_colors": 0.1}
-    assert BitPrice.of(parameters, steps, weight=1.0, free=False) is None
-    bit_price = BitPrice.of(parameters, steps, weight=1.0, free=True)
-    assert bit_price is not None
+    assert RateTerm.of(parameters, steps, weight=1.0, free=False) is None
+    rate_term = RateTerm.of(parameters, steps, weight=1.0, free=True)
+    assert rate_term is not None
     keep = torch.tensor([True, False, True, True, False, True])
-    bit_price, old = bit_price.after_pruning(keep), parameters.values["free_means"]
+    rate_term, old = rate_term.after_pruning(keep), parameters.values["free_means"]
     values: dict = {name: value.detach()[keep] for name, value in parameters.values.items() if name in steps}
     values["free_means"] = torch.cat([values["free_means"], old[:3].detach() + 7.0])
     values["free_colors"] = torch.cat([values["free_colors"], values["free_colors"][:3]])
-    assert bit_price.price(values, BACKEND).item() == 0.0
+    assert rate_term.value(values, BACKEND).item() == 0.0
     values["free_means"][2, 1] += 1.5  # Two bits.
-    assert bit_price.price(values, BACKEND).item() == pytest.approx(2.0 / 8000, rel=1e-4)
+    assert rate_term.value(values, BACKEND).item() == pytest.approx(2.0 / 8000, rel=1e-4)
 
 
 def test_the_gradient_of_the_price_is_that_of_its_formula() -> None:
@@ -53,7 +52,7 @@ def test_the_gradient_of_the_price_is_that_of_its_formula() -> None:
     before, change = torch.rand(7, 3, generator=generator), torch.rand(7, 3, generator=generator) - 0.5
     change[2] = 0.0
     value = (before + change).requires_grad_()
-    price = BitPrice(8000.0, {"anchor_positions": before}, {"anchor_positions": 0.1}).price(
+    price = RateTerm(8000.0, {"anchor_positions": before}, {"anchor_positions": 0.1}).value(
         {"anchor_positions": value}, BACKEND
     )
     formula = torch.log2(1.0 + (value - before).abs() / 0.1).sum()
@@ -66,4 +65,4 @@ def test_the_gradient_of_the_price_is_that_of_its_formula() -> None:
 @pytest.mark.parametrize(("steps", "weight"), [({}, 1.0), ({"covariance_mlp": 0.1}, 1.0), ({"base_scales": 0.1}, 0.0)])
 def test_no_price_where_nothing_is_paid(steps: dict, weight: float) -> None:
     parameters = Parameters.of(random_scene(3), trained=parameters_of_fields({"anchor_positions"}))
-    assert BitPrice.of(parameters, steps, weight=weight, free=True) is None
+    assert RateTerm.of(parameters, steps, weight=weight, free=True) is None

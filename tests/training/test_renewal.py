@@ -10,18 +10,17 @@ from structgstream.kernels._load import native_reason
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
-from structgstream.training.births import BirthConfig, ThinBirthConfig
-from structgstream.training.motion import MotionConfig
-from structgstream.training.partition import Partition, focus_views
-from structgstream.training.patching import BIRTHS_PER_FRAME
-from structgstream.training.renewal import Renewal, renew_free_gaussians
+from structgstream.training.online.config import MotionConfig, SpawnConfig, ThinSpawnConfig
+from structgstream.training.online.patching import IDS_PER_FRAME
+from structgstream.training.online.spawn import SpawnResult, prune_and_spawn
+from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.residuals import ResidualFloor, residual_floor
 from structgstream.training.views import training_views
 from worlds import emerging_ball, moved_since, moving_world
 
 CPU = torch.device("cpu")
 WORLD = moving_world(2, cameras=6, emerges_at=1, movers=0, width=96, height=64)
-CONFIG = BirthConfig(enabled=True, least_hits=2)
+CONFIG = SpawnConfig(enabled=True, least_hits=2)
 BACKENDS = [
     pytest.param(reference_backend, id="reference"),
     pytest.param(cpu_backend, id="cpu", marks=pytest.mark.skipif(native_reason() is not None, reason="no native")),
@@ -32,17 +31,17 @@ def renewed(
     backend: Backend,
     *,
     scene: Scene = WORLD.scene,
-    config: BirthConfig = CONFIG,
+    config: SpawnConfig = CONFIG,
     room: int = 1000,
     floor: ResidualFloor | None = None,
-) -> Renewal:
+) -> SpawnResult:
     motion = MotionConfig(enabled=True, picture_scale=1.0)
     first, views = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (0, 1))
-    partition = Partition.of(scene, moved_since(scene, views, first, config=motion, backend=backend))
-    return renew_free_gaussians(
-        partition,
+    split = DynamicSplit.of(scene, moved_since(scene, views, first, config=motion, backend=backend))
+    return prune_and_spawn(
+        split,
         views,
-        focus_views(partition, views, config=motion, backend=backend),
+        find_active_tiles(split, views, config=motion, backend=backend),
         first_birth=1 << 32,
         floor=residual_floor(WORLD.scene, first, scale=1.0, backend=backend) if floor is None else floor,
         room=room,
@@ -61,7 +60,7 @@ def test_an_emerging_ball_is_born_where_it_is(backend) -> None:
     near = (born.means - ball.means).norm(dim=1)
     assert near.median() < 2.5 * float(ball.scales[0, 0])
     torch.testing.assert_close(born.colors.median(0).values, ball.colors[0], atol=0.4, rtol=0)  # soft, before others
-    assert born.births.tolist() == [BIRTHS_PER_FRAME + n for n in range(len(born))]
+    assert born.births.tolist() == [IDS_PER_FRAME + n for n in range(len(born))]
     torch.testing.assert_close(born.logit_opacities.sigmoid(), torch.full((len(born),), 0.7))
 
 
@@ -87,7 +86,7 @@ def test_where_no_picture_lacks_anything_nothing_is_drawn(monkeypatch: pytest.Mo
         drawn.append("once")
         return draw(*arguments, **options)
 
-    monkeypatch.setattr("structgstream.training.birth_sweep.draw", counting)
+    monkeypatch.setattr("structgstream.training.online.spawn.draw", counting)
     assert not len(renewed(reference_backend(), config=replace(CONFIG, missing_threshold=10.0)).new_free)
     assert not drawn
     assert len(renewed(reference_backend()).new_free)
@@ -139,13 +138,13 @@ def test_a_ghost_dies() -> None:
     first, views = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (0, 1))
     motion = MotionConfig(enabled=True, picture_scale=1.0, residual_threshold=0.05)
     floor = residual_floor(WORLD.scene, first, scale=1.0, backend=backend)
-    segmentation = moved_since(scene, views, first, config=motion, backend=backend, floor=floor)
-    assert segmentation.free.all(), "what is wrong passes the gate"
-    partition = Partition.of(scene, segmentation)
-    found = renew_free_gaussians(
-        partition,
+    selection = moved_since(scene, views, first, config=motion, backend=backend, floor=floor)
+    assert selection.free.all(), "what is wrong passes the gate"
+    split = DynamicSplit.of(scene, selection)
+    found = prune_and_spawn(
+        split,
         views,
-        focus_views(partition, views, config=motion, backend=backend),
+        find_active_tiles(split, views, config=motion, backend=backend),
         first_birth=1 << 32,
         floor=floor,
         room=1000,
@@ -158,7 +157,7 @@ def test_a_ghost_dies() -> None:
 
 BLIND = replace(CONFIG, missing_threshold=0.9)
 """By these rules nothing is missing."""
-THIN = ThinBirthConfig(
+THIN = ThinSpawnConfig(
     enabled=True,
     picture_width=96,
     missing_threshold=0.10,

@@ -8,7 +8,7 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.motion import MotionConfig
+from structgstream.training.online.config import MotionConfig
 from structgstream.training.residuals import ResidualFloor, apply_camera_color, box_mean, residual, residual_floor
 from structgstream.training.views import blackened, training_views
 from worlds import moved_since, moving_world

@@ -12,8 +12,13 @@ from structgstream.codec.scene.bins import LARGEST, dequantize_state, quantize_s
 from structgstream.codec.scene.compact import CODABLE
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import FieldName, ParameterName, parameters_of, state_of
-from structgstream.training.parameters import Parameters, parameters_of_fields
-from structgstream.training.rounding import RoundingConfig, pixel_size, round_straight_through
+from structgstream.training.parameters import (
+    Parameters,
+    RoundingConfig,
+    parameters_of_fields,
+    pixel_size,
+    round_straight_through,
+)
 
 
 def test_rounding_is_drawn_and_not_felt() -> None:

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from structgstream.errors import CaptureError
-from structgstream.training.seeding import neighbor_distances, seeded_scene, voxel_centers
+from structgstream.training.frame0.seeding import neighbor_distances, seeded_scene, voxel_centers
 
 
 def seeded(points: torch.Tensor, **options):

@@ -7,7 +7,7 @@ import torch
 from rigs import arc_rig
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.solidity import SolidityConfig, depth_spread
+from structgstream.training.frame0.regularizers import DepthDistortionConfig, depth_distortion
 
 RIG = arc_rig()
 CAMERA = RIG["cam01"]
@@ -30,7 +30,7 @@ def sheets(depths: list[float], opacities: list[float]) -> Gaussians:
 
 
 def spread(gaussians: Gaussians, *, scale: float = 1.0) -> torch.Tensor:
-    return depth_spread(gaussians, CAMERA, scale=scale, backend=reference_backend())
+    return depth_distortion(gaussians, CAMERA, scale=scale, backend=reference_backend())
 
 
 def test_one_surface_has_no_spread() -> None:
@@ -65,9 +65,9 @@ def test_nothing_drawn_is_no_spread_and_no_nan() -> None:
 
 
 def test_when_it_counts() -> None:
-    config = SolidityConfig(weight=0.05, from_share=0.3, every=4)
+    config = DepthDistortionConfig(weight=0.05, from_share=0.3, every=4)
     counts = [config.weight_at(iteration, 100) for iteration in range(1, 101)]
     assert not any(counts[:30])
     assert counts[31] == pytest.approx(0.2)
     assert sum(counts) / 70 == pytest.approx(0.05, rel=0.05)
-    assert SolidityConfig().weight_at(80, 100) == 0.0
+    assert DepthDistortionConfig().weight_at(80, 100) == 0.0

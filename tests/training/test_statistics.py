@@ -3,7 +3,7 @@ import torch
 
 from structgstream.gaussians import Gaussians
 from structgstream.scene.render import Rendering
-from structgstream.training.statistics import GradientStatistics
+from structgstream.training.losses import GradientStatistics
 
 
 def rendering(ids: list[int], radii: list[float], *, width: int = 20, height: int = 10) -> Rendering:

@@ -9,13 +9,12 @@ from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
 from structgstream.kernels.raster_types import TileSelection
 from structgstream.kernels.reference_ssim import l1_ssim as reference_l1_ssim
+from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.color import CameraColor
-from structgstream.scene.focus import Focus
 from structgstream.scene.render import draw
-from structgstream.training.losses import LossWeights
+from structgstream.training.losses import LossWeights, picture_loss, view_loss, with_term
 from structgstream.training.parameters import Parameters
-from structgstream.training.step import picture_loss, view_loss, with_term
-from structgstream.training.stopwatch import Stopwatch
+from structgstream.training.result import Stopwatch
 from structgstream.training.views import View, blackened
 
 CPU = torch.device("cpu")
@@ -82,7 +81,7 @@ def test_masked_pixels_have_no_influence_on_loss_and_gradient(learned: bool, foc
     colors = gaussians.colors.detach().requires_grad_()
     tiles = TileSelection(torch.arange(24).reshape(4, 6) % 3 > 0, 96, 64)
     drawn = draw(gaussians, camera, backend).image.detach()
-    focus = Focus(tiles, drawn.clone(), gaussians.select(torch.zeros(len(gaussians), dtype=torch.bool)))
+    active = ActiveTiles(tiles, drawn.clone(), gaussians.select(torch.zeros(len(gaussians), dtype=torch.bool)))
     loss = picture_loss(
         replace(gaussians, colors=colors),
         View(0, camera, truth, mask),
@@ -91,7 +90,7 @@ def test_masked_pixels_have_no_influence_on_loss_and_gradient(learned: bool, foc
         weights=weights,
         track_screen=False,
         watch=Stopwatch(),
-        focus=focus if focused else None,
+        active=active if focused else None,
     )
     (found,) = torch.autograd.grad(loss.total, colors)
 

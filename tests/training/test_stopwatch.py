@@ -3,7 +3,7 @@ import time
 
 import pytest
 
-from structgstream.training.stopwatch import Stopwatch
+from structgstream.training.result import Stopwatch
 
 
 def test_stages_add_up_and_survive_errors() -> None:

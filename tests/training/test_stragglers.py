@@ -5,19 +5,18 @@ from dataclasses import replace
 
 import torch
 
+from structgstream.groups.lost_anchors import LostAnchorConfig, relocate_lost_anchors
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.scene import Scene
-from structgstream.training.births import BirthConfig
-from structgstream.training.motion import MotionConfig
-from structgstream.training.partition import Partition, focus_views
-from structgstream.training.stragglers import StragglerConfig, recall_stragglers
+from structgstream.training.online.config import MotionConfig, SpawnConfig
+from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.views import training_views
 from worlds import moved_since, moving_world
 
 SHIFT = 0.4
 WORLD = moving_world(2, cameras=6, speed=SHIFT, width=96, height=64)
 BACKEND = reference_backend()
-CONFIG = StragglerConfig(neighbours=8, feature_bandwidth=5.0)
+CONFIG = LostAnchorConfig(neighbours=8, feature_bandwidth=5.0)
 
 
 def arrived(*, but: list[int], by: float = 0.0) -> Scene:
@@ -29,19 +28,19 @@ def arrived(*, but: list[int], by: float = 0.0) -> Scene:
     return replace(WORLD.scene, anchors=replace(anchors, positions=anchors.positions + shares * shift))
 
 
-def recalled(scene: Scene, *, config: StragglerConfig = CONFIG) -> tuple[torch.Tensor, int]:
+def recalled(scene: Scene, *, config: LostAnchorConfig = CONFIG) -> tuple[torch.Tensor, int]:
     motion = MotionConfig(enabled=True, picture_scale=1.0)
     first, views = (training_views(WORLD.frames[t], WORLD.rig, BACKEND.device) for t in (0, 1))
     found = moved_since(scene, views, first, config=motion, backend=BACKEND)
-    partition = Partition.of(scene, replace(found, anchors=torch.ones(60, dtype=torch.bool)))
-    moving, count = recall_stragglers(
-        partition.moving,
+    split = DynamicSplit.of(scene, replace(found, anchors=torch.ones(60, dtype=torch.bool)))
+    moving, count = relocate_lost_anchors(
+        split.dynamic,
         WORLD.scene.anchors,
         views,
-        focus_views(partition, views, config=motion, backend=BACKEND),
+        find_active_tiles(split, views, config=motion, backend=BACKEND),
         floor=None,
         least_pixels=motion.least_pixels,
-        births=BirthConfig(enabled=True, picture_width=96),
+        births=SpawnConfig(enabled=True, picture_width=96),
         config=config,
         backend=BACKEND,
     )

@@ -9,9 +9,8 @@ import torch
 from backends import quickest_backend
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
-from structgstream.training.lifting import LiftConfig
-from structgstream.training.motion import MotionConfig
-from structgstream.training.tracking import TrackConfig, Tracked, Tracker, _seen, track_frame
+from structgstream.groups.tracking import TrackConfig, Tracked, Tracker, _seen, track_frame
+from structgstream.training.online.config import LiftConfig, MotionConfig
 from worlds import World, moving_world
 
 SPEED, FRAMES = 0.06, 5

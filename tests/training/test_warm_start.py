@@ -8,7 +8,7 @@ import torch
 from rigs import random_scene
 from streams import same
 from structgstream.scene.appearance import with_appearance
-from structgstream.training.warm_start import warm_start
+from structgstream.training.frame0.seeding import warm_start
 
 CELL = 0.1
 

@@ -62,8 +62,8 @@ def main(arguments: list[str]) -> None:
     first, end = int(matched[1]), int(matched[2])
     if first >= end:
         raise UsageError(f"--frames {options.frames} is empty; B is the frame after the last one.")
+    from structgstream.groups.first_frame import GroupStartConfig
     from structgstream.groups.unit import SegmentTask
-    from structgstream.training.group_start import GroupStartConfig
 
     logging.basicConfig(format="structgstream: %(message)s")  # what a run says beside its progress
     start = GroupStartConfig(iterations=options.iterations, rounds=options.rounds)

@@ -68,7 +68,7 @@ def change(came: int, went: int) -> str:
 
 
 def remarks(counts: Mapping[str, int]) -> str:
-    """Remarks on a frame's pictures: outlier views and refused births (``training/trust.py``)."""
+    """Remarks on a frame's pictures: outlier views and refused births (``training/online/select.py``)."""
     found = []
     if counts.get("held"):
         found.append("no pictures show anything: the scene is held")

@@ -179,7 +179,7 @@ def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, con
     from structgstream.evaluation.capture import part_metadata
     from structgstream.kernels.backend import select_backend
     from structgstream.presets import departures
-    from structgstream.training.trust import unrecognized_faults
+    from structgstream.training.online.select import unrecognized_faults
 
     if options.live.live:
         source = open_live(

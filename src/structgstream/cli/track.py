@@ -71,8 +71,8 @@ def main(arguments: list[str]) -> None:
     from structgstream.groups.pictures import open_for
     from structgstream.groups.segment_file import open_segment
     from structgstream.groups.track_pass import TrackOptions
+    from structgstream.groups.tracking import TrackConfig
     from structgstream.kernels.backend import select_backend
-    from structgstream.training.tracking import TrackConfig
     from structgstream.whole_files import partial_path
 
     base = GroupBase.read(options.init)

@@ -11,7 +11,10 @@ from structgstream.cameras import CameraRig
 from structgstream.kernels.backend import Backend
 from structgstream.scene.render import render, to_8bit_image
 from structgstream.scene.scene import Scene
-from structgstream.training.motion import MotionConfig, changed_movers, detect_changes, segment_motion
+from structgstream.training.online.config import MotionConfig
+from structgstream.training.online.measure import measure
+from structgstream.training.online.preprocess import detect_changes
+from structgstream.training.online.select import changed_primitives, select_dynamic
 from structgstream.training.views import View
 
 CAMERAS = 9
@@ -72,13 +75,14 @@ def moving_at_border(
     config = MotionConfig(enabled=True, picture_scale=0.5)
     views, earlier_views = (_as_views(drawn, rig, backend) for drawn in (pictures.first, pictures.before))
     changes = detect_changes(views, earlier_views, config=config, backend=backend)
-    found = segment_motion(first, views, changes, config=config, backend=backend)
+    measured = measure(first, views, changes, config=config, backend=backend)
+    found = select_dynamic(first, measured, config=config, backend=backend)
     if found.scene_cut:
         return None
     moving = found.anchors
     for older, newer in ((earlier, before), (first, second)):
         if older is not None and newer is not None:
-            moving = moving | changed_movers(older, newer)[: len(moving)]
+            moving = moving | changed_primitives(older, newer)[: len(moving)]
     return moving
 
 

@@ -13,8 +13,8 @@ most are of one or two, so each value is rounded by a threshold of its own, else
 A mixture of the two fits may show what neither does (``mixture``): there nothing is handed over (``withdraw``).
 
 Free Gaussians cannot be paired, and are the group's own: what is new is there at once. The light
-(``training/light.py``), which each group follows by itself, is that of the frame before and goes over in equal steps: a
-jump of it would show everywhere.
+(``training/online/exposure.py``), which each group follows by itself, is that of the frame before and goes over in
+equal steps: a jump of it would show everywhere.
 """
 
 from collections.abc import Mapping
@@ -24,8 +24,8 @@ from torch import Tensor
 
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, fields_of, scene_of, state_of
-from structgstream.training.motion import changed_movers
 from structgstream.training.neighbours import nearest
+from structgstream.training.online.select import changed_primitives
 
 NEIGHBOURS = 65
 """Anchors, itself included, that are handed over together."""
@@ -111,7 +111,7 @@ class HandOver:
         return scene_of(state, distance_input=found.distance_input, sampling=found.sampling)
 
     def _advance(self, found: Scene) -> None:
-        moved = changed_movers(self._last, found)[: len(found.anchors)]
+        moved = changed_primitives(self._last, found)[: len(found.anchors)]
         fading = (moved | self._most_neighbours(moved))[:, None]
         for name, difference in self._differences.items():
             self._differences[name] = torch.where(fading, torch.div(difference, 2, rounding_mode="trunc"), difference)

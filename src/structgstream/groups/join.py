@@ -19,7 +19,7 @@ from structgstream.groups.handing_run import HandedRun, header_of, run_task, run
 from structgstream.groups.segment_file import Segment, open_segment
 from structgstream.kernels.backend import Backend
 from structgstream.owned_folders import own_folder, remove_own
-from structgstream.training.patching import BIRTHS_PER_FRAME
+from structgstream.training.online.patching import IDS_PER_FRAME
 from structgstream.whole_files import whole_file
 
 POLL_SECONDS = 0.2
@@ -202,7 +202,7 @@ def check_births(path: Path, firsts: Sequence[int]) -> None:
         for info, scene in reader.scenes():
             if info.index in firsts:
                 group = info.index
-            frames = scene.free.births // BIRTHS_PER_FRAME
+            frames = scene.free.births // IDS_PER_FRAME
             if len(frames) and not group <= int(frames.min()) <= int(frames.max()) <= info.index:
                 raise StreamError(
                     f"Frame {info.index} of {path} has free Gaussians born in frames {int(frames.min())} to "

@@ -11,18 +11,18 @@ from torch import Tensor
 from structgstream.cameras import CameraRig
 from structgstream.errors import ConfigError
 from structgstream.frames import LEAST_CAMERAS, MultiViewFrame
+from structgstream.groups.first_frame import GroupStartConfig, fit_group_start
 from structgstream.kernels.backend import Backend
 from structgstream.pipeline import FrameTask, Past
 from structgstream.presets import StreamConfig
 from structgstream.rate_control import with_rate_control
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
-from structgstream.struct_gstream import FirstFrame, StructGStream
-from structgstream.training.group_start import GroupStartConfig, fit_group_start
-from structgstream.training.motion_start import with_displacements
-from structgstream.training.online import held
-from structgstream.training.online_config import OnlineConfig
-from structgstream.training.pictures import FramePictures, pictures_of
+from structgstream.struct_gstream import FrameZeroContext, StructGStream
+from structgstream.training.online.config import OnlineConfig
+from structgstream.training.online.fit import held
+from structgstream.training.online.preprocess import FramePictures, preprocess
+from structgstream.training.online.split import with_displacements
 from structgstream.training.result import FitResult
 
 CATCH_UP_FRAMES = 6
@@ -37,7 +37,7 @@ class GroupEntry:
 
     Args:
         frame: its first frame, after frame 0.
-        displacements: ``[M + F, 3]`` of frame 0's movers (Note [Movers]) since then.
+        displacements: ``[M + F, 3]`` of frame 0's primitives (Note [Primitives]) since then.
         velocities: ``[M + F, 3]`` since the frame before.
         first_pictures: gives the pictures of frame 0.
     """
@@ -94,9 +94,8 @@ class GroupMethod:
             return self._usual.observe(frame, before, rig=rig, backend=backend)
         online = self.config.online
         without_flow = replace(online.start, enabled=False)
-        motion = replace(online.motion, full_every_frames=0)
         first = self.entry.first_pictures()
-        return pictures_of(frame, rig, before=first, motion=motion, start=without_flow, backend=backend)
+        return preprocess(frame, rig, before=first, motion=online.motion, start=without_flow, backend=backend)
 
     def first(self, task: FrameTask) -> FitResult[Scene]:
         """Frame 0 is that of the header, so that none is fitted.
@@ -106,11 +105,11 @@ class GroupMethod:
         """
         raise ConfigError("A group begins from a header that has frame 0; give one with --init.")
 
-    def prepare(self, state: Scene, task: Callable[[], FrameTask]) -> FirstFrame:
+    def prepare(self, state: Scene, task: Callable[[], FrameTask]) -> FrameZeroContext:
         """See ``StructGStream.prepare``."""
         return self._usual.prepare(state, task)
 
-    def next(self, past: Past[Scene, FirstFrame], task: FrameTask) -> FitResult[Scene]:
+    def next(self, past: Past[Scene, FrameZeroContext], task: FrameTask) -> FitResult[Scene]:
         """Fit a frame of the group."""
         try:
             return self._fit(past, task)
@@ -127,7 +126,7 @@ class GroupMethod:
         found = self._fit(past, task)
         return replace(found, counts={**found.counts, "lowered budgets": 1})
 
-    def _fit(self, past: Past[Scene, FirstFrame], task: FrameTask) -> FitResult[Scene]:
+    def _fit(self, past: Past[Scene, FrameZeroContext], task: FrameTask) -> FitResult[Scene]:
         entry = self.entry
         if entry is not None and task.frame.index == entry.frame:
             return self._begin(entry, past, task)
@@ -135,7 +134,7 @@ class GroupMethod:
             past = replace(past, older=_older(past.state, entry.velocities), seconds=None)
         return StructGStream(self._config_at(task.frame.index)).next(past, task)
 
-    def _begin(self, entry: GroupEntry, past: Past[Scene, FirstFrame], task: FrameTask) -> FitResult[Scene]:
+    def _begin(self, entry: GroupEntry, past: Past[Scene, FrameZeroContext], task: FrameTask) -> FitResult[Scene]:
         pictures, device = task.pictures, task.backend.device
         if len(pictures.views) < LEAST_CAMERAS:
             return held(with_displacements(on_device(past.state, device), entry.displacements.to(device)))
@@ -158,7 +157,7 @@ class GroupMethod:
 
 def catching_up(config: StreamConfig) -> StreamConfig:
     """``config`` for a group's first frames, which lack what the frames before them would have borne: thin births in
-    small clusters come also where there are many (``ThinBirthConfig.crowded``)."""
+    small clusters come also where there are many (``ThinSpawnConfig.crowded``)."""
     births = config.online.births
     thin = replace(births.thin, crowded="small-clusters")
     return replace(config, online=replace(config.online, births=replace(births, thin=thin)))

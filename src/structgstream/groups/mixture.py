@@ -13,7 +13,7 @@ from structgstream.groups.border import BorderPictures
 from structgstream.kernels.backend import Backend
 from structgstream.scene.render import render
 from structgstream.scene.scene import Scene
-from structgstream.training.observation import movers_of, sum_by_mover, weigh_maps
+from structgstream.training.online.measure import accumulate, primitive_of, sum_by_primitive
 from structgstream.training.views import area_mean
 
 TOLERANCE = 3.0 / 255.0
@@ -49,8 +49,8 @@ def visible_mixtures(mixed: Scene, pictures: BorderPictures, rig: CameraRig, bac
             excess = area_mean(excess[None, None], (small.height, small.width))
             gaussians = folded.gaussians(small, backend)
             maps = torch.stack([torch.ones_like(excess[0, 0]), excess[0, 0]], dim=-1)
-            of_gaussians = weigh_maps(gaussians, small, maps, backend)
-            sums += sum_by_mover(of_gaussians, movers_of(gaussians, folded), folded)[:count]
+            of_gaussians = accumulate(gaussians, small, maps, backend)
+            sums += sum_by_primitive(of_gaussians, primitive_of(gaussians, folded), folded)[:count]
     covered = sums[:, 0]
     return (covered > LEAST_PIXELS) & (sums[:, 1] > LEAST_EXCESS * covered)
 

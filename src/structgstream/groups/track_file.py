@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The file of a tracking pass: where movers are when a group may begin.
+"""The file of a tracking pass: where primitives are when a group may begin.
 
 ::
 
@@ -30,7 +30,7 @@ from structgstream.whole_files import partial_path
 SIGNATURE = b"\x89SGT\r\n\x1a\n"
 MAJOR, MINOR = 1, 0
 PREFIX = struct.Struct("<8sHH")
-START = struct.Struct("<III")  # frame, number of movers, number of changed shares
+START = struct.Struct("<III")  # frame, number of primitives, number of changed shares
 SHARE_UNIT = 1 / 65535
 
 
@@ -44,19 +44,19 @@ class TrackRecord(IntEnum):
 
 @dataclass(frozen=True)
 class TrackStart:
-    """Where movers (Note [Movers]) are in a frame, in steps of positions; those that are not listed are where frame 0
-    has them.
+    """Where primitives (Note [Primitives]) are in a frame, in steps of positions; those that are not listed are where
+    frame 0 has them.
 
     Args:
         frame: the frame.
-        movers: ``[r]`` int32, ascending.
+        primitives: ``[r]`` int32, ascending.
         displacements: ``[r, 3]`` int32, since frame 0.
         velocities: ``[r, 3]`` int32, since the frame before.
         changed: ``[n]`` float32, share of pixels that changed in each frame since the last start, this one included.
     """
 
     frame: int
-    movers: NDArray[np.int32]
+    primitives: NDArray[np.int32]
     displacements: NDArray[np.int32]
     velocities: NDArray[np.int32]
     changed: NDArray[np.float32]
@@ -64,11 +64,11 @@ class TrackStart:
     def packed(self) -> bytes:
         """The payload of a start record."""
         shares = np.clip(np.round(self.changed / SHARE_UNIT), 0, 65535).astype("<u2")
-        gaps = np.diff(self.movers, prepend=np.int32(0)).astype(np.int32)
+        gaps = np.diff(self.primitives, prepend=np.int32(0)).astype(np.int32)
         table = np.column_stack([gaps, self.displacements, self.velocities]).astype("<i4")
         # Bytes of one significance lie together: the upper ones of small numbers are all alike.
         planes = np.ascontiguousarray(table.T).view(np.uint8).reshape(-1, 4).T.tobytes()
-        return START.pack(self.frame, len(self.movers), len(shares)) + zlib.compress(shares.tobytes() + planes, 9)
+        return START.pack(self.frame, len(self.primitives), len(shares)) + zlib.compress(shares.tobytes() + planes, 9)
 
     @classmethod
     def unpacked(cls, payload: bytes) -> "TrackStart":
@@ -86,8 +86,8 @@ class TrackStart:
         changed = np.frombuffer(data, "<u2", shares).astype(np.float32) * np.float32(SHARE_UNIT)
         planes = np.frombuffer(data, np.uint8, 28 * rows, 2 * shares).reshape(4, -1)
         table = np.ascontiguousarray(planes.T).view("<i4").reshape(7, rows).astype(np.int32)
-        movers = np.cumsum(table[0], dtype=np.int32)
-        return cls(frame, movers, table[1:4].T.copy(), table[4:7].T.copy(), changed)
+        primitives = np.cumsum(table[0], dtype=np.int32)
+        return cls(frame, primitives, table[1:4].T.copy(), table[4:7].T.copy(), changed)
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class TrackHead:
         header: SHA-256 of the header and frame 0 that it begins with (``base.GroupBase.sha256``).
         capture: fingerprint of the capture.
         step: of positions, in units of the scene.
-        movers: number of movers of frame 0.
+        primitives: number of primitives of frame 0.
         every: frames from one possible start to the next.
         config: of the pass, as plain JSON values.
     """
@@ -106,7 +106,7 @@ class TrackHead:
     header: str
     capture: str
     step: float
-    movers: int
+    primitives: int
     every: int
     config: Mapping[str, Any]
 
@@ -165,7 +165,7 @@ class TrackFile:
         return offset
 
     def start(self, frame: int) -> TrackStart:
-        """Where movers are in ``frame``.
+        """Where primitives are in ``frame``.
 
         Raises:
             StreamError: the pass has stored no start there, or it is damaged.

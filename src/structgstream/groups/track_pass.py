@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The serial pass: movers of frame 0 followed through every frame of a capture, into a track.
+"""The serial pass: primitives of frame 0 followed through every frame of a capture, into a track.
 
 At a start what is stored is rounded, and the pass goes on from the rounded values, so that an interrupted pass that
 goes on from its last start writes the same bytes.
@@ -24,12 +24,12 @@ from structgstream.groups.pictures import fingerprint
 from structgstream.groups.segment_file import Segment
 from structgstream.groups.segment_sink import GroupSoFar
 from structgstream.groups.track_file import TrackFile, TrackHead, TrackStart, TrackWriter, open_track
+from structgstream.groups.tracking import TrackConfig, Tracked, Tracker, TrackPictures, track_frame
 from structgstream.kernels.backend import Backend
 from structgstream.lookahead import Lookahead
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
-from structgstream.training.motion_start import with_displacements
-from structgstream.training.tracking import TrackConfig, Tracked, Tracker, TrackPictures, track_frame
+from structgstream.training.online.split import with_displacements
 from structgstream.whole_files import partial_path
 
 
@@ -41,7 +41,7 @@ class TrackOptions:
         length: frames of a group.
         quiet: whether groups begin where little moves, rather than at equal distances.
         after: a finished group, from whose last frame on is tracked, which corrects what tracking has lost before.
-        tracking: how movers are followed.
+        tracking: how primitives are followed.
     """
 
     length: int
@@ -61,7 +61,7 @@ class TrackProgress:
 
     Args:
         frame: its index.
-        moved: number of movers that were followed.
+        moved: number of primitives that were followed.
         changed: share of pixels that changed.
         cpu_seconds: processor time of all threads.
         seconds: wall-clock seconds by stage.
@@ -94,7 +94,7 @@ def track_capture(
         header=base.sha256,
         capture=fingerprint(source),
         step=base.position_step,
-        movers=len(base.scene().anchors) + len(base.scene().free),
+        primitives=len(base.scene().anchors) + len(base.scene().free),
         every=every,
         config=asdict(options.tracking)
         | {"length": options.length, "quiet": options.quiet, "frames": len(source)}
@@ -143,7 +143,7 @@ def _groups(options: TrackOptions, frames: int, changed: Mapping[int, float]) ->
 
 
 def start_after(group: Segment, base: GroupBase) -> TrackStart:
-    """Where the movers of frame 0 are in the last frame of a finished group, whose births are not among them.
+    """Where the primitives of frame 0 are in the last frame of a finished group, whose births are not among them.
 
     Raises:
         ConfigError: the group is not finished, or has another header.
@@ -197,9 +197,9 @@ class Pass:
 
     Args:
         first: frame 0.
-        tracker: how movers are followed.
+        tracker: how primitives are followed.
         step: of positions.
-        tracked: where movers are in the last frame.
+        tracked: where primitives are in the last frame.
         index: the last frame.
     """
 
@@ -239,14 +239,14 @@ class Pass:
 
 
 def tracked_at(first: Scene, start: TrackStart, *, step: float) -> Tracked:
-    """Where the movers of frame 0 are at ``start``."""
+    """Where the primitives of frame 0 are at ``start``."""
     displacements, velocities = dense(first, start, step=step)
     return Tracked(with_displacements(first, displacements), velocities)
 
 
 def dense(first: Scene, start: TrackStart, *, step: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Displacements since frame 0 and velocities at ``start``, ``[M + F, 3]`` each, in units of the scene."""
-    like, rows = first.anchors.positions, torch.from_numpy(start.movers).to(first.anchors.positions.device).long()
+    like, rows = first.anchors.positions, torch.from_numpy(start.primitives).to(first.anchors.positions.device).long()
     found = []
     for values in (start.displacements, start.velocities):
         full = torch.zeros(len(first.anchors) + len(first.free), 3).to(like)

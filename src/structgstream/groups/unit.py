@@ -11,6 +11,7 @@ from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError, StorageError
 from structgstream.frames import MultiViewFrame
 from structgstream.groups.base import GroupBase
+from structgstream.groups.first_frame import GroupStartConfig
 from structgstream.groups.method import GroupEntry, GroupMethod
 from structgstream.groups.pictures import fingerprint, open_for
 from structgstream.groups.segment_file import Segment, SegmentIdentity
@@ -21,13 +22,12 @@ from structgstream.kernels.backend import Backend
 from structgstream.pipeline import Pipeline
 from structgstream.recorder import LogExtras, Run, record
 from structgstream.scene.scene import Scene
-from structgstream.struct_gstream import FirstFrame, stream_pipeline
-from structgstream.training.group_start import GroupStartConfig
+from structgstream.struct_gstream import FrameZeroContext, stream_pipeline
 from structgstream.training.result import StepListener
 from structgstream.whole_files import partial_path
 
 LEAST_PIXELS = 0.5
-"""A mover that was tracked no further than this, pixels of a median camera, is where frame 0 has it."""
+"""A primitive that was tracked no further than this, pixels of a median camera, is where frame 0 has it."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def fit_segment(
 
 
 def _start(task: SegmentTask, base: GroupBase) -> TrackStart | None:
-    """Where movers are in the first frame; None in frame 0."""
+    """Where primitives are in the first frame; None in frame 0."""
     if task.first == 0:
         return None
     if task.track is None:
@@ -158,7 +158,7 @@ def _entry(start: TrackStart, base: GroupBase, source: FrameSource) -> GroupEntr
     return GroupEntry(start.frame, displacements, velocities, first_pictures)
 
 
-def _pipeline(base: GroupBase, method: GroupMethod, first: int) -> Pipeline[Scene, FirstFrame]:
+def _pipeline(base: GroupBase, method: GroupMethod, first: int) -> Pipeline[Scene, FrameZeroContext]:
     """The pipeline of the stream with the group's method; the group's first frame is denoised as frame 0 is."""
     return replace(stream_pipeline(base.config), method=method, denoised=(0, first))
 

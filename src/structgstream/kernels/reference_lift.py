@@ -9,9 +9,9 @@ from structgstream.kernels.motion_types import Lifted, Neighbors, ViewFlows
 LEAST_TOLERANCE, TOLERANCE_SHARE = 1.0, 0.1
 """Tolerance of an observed flow f: the first plus the second times |f|, in the unit of f.
 
-The unit is the error of the flow of what hardly moves (``training/lifting.py``). The second covers what grows with the
-displacement: the linearised projection, rotation of the object (one displacement fits several neighbours), and errors
-of the search on large motion, together 5 to 10 per cent of |f|."""
+The unit is the error of the flow of what hardly moves (``training/online/scene_flow.py``). The second covers what grows
+with the displacement: the linearised projection, rotation of the object (one displacement fits several neighbours), and
+errors of the search on large motion, together 5 to 10 per cent of |f|."""
 ROBUST_SCALES = (4.0, 2.5, 1.5, 1.5, 1.0, 1.0)
 """Scale of the Geman-McClure weights in each round after the first, which has none, in tolerances."""
 INLIER_SCALE = 1.5

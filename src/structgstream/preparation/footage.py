@@ -25,7 +25,7 @@ from structgstream.data.camera_files import NO_CAMERAS, ROOTS, filmed_folder, ot
 from structgstream.data.folder_files import check_link, files_of, is_hidden
 from structgstream.data.images import PICTURE_SUFFIXES, read_picture, significant_bits
 from structgstream.data.picture_size import picture_size
-from structgstream.data.prepared import pictures_of
+from structgstream.data.prepared import preprocess
 from structgstream.data.timeline import natural, picture_slots
 from structgstream.data.video import measured_fps
 from structgstream.data.video_index import VIDEO_SUFFIXES, VideoTrack, open_video, scan_videos, video_stream
@@ -226,7 +226,7 @@ def _runs(indices: Sequence[int]) -> list[list[int]]:
 def _footage(where: Path, files: Mapping[str, Path], picture_fps: float) -> Footage:
     videos = {name: file for name, file in files.items() if file.suffix.lower() in VIDEO_SUFFIXES}
     stills = {
-        name: pictures_of(file) if file.is_dir() else (file,) for name, file in files.items() if name not in videos
+        name: preprocess(file) if file.is_dir() else (file,) for name, file in files.items() if name not in videos
     }
     if videos and stills:
         video, still = next(iter(videos)), next(iter(stills))

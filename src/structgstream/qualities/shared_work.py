@@ -22,8 +22,8 @@ from structgstream.kernels.backend import Backend
 from structgstream.pipeline import FrameTask, Past, Pipeline
 from structgstream.presets import StreamConfig
 from structgstream.scene.scene import Scene
-from structgstream.struct_gstream import FirstFrame, StructGStream, stream_pipeline
-from structgstream.training.pictures import FramePictures
+from structgstream.struct_gstream import FrameZeroContext, StructGStream, stream_pipeline
+from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.result import FitResult
 
 Value = TypeVar("Value")
@@ -107,7 +107,7 @@ class SharedMethod(StructGStream):
         fit, mine = self.shared.first.value(task.frame.index, lambda: first(task))
         return fit if mine else replace(fit, seconds={})
 
-    def next(self, past: Past[Scene, FirstFrame], task: FrameTask) -> FitResult[Scene]:
+    def next(self, past: Past[Scene, FrameZeroContext], task: FrameTask) -> FitResult[Scene]:
         """See ``StructGStream``."""
         if task.begins is None:  # Every quality has the frame before, so the fit of a first one is not needed again.
             self.shared.first.clear()

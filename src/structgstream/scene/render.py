@@ -12,8 +12,8 @@ from torch import Tensor
 from structgstream.cameras import Camera
 from structgstream.gaussians import Gaussians, concatenate
 from structgstream.kernels.backend import Backend
+from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.environment import in_environment
-from structgstream.scene.focus import Focus
 from structgstream.scene.scene import Scene
 
 
@@ -47,7 +47,7 @@ def draw(
     backend: Backend,
     *,
     track_screen: bool = False,
-    focus: Focus | None = None,
+    active: ActiveTiles | None = None,
     background: Tensor | None = None,
 ) -> Rendering:
     """Rasterise a set of Gaussians.
@@ -57,25 +57,25 @@ def draw(
         camera: the view.
         backend: the compute back-end.
         track_screen: keep the view-space positional gradient (see :class:`Rendering`).
-        focus: draw only its tiles, into its picture and together with its still Gaussians. ``radii``, ``gaussians``
+        active: draw only its tiles, into its picture and together with its still Gaussians. ``radii``, ``gaussians``
             and ``screen_offsets`` of the result cover ``gaussians`` alone.
         background: ``[3]`` background colour; None for black.
     """
     means, count = gaussians.means, len(gaussians)
     offsets = torch.zeros_like(means[:, :2], requires_grad=True) if track_screen else None
     drawn, drawn_offsets = gaussians, offsets
-    if focus is not None:
-        drawn = concatenate(gaussians, focus.still)
+    if active is not None:
+        drawn = concatenate(gaussians, active.static)
         if offsets is not None:
-            drawn_offsets = torch.cat([offsets, offsets.new_zeros(len(focus.still), 2)])
+            drawn_offsets = torch.cat([offsets, offsets.new_zeros(len(active.static), 2)])
     output = backend.rasterize(
         drawn,
         camera.viewport(means),
         background=background,
         screen_offsets=drawn_offsets,
-        tiles=None if focus is None else focus.tiles,
-        onto=None if focus is None else focus.picture,
-        trained=None if focus is None else count,
+        tiles=None if active is None else active.tiles,
+        onto=None if active is None else active.picture,
+        trained=None if active is None else count,
     )
     return Rendering(output.image, output.alpha, output.radii[:count], gaussians, offsets)
 

@@ -67,12 +67,9 @@ class Scene:
         return background(self.environment, camera)
 
     def structured(
-        self, camera: Camera, backend: Backend, *, tiles: TileSelection | None = None, seen_from: Tensor | None = None
+        self, camera: Camera, backend: Backend, *, tiles: TileSelection | None = None
     ) -> StructuredGaussians:
-        """The structured Gaussians of the anchors in ``camera``'s view, or of those that reach ``tiles``.
-
-        View direction and distance are taken from ``seen_from`` ``[3]``, by default the camera's centre.
-        """
+        """The structured Gaussians of the anchors in ``camera``'s view, or of those that reach ``tiles``."""
         cloud = self.anchors
         anchors = Anchors(cloud.positions, cloud.log_offset_scales, cloud.log_base_scales, cloud.offsets, self.features)
         intervals = self.anchor_intervals
@@ -84,7 +81,6 @@ class Scene:
             camera.viewport(cloud.positions),
             distance_input=self.distance_input,
             tiles=tiles,
-            seen_from=seen_from,
             sampling_intervals=intervals,
         )
         if intervals is None:

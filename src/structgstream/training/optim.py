@@ -1,15 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adam over named parameters whose rows come and go."""
+"""Adam, the optimisation loop of all fits, and what follows its steps.
+
+Adam over named parameters whose rows come and go.
+
+The optimisation loop of all fits: a view, its loss, one Adam step.
+
+Fits differ in their hooks: the loss of a view, and the actions between steps (growing, patching, early stopping).
+``training/frame0/fit.py``, ``training/online/fit.py`` and all peers use this loop.
+
+The mean of a fit's last iterations (Polyak and Juditsky, 1992): it has less of the noise of single views.
+
+Early stopping of a frame's optimisation.
+
+Loss and PSNR at the end of a fit, from the last rendering of each view.
+"""
 
 import math
-from collections.abc import Iterable, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor
 
 from structgstream.kernels.backend import Backend
+from structgstream.kernels.cuda_graph import Recorder
+from structgstream.scene.state import ParameterName
+from structgstream.training.losses import Loss, ViewLoss
+from structgstream.training.result import Step, StepListener, Stopwatch
+from structgstream.training.views import View
 
 BETAS = (0.9, 0.999)
 EPS = 1e-15  # As in 3D Gaussian splatting: gradients of a mean over pixels are tiny, and torch's 1e-8 would damp them.
@@ -109,3 +130,232 @@ class Adam(Generic[Name]):
         for state in (self.first, self.second):
             if name in state:
                 state[name] = torch.zeros_like(value)
+
+
+SampleT = TypeVar("SampleT")
+LossT = TypeVar("LossT", bound=Loss)
+
+
+@dataclass(frozen=True)
+class Schedule(Generic[Name]):
+    """Number of iterations and learning rates.
+
+    Args:
+        iterations: largest number of steps.
+        rates: gives the learning rate of every leaf in an iteration, counted from 1.
+        before: steps of the frame in stages before this one, for progress.
+        after: steps of the frame in stages after this one, for progress.
+        done: iterations that count as done: the first one is the one after them.
+    """
+
+    iterations: int
+    rates: Callable[[int], Mapping[Name, float]]
+    before: int = 0
+    after: int = 0
+    done: int = 0
+
+
+class Hooks(ABC, Generic[SampleT, LossT]):
+    """The parts of an iteration, counted from 1, in which fits differ."""
+
+    @abstractmethod
+    def loss(self, iteration: int, sample: SampleT) -> LossT:
+        """The loss of a sample, which usually is a view of the frame; what else there is to do belongs in
+        :meth:`after_step`, since this may be recorded."""
+
+    def after_step(self, iteration: int, sample: SampleT, loss: LossT, screen_gradient: Tensor | None) -> None:
+        """Called after the step: statistics, spawning, pruning.
+
+        ``screen_gradient`` ``[N, 2]`` is the view-space gradient in pixels; None if it was not tracked.
+        """
+
+    def repeats(self, iteration: int, sample: SampleT) -> Hashable | None:
+        """Key of the iterations that run the same operations on the same tensors as this one; None if no later one
+        does. On a GPU these are recorded, without what the hooks do between steps.
+        """
+        return None
+
+    def counts(self) -> tuple[int, int]:
+        """Anchors and free Gaussians, for progress."""
+        return 0, 0
+
+
+def minimize(
+    adam: Adam[Name],
+    samples: Iterator[SampleT],
+    schedule: Schedule[Name],
+    hooks: Hooks[SampleT, LossT],
+    *,
+    watch: Stopwatch,
+    on_step: StepListener | None = None,
+    recorder: Recorder[tuple[LossT, Tensor | None]] | None = None,
+) -> int:
+    """Minimise the losses of ``samples`` over the leaves of ``adam``; returns the number of iterations done.
+
+    Args:
+        adam: with the leaves.
+        samples: an endless iterator; one sample per iteration.
+        schedule: number of iterations and learning rates.
+        hooks: the loss, and the actions between steps.
+        watch: gets the seconds of stages ``backward`` and ``optimise``.
+        on_step: called after every iteration; on a GPU, where reading the loss synchronises, after every tenth.
+        recorder: records iterations that repeat (``kernels.cuda_graph``); None: all are run one by one.
+    """
+    report_interval = 1 if adam.backend.device.type == "cpu" else 10
+    total = schedule.before + schedule.iterations + schedule.after
+    iteration = schedule.done
+    recorded = None if recorder is None else RecordedRates.of(schedule, adam)
+    while iteration < schedule.iterations:
+        iteration += 1
+        sample = next(samples)
+        rates = schedule.rates(iteration) if recorded is None else recorded.at(iteration)
+        take = partial(_take_step, adam, hooks, iteration, sample, rates, watch)
+        # The first iteration is never recorded: libraries set themselves up in it.
+        key = None if recorder is None or iteration == schedule.done + 1 else hooks.repeats(iteration, sample)
+        if recorder is None or key is None:
+            loss, screen_gradient = take()
+        else:
+            if key not in recorder:
+                recorder.record(key, take)
+            with watch.stage("replay"):
+                loss, screen_gradient = recorder.replay(key)
+        hooks.after_step(iteration, sample, loss, screen_gradient)
+        if on_step is not None and iteration % report_interval == 0:
+            on_step(Step(schedule.before + iteration, total, float(loss.total.detach()), *hooks.counts()))
+    return iteration - schedule.done
+
+
+def _take_step(
+    adam: Adam[Name],
+    hooks: Hooks[SampleT, LossT],
+    iteration: int,
+    sample: SampleT,
+    rates: Mapping[Name, float | Tensor],
+    watch: Stopwatch,
+) -> tuple[LossT, Tensor | None]:
+    """One iteration: the loss, without its gradient graph, and the view-space gradient if it was tracked."""
+    loss = hooks.loss(iteration, sample)
+    gradients, screen_gradient = gradients_of(loss, adam.values, watch)
+    with watch.stage("optimise"):
+        adam.step(gradients, rates)
+    return loss.detached(), screen_gradient
+
+
+@dataclass(frozen=True)
+class RecordedRates(Generic[Name]):
+    """Learning rates of all iterations of a schedule, for steps that are recorded.
+
+    Args:
+        first: the iteration of the first row of ``table``.
+        table: ``[iterations, P]`` float32 on the device.
+        current: ``[P]``, a row of the table; recorded steps read it.
+        rates: views of ``current`` by name; 0 for leaves that are not trained.
+    """
+
+    first: int
+    table: Tensor
+    current: Tensor
+    rates: Mapping[Name, float | Tensor]
+
+    @classmethod
+    def of(cls, schedule: Schedule[Name], adam: Adam[Name]) -> "RecordedRates[Name]":
+        """The rates of the leaves that ``schedule`` trains, whose steps are counted on the device from now on."""
+        first = schedule.done + 1
+        rows = [schedule.rates(iteration) for iteration in range(first, schedule.iterations + 1)]
+        names = tuple(name for name, value in adam.values.items() if value.requires_grad and any(r[name] for r in rows))
+        adam.count_on_device(names)
+        table = torch.tensor([[row[name] for name in names] for row in rows], device=adam.backend.device)
+        current = table.new_zeros(len(names))
+        return cls(first, table, current, {**dict.fromkeys(adam.values, 0.0), **dict(zip(names, current, strict=True))})
+
+    def at(self, iteration: int) -> Mapping[Name, float | Tensor]:
+        """Writes the rates of ``iteration`` into ``current``."""
+        self.current.copy_(self.table[iteration - self.first])
+        return self.rates
+
+
+def gradients_of(
+    loss: Loss, values: Mapping[Name, Tensor], watch: Stopwatch
+) -> tuple[dict[Name, Tensor], Tensor | None]:
+    """Gradients of the leaves, and the view-space gradient ``[N, 2]`` in pixels if it was tracked.
+
+    Leaves that the loss does not depend on have no entry; if nothing is drawn there are no entries.
+    """
+    names = [name for name, value in values.items() if value.requires_grad and value.numel()]
+    screen = loss.screen_offsets
+    inputs = [*(values[name] for name in names), *(() if screen is None else (screen,))]
+    if not inputs or not loss.total.requires_grad:
+        return {}, None
+    with watch.stage("backward"):
+        found = torch.autograd.grad(loss.total, inputs, allow_unused=True)
+    by_name = {name: gradient for name, gradient in zip(names, found, strict=False) if gradient is not None}
+    return by_name, None if screen is None else found[-1]
+
+
+@dataclass
+class MeanOfSteps:
+    """Sums of trained leaves over the iterations after ``after``.
+
+    A leaf whose number of rows changes, because free Gaussians are pruned or born, starts again.
+    """
+
+    after: int
+    sums: dict[ParameterName, Tensor] = field(default_factory=dict)
+    counts: dict[ParameterName, int] = field(default_factory=dict)
+
+    def add(self, iteration: int, values: Mapping[ParameterName, Tensor]) -> None:
+        """Add the leaves after ``iteration``, counted from 1."""
+        if iteration <= self.after:
+            return
+        for name, value in values.items():
+            if not value.requires_grad:
+                continue
+            if name in self.sums and self.sums[name].shape == value.shape:
+                self.sums[name] += value.detach()
+                self.counts[name] += 1
+            else:
+                self.sums[name], self.counts[name] = value.detach().clone(), 1
+
+    def apply(self, values: Mapping[ParameterName, Tensor]) -> None:
+        """Set the leaves to their means, in place."""
+        with torch.no_grad():
+            for name, total in self.sums.items():
+                if total.shape == values[name].shape:
+                    values[name].copy_(total / self.counts[name])
+
+
+class LastPass:
+    """Mean loss terms and PSNR over the last pass through the views; tensors are read on access only.
+
+    Args:
+        after: number of first iterations to ignore.
+        terms_after: the same for loss terms, where not every visit of a view has terms that can be compared.
+    """
+
+    def __init__(self, after: int = 0, *, terms_after: int | None = None) -> None:
+        self._after, self._terms_after = after, after if terms_after is None else terms_after
+        self._terms: dict[int, dict[str, Tensor]] = {}
+        self._squared_errors: dict[int, Tensor] = {}
+
+    def add(self, iteration: int, loss: ViewLoss, view: View, *, comparable: bool = True) -> None:
+        """Record a view's result, replacing its earlier one; its loss terms only if they are ``comparable``."""
+        if iteration > self._after:
+            self._squared_errors[view.index] = loss.squared_error(view)
+        if comparable and iteration > self._terms_after:
+            # Copies: the next recorded iteration writes over the tensors of this one.
+            self._terms[view.index] = {name: value.detach().clone() for name, value in loss.terms.items()}
+
+    @property
+    def psnr(self) -> float:
+        """Mean over views of the PSNR in dB, NaN before any view."""
+        values = [-10.0 * math.log10(max(float(error), 1e-10)) for error in self._squared_errors.values()]
+        return sum(values) / len(values) if values else math.nan
+
+    @property
+    def terms(self) -> dict[str, float]:
+        """Mean of each loss term."""
+        names = dict.fromkeys(
+            name for terms in self._terms.values() for name in terms
+        )  # Not every view has every term.
+        by_name = {name: [terms[name] for terms in self._terms.values() if name in terms] for name in names}
+        return {name: float(torch.stack(values).mean()) for name, values in by_name.items()}

@@ -1,11 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scene as the tensors that the optimiser trains, and back."""
+"""The tensors that are trained, their quantization while they are, and the rate term.
 
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+Quantization-aware training: dynamic values are quantized while they are trained.
 
+Note [Bins]
+~~~~~~~~~~~
+A dynamic value is sent as an integer bin times a step. Leaves are continuous, renderings use the quantized values, and
+gradients pass the rounding unchanged (straight-through). Bins are absolute, so differences between frames are exact
+integers and errors do not accumulate.
+
+A scene as the tensors that the optimiser trains, and back.
+
+The rate term of the loss: a price on changing bins since the last frame (Note [Bins]).
+"""
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Final
+
+import torch
 from torch import Tensor
 
+from structgstream.cameras import Camera, enlargement
+from structgstream.kernels.backend import Backend
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
@@ -21,7 +38,111 @@ from structgstream.scene.state import (
     state_of,
     tensor_of,
 )
-from structgstream.training.rounding import round_all_straight_through
+
+# torch's operations on lists of tensors have a leading underscore; its own optimisers are built on them.
+# pyright: reportPrivateImportUsage=false
+
+
+class _RoundStraightThrough(torch.autograd.Function):
+    """Operations are on lists of tensors, which on a GPU is one launch for all of them."""
+
+    @staticmethod
+    def forward(ctx: Any, steps: list[float], *values: Tensor) -> tuple[Tensor, ...]:
+        found = torch._foreach_div(values, steps)
+        torch._foreach_round_(found)
+        torch._foreach_mul_(found, steps)
+        return tuple(found)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        return None, *grads
+
+
+def round_straight_through(value: Tensor, step: float) -> Tensor:
+    """``value`` on the grid of ``step``; the gradient is that of ``value``."""
+    return round_all_straight_through([value], [step])[0]
+
+
+def round_all_straight_through(values: Sequence[Tensor], steps: Sequence[float]) -> tuple[Tensor, ...]:
+    """Each of ``values`` on the grid of its step; the gradients are those of ``values``."""
+    return _RoundStraightThrough.apply([*steps], *values) if values else ()  # type: ignore[return-value]
+
+
+# The quality multiplies a field of RoundingConfig by 2^(-quality * share); the share is 1 unless stated. For frame 0 it
+# is 0.5, because its errors affect every later frame and its bytes are sent once. Fields that are no steps have 0.
+_HALF_SHARE = {"quality_share": 0.5}
+_NO_STEP = {"quality_share": 0.0}
+
+
+@dataclass(frozen=True)
+class RoundingConfig:
+    """Quantization steps and price of bits for the codec ``compact``; not in the paper."""
+
+    position_pixels: float = 0.25
+    """Step of positions of anchors and free Gaussians, in pixels of a median camera at a median distance
+    (:func:`pixel_size`)."""
+    log_scale_step: float = 0.02
+    """Step of the logarithms of anchors' scales."""
+    appearance_step: float = 1 / 16
+    """Step of appearance, in standard deviations of the features along a row of the basis."""
+    weight_step: float = field(default=1 / 1024, metadata=_HALF_SHARE)
+    """Step of the MLPs' weights after frame 0: that of frame 0, so that its weights stay as they are."""
+    free_log_scale_step: float = 0.05
+    """Step of the logarithms of free Gaussians' scales."""
+    free_quat_step: float = 1 / 64
+    """Step of the components of free Gaussians' quaternions."""
+    free_logit_opacity_step: float = 0.125
+    """Step of the logits of free Gaussians' opacities."""
+    free_color_step: float = 1 / 128
+    """Step of free Gaussians' colours, full scale 1."""
+    first_noise_levels: float = field(default=0.5, metadata=_HALF_SHARE)
+    """Root mean square error that quantizing frame 0 may add to the pictures, in 8-bit levels."""
+    first_weight_step: float = field(default=1 / 1024, metadata=_HALF_SHARE)
+    """Step of the MLPs' weights in frame 0."""
+    rate_weight: float = field(default=7.5e-5, metadata=_NO_STEP)
+    """What a kilobyte of changes adds to the loss."""
+    free_priced: bool = field(default=False, metadata=_NO_STEP)
+    """Whether bits of free Gaussians that existed in the last frame are priced too."""
+    quality: float = field(default=0.0, metadata=_NO_STEP)
+    """Steps are multiplied by 2^-quality and ``rate_weight`` by 4^-quality; frame 0's steps and those of MLPs by
+    2^(-quality / 2)."""
+
+    def resolved(self) -> "RoundingConfig":
+        """The configuration with the quality applied to the other fields and set to 0."""
+        shares = {f.name: f.metadata.get("quality_share", 1.0) for f in fields(self)}
+        finer = {name: getattr(self, name) * 2.0 ** (-self.quality * share) for name, share in shares.items() if share}
+        # Errors grow with the square of a step.
+        return replace(self, **finer, rate_weight=self.rate_weight * 4.0**-self.quality, quality=0.0)
+
+    def steps(self, pixel: float) -> dict[ParameterName, float]:
+        """The step of every dynamic parameter; ``pixel`` is the size of a pixel in scene units (:func:`pixel_size`)."""
+        plain = self.resolved()
+        units = {"position_pixels": pixel}
+        return {p.name: getattr(plain, p.step) * units.get(p.step, 1.0) for p in PARAMETERS if p.step}
+
+
+def pixel_size(positions: Tensor, cameras: Iterable[Camera]) -> float | None:
+    """Size of a pixel of a picture of the reference size, in scene units, at the median distance of the anchors for the
+    median camera.
+
+    Args:
+        positions: ``[M, 3]`` of anchors.
+        cameras: of the training views, in units of the scene.
+
+    Returns:
+        None if no camera sees an anchor.
+    """
+    sizes, positions = [], positions.cpu()  # A GPU would be waited for four times a camera.
+    for camera in cameras:
+        viewmat, K = camera.viewport(positions)[:2]
+        points = positions @ viewmat[:3, :3].T + viewmat[:3, 3]
+        pixels = (points @ K.T)[:, :2] / points[:, 2:]
+        size = pixels.new_tensor([camera.width, camera.height])
+        seen = (points[:, 2] > camera.near) & ((pixels >= 0) & (pixels < size)).all(1)
+        if seen.any():
+            enlarged = enlargement(camera.width, camera.height)
+            sizes.append(enlarged * float(points[seen, 2].median() / K[0, 0]))
+    return float(torch.tensor(sizes).median()) if sizes else None
 
 
 def trainable(*granularities: Granularity) -> tuple[ParameterName, ...]:
@@ -88,3 +209,56 @@ def detached(scene: Scene) -> Scene:
     """The same scene without a gradient graph."""
     state: dict[FieldName, Tensor] = {name: value.detach().contiguous() for name, value in state_of(scene).items()}
     return scene_of(state, distance_input=scene.distance_input, sampling=scene.sampling)
+
+
+_BITS_PER_KB: Final = 8000
+
+
+@dataclass(frozen=True)
+class RateTerm:
+    """An estimate of the bits of changes, as a loss term.
+
+    A bit has the same price in every frame, however much moves: that gives the best pictures for the bytes of all.
+
+    Args:
+        weight: what a kilobyte adds to the loss.
+        before: the last frame's values by name.
+        steps: the quantization steps by name.
+    """
+
+    weight: float
+    before: Mapping[ParameterName, Tensor]
+    steps: Mapping[ParameterName, float]
+
+    @classmethod
+    def of(
+        cls, parameters: Parameters, steps: Mapping[ParameterName, float], *, weight: float, free: bool
+    ) -> "RateTerm | None":
+        """The price of changing ``parameters`` from their present values; None for none.
+
+        With ``free``, bits of free Gaussians are priced like those of anchors, else not at all.
+        """
+        names = (*ANCHOR_ROWS, *FREE_ROWS) if free else ANCHOR_ROWS
+        paid: dict[ParameterName, float] = {
+            name: steps[name] for name in names if name in steps and name in parameters.values
+        }
+        if not paid or weight <= 0.0:
+            return None
+        return cls(weight, {name: parameters.values[name].detach().clone() for name in paid}, paid)
+
+    def after_pruning(self, keep: Tensor) -> "RateTerm":
+        """The price after free Gaussians outside the mask ``keep`` were pruned; ones born since are not priced."""
+        before = {
+            name: value[keep[: len(value)]] if name in FREE_ROWS else value for name, value in self.before.items()
+        }
+        return replace(self, before=before)
+
+    def value(self, values: Mapping[ParameterName, Tensor], backend: Backend) -> Tensor:
+        """Weighted sum of log2(1 + distance in bins), in kilobytes."""
+        priced = [_first_rows(values[name], len(self.before[name])) for name in self.steps]
+        before = [self.before[name] for name in self.steps]
+        return self.weight / _BITS_PER_KB * backend.change_bits(priced, before, [*self.steps.values()])
+
+
+def _first_rows(value: Tensor, count: int) -> Tensor:
+    return value if len(value) == count else value[:count]

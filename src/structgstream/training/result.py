@@ -1,9 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Result and progress of fitting one frame."""
+"""What a fit reports: its result, its steps, and its seconds by stage.
 
-from collections.abc import Callable, Mapping
+Seconds by stage.
+
+Result and progress of fitting one frame.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
+
+
+class Stopwatch:
+    """Adds up wall-clock seconds by stage name, without waiting for a GPU."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time the body as part of stage ``name``."""
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
+
 
 SceneT = TypeVar("SceneT", covariant=True)
 OtherT = TypeVar("OtherT")

@@ -98,6 +98,6 @@ def jack(t: float) -> Parts:
     return {"jack": (head, "jack"), "spring": (tube(coil, 0.0045, around=12), "brass")}
 
 
-def segment_motion(t: float) -> Parts:
+def select_dynamic(t: float) -> Parts:
     """Everything that moves, at time ``t``."""
     return toys(t) | soft_things(t) | pour(t) | jack(t)

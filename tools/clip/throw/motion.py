@@ -112,7 +112,7 @@ def ball(t: float) -> Parts:
     return {"ball": (sphere(BALL_RADIUS).placed(ball_centre(t), spin), "ball")}
 
 
-def segment_motion(t: float) -> Parts:
+def select_dynamic(t: float) -> Parts:
     """Everything that moves, at time ``t``."""
     cloth: Parts = {"cloth": (fallen_cloth(t, over=STOOL), "cloth")}
     return figure(thrower(t), THROWER, name="thrower") | figure(catcher(t), CATCHER, name="catcher") | ball(t) | cloth

@@ -7,11 +7,10 @@ from dataclasses import replace
 from structgstream.errors import ConfigError
 from structgstream.presets import StreamConfig
 from structgstream.scene.state import FieldName
+from structgstream.training.frame0.regularizers import PerturbationConfig
 from structgstream.training.losses import LossWeights
-from structgstream.training.motion import MotionConfig
-from structgstream.training.online_config import OnlineConfig
-from structgstream.training.perturbation import PerturbationConfig
-from structgstream.training.rounding import RoundingConfig
+from structgstream.training.online.config import MotionConfig, OnlineConfig
+from structgstream.training.parameters import RoundingConfig
 from structgstream_studies.experiments.results import Result
 from structgstream_studies.experiments.sheets import SCORES, Sheet, format_score
 from structgstream_studies.experiments.summary import Summary, summaries
@@ -25,11 +24,9 @@ BETTER_FIRST = "paper-better-first"
 DISTURBANCE_FIELDS = tuple(f"initial.disturbance.{name}" for name in ("dropped_share", "noise_scales", "until_share"))
 LOSS_FIELDS = ("initial.losses.l1", "initial.losses.ssim")
 OFFSET_FIELDS, PAPER_OFFSETS = ("initial.offsets_per_anchor", "initial.all_drawn"), 5
-CARRIED_SHARE, EASED, LEAST_GAIN, OTHER_RANK, VIEWS_SHARE = 0.4, 0.5, 0.1, 8, 0.3
+CARRIED_SHARE, EASED, OTHER_RANK = 0.4, 0.5, 8
 """Values of switches that are off in the whole preset."""
 PAPER_ITERATIONS = 100
-REFRESH_FRAMES = 5
-"""Interval of frames in which everything is trained, for the variant that trains an MLP."""
 
 _COLUMNS = (
     ("psnr_changed", "psnr_changed"),
@@ -67,7 +64,6 @@ def effects(full: StreamConfig, *, paper: StreamConfig) -> dict[str, Variant]:
     _of_the_start(rows)
     _of_free_gaussians(rows)
     _of_the_light(rows)
-    _of_a_trained_covariance(rows)
     return rows.found
 
 
@@ -127,9 +123,6 @@ def _with_first_of(config: StreamConfig, full: StreamConfig) -> StreamConfig:
 def _of_the_gate(rows: _Rows) -> None:
     motion = rows.whole.motion
     rows.gated("without-gate", "w/o change gate", replace(motion, enabled=False), "enabled")
-    share = 0.0 if motion.least_views_share else VIEWS_SHARE
-    title = f"movers cover changed pixels in {f'{share:.0%} of their' if share else 'two'} views"
-    rows.gated("views-share", title, replace(motion, least_views_share=share), "least_views_share")
     eased = EASED if motion.moved_ease == 1.0 else 1.0
     title = "hysteresis of the gate" if eased != 1.0 else "w/o hysteresis of the gate"
     rows.gated("memory", title, replace(motion, moved_ease=eased), "moved_ease")
@@ -154,9 +147,6 @@ def _of_coding(rows: _Rows) -> None:
 
 def _of_iterations(rows: _Rows) -> None:
     whole = rows.whole
-    gain = 0.0 if whole.least_gain else LEAST_GAIN
-    title = "early stopping of frames" if gain else "all iterations in every frame"
-    rows.online("settling", title, replace(whole, least_gain=gain), "least_gain")
     patching = replace(whole.patching, iteration=PAPER_ITERATIONS // 2)
     paced = replace(whole, iterations=PAPER_ITERATIONS, patching=patching)
     title = f"{PAPER_ITERATIONS} iterations in a frame"
@@ -193,14 +183,6 @@ def _of_the_light(rows: _Rows) -> None:
     whole = rows.whole
     dark = replace(whole, light=replace(whole.light, enabled=False), dynamic=whole.dynamic.difference(["color_mlp"]))
     rows.online("without-light", "global light not followed", dark, "light.enabled", "dynamic")
-
-
-def _of_a_trained_covariance(rows: _Rows) -> None:
-    whole = rows.whole
-    motion = replace(whole.motion, full_every_frames=REFRESH_FRAMES)
-    refreshed = replace(whole, dynamic=whole.dynamic.union(["covariance_mlp"]), motion=motion)
-    title = f"F_Sigma trained in every {REFRESH_FRAMES}th frame, ungated"
-    rows.online("with-covariance-mlp", title, refreshed, "dynamic", "motion.full_every_frames")
 
 
 def require_compact(config: StreamConfig) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from structgstream.errors import ConfigError
 from structgstream.presets import StreamConfig
-from structgstream.training.online_config import OnlineConfig
+from structgstream.training.online.config import OnlineConfig
 from structgstream_studies.experiments.effects import WHOLE, require_compact
 from structgstream_studies.experiments.variants import Variant
 
@@ -23,7 +23,7 @@ class Part:
 
     Args:
         title: its name in tables.
-        field: the switch of :class:`~structgstream.training.online_config.OnlineConfig` that it has.
+        field: the switch of :class:`~structgstream.training.online.config.OnlineConfig` that it has.
         without: the configuration with the switch off.
     """
 

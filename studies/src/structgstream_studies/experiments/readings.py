@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from structgstream.presets import StreamConfig
-from structgstream.training.initial import InitialConfig
+from structgstream.training.frame0.fit import InitialConfig
 from structgstream.training.losses import LossWeights
-from structgstream.training.online_config import OnlineConfig
+from structgstream.training.online.config import OnlineConfig
 from structgstream_studies.experiments.results import Result
 from structgstream_studies.experiments.sheets import SCORES, Sheet, format_score
 from structgstream_studies.experiments.summary import summaries

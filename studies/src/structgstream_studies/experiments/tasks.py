@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from structgstream.errors import ConfigError
 from structgstream.presets import StreamConfig, to_json
 from structgstream.rate_control import RateConfig
-from structgstream.training.environment import EnvironmentConfig
-from structgstream.training.online_config import OnlineConfig
+from structgstream.training.frame0.seeding import EnvironmentConfig
+from structgstream.training.online.config import OnlineConfig
 from structgstream_studies.errors import ExperimentError
 from structgstream_studies.experiments.captures import CapturePart, capture_facts
 from structgstream_studies.experiments.results import Result, read_result, result_of, round_floats, write_result

@@ -11,8 +11,7 @@ from dataclasses import dataclass, field, replace
 
 from structgstream.presets import StreamConfig
 from structgstream.scene.state import FieldName
-from structgstream.training.online_config import OnlineConfig
-from structgstream.training.patching import PatchingConfig
+from structgstream.training.online.config import OnlineConfig, PatchingConfig
 
 PaperFigures = Mapping[str, float]
 

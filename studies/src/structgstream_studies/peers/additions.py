@@ -11,12 +11,9 @@ from torch import Tensor
 from structgstream.gaussians import Gaussians, concatenate
 from structgstream.kernels.backend import Backend
 from structgstream.scene.color import CameraColor
-from structgstream.training.last_pass import LastPass
-from structgstream.training.optim import Adam, leaves
-from structgstream.training.optimize import Hooks, Schedule, optimize
-from structgstream.training.result import StepListener
-from structgstream.training.step import ViewLoss, picture_loss
-from structgstream.training.stopwatch import Stopwatch
+from structgstream.training.losses import ViewLoss, picture_loss
+from structgstream.training.optim import Adam, Hooks, LastPass, Schedule, leaves, minimize
+from structgstream.training.result import StepListener, Stopwatch
 from structgstream.training.views import View
 from structgstream_studies.peers.gaussians import LOSSES
 from structgstream_studies.peers.plain import PlainGaussians, rotated
@@ -156,5 +153,5 @@ def fit_additions(
     last_pass = LastPass(config.iterations - views)
     hooks = _AdditionsHooks(config, adam, base, color, extent, watch, last_pass)
     schedule = Schedule(config.iterations, lambda _: rates, before=before)
-    optimize(adam, order, schedule, hooks, watch=watch, on_step=on_step)
+    minimize(adam, order, schedule, hooks, watch=watch, on_step=on_step)
     return Additions(hooks.added.detached(), last_pass.psnr)

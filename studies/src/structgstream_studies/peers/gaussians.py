@@ -12,16 +12,11 @@ from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.scene.color import CameraColor
 from structgstream.scene.state import fields_of, parameters_of
-from structgstream.training.initial import rig_extent
-from structgstream.training.last_pass import LastPass
-from structgstream.training.losses import LossWeights
-from structgstream.training.optim import Adam, LearningRate, constant, leaves
-from structgstream.training.optimize import Hooks, Schedule, optimize
-from structgstream.training.result import FitResult, StepListener
-from structgstream.training.seeding import neighbor_distances, voxel_centers
-from structgstream.training.statistics import GradientStatistics
-from structgstream.training.step import ViewLoss, picture_loss
-from structgstream.training.stopwatch import Stopwatch
+from structgstream.training.frame0.fit import rig_extent
+from structgstream.training.frame0.seeding import neighbor_distances, voxel_centers
+from structgstream.training.losses import GradientStatistics, LossWeights, ViewLoss, picture_loss
+from structgstream.training.optim import Adam, Hooks, LastPass, LearningRate, Schedule, constant, leaves, minimize
+from structgstream.training.result import FitResult, StepListener, Stopwatch
 from structgstream.training.views import View, coarse_to_fine, training_views
 from structgstream_studies.peers.densify import DensifyConfig, densify, reset_opacities
 from structgstream_studies.peers.plain import Y0, PlainGaussians
@@ -177,7 +172,7 @@ def fit_gaussians(
     statistics, last_pass = GradientStatistics(len(start), backend.device), LastPass(config.iterations - len(views))
     hooks = _FromScratchHooks(config, adam, identity, statistics, extent, generator, watch, last_pass)
     schedule = Schedule(config.iterations, lambda iteration: rates_at(iteration, config, extent=extent))
-    iterations = optimize(adam, samples, schedule, hooks, watch=watch, on_step=on_step)
+    iterations = minimize(adam, samples, schedule, hooks, watch=watch, on_step=on_step)
     gaussians, color = hooks.parts()
     return FitResult(
         scene=RecordedGaussians(gaussians.detached(), CameraColor(color.gains.detach(), color.biases.detach())),

@@ -15,7 +15,7 @@ from structgstream.pipeline import FrameTask
 from structgstream.presets import RIG
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import STATE_TABLE, FieldName, on_device, scene_of, state_of
-from structgstream.training.initial import InitialConfig, fit_first_frame
+from structgstream.training.frame0.fit import InitialConfig, fit_first_frame
 from structgstream.training.losses import LossWeights
 from structgstream.training.result import FitResult
 from structgstream_studies.peers.method import Arrays, IndependentFrames, stored

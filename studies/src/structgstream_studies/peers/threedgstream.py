@@ -23,14 +23,10 @@ from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
 from structgstream.pipeline import FrameTask, Past
 from structgstream.scene.color import CameraColor
-from structgstream.training.initial import rig_extent
-from structgstream.training.last_pass import LastPass
-from structgstream.training.optim import Adam, leaves
-from structgstream.training.optimize import Hooks, Schedule, optimize
-from structgstream.training.result import FitResult
-from structgstream.training.statistics import GradientStatistics
-from structgstream.training.step import ViewLoss, picture_loss
-from structgstream.training.stopwatch import Stopwatch
+from structgstream.training.frame0.fit import rig_extent
+from structgstream.training.losses import GradientStatistics, ViewLoss, picture_loss
+from structgstream.training.optim import Adam, Hooks, LastPass, Schedule, leaves, minimize
+from structgstream.training.result import FitResult, Stopwatch
 from structgstream.training.views import View, shuffled_views
 from structgstream_studies.peers.additions import AdditionsConfig, fit_additions, spawned_at
 from structgstream_studies.peers.gaussians import LOSSES, GaussiansConfig, fit_gaussians
@@ -200,7 +196,7 @@ class ThreeDGStream(PicturesOnly):
         )
         rates = dict.fromkeys(adam.values, config.rate)
         schedule = Schedule(config.iterations, lambda _: rates, after=config.additions.iterations)
-        optimize(adam, order, schedule, hooks, watch=watch, on_step=task.on_step)
+        minimize(adam, order, schedule, hooks, watch=watch, on_step=task.on_step)
         fitted = replace(state, cache=Cache.of(adam.values).as_stored())
         decoded = self._moved(fitted, rows, query)
         parents = decoded.select(hooks.parents())

@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 
 from structgstream.kernels.backend import Backend
-from structgstream.training.optim import Adam, leaves
-from structgstream.training.optimize import Hooks, Schedule, optimize
-from structgstream.training.step import Loss
-from structgstream.training.stopwatch import Stopwatch
+from structgstream.training.losses import Loss
+from structgstream.training.optim import Adam, Hooks, Schedule, leaves, minimize
+from structgstream.training.result import Stopwatch
 from structgstream_studies.peers.hash_grid import Cache, GridConfig, GridQuery, transformation
 
 
@@ -59,7 +58,7 @@ def warm_up(
     ]
     hooks = _WarmUpHooks(adam, grid)
     rates = dict.fromkeys(adam.values, config.rate)
-    optimize(adam, cycle(pool), Schedule(config.iterations, lambda _: rates), hooks, watch=Stopwatch())
+    minimize(adam, cycle(pool), Schedule(config.iterations, lambda _: rates), hooks, watch=Stopwatch())
     value = math.nan if hooks.last is None else float(hooks.last.total.detach())
     return Cache.of({name: leaf.detach() for name, leaf in adam.values.items()}), value
 

@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The first frame of a group: from the scene of frame 0 and tracked positions, without the frames between.
+
+A jump to a far frame fails where things moved far, so anchors begin where ``tracking`` followed them to. Rounds of flow
+from the rendering to the pictures, births, and iterations do the rest. Changes are priced against frame 0, which a key
+packet is predicted from (``price``), and what neither moved nor looks wrong keeps frame 0's bits, so that the
+background of all groups is the same.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from structgstream.groups.lost_anchors import LostAnchorConfig, relocate_lost_anchors
+from structgstream.kernels.backend import Backend
+from structgstream.scene.free import FreeGaussians
+from structgstream.scene.scene import Scene
+from structgstream.training.online.config import OnlineConfig
+from structgstream.training.online.exposure import ExposureReference, with_exposure_of
+from structgstream.training.online.measure import measure
+from structgstream.training.online.optimize import FrameOptimizer, StartingPoint
+from structgstream.training.online.patching import IDS_PER_FRAME
+from structgstream.training.online.preprocess import PictureChange, flow_views
+from structgstream.training.online.scene_flow import residual_flow
+from structgstream.training.online.select import select_dynamic
+from structgstream.training.online.spawn import prune_and_spawn
+from structgstream.training.online.split import DynamicSplit, find_active_tiles, with_displacements
+from structgstream.training.residuals import ResidualFloor
+from structgstream.training.result import FitResult, StepListener, Stopwatch
+from structgstream.training.views import View
+
+USUAL_FRAMES = 11
+"""A group's first frame has the iterations of so many online frames. With fewer, births stand in for what iterations
+would have mended, which costs bytes, and late groups fall behind (docs/groups-measured.md)."""
+
+
+@dataclass(frozen=True)
+class GroupStartConfig:
+    """The fit of a group's first frame; not in the paper."""
+
+    iterations: int | None = None
+    """Optimisation steps of all rounds together; None for :data:`USUAL_FRAMES` times those of an online frame."""
+    rounds: int = 3
+    """Rounds of flow, births and iterations."""
+    flow_rounds: int = 1
+    """Displacements by flow from the rendering to the pictures before the iterations of a round. Each adds noise."""
+    stragglers: LostAnchorConfig = LostAnchorConfig()
+    """Anchors that tracking lost."""
+    births: int = 2000
+    """Largest number of births in a round: content that came since frame 0."""
+    coherence_share: float = 0.25
+    """Weight of ``online.coherence``, which counts from frame 0 here, relative to that of other frames. All of it suits
+    bodies that move, but costs 0.8 dB where looks change in place, as displacements also stand in for them."""
+
+
+def fit_group_start(
+    scene: Scene,
+    displacements: Tensor,
+    views: list[View],
+    changes: list[PictureChange | None],
+    *,
+    frame_index: int,
+    config: OnlineConfig,
+    start: GroupStartConfig,
+    backend: Backend,
+    seed: int,
+    steps: Mapping[str, float] | None = None,
+    floor: ResidualFloor | None = None,
+    light: ExposureReference | None = None,
+    on_step: StepListener | None = None,
+) -> FitResult[Scene]:
+    """Fit ``scene``, the decoded scene of frame 0, to a later frame.
+
+    Args:
+        scene: of frame 0.
+        displacements: ``[M + F, 3]`` of its primitives (Note [Primitives]) since frame 0, as tracked.
+        views: the pictures.
+        changes: of each of them since frame 0; a view without one does not vote.
+        frame_index: of the frame, for the identities of births.
+        config: of online frames.
+        start: of this fit.
+        backend: the compute back-end.
+        seed: of all random numbers.
+        steps: quantization steps (Note [Bins]).
+        floor: residuals of frame 0; None for none.
+        light: of frame 0, for ``config.light``; None for none.
+        on_step: called after every iteration.
+    """
+    iterations = USUAL_FRAMES * config.iterations if start.iterations is None else start.iterations
+    each = replace(
+        config,
+        iterations=-(-iterations // start.rounds),
+        births=replace(config.births, most=start.births),
+        coherence=replace(config.coherence, weight=start.coherence_share * config.coherence.weight),
+    )
+    if config.light.enabled and light is not None:
+        step = None if steps is None else steps.get("color_mlp")
+        scene = with_exposure_of(scene, views, light, config=config.light, step=step)
+
+    optimizer = FrameOptimizer(
+        each, backend, frame_index, torch.Generator().manual_seed(seed), Stopwatch(), steps or {}, on_step
+    )
+    rounds = _Rounds(optimizer, start, scene, views, changes, floor)
+    current, results = with_displacements(scene, displacements), list[FitResult[Scene]]()
+    for number in range(start.rounds):
+        results.append(rounds.run(current, again=number > 0))
+        current = results[-1].scene
+    return _together(results)
+
+
+@dataclass(frozen=True)
+class _Rounds:
+    """What the rounds of a group's first frame share; ``first`` is frame 0."""
+
+    fit: FrameOptimizer
+    start: GroupStartConfig
+    first: Scene
+    views: list[View]
+    changes: list[PictureChange | None]
+    floor: ResidualFloor | None
+
+    def run(self, current: Scene, *, again: bool) -> FitResult[Scene]:
+        """One round from ``current``, whose anchors are those of frame 0; ``again`` if it is not the first."""
+        fit, config, backend = self.fit, self.fit.config, self.fit.backend
+        with fit.watch.stage("find motion"):
+            split = self._partition(current)
+            inliers = [self.views[number] for number in split.selection.inliers]
+        with fit.watch.stage("recall stragglers"):
+            # What the first round's flow and iterations have found needs no help.
+            split, recalled = self._recalled(split, inliers) if again else (split, 0)
+        with fit.watch.stage("start motion"):
+            displaced, lifted = self._displaced(split, inliers)
+            active_tiles = find_active_tiles(displaced, inliers, config=config.motion, backend=backend)
+        with fit.watch.stage("renew"):
+            new = prune_and_spawn(
+                displaced,
+                inliers,
+                active_tiles,
+                first_birth=self._first_birth(current.free),
+                floor=self.floor,
+                room=config.patching.max_free - len(split.static.free),
+                least_pixels=config.motion.least_pixels,
+                config=config.births,
+                backend=backend,
+            )
+        dynamic = replace(displaced.dynamic, free=displaced.dynamic.free.select(new.kept))
+        begun = StartingPoint(
+            dynamic,
+            inliers,
+            torch.zeros(len(dynamic.anchors) + len(dynamic.free), 3).to(dynamic.anchors.positions),
+            displaced,
+            active_tiles,
+            new.new_free,
+            reference=replace(dynamic, anchors=self.first.anchors.select(split.selection.anchors)),
+        )
+        result = fit.run(begun)
+        return replace(
+            result,
+            scene=displaced.merge(result.scene),
+            pruned=result.pruned + int((~new.kept).sum()),
+            spawned=result.spawned + len(new.new_free),
+            counts={**result.counts, "corrected": lifted, "recalled": recalled, **new.counts},
+        )
+
+    def _partition(self, current: Scene) -> DynamicSplit:
+        """What has changed, looks wrong, or is not where frame 0 has it, against the rest."""
+        fit, config = self.fit, self.fit.config
+        measured = measure(
+            current, self.views, self.changes, config=config.motion, backend=fit.backend, floor=self.floor
+        )
+        found = select_dynamic(current, measured, config=config.motion, backend=fit.backend)
+        away = (current.anchors.positions != self.first.anchors.positions).any(1)
+        return DynamicSplit.of(current, replace(found, anchors=found.anchors | away, free=torch.ones_like(found.free)))
+
+    def _recalled(self, split: DynamicSplit, views: list[View]) -> tuple[DynamicSplit, int]:
+        """``split`` with its stragglers where their neighbours are; how many they are."""
+        fit, config = self.fit, self.fit.config
+        dynamic, count = relocate_lost_anchors(
+            split.dynamic,
+            self.first.anchors.select(split.selection.anchors),
+            views,
+            find_active_tiles(split, views, config=config.motion, backend=fit.backend),
+            floor=self.floor,
+            least_pixels=config.motion.least_pixels,
+            births=config.births,
+            config=self.start.stragglers,
+            backend=fit.backend,
+        )
+        return replace(split, dynamic=dynamic), count
+
+    def _displaced(self, split: DynamicSplit, views: list[View]) -> tuple[DynamicSplit, int]:
+        """``split`` after rounds of flow from its rendering to the pictures; how many primitives flow displaced."""
+        fit, config = self.fit, self.fit.config
+        chosen = flow_views(views, fit.frame_index, config.start)
+        seen, lifted = [view for view in views if view.index in chosen], 0
+        for _ in range(self.start.flow_rounds if chosen else 0):
+            found = residual_flow(
+                split.dynamic,
+                seen,
+                find_active_tiles(split, seen, config=config.motion, backend=fit.backend),
+                scale=config.motion.picture_scale,
+                config=config.start,
+                backend=fit.backend,
+            )
+            lifted = int(found.lifted.sum())
+            split = split.displaced(found.displacements)
+        return split, lifted
+
+    def _first_birth(self, free: FreeGaussians) -> int:
+        """The first identity of the frame that no birth of an earlier round has."""
+        first = self.fit.frame_index * IDS_PER_FRAME
+        return max(first, int(free.births.max()) + 1) if len(free) else first
+
+
+def _together(results: list[FitResult[Scene]]) -> FitResult[Scene]:
+    """The last round's result with the sums of all."""
+    last = results[-1]
+    return replace(
+        last,
+        iterations=sum(result.iterations for result in results),
+        spawned=sum(result.spawned for result in results),
+        pruned=sum(result.pruned for result in results),
+        counts={name: sum(result.counts[name] for result in results) for name in last.counts},
+    )

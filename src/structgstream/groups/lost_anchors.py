@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stragglers: anchors that tracking lost on the way to a group's first frame, and that look wrong where they are.
+
+What covers few pixels at the rim of a body may get no vote for a while, stays behind as a speck on the background, and
+then nothing there changes any more. Iterations do not find the way back, which is far. But what was beside it in frame
+0 and looks alike has arrived: a straggler gets the displacement of these neighbours, and iterations do the rest.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from structgstream.kernels.backend import Backend
+from structgstream.scene.active_tiles import ActiveTiles
+from structgstream.scene.anchors import AnchorCloud
+from structgstream.scene.scene import Scene
+from structgstream.training.neighbours import nearest
+from structgstream.training.online.config import SpawnConfig
+from structgstream.training.online.measure import accumulate, primitive_of, sum_by_primitive
+from structgstream.training.online.spawn import outlier_mask, view_residual
+from structgstream.training.parameters import pixel_size
+from structgstream.training.residuals import ResidualFloor
+from structgstream.training.views import View
+
+MEDIAN_STEPS = 12
+
+
+@dataclass(frozen=True)
+class LostAnchorConfig:
+    """Anchors that are put where their neighbours went; not in the paper."""
+
+    enabled: bool = True
+    neighbours: int = 32
+    """Number of nearest anchors of frame 0 that are not wrong, by whose displacements one is put."""
+    feature_bandwidth: float = 0.5
+    """Standard deviation of the Gaussian weight of a neighbour by the root mean square difference of features, in their
+    standard deviations."""
+    least_pixels: float = 3.0
+    """Anchors nearer to where their neighbours say stay."""
+
+
+def relocate_lost_anchors(
+    dynamic: Scene,
+    first: AnchorCloud,
+    views: Sequence[View],
+    active_tiles: Mapping[int, ActiveTiles],
+    *,
+    floor: ResidualFloor | None,
+    least_pixels: float,
+    births: SpawnConfig,
+    config: LostAnchorConfig,
+    backend: Backend,
+) -> tuple[Scene, int]:
+    """``dynamic`` with its stragglers where neighbours are, and how many they are.
+
+    Args:
+        dynamic: the dynamic part of a scene.
+        first: its anchors in frame 0, in the same order.
+        views: of the frame.
+        active_tiles: by view index, with up-to-date renderings; views without one are skipped.
+        floor: residuals of frame 0; None for none.
+        least_pixels: views where an anchor covers fewer pixels do not count.
+        births: what is wrong, and by how many views.
+        config: of the neighbours.
+        backend: the compute back-end.
+
+    Raises:
+        MissingExtraError: SciPy is not installed.
+    """
+    pixel = pixel_size(first.positions, [view.camera for view in views])
+    if not config.enabled or pixel is None or len(first) < 2:
+        return dynamic, 0
+    with torch.no_grad():
+        wrong = _wrong_anchors(dynamic, views, active_tiles, floor, least_pixels, births, backend)
+        if not wrong.any() or wrong.all():
+            return dynamic, 0
+        positions = dynamic.anchors.positions
+        displacements = positions - first.positions
+        rows = wrong.nonzero()[:, 0]
+        expected = _displacements_of_neighbours(first, displacements, rows, ~wrong, config)
+        far = (expected - displacements[rows]).norm(dim=1) > config.least_pixels * pixel
+        rows, expected = rows[far], expected[far]
+        positions = positions.index_copy(0, rows, first.positions[rows] + expected)
+    return replace(dynamic, anchors=replace(dynamic.anchors, positions=positions)), len(rows)
+
+
+def _wrong_anchors(
+    dynamic: Scene,
+    views: Sequence[View],
+    active_tiles: Mapping[int, ActiveTiles],
+    floor: ResidualFloor | None,
+    least_pixels: float,
+    births: SpawnConfig,
+    backend: Backend,
+) -> Tensor:
+    """Mask ``[M]`` of the anchors that are outliers in several views (``births.outlier_mask``)."""
+    folded, coverage, wrong = dynamic.with_folded_appearance(), [], []
+    for view in views:
+        active = active_tiles.get(view.index)
+        if active is None:
+            continue
+        found = view_residual(active.picture, view, dynamic.camera_color, floor=floor, config=births, backend=backend)
+        small = found.view
+        pixels = found.wrong.to(active.picture)
+        counting = torch.ones_like(pixels) if small.mask is None else small.mask.to(pixels)
+        gaussians = folded.gaussians(small.camera, backend)
+        maps = torch.stack([counting, pixels], dim=-1)
+        of_gaussians = accumulate(gaussians, small.camera, maps, backend, static=active.static)
+        sums = sum_by_primitive(of_gaussians, primitive_of(gaussians, folded), folded)
+        coverage.append(sums[: len(dynamic.anchors), 0])
+        wrong.append(sums[: len(dynamic.anchors), 1])
+    if not coverage:
+        return torch.zeros(len(dynamic.anchors), dtype=torch.bool, device=dynamic.anchors.positions.device)
+    return outlier_mask(torch.stack(coverage), torch.stack(wrong), least_pixels=least_pixels, config=births)
+
+
+def _displacements_of_neighbours(
+    first: AnchorCloud, displacements: Tensor, rows: Tensor, right: Tensor, config: LostAnchorConfig
+) -> Tensor:
+    """Weighted geometric median ``[R, 3]`` of the displacements of the neighbours in frame 0 of ``rows``, which are
+    ``right``: neighbours on another body do not pull it as they would a mean."""
+    among = right.nonzero()[:, 0]
+    near, _ = nearest(first.positions[rows], first.positions[among], config.neighbours)
+    near = among[near]
+    features = first.features.detach()
+    features = features / features.std(0).clamp(min=1e-6)
+    apart = (features[near] - features[rows][:, None]).square().mean(-1)
+    weights = torch.exp(-0.5 * apart / config.feature_bandwidth**2).clamp(min=1e-12)
+    values = displacements[near]
+    median = (weights[..., None] * values).sum(1) / weights.sum(1, keepdim=True)
+    for _ in range(MEDIAN_STEPS):  # Weiszfeld
+        shares = weights / (values - median[:, None]).norm(dim=-1).clamp(min=1e-6)
+        median = (shares[..., None] * values).sum(1) / shares.sum(1, keepdim=True)
+    return median

@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tracking: primitives follow lifted flow through every frame, without an iteration.
+
+What carries a sequential run through large motion is its scene flow (``training/online/scene_flow.py``), not its iterations. Tracking
+is that alone, made cheap: a part of the cameras in turn, only the tiles in which pictures changed, and sums of flow at
+a quarter of the size. Flow from the last pictures to these displaces the primitives, then flow from the rendering to
+these in a part of those cameras, which bounds drift, because renderings do not forget what things look like. A few
+cameras in every frame do that better than all in every second or third. Gaussians are generated once a camera and
+frame.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from structgstream.cameras import CameraRig, enlargement
+from structgstream.frames import MultiViewFrame
+from structgstream.gaussians import Gaussians
+from structgstream.kernels.backend import Backend
+from structgstream.kernels.raster_types import TileSelection
+from structgstream.scene.scene import Scene
+from structgstream.training.online.config import FlowConfig, LiftConfig, MotionConfig
+from structgstream.training.online.measure import (
+    ViewChange,
+    accumulate,
+    flow_evidence,
+    primitive_centers,
+    primitive_of,
+    slot_count,
+    sum_by_primitive,
+)
+from structgstream.training.online.preprocess import PictureChange, detect_changes, flow_map
+from structgstream.training.online.scene_flow import lift_flow
+from structgstream.training.online.select import inlier_views, occluded_dynamic
+from structgstream.training.online.split import with_displacements
+from structgstream.training.residuals import apply_camera_color
+from structgstream.training.result import Stopwatch
+from structgstream.training.views import View, area_mean, as_picture, blackened, training_views
+
+FEWEST_HALVED, MOST_CAMERAS = 6, 14
+"""Half of a rig's cameras are used in a frame if that is at least the first, and at most the second number."""
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    """Tracking; not in the paper."""
+
+    scale: float = 1.0
+    """Size of the pictures relative to those of the stream."""
+    cameras: int | None = None
+    """Approximate upper bound of the cameras of a frame; of more, every second or third, in turn. None: half of them
+    (:data:`FEWEST_HALVED`, :data:`MOST_CAMERAS`)."""
+    picture_scale: float = 0.25
+    """Scale, relative to these pictures, at which coverage is computed."""
+    flow: FlowConfig = FlowConfig(apart=True, far=True)
+    """How flow is searched."""
+    prior: float = 0.7
+    """Primitives are initially displaced by this share of their last displacement."""
+    rendered_every: int = 3
+    """Flow from the rendering in every so-manieth of these cameras, in turn; 0: in none."""
+
+
+@dataclass(frozen=True)
+class TrackPictures:
+    """Reduced pictures of one frame.
+
+    Args:
+        index: of the frame.
+        views: of all cameras.
+        changes: by position in ``views``, of those that are tracked with: since the frame before, with flow.
+    """
+
+    index: int
+    views: list[View]
+    changes: Mapping[int, PictureChange] = field(default_factory=dict)
+
+    @property
+    def changed_share(self) -> float:
+        """Mean share of pixels that changed since the frame before; 0 without one."""
+        shares = [float(change.changed.float().mean()) for change in self.changes.values()]
+        return sum(shares) / len(shares) if shares else 0.0
+
+
+@dataclass(frozen=True)
+class Tracker:
+    """Follows the primitives of a scene.
+
+    Args:
+        config: sizes and cameras.
+        motion: thresholds of the change gate, for pictures of the stream.
+        lift: of the fit of displacements.
+        rig: of the stream, in the units of the scene.
+        backend: the compute back-end.
+    """
+
+    config: TrackConfig
+    motion: MotionConfig
+    lift: LiftConfig
+    rig: CameraRig
+    backend: Backend
+
+    def stride(self, cameras: int) -> int:
+        """Every so-manieth of ``cameras`` cameras is used in a frame."""
+        half = -(-cameras // 2)
+        usual = min(half if half >= FEWEST_HALVED else cameras, MOST_CAMERAS)
+        most = usual if self.config.cameras is None else self.config.cameras
+        return -(-cameras // max(most, 2))
+
+    def pictures(self, frame: MultiViewFrame, before: Sequence[View] | None) -> TrackPictures:
+        """The reduced pictures of ``frame`` and what changed since those before, independent of the scene."""
+        views = [view.reduced(self.config.scale) for view in training_views(frame, self.rig, self.backend.device)]
+        if before is None:
+            return TrackPictures(frame.index, views)
+        stride = self.stride(len(views))
+        chosen = [n for n in range(len(views)) if n % stride == frame.index % stride]
+        taken = [views[n] for n in chosen]
+        motion = replace(
+            self.motion,
+            reach_pixels=max(1, round(self.motion.reach_pixels * self.config.scale)),
+            picture_scale=self.config.picture_scale,
+        )
+        indices = [view.index for view in taken]
+        found = detect_changes(
+            taken, before, config=motion, backend=self.backend, flow_from=indices, flow=self.config.flow
+        )
+        changes = {n: change for n, change in zip(chosen, found, strict=True) if change is not None}
+        return TrackPictures(frame.index, views, changes)
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """Where the primitives of a scene are.
+
+    Args:
+        scene: moved.
+        velocities: ``[M + F, 3]`` displacements by the last frame.
+        seconds: wall-clock seconds by stage of the last frame.
+        moved: number of primitives in the last frame.
+    """
+
+    scene: Scene
+    velocities: Tensor
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    moved: int = 0
+
+    @classmethod
+    def at_rest(cls, scene: Scene) -> "Tracked":
+        """A scene that nothing is known of before."""
+        return cls(scene, torch.zeros(len(scene.anchors) + len(scene.free), 3).to(scene.anchors.positions))
+
+
+def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tracked:
+    """Where the primitives of ``past`` are one frame later.
+
+    Args:
+        tracker: thresholds and cameras.
+        past: one frame before.
+        pictures: of this frame.
+    """
+    watch, velocities = Stopwatch(), torch.zeros_like(past.velocities)
+    scene = past.scene.with_folded_appearance()
+    with torch.no_grad():
+        with watch.stage("gate"):
+            seen = [_seen(tracker, scene, pictures.views[n], change) for n, change in pictures.changes.items()]
+            inliers = inlier_views([entry.change for entry in seen]) if seen else []
+            seen = [entry for entry, good in zip(seen, inliers, strict=True) if good]
+            if not seen:
+                return Tracked(past.scene, velocities, watch.seconds)
+            votes = torch.stack([entry.votes for entry in seen]).sum(0)
+            # What moved goes on as long as one camera sees it: not all that see it are used in every frame.
+            goes_on = (past.velocities != 0).any(1) & (votes > 0)
+            moving = (votes >= tracker.motion.least_views) | goes_on
+            moving[: len(scene.anchors)] |= _occluded(tracker.motion, scene, seen, moving[: len(scene.anchors)])
+            primitives = moving.nonzero()[:, 0]
+        with watch.stage("flow between pictures"):
+            views = [entry.view for entry in seen]
+            evidence = flow_evidence([entry.flows[primitives] for entry in seen])
+            centers = primitive_centers(scene, _coverage(seen, scene))
+            priors, lift = tracker.config.prior * past.velocities[primitives], tracker.lift
+            found = lift_flow(evidence, centers[primitives], priors, views, config=lift, backend=tracker.backend)
+            velocities[primitives] = found.displacements
+        if len(primitives) and (every := tracker.config.rendered_every):
+            with watch.stage("flow from the rendering"):
+                turn = pictures.index // tracker.stride(len(pictures.views))
+                part = [entry for n, entry in enumerate(seen) if (n + turn) % every == 0] or seen
+                flows = [_rendered_flow(tracker, scene, entry, velocities)[primitives] for entry in part]
+                again = lift_flow(
+                    flow_evidence(flows),
+                    (centers + velocities)[primitives],
+                    torch.zeros_like(priors),
+                    [entry.view for entry in part],
+                    config=lift,
+                    backend=tracker.backend,
+                )
+                velocities[primitives] += again.displacements
+    return Tracked(with_displacements(past.scene, velocities), velocities, watch.seconds, len(primitives))
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What one camera tells: its ``N`` Gaussians in changed tiles, the primitive and coverage ``[N]`` of each, votes
+    ``[E]`` and sums of flow ``[E, 7]``."""
+
+    view: View
+    tiles: TileSelection
+    gaussians: Gaussians
+    primitives: Tensor
+    votes: Tensor
+    coverage: Tensor
+    flows: Tensor
+    change: ViewChange
+
+
+def _seen(tracker: Tracker, scene: Scene, view: View, change: PictureChange) -> _Seen:
+    backend, motion = tracker.backend, tracker.motion
+    tiles = TileSelection.of(change.changed)
+    gaussians = scene.with_free_gaussians(scene.structured(view.camera, backend, tiles=tiles))
+    small = view.evidence(tracker.config.picture_scale)
+    size = (small.camera.height, small.camera.width)
+    inside = area_mean(_counting(tiles, view)[None, None].float(), size)[0, 0]
+    part = area_mean(change.changed[None, None].float(), size)[0, 0]
+    assert change.flow is not None, "estimated for all that are tracked with"
+    # In the order of the evidence, then the changed part. All are zero outside the tiles, which then cost nothing.
+    colors = change.flow[..., 3:] * inside[..., None]
+    maps = torch.cat([change.flow[..., :3], inside[..., None], colors, part[..., None]], dim=-1)
+    primitives = primitive_of(gaussians, scene)
+    sums = accumulate(gaussians, small.camera, maps, backend)
+    sums *= _enlarged(tracker, view, size)
+    moved = sum_by_primitive(sums, primitives, scene)
+    total, changed = moved[:, 3], moved[:, 7]
+    votes = (changed > motion.least_pixels) & (changed > motion.least_share * total)
+    of_view = ViewChange(float(change.changed.float().mean()), 0.0, repeated=change.repeated)
+    return _Seen(view, tiles, gaussians, primitives, votes, sums[:, 3], moved[:, :7], of_view)
+
+
+def _occluded(motion: MotionConfig, scene: Scene, seen: Sequence[_Seen], moving: Tensor) -> Tensor:
+    """Mask ``[M]`` of the anchors that are occluded in changed tiles and dynamic like their neighbours.
+
+    Nothing is known of anchors outside of these tiles: they are neither propagated to nor compared with.
+
+    Args:
+        motion: thresholds.
+        scene: whose anchors may be occluded.
+        seen: what the cameras tell.
+        moving: mask ``[M]`` of the anchors that move by themselves.
+    """
+    anchors, occluded = len(moving), torch.zeros_like(moving)
+    drawn, shown = (torch.zeros_like(moving, dtype=torch.int32) for _ in range(2))
+    for entry in seen:
+        of_view = torch.zeros(len(entry.votes), dtype=torch.bool, device=moving.device)
+        of_view[entry.primitives] = True
+        drawn += of_view[:anchors]
+        shown += entry.flows[:anchors, 3] > motion.least_pixels
+    among = ((drawn >= motion.least_views) | (shown >= motion.least_views)).nonzero()[:, 0]
+    occluded[among] = occluded_dynamic(
+        scene.anchors.positions[among], moving[among], shown[among] >= motion.least_views, share=motion.carried_share
+    )
+    return occluded
+
+
+def _rendered_flow(tracker: Tracker, scene: Scene, seen: _Seen, velocities: Tensor) -> Tensor:
+    """Sums ``[E, 7]`` of the flow from the rendering of the displaced primitives to the picture."""
+    view, backend, gaussians = seen.view, tracker.backend, seen.gaussians
+    moved = replace(gaussians, means=gaussians.means + velocities[seen.primitives])
+    drawn = backend.rasterize(
+        moved, view.camera.viewport(moved.means), background=scene.background(view.camera), tiles=seen.tiles
+    )
+    image = apply_camera_color(drawn.image, scene.camera_color, view.index)
+    counting = _counting(seen.tiles, view)
+    # Outside the tiles nothing was drawn: there the picture replaces the rendering.
+    rendered = as_picture(image)
+    picture = seen.tiles.choose(blackened(rendered, view.mask), view.image)
+    small = view.evidence(tracker.config.picture_scale)
+    size = (small.camera.height, small.camera.width)
+    found = flow_map(picture, view.image, counting, size, mask=counting, config=tracker.config.flow, backend=backend)
+    inside = area_mean(counting[None, None].float(), size)[0, 0]
+    maps = torch.cat([found.maps, inside[..., None], small.colors * inside[..., None]], dim=-1)
+    sums = accumulate(moved, small.camera, maps, backend)
+    sums *= _enlarged(tracker, view, size)
+    return sum_by_primitive(sums, seen.primitives, scene)
+
+
+def _coverage(seen: Sequence[_Seen], scene: Scene) -> Tensor:
+    """Coverage by id in all views, ``[M * K + F]``."""
+    found = torch.zeros(slot_count(scene)).to(scene.anchors.positions)
+    for entry in seen:
+        found[entry.gaussians.ids] += entry.coverage
+    return found
+
+
+def _enlarged(tracker: Tracker, view: View, size: tuple[int, int]) -> float:
+    """Pixels of the stream's pictures, at the reference size, for a pixel of the maps: thresholds are in these."""
+    width, height = (side / tracker.config.scale for side in (view.camera.width, view.camera.height))
+    return width * height / enlargement(width, height) ** 2 / (size[0] * size[1])
+
+
+def _counting(tiles: TileSelection, view: View) -> Tensor:
+    """Mask ``[H, W]`` of the pixels in the tiles that count."""
+    return tiles.pixels() if view.mask is None else tiles.pixels() & view.mask

@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Growing and pruning of anchors in frame 0.
+
+Growing and pruning anchors during frame 0, after Scaffold-GS (Lu et al., CVPR 2024).
+
+Contribution of each anchor to the training pictures, used to prune anchors that are hardly visible.
+
+Applies growing and pruning of anchors to parameters, optimiser moments and statistics.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from structgstream.kernels.anchor_types import StructuredGaussians
+from structgstream.scene.anchors import AnchorCloud
+from structgstream.scene.scene import Scene
+from structgstream.scene.state import ParameterName
+from structgstream.training.losses import GradientStatistics
+from structgstream.training.optim import Adam
+from structgstream.training.parameters import ANCHOR_ROWS, values_of_rows
+
+MOST_ANCHORS = 400_000
+"""Bound of what larger pictures may have: about 1 GB of memory while frame 0 is trained."""
+
+
+@dataclass(frozen=True)
+class GrowthConfig:
+    """Schedule and thresholds of growing and pruning anchors in frame 0."""
+
+    collect_from: int = 500
+    """Statistics are collected after this iteration."""
+    start: int = 1500
+    """Anchors are grown and pruned after this iteration (paper: 1500)."""
+    stop: int = 15_000
+    """Anchors are grown and pruned until this iteration, and not within the last ``interval`` of a fit (:meth:`last`;
+    Scaffold-GS: 15,000)."""
+    interval: int = 100
+    """Iterations between growing and pruning (Scaffold-GS: 100)."""
+    grad_threshold: float = 2e-4
+    """Mean view-space gradient (NDC) above which a Gaussian proposes an anchor at the coarsest level; doubles with each
+    finer level (Scaffold-GS: 2e-4)."""
+    levels: int = 3
+    """Number of cell sizes, 16, 4 and 1 voxels (Scaffold-GS: 3)."""
+    eligible_count: int = 40
+    """A Gaussian proposes anchors only if it was drawn more often than this since the last growing."""
+    prune_visits: int = 80
+    """An anchor can be pruned by opacity once it was in view more often than this."""
+    prune_opacity: float = 0.005
+    """An anchor is pruned if the sum of its Gaussians' opacities is below this on average over the views."""
+    max_anchors: int = 1_000_000
+    """Largest number of anchors for pictures of the reference size (:meth:`for_pictures`); proposals with the largest
+    gradients are taken first (paper: no bound)."""
+    least_growth: float = 0.0
+    """At least this share of the number of seeds may be added, even beyond ``max_anchors``."""
+    room_until: int = 0
+    """The allowed number of anchors rises linearly from ``start`` to this iteration; 0: all are allowed at once."""
+
+    def for_pictures(self, enlarged: float) -> "GrowthConfig":
+        """The same for pictures whose sides are ``enlarged`` times those of the reference size (``View.enlargement``).
+
+        Their detail has as many times the anchors: in proportion to the pictures' sides, since edges and not areas have
+        most of it, and at most :data:`MOST_ANCHORS` (docs/scaling.md).
+        """
+        most = min(round(self.max_anchors * enlarged), MOST_ANCHORS)
+        return replace(self, max_anchors=max(self.max_anchors, most))
+
+    def room_at(self, iteration: int, seeds: int) -> int:
+        """Allowed number of anchors after ``iteration``, with ``seeds`` initial ones.
+
+        Few anchors are cheap while the pictures are coarse, and late ones are placed where gradients are still large.
+        """
+        most = self.max_anchors
+        if self.least_growth:
+            most = max(most, seeds + round(self.least_growth * seeds))
+        if iteration >= self.room_until:
+            return most
+        share = max(0.0, (iteration - self.start) / (self.room_until - self.start))
+        return min(most, seeds + round(share * max(0, most - seeds)))
+
+    def last(self, iterations: int) -> int:
+        """The last iteration after which anchors are grown or pruned, in a fit of ``iterations``.
+
+        One interval is left to train the last added anchors. This does not affect Scaffold-GS, which stops growing half
+        way through its 30,000 iterations, but the paper, whose 4,000 iterations end during the growing.
+        """
+        return min(self.stop, iterations - self.interval)
+
+
+class OpacityStatistics:
+    """Sum of opacities, and number of views, of each anchor."""
+
+    def __init__(self, anchors: int, device: torch.device) -> None:
+        self.opacity = torch.zeros(anchors, device=device)
+        self.visits = torch.zeros(anchors, device=device)
+
+    def add(self, structured: StructuredGaussians) -> None:
+        """Add one rendering."""
+        self.opacity[structured.anchors] += structured.raw_opacities.clamp(min=0.0).sum(1)
+        self.visits[structured.anchors] += 1.0
+
+
+@dataclass(frozen=True)
+class NewAnchors:
+    """Anchors to append: positions ``[A, 3]``, one cell size each ``[A]``, features ``[A, D]``.
+
+    ``strengths`` ``[A]`` are the largest mean gradients of the proposing Gaussians, in units of the level's threshold.
+    """
+
+    positions: Tensor
+    cell_sizes: Tensor
+    features: Tensor
+    strengths: Tensor
+
+    def __len__(self) -> int:
+        return self.positions.shape[0]
+
+    def strongest(self, count: int) -> "NewAnchors":
+        """At most ``count`` of them, in their order; of equals the first."""
+        if len(self) <= count:
+            return self
+        rows = self.strengths.argsort(descending=True, stable=True)[: max(count, 0)].sort().values
+        return NewAnchors(self.positions[rows], self.cell_sizes[rows], self.features[rows], self.strengths[rows])
+
+
+def cell_keys(points: Tensor, cell: float, origin: Tensor, extent: Tensor) -> Tensor:
+    """An int64 key of the cell of each point ``[P, 3]``; ``origin``, ``extent`` ``[3]`` int64 bound all cells."""
+    cells = (points / cell).round().to(torch.int64) - origin
+    return (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
+
+
+def grow(
+    anchors: AnchorCloud,
+    *,
+    mean_gradient: Tensor,
+    count: Tensor,
+    voxel_size: float,
+    config: GrowthConfig,
+    most: int,
+    generator: torch.Generator,
+) -> NewAnchors:
+    """Propose anchors where view-space gradients are large.
+
+    Args:
+        anchors: the present anchors, ``M`` with ``K`` Gaussians each.
+        mean_gradient: ``[M * K]`` mean view-space gradient, NDC.
+        count: ``[M * K]`` number of views that drew each Gaussian.
+        voxel_size: the finest cell, scene units.
+        config: thresholds.
+        most: largest number of anchors, including the present ones.
+        generator: for the random thinning.
+
+    Three levels of cells (16, 4, 1 voxels); finer levels only if a coarser one has added anchors in this call. Cells
+    with an anchor, present or proposed, get none. If ``most`` is exceeded, the proposals with the largest ratio of
+    gradient to threshold are taken.
+    """
+    eligible = count > config.eligible_count
+    means = (anchors.positions[:, None] + anchors.offsets * anchors.log_offset_scales.exp()[:, None]).reshape(-1, 3)
+    added: list[NewAnchors] = []
+    occupied = anchors.positions
+    for level in range(config.levels):
+        if level > 0 and not added:
+            break
+        sampled = torch.rand(means.shape[0], generator=generator).to(means.device) > 0.5 ** (level + 1)
+        threshold = config.grad_threshold * 2**level
+        chosen = (eligible & (mean_gradient >= threshold) & sampled).nonzero()[:, 0]
+        if chosen.numel() == 0:
+            continue
+        new = _new_cells(
+            means[chosen],
+            anchors.features[chosen // anchors.offsets_per_anchor],
+            mean_gradient[chosen] / threshold,
+            occupied=occupied,
+            cell=voxel_size * 16 / 4**level,
+        )
+        if len(new):
+            added.append(new)
+            occupied = torch.cat([occupied, new.positions])
+    if not added:
+        none = means.new_zeros(0)
+        return NewAnchors(means[:0], none, anchors.features[:0], none)
+    return NewAnchors(
+        torch.cat([new.positions for new in added]),
+        torch.cat([new.cell_sizes for new in added]),
+        torch.cat([new.features for new in added]),
+        torch.cat([new.strengths for new in added]),
+    ).strongest(most - len(anchors))
+
+
+def _new_cells(means: Tensor, features: Tensor, strengths: Tensor, *, occupied: Tensor, cell: float) -> NewAnchors:
+    """One anchor for each cell of side ``cell`` that holds some of ``means`` ``[n, 3]`` and none of ``occupied``.
+
+    It gets the largest of their ``features`` ``[n, D]``, column by column, and of their ``strengths`` ``[n]``.
+    """
+    coordinates = (torch.cat([means, occupied]) / cell).round().to(torch.int64)
+    origin = coordinates.amin(0)
+    extent = coordinates.amax(0) - origin + 1
+    keys = cell_keys(means, cell, origin, extent)
+    fresh = ~torch.isin(keys, cell_keys(occupied, cell, origin, extent))
+    unique, index = keys[fresh].unique(return_inverse=True)
+    parents = features[fresh]
+    largest = parents.new_full((len(unique), parents.shape[1]), -torch.inf)
+    largest.scatter_reduce_(0, index[:, None].expand_as(parents), parents, reduce="amax")
+    strongest = strengths.new_zeros(len(unique)).scatter_reduce_(0, index, strengths[fresh], reduce="amax")
+    cells = torch.stack([unique // (extent[1] * extent[2]), unique // extent[2] % extent[1], unique % extent[2]], dim=1)
+    positions = (cells + origin).to(means) * cell
+    return NewAnchors(positions, positions.new_full((len(unique),), cell), largest, strongest)
+
+
+def prunable_mask(statistics: OpacityStatistics, config: GrowthConfig) -> Tensor:
+    """Mask ``[M]`` of the anchors that were in view often enough and are nearly transparent."""
+    judged = statistics.visits > config.prune_visits
+    return judged & (statistics.opacity < config.prune_opacity * statistics.visits)
+
+
+@dataclass
+class Densifier:
+    """Collects statistics of frame 0, and grows and prunes anchors by them.
+
+    The clamp of the base scales is Scaffold-GS's: at most ``exp(0.05)`` scene units, whenever anchors are pruned.
+    """
+
+    config: GrowthConfig
+    iterations: int
+    voxel_size: float
+    offsets_per_anchor: int
+    seeds: int
+    gradients: GradientStatistics
+    opacities: OpacityStatistics
+    grown: int = 0
+    pruned: int = 0
+
+    @classmethod
+    def of(cls, scene: Scene, *, config: GrowthConfig, iterations: int, voxel_size: float) -> "Densifier":
+        """Empty statistics for ``scene``, which is fitted in ``iterations`` iterations."""
+        m, k = len(scene.anchors), scene.anchors.offsets_per_anchor
+        device = scene.anchors.positions.device
+        return cls(
+            config, iterations, voxel_size, k, m, GradientStatistics(m * k, device), OpacityStatistics(m, device)
+        )
+
+    def collects(self, iteration: int) -> bool:
+        """Whether statistics are collected at this iteration."""
+        return self.config.collect_from < iteration <= self.config.last(self.iterations)
+
+    def is_due(self, iteration: int) -> bool:
+        """Whether anchors change after this iteration."""
+        c = self.config
+        return c.start < iteration <= c.last(self.iterations) and iteration % c.interval == 0
+
+    def apply(
+        self, scene: Scene, adam: Adam[ParameterName], generator: torch.Generator, *, iteration: int
+    ) -> tuple[int, int]:
+        """Grow, then prune, after ``iteration``; returns how many anchors were added and removed."""
+        k = self.offsets_per_anchor
+        new = grow(
+            scene.anchors,
+            mean_gradient=self.gradients.mean(),
+            count=self.gradients.count,
+            voxel_size=self.voxel_size,
+            config=self.config,
+            most=self.config.room_at(iteration, self.seeds),
+            generator=generator,
+        )
+        eligible = self.gradients.count > self.config.eligible_count
+        self.gradients.total[eligible] = 0.0
+        self.gradients.count[eligible] = 0.0
+        remove = prunable_mask(self.opacities, self.config)
+        judged = self.opacities.visits > self.config.prune_visits
+        self.opacities.opacity[judged] = 0.0
+        self.opacities.visits[judged] = 0.0
+        keep = ~remove
+        log_cells = new.cell_sizes.log()[:, None].expand(-1, 3)
+        anchors = AnchorCloud(
+            new.positions, log_cells, log_cells, new.positions.new_zeros(len(new), k, 3), new.features
+        )
+        self._replace(adam, keep=keep, added=values_of_rows(anchors, ANCHOR_ROWS), count=len(new))
+        adam.values["base_scales"].detach().clamp_(max=0.05)
+        return len(new), int(remove.sum())
+
+    def _replace(
+        self, adam: Adam[ParameterName], *, keep: Tensor, added: dict[ParameterName, Tensor], count: int
+    ) -> None:
+        """Keep the rows of a mask ``[M]`` and append ``count`` rows, in all tensors with a row per anchor.
+
+        New rows of parameters that are not in ``added`` are zero.
+        """
+        k = self.offsets_per_anchor
+        new: dict[ParameterName, Tensor] = {}
+        for name, old in adam.values.items():
+            if name in ANCHOR_ROWS:
+                new[name] = added[name] if name in added else old.detach().new_zeros(count, *old.shape[1:])
+        adam.replace_rows(new, keep=keep)
+        for statistics in (self.gradients, self.opacities):
+            rows = keep.repeat_interleave(k) if statistics is self.gradients else keep
+            more = count * k if statistics is self.gradients else count
+            for name, values in vars(statistics).items():
+                setattr(statistics, name, torch.cat([values[rows], values.new_zeros(more)]))
+        self.grown, self.pruned = self.grown + count, self.pruned + int((~keep).sum())

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What keeps frame 0 from explaining each camera alone.
+
+Regularisation of frame 0 against overfitting to the training views: Gaussian dropout and random perturbation.
+
+A rig sees a surface from few directions, so combinations of Gaussians can fit the training views and be wrong between
+them. Dropping some Gaussians and perturbing the others in every iteration gives such combinations a large loss.
+
+A regulariser of frame 0 that concentrates the Gaussians along a ray in depth.
+
+A haze of faint Gaussians around a surface can fit every training view and be wrong in all others; its depths along a
+ray are spread. The loss is the standard deviation of depth relative to its mean (compare the distortion loss of
+Mip-NeRF 360, Barron et al., CVPR 2022).
+
+Anchors in free space that one or few cameras need and the others see through; they are removed from frame 0.
+
+Note [Free space]
+~~~~~~~~~~~~~~~~~
+F_alpha sees the direction, so an anchor near one camera can be opaque for that camera alone, and make up for its lens
+or its exposure there. From any other place near it, what F_alpha says is chance: a viewer who comes close stands in a
+haze. A surface is not like that: few cameras see it in front of what they draw. So an anchor goes if many cameras see
+something behind it, and hardly any of them draws it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from structgstream.cameras import Camera
+from structgstream.gaussians import Gaussians
+from structgstream.kernels.backend import Backend
+from structgstream.scene.scene import Scene
+
+TABLE_LENGTH = 1 << 21
+"""Of a table of random numbers; it is a few times what an iteration reads."""
+
+
+@dataclass(frozen=True)
+class PerturbationConfig:
+    """Dropout and perturbation while frame 0 is trained."""
+
+    dropped_share: float = 0.0
+    """Share of the Gaussians dropped in an iteration; the others' opacities are scaled up accordingly (paper: 0)."""
+    noise_scales: float = 0.0
+    """Standard deviation of normal noise on the means, in units of each Gaussian's own scale (paper: 0)."""
+    until_share: float = 1.0
+    """Both decrease linearly to 0 at this share of the iterations."""
+
+
+class RandomNumbers:
+    """Random numbers that are read from random places of tables: to draw them anew takes a thirtieth of frame 0.
+
+    Args:
+        generator: of the tables and of the places.
+        device: of the numbers.
+        length: of a table. It grows where more are read at once.
+    """
+
+    def __init__(self, generator: torch.Generator, device: torch.device, *, length: int = TABLE_LENGTH) -> None:
+        self._generator = generator
+        self._device = device
+        self._length = length
+        self._tables: dict[str, Tensor] = {}
+
+    def uniform(self, count: int) -> Tensor:
+        """``[count]`` in [0, 1)."""
+        return self._read("uniform", count)
+
+    def normal(self, count: int) -> Tensor:
+        """``[count, 3]`` of mean 0 and deviation 1."""
+        return self._read("normal", 3 * count).reshape(count, 3)
+
+    def _read(self, name: str, count: int) -> Tensor:
+        table = self._tables.get(name)
+        if table is None or len(table) < 2 * count:
+            draw = torch.rand if name == "uniform" else torch.randn
+            length = max(self._length, 2 * count)
+            table = self._tables[name] = draw(length, generator=self._generator).to(self._device)
+        first = int(torch.randint(len(table) - count + 1, (), generator=self._generator))
+        return table[first : first + count]
+
+
+class Perturbation:
+    """Perturbs the Gaussians of one iteration.
+
+    Args:
+        config: amounts of dropout and noise.
+        numbers: to perturb with.
+        strength: factor on the amounts, 0 to 1.
+    """
+
+    def __init__(self, config: PerturbationConfig, numbers: RandomNumbers, *, strength: float) -> None:
+        self._config = config
+        self._numbers = numbers
+        self._strength = strength
+
+    def __call__(self, gaussians: Gaussians) -> Gaussians:
+        dropped, noise = (self._strength * x for x in (self._config.dropped_share, self._config.noise_scales))
+        opacities, means = gaussians.opacities, gaussians.means
+        if dropped > 0.0:
+            kept = (self._numbers.uniform(len(gaussians)) >= dropped).to(opacities)
+            opacities = (opacities * kept / (1.0 - dropped)).clamp(max=0.999)
+        if noise > 0.0:
+            # Isotropic noise by the mean scale: following each Gaussian's rotation is not worth its cost.
+            sizes = gaussians.scales.detach().mean(1, keepdim=True)
+            means = means + noise * sizes * self._numbers.normal(len(gaussians)).to(means)
+        return replace(gaussians, opacities=opacities, means=means)
+
+
+def perturbation_at(
+    iteration: int, iterations: int, config: PerturbationConfig, numbers: RandomNumbers
+) -> Perturbation | None:
+    """The perturbation of ``iteration`` of ``iterations``; None for none."""
+    strength = 1.0 - iteration / max(1.0, iterations * config.until_share)
+    if strength <= 0.0 or not (config.dropped_share or config.noise_scales):
+        return None
+    return Perturbation(config, numbers, strength=strength)
+
+
+COVERED = 0.5
+"""Rays with less coverage are not counted."""
+
+
+@dataclass(frozen=True)
+class DepthDistortionConfig:
+    """Weight and schedule of the depth regulariser; not in the paper."""
+
+    weight: float = 0.0
+    """Mean weight of the depth spread in the loss per iteration (paper: 0)."""
+    from_share: float = 0.3
+    """Share of the iterations before it starts, in which surfaces form."""
+    every: int = 2
+    """It is computed in every ``every``-th iteration, with ``every`` times the weight."""
+    scale: float = 0.5
+    """Scale of width and height of the pictures in which depth is drawn."""
+
+    def weight_at(self, iteration: int, iterations: int) -> float:
+        """Weight of the depth spread in ``iteration`` of ``iterations``; 0: it is not computed."""
+        if iteration <= self.from_share * iterations or iteration % self.every:
+            return 0.0
+        return self.weight * self.every
+
+
+def depth_distortion(gaussians: Gaussians, camera: Camera, *, scale: float, backend: Backend) -> Tensor:
+    """Relative spread of depth along rays, ``[]``.
+
+    The standard deviation of depth, weighted by blending weights, relative to the mean depth, averaged over the pixels
+    with coverage above :data:`COVERED`. It takes one more rendering, with "colours" z, z^2 and 1.
+    """
+    small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    viewport = small.viewport(gaussians.means)
+    depths = gaussians.means @ viewport.viewmat[2, :3] + viewport.viewmat[2, 3]
+    moments = torch.stack([depths, depths.square(), torch.ones_like(depths)], dim=1)
+    image = backend.rasterize(replace(gaussians, colors=moments), viewport).image
+    first, second, coverage = image.unbind(-1)
+    covered = coverage.detach() > COVERED
+    divisor = coverage.clamp(min=COVERED)  # Avoids NaN in pixels that are not counted.
+    mean = (first / divisor).clamp(min=small.near)
+    variance = (second / divisor - mean.square()).clamp(min=0.0)
+    spread = (variance + 1e-8).sqrt() / mean
+    return (spread * covered).sum() / covered.sum().clamp(min=1)
+
+
+COVERED = 0.5
+"""Pixels with less coverage show no surface, so nothing is in front of one there."""
+
+
+@dataclass(frozen=True)
+class FreeSpaceConfig:
+    """Removal of anchors in free space (Note [Free space]); not in the paper."""
+
+    enabled: bool = False
+    """Remove them after the last iteration (paper: no)."""
+    depth_share: float = 0.9
+    """An anchor is in front of what a camera draws if its depth is below this share of the drawn depth."""
+    least_views: int = 6
+    """An anchor is judged only if as many cameras see it in front of what they draw."""
+    drawn_share: float = 0.34
+    """It is removed if at most this share of them, or a single one, draws one of its Gaussians."""
+    drawn_opacity: float = 0.05
+    """Opacity above which a Gaussian counts as drawn."""
+    scale: float = 0.5
+    """Scale of width and height of the pictures in which depth is drawn."""
+
+
+def in_free_space(scene: Scene, cameras: Sequence[Camera], *, config: FreeSpaceConfig, backend: Backend) -> Tensor:
+    """Mask ``[M]`` of the anchors of ``scene`` that float in front of surfaces, as ``cameras`` see it."""
+    in_front = scene.anchors.positions.new_zeros(len(scene.anchors))
+    drawn = torch.zeros_like(in_front)
+    with torch.no_grad():
+        for camera in cameras:
+            small = camera.resized(*(max(1, round(side * config.scale)) for side in (camera.width, camera.height)))
+            structured = scene.structured(small, backend)
+            rows = structured.anchors
+            before = _before_surfaces(scene.anchors.positions[rows], scene, small, config.depth_share, backend)
+            opaque = structured.raw_opacities.amax(1) > config.drawn_opacity
+            in_front[rows] += before.to(in_front)
+            drawn[rows] += (before & opaque).to(drawn)
+    return (in_front >= config.least_views) & (drawn <= (config.drawn_share * in_front).clamp(min=1.0))
+
+
+def _before_surfaces(points: Tensor, scene: Scene, camera: Camera, share: float, backend: Backend) -> Tensor:
+    """Mask ``[n]`` of the points that lie in ``camera``'s picture, nearer than ``share`` of the depth drawn there."""
+    viewport = camera.viewport(points)
+    depth = _nearest_depth(scene, camera, backend)
+    at = points @ viewport.viewmat[:3, :3].T + viewport.viewmat[:3, 3]
+    x, y, z = (at @ viewport.K.T).unbind(1)
+    column, row = (x / z).floor().long(), (y / z).floor().long()
+    inside = (z > viewport.near) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    drawn = depth[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
+    return inside & (z < share * drawn)
+
+
+def _nearest_depth(scene: Scene, camera: Camera, backend: Backend) -> Tensor:
+    """``[H, W]`` the least drawn depth of 3 x 3 pixels; 0 where one of them shows no surface."""
+    gaussians = scene.gaussians(camera, backend)
+    viewport = camera.viewport(gaussians.means)
+    z = gaussians.means @ viewport.viewmat[2, :3] + viewport.viewmat[2, 3]
+    moments = torch.stack([z, torch.ones_like(z), torch.zeros_like(z)], dim=1)
+    first, coverage, _ = backend.rasterize(replace(gaussians, colors=moments), viewport).image.unbind(-1)
+    depth = torch.where(coverage > COVERED, first / coverage.clamp(min=COVERED), 0.0)
+    return -torch.nn.functional.max_pool2d(-depth[None], 3, stride=1, padding=1)[0]

@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where frame 0 starts: anchors at points, the environment, or an earlier scene.
+
+Initialisation of frame 0: anchors from points, random MLPs.
+
+Note [Dead outputs]
+~~~~~~~~~~~~~~~~~~~
+F_alpha has one output for each of an anchor's K Gaussians, shared by all anchors. Only Gaussians of positive opacity
+are drawn and get a gradient, as with a ReLU. With random weights about half of the outputs are initially negative for
+every anchor, because all features start equal, and an output that no anchor draws stays dead: of K = 5, one to four
+survive, depending on the seed. ``all_drawn`` avoids this: a smaller K, with all outputs initially positive.
+
+Least-squares fit of a scene's environment (``scene/environment.py``) to the training pictures of frame 0.
+
+Note [Honest coverage]
+~~~~~~~~~~~~~~~~~~~~~~
+With a black background the optimiser represents dark surfaces by transparency. Coverage then does not distinguish dark
+surfaces from unobserved regions, and an environment would shine through dark doors and hair. With a random background
+colour in every iteration (``InitialConfig.random_background``) only opaque surfaces can match the pictures, so what
+stays transparent is unobserved.
+
+The scene of a frame as the start of another period's first frame: anchors only, everything trainable again.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from structgstream.errors import CaptureError, MissingExtraError
+from structgstream.kernels.anchor_types import HeadWeights, MLPWeights
+from structgstream.kernels.backend import Backend
+from structgstream.scene.anchors import AnchorCloud
+from structgstream.scene.color import CameraColor
+from structgstream.scene.environment import pixel_directions
+from structgstream.scene.free import FreeGaussians
+from structgstream.scene.harmonics import sh_basis
+from structgstream.scene.render import draw
+from structgstream.scene.scene import Scene
+from structgstream.training.frame0.densify import cell_keys
+from structgstream.training.neighbours import nearest
+from structgstream.training.views import View
+
+
+def voxel_centers(points: Tensor, voxel_size: float) -> Tensor:
+    """The centres of the voxels that hold a point: ``unique(round(p / eps)) * eps``, ``[M, 3]``."""
+    return (points / voxel_size).round().to(torch.int64).unique(dim=0).to(points) * voxel_size
+
+
+def neighbor_distances(points: Tensor) -> Tensor:
+    """Root of the mean squared distance of each point to its three nearest neighbours, ``[M]``."""
+    try:
+        from scipy.spatial import KDTree
+    except ImportError as error:
+        raise MissingExtraError("scipy", "capture") from error
+    values = points.double().numpy(force=True)
+    distances, _ = KDTree(values).query(values, k=min(4, len(values)))
+    squared = np.square(np.atleast_2d(distances)[:, 1:]).mean(axis=1)
+    return torch.from_numpy(np.sqrt(np.maximum(squared, 1e-7))).to(points)
+
+
+def random_head(inputs: int, hidden: int, outputs: int, generator: torch.Generator) -> HeadWeights:
+    """Random weights as in torch's linear layers: uniform within 1 / sqrt(inputs)."""
+
+    def layer(rows: int, columns: int) -> tuple[Tensor, Tensor]:
+        bound = 1.0 / math.sqrt(columns)
+        weight = (torch.rand(rows, columns, generator=generator) * 2 - 1) * bound
+        return weight, (torch.rand(rows, generator=generator) * 2 - 1) * bound
+
+    return HeadWeights(*layer(hidden, inputs), *layer(outputs, hidden))
+
+
+def seeded_scene(
+    points: Tensor,
+    *,
+    cameras: int,
+    voxel_size: float,
+    offsets_per_anchor: int,
+    feature_width: int,
+    hidden_width: int,
+    distance_input: bool,
+    device: torch.device,
+    generator: torch.Generator,
+    all_drawn: bool = False,
+) -> Scene:
+    """A scene of untrained anchors at ``points`` ``[P, 3]``, normalised units.
+
+    Offsets and features start at zero, both scales at the distance to the neighbours, the MLPs at random (Scaffold-GS).
+    With ``all_drawn`` the last layer of F_alpha has no negative weight, so that every Gaussian is initially drawn.
+
+    Raises:
+        CaptureError: fewer than four distinct points.
+    """
+    positions = voxel_centers(points.float(), voxel_size)
+    m, k = positions.shape[0], offsets_per_anchor
+    if m < 4:
+        raise CaptureError(
+            f"Only {m} initial points remain at a voxel size of {voxel_size:g}; at least 4 are needed. "
+            "Check the poses, or give a capture with more overlap between cameras."
+        )
+    log_scales = neighbor_distances(positions).log()[:, None].expand(m, 3).contiguous().to(device)
+    positions = positions.to(device)
+    inputs = feature_width + 3 + int(distance_input)
+    heads = [random_head(inputs, hidden_width, width * k, generator) for width in (1, 3, 7)]
+    if all_drawn:
+        heads[0] = heads[0]._replace(w2=heads[0].w2.abs(), b2=heads[0].b2.abs())
+    opacity, color, covariance = (HeadWeights(*(w.to(device) for w in head)) for head in heads)
+    return Scene(
+        anchors=AnchorCloud(
+            positions=positions,
+            log_offset_scales=log_scales,
+            log_base_scales=log_scales.clone(),
+            offsets=positions.new_zeros(m, k, 3),
+            features=positions.new_zeros(m, feature_width),
+        ),
+        mlps=MLPWeights(opacity=opacity, color=color, covariance=covariance),
+        free=FreeGaussians.empty(positions),
+        camera_color=CameraColor.identity(cameras, positions),
+        distance_input=distance_input,
+    )
+
+
+_STRIDE = 4  # pixels between samples: enough for a few coefficients
+_LEAST_GAIN = 0.1
+
+
+@dataclass(frozen=True)
+class EnvironmentConfig:
+    """The environment behind the scene; needs ``random_background`` (Note [Honest coverage])."""
+
+    enabled: bool = False
+    """Whether an environment is fitted (paper: no, black)."""
+    degree: int = 2
+    """Degree of the spherical harmonics, 0 to 2."""
+    smoothness: float = 1e-3
+    """Ridge penalty: for a coefficient of degree l, l (l + 1) times this times the mean weight of the pixels."""
+    least_weight: float = 1e-2
+    """Added to a pixel's transparency (1 - coverage) to give its weight, so that covered pixels count a little."""
+    step: float = 1 / 256
+    """Quantization step of the coefficients with the codec ``compact``, full scale 1."""
+
+
+def fit_environment(scene: Scene, views: Sequence[View], *, config: EnvironmentConfig, backend: Backend) -> Tensor:
+    """Coefficients ``[(degree + 1)^2, 3]`` of the colours in the pictures' directions, by least squares.
+
+    Args:
+        scene: frame 0; its coverage determines the pixels' weights, its colour correction the reference colours.
+        views: the training pictures.
+        config: of the fit.
+        backend: the compute back-end.
+    """
+    count = (config.degree + 1) ** 2
+    products = torch.zeros(count, count, dtype=torch.float64)
+    targets = torch.zeros(count, 3, dtype=torch.float64)
+    total, color = 0.0, scene.camera_color
+    for view in views:
+        with torch.no_grad():
+            alpha = draw(scene.gaussians(view.camera, backend), view.camera, backend).alpha
+        rows, columns = (torch.arange(0, size, _STRIDE, device=alpha.device) for size in alpha.shape)
+        pixels = (rows[:, None] * alpha.shape[1] + columns).reshape(-1)
+        gains, biases = (value[view.index].cpu().double() for value in (color.gains, color.biases))
+        colors = (view.image.reshape(-1, 3)[pixels].cpu().double() / 255.0 - biases) / gains.clamp(min=_LEAST_GAIN)
+        weights = (1.0 - alpha.reshape(-1)[pixels]).cpu().double() + config.least_weight
+        if view.mask is not None:
+            weights = weights * view.mask.reshape(-1)[pixels].cpu()
+        basis = sh_basis(pixel_directions(view.camera, pixels).cpu().double(), config.degree)
+        products += (basis * weights[:, None]).T @ basis
+        targets += (basis * weights[:, None]).T @ (colors - 0.5)
+        total += float(weights.sum())
+    degrees = torch.tensor([degree for degree in range(config.degree + 1) for _ in range(2 * degree + 1)])
+    ridge = config.smoothness * total / (4.0 * torch.pi) * (degrees * (degrees + 1)).double()
+    found = torch.linalg.solve(products + ridge.diag(), targets)
+    return found.to(scene.anchors.positions)
+
+
+def warm_start(scene: Scene, *, cell: float) -> Scene:
+    """``scene`` with its appearance in the features, its free Gaussians as anchors, and without environment.
+
+    An environment belongs to frame 0's fit, which finds another one. Free Gaussians become one anchor for each cell of
+    side ``cell`` (scene units) that has no anchor, with the features of the nearest one.
+    """
+    scene = scene.with_folded_appearance()
+    anchors = scene.anchors
+    if len(scene.free):
+        anchors = _joined(anchors, _anchors_of(scene.free, anchors, cell))
+    return replace(scene, anchors=anchors, free=FreeGaussians.empty(anchors.positions), environment=None)
+
+
+def _anchors_of(free: FreeGaussians, anchors: AnchorCloud, cell: float) -> AnchorCloud:
+    """An anchor for each cell that free Gaussians are in and no anchors: at their mean, as large as they are."""
+    both = torch.cat([free.means, anchors.positions])
+    places = (both / cell).round().to(torch.int64)
+    origin = places.amin(0)
+    extent = places.amax(0) - origin + 1
+    keys = cell_keys(free.means, cell, origin, extent)
+    fresh = ~torch.isin(keys, cell_keys(anchors.positions, cell, origin, extent))
+    unique, index, count = keys[fresh].unique(return_inverse=True, return_counts=True)
+    rows = torch.cat([free.means[fresh], free.log_scales[fresh].amax(1, keepdim=True)], dim=1)
+    sums = rows.new_zeros(len(unique), 4).index_add_(0, index, rows)
+    means = sums / count[:, None]
+    # A Gaussian is at most as large as the base scale, and half of it on average.
+    log_scales = (means[:, 3:] + np.log(2.0)).expand(-1, 3)
+    return AnchorCloud(
+        positions=means[:, :3].contiguous(),
+        log_offset_scales=log_scales.contiguous(),
+        log_base_scales=log_scales.contiguous(),
+        offsets=means.new_zeros(len(unique), anchors.offsets_per_anchor, 3),
+        features=anchors.features[nearest(means[:, :3], anchors.positions, 1)[0][:, 0]],
+    )
+
+
+def _joined(first: AnchorCloud, second: AnchorCloud) -> AnchorCloud:
+    return AnchorCloud(
+        positions=torch.cat([first.positions, second.positions]),
+        log_offset_scales=torch.cat([first.log_offset_scales, second.log_offset_scales]),
+        log_base_scales=torch.cat([first.log_base_scales, second.log_base_scales]),
+        offsets=torch.cat([first.offsets, second.offsets]),
+        features=torch.cat([first.features, second.features]),
+    )

@@ -1,0 +1,341 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Configuration of the frames after the first: the paper's method, and what goes beyond it."""
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from structgstream.errors import ConfigError
+from structgstream.scene.state import (
+    PAPER_DYNAMIC,
+    STATE_TABLE,
+    FieldName,
+    ParameterName,
+)
+from structgstream.training.losses import LossWeights
+from structgstream.training.parameters import RoundingConfig
+
+
+@dataclass(frozen=True)
+class FlowConfig:
+    """How finely flow is searched (``flow.dis_search``)."""
+
+    finest_level: int = 1
+    """Of the search's pyramid: 0 is the size of the pictures, 1 half of it."""
+    least_width: int = 240
+    """Where the finest level would be narrower than this, pixels, a finer one is searched: in small pictures what moves
+    is small, too."""
+    apart: bool = False
+    """Search in a box for each part of a picture that changed, instead of one around all: quicker where things move far
+    from each other."""
+    far: bool = False
+    """Where flow is inconsistent, search again for motion by more than things are large (``flow.block_search``)."""
+
+    def __post_init__(self) -> None:
+        if self.finest_level < 0 or self.least_width < 0:
+            raise ConfigError(
+                f"online.start.flow has finest level {self.finest_level} and least width {self.least_width}; "
+                "expected neither below 0."
+            )
+
+    def level_of(self, width: int) -> int:
+        """The finest level for pictures ``width`` pixels wide."""
+        level = self.finest_level
+        while level > 0 and width >> level < self.least_width:
+            level -= 1
+        return level
+
+
+USUAL_FLOW = FlowConfig()
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """Thresholds of motion selection; not in the paper.
+
+    Pixels are those of pictures of the reference size (``cameras.enlargement``).
+    """
+
+    enabled: bool = False
+    """Train only primitives (paper: False, everything is trained)."""
+    change_threshold: float = 0.05
+    """A pixel has changed if its mean absolute difference to the previous picture over 3 x 3 pixels and the channels
+    (full scale 1) exceeds this; above the sensors' noise."""
+    residual_threshold: float = 0.0
+    """A pixel has also changed if its residual exceeds frame 0's by this (full scale 1). 0: residuals are not used."""
+    reach_pixels: int = 3
+    """Changed pixels are dilated by this many pixels."""
+    least_pixels: float = 0.3
+    """Least number of changed pixels, summed by blending weight, that a primitive covers in a view to get its vote."""
+    least_share: float = 0.3
+    """Least share of changed pixels among all that a primitive covers in a view to get its vote."""
+    least_views: int = 2
+    """Least number of votes of a primitive that is trained: two, because one view may have changed by noise."""
+    moved_ease: float = 1.0
+    """Factor (hysteresis) on the thresholds of pixels and shares for primitives that the last frame changed. 1:
+    none."""
+    carried_share: float = 0.0
+    """An anchor that fewer than ``least_views`` views show is trained if at least this share of its nearest shown ones
+    is: it lies in or behind what moves. 0: none."""
+    picture_scale: float = 0.25
+    """Scale of width and height, relative to the reference size, of the pictures on which coverage is computed."""
+    margin_pixels: int = 8
+    """Tiles within this many pixels of moving Gaussians are drawn too, so that these get gradients where they move."""
+    rest_every: int = 1
+    """Tiles in which nothing has changed are drawn only every this many times that a view is. 1: always."""
+    tiles_around: int = -1
+    """Tiles (16 pixels) farther than this many tiles from one in which something has changed are not drawn, though
+    moving Gaussians reach them. -1: all are."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.carried_share <= 1.0:
+            raise ConfigError(f"online.motion.carried_share is {self.carried_share:g}; expected a share from 0 to 1.")
+
+
+@dataclass(frozen=True)
+class LiftConfig:
+    """Robust fit of displacements to the flow of neighbouring primitives; not in the paper."""
+
+    neighbours: int = 12
+    """Number of nearest primitives, including itself, whose flow a displacement is fitted to."""
+    bandwidth: float = 0.7
+    """Standard deviation of the Gaussian weight of a neighbour by distance, relative to the farthest neighbour's."""
+    color_bandwidth: float = 0.15
+    """Standard deviation of the Gaussian weight of a neighbour by colour difference (full scale 1), which separates
+    adjacent objects. 0: no weight by colour."""
+    inlier_share: float = 0.4
+    """Least share of inliers of a valid displacement, over all flow and in each agreeing view."""
+    agreeing_views: int = 2
+    """Least number of agreeing views; otherwise a primitive takes the motion prior."""
+
+
+@dataclass(frozen=True)
+class SceneFlowConfig:
+    """Initial displacement of primitives; not in the paper."""
+
+    enabled: bool = False
+    """Displace primitives by optical flow (paper: False, everything starts at its last position)."""
+    rounds: int = 2
+    """1: flow between pictures only; 2: also from the rendering to the pictures."""
+    views: int = 12
+    """Approximate upper bound of the views in which flow is estimated and what is missing is looked for; of more views
+    every second or third, in turn."""
+    flow: FlowConfig = FlowConfig()
+    """How flow is searched."""
+    lift: LiftConfig = field(default_factory=LiftConfig)
+
+
+@dataclass(frozen=True)
+class ThinSpawnConfig:
+    """A second sweep, for thin and faint content such as a stream of water, in frames in which the first bears nothing.
+
+    Its fields replace those of the same names of :class:`SpawnConfig`: finer pictures, every ray, lower thresholds. By
+    these rules something large would be born of many small Gaussians, which follow it worse than few large ones do and
+    cost more.
+    """
+
+    enabled: bool = False
+    picture_width: int = 480
+    missing_threshold: float = 0.04
+    pixel_step: int = 1
+    most_contradictions: float = 0.5
+    most_cost: float = 0.2
+    least_hits: int = 3
+    most: int = 150
+    crowded: Literal["coarser", "none", "small-clusters"] = "none"
+    """Thin content is little. Where more would be born, what moves is not where it should be, as in a throw: births in
+    its place follow it worse and cost more than what they stand for. A group of frames that is fitted apart lacks what
+    the frames before it would have borne: its first frames bear what lies in small clusters."""
+    most_missing_share: float = 0.02
+    """Of the pictures 0.0005 lack something where a pitcher pours. More is light that changed."""
+
+
+@dataclass(frozen=True)
+class SpawnConfig:
+    """Spawning of free Gaussians from geometry, and pruning by residuals; not in the paper."""
+
+    enabled: bool = False
+    """Paper: False, free Gaussians are spawned by gradients only."""
+    picture_width: int = 320
+    """Pictures are reduced to at most this width, pixels."""
+    residual_threshold: float = 0.10
+    """Residual, 0 to 1, above which a pixel counts as wrong."""
+    missing_threshold: float = 0.10
+    """Excess of the residual over frame 0's, 0 to 1, above which a pixel counts as missing."""
+    changed_floor_medians: float | None = None
+    """Where a picture has changed, frame 0's residual, which was of other content, counts as at most this many medians
+    of its view's. None: all of it counts, as it does in the sweep for thin content."""
+    pixel_step: int = 2
+    """Distance in pixels, across and down, between missing pixels whose rays are swept."""
+    planes: int = 48
+    least_supports: int = 2
+    """Least number of other views that support a point: there a missing pixel lies at its projection."""
+    most_contradictions: float = 0.34
+    """Largest share of contradicting views, which would see the point but miss nothing, among those that can judge."""
+    most_cost: float = 0.12
+    least_hits: int = 4
+    """Least number of ray points within 1.8 voxels for a birth."""
+    most: int = 5000
+    """Largest number of births per frame: more than who walks in needs, since below that number all of it is haze."""
+    crowded: Literal["coarser", "none", "small-clusters"] = "coarser"
+    """Where there would be more than ``most``: births in larger voxels, none, or those in the smallest clusters."""
+    most_missing_share: float = 0.25
+    """If a larger share of the pictures is missing there are no births: the light changed, or a camera moved."""
+    size: float = 0.7
+    """Standard deviation at birth, in units of the distance between neighbouring swept rays."""
+    opacity: float = 0.7
+    blame_share: float = 0.5
+    """A free Gaussian is an outlier in a view if more than this share of its pixels is wrong."""
+    blame_views: int = 2
+    """A free Gaussian is removed if it is an outlier in at least this many views and in half of those that show it."""
+    thin: ThinSpawnConfig = field(default_factory=ThinSpawnConfig)
+
+    @property
+    def for_thin(self) -> "SpawnConfig":
+        """The rules of the second sweep."""
+        return replace(self, **vars(self.thin))
+
+
+@dataclass(frozen=True)
+class SmoothnessConfig:
+    """The price of moving unlike the neighbours; not in the paper."""
+
+    weight: float = 0.0
+    """Weight in the loss of the mean difference of displacement from the neighbours, pixels (paper: 0, none)."""
+    neighbours: int = 8
+    """Number of nearest moving anchors that an anchor is compared with."""
+    bandwidth: float = 0.7
+    """Standard deviation of the Gaussian weight of a neighbour by distance, relative to the farthest neighbour's."""
+    feature_bandwidth: float = 1.0
+    """Standard deviation of the Gaussian weight of a neighbour by the root mean square difference of features, in their
+    standard deviations. 0: no weight by features."""
+    slack_pixels: float = 0.25
+    """Differences far below this cost in proportion to their square, those far above it to their length."""
+
+    def __post_init__(self) -> None:
+        least_of_two = min(self.weight, self.feature_bandwidth)
+        if least_of_two < 0.0 or self.neighbours < 1 or self.bandwidth <= 0.0 or self.slack_pixels <= 0.0:
+            raise ConfigError(
+                f"online.coherence has weight {self.weight:g}, {self.neighbours} neighbours, bandwidth "
+                f"{self.bandwidth:g}, feature bandwidth {self.feature_bandwidth:g} and slack {self.slack_pixels:g}; "
+                "expected a weight and a feature bandwidth of at least 0, at least one neighbour, the others above 0."
+            )
+
+
+@dataclass(frozen=True)
+class ExposureConfig:
+    """Following the global light; not in the paper."""
+
+    enabled: bool = False
+    """Follow it (paper: False); needs ``color_mlp`` in the dynamic set, of which only the output biases then change."""
+    picture_scale: float = 0.25
+    """Scale of width and height, relative to the reference size, of the pictures that are compared."""
+    same_threshold: float = 0.03
+    """Largest mean difference over the channels (full scale 1), beyond the light followed so far, of a pixel that shows
+    the same as in frame 0."""
+    least_share: float = 0.2
+    """Least share of such pixels, weighted by what they tell (black and white ones little), in a view that counts."""
+    least_change: float = 1 / 256
+    """Smallest change of a bias that is followed at first, at most a quarter of an 8-bit level: flicker below it costs
+    no bits."""
+    least_further_change: float = 1 / 1024
+    """Smallest change of a bias that is made once the light differs from that of frame 0."""
+
+
+@dataclass(frozen=True)
+class PatchingConfig:
+    """Spawning and pruning of free Gaussians."""
+
+    spawn: Literal["gradient", "random", "off"] = "gradient"
+    """Choice of parents: ``gradient`` (paper), ``random`` (its ablation: as many, drawn at random), ``off``."""
+    iteration: int = 50
+    """Iteration after which patching is done, once per frame (paper: 50 of 100)."""
+    grad_threshold: float = 1e-3
+    """The paper's tau_grad (0.001), on the mean view-space gradient in NDC (Note [View-space units])."""
+    collect_from: int = 0
+    """Iteration of the frame after which gradients are averaged (paper: not stated)."""
+    covariance_factor: float = 2.0
+    """Factor on the covariance from which a child's mean is drawn, N(mu, factor * Sigma) (paper: 2)."""
+    opacity: float = 0.1
+    """Opacity at birth (paper: 0.1)."""
+    prune_opacity: float | None = 0.005
+    """Free Gaussians of less opacity are removed before spawning (paper: 0.005); None: no pruning, the paper's "w/o
+    quantity control"."""
+    lifetime: Literal["stream", "frame"] = "stream"
+    """``stream``: inherited by the next frame (paper: global patching); ``frame``: dropped at its start (I1 to I3)."""
+    max_free: int = 1_000_000
+    """Largest number of free Gaussians; parents with the largest gradients are taken first (paper: no bound)."""
+
+
+@dataclass(frozen=True)
+class OnlineRates:
+    """Learning rates of online frames (values of the paper, section Implementations), in normalised units."""
+
+    anchor_positions: float = 4e-4
+    offset_scales: float = 5e-3
+    covariance_mlp: float = 4e-3
+    free_means: float = 2e-4
+    free_log_scales: float = 5e-3
+    free_quats: float = 1e-3
+    free_logit_opacities: float = 5e-2
+    free_colors: float = 2.5e-3
+    base_scales: float = 5e-3
+    """This and the following are used only if the field is in the dynamic set (not in the paper)."""
+    anchor_offsets: float = 1e-3
+    anchor_features: float = 2.5e-3
+    appearance: float = 2e-2
+    opacity_mlp: float = 2e-3
+    color_mlp: float = 4e-3
+    final_share: float = 1.0
+    """Learning rates of anchors and MLPs decay log-linearly to this share within a frame (paper: 1, constant)."""
+
+
+@dataclass(frozen=True)
+class OnlineConfig:
+    """Configuration of the frames after the first."""
+
+    iterations: int = 100
+    """Optimisation steps per frame (paper: 100)."""
+    dynamic: frozenset[FieldName] = PAPER_DYNAMIC
+    """Fields of the state table that are trained after frame 0 (paper: x_v, l_v, F_Sigma and free 3DGs)."""
+    appearance_rank: int = 4
+    """Number of principal components along which features change, if ``appearance`` is dynamic (not in the paper)."""
+    losses: LossWeights = field(default_factory=LossWeights)
+    rates: OnlineRates = field(default_factory=OnlineRates)
+    patching: PatchingConfig = field(default_factory=PatchingConfig)
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    start: SceneFlowConfig = field(default_factory=SceneFlowConfig)
+    """Initial displacements of primitives; only with ``motion``."""
+    births: SpawnConfig = field(default_factory=SpawnConfig)
+    """Spawning of free Gaussians from geometry, and pruning of outliers; only with ``motion``."""
+    coherence: SmoothnessConfig = field(default_factory=SmoothnessConfig)
+    """The price of moving unlike the neighbours."""
+    motion_prior: float = 0.0
+    """Moving anchors are initially displaced by this share of their last displacement (paper: 0)."""
+    mean_of_last: float = 0.0
+    """The result is the mean of this share of the iterations, the last ones (paper: 0, the last step)."""
+    light: ExposureConfig = field(default_factory=ExposureConfig)
+    """Following the global light by the output biases of F_c."""
+    rounding: RoundingConfig = field(default_factory=RoundingConfig)
+    sampling_filter: bool = False
+    """Train and compare through the low-pass with which players draw (``scene/sampling.py``, Note [Drawn as it was
+    trained]), also where pictures are reduced (paper: no, 0.3 square pixels of each picture)."""
+
+    def __post_init__(self) -> None:
+        if self.light.enabled and "color_mlp" not in self.dynamic:
+            raise ConfigError("online.light changes F_c, which packets do not carry; add color_mlp to online.dynamic.")
+
+    @property
+    def trained(self) -> frozenset[FieldName]:
+        """The dynamic fields that optimisation changes: F_c, if it follows the light, is not among them."""
+        return self.dynamic.difference(["color_mlp"]) if self.light.enabled else self.dynamic
+
+
+def online_rates(config: OnlineConfig, share: float) -> dict[ParameterName, float]:
+    """Learning rate of every parameter after ``share`` (0 to 1) of a frame's iterations."""
+    falling = config.rates.final_share**share
+    rates: dict[ParameterName, float] = {}
+    for row in STATE_TABLE:
+        for parameter in row.parameters:
+            rate = getattr(config.rates, parameter.online_rate) if parameter.online_rate else 0.0
+            rates[parameter.name] = rate if row.granularity == "free" else rate * falling
+    return rates

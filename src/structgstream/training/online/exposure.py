@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Global light: what all cameras see fade or brighten together, slower than the change gate notices.
+
+Lamps warm up, the sun goes, and every pixel follows by a fraction of a level per frame. No pixel changes, so nothing is
+trained, and what stands still keeps frame 0's colours. Here the change since frame 0 is measured in the training
+pictures, where they show the same as in frame 0, and added to the output biases of F_c: one number per colour channel
+for all anchors.
+
+Note [Light]
+~~~~~~~~~~~~
+F_c's colours are c = sigmoid(x), so a change d of the biases changes a picture by s d to first order, with s = gain c
+(1 - c). In each view d is fitted by least squares to the difference of the two pictures; the median over the views
+leaves out cameras that correct their own exposure. The fit is against the pictures of frame 0, not against renderings
+or the last frame, so errors do not accumulate and renderings' own errors do not enter.
+
+Where the light is steady, the estimate still wavers by up to half of ``least_change``, and what would follow that
+flickers. Where it fades, coarse steps show and lag behind. So the first step takes a large change, and later ones small
+changes.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from structgstream.kernels.anchor_types import HeadWeights
+from structgstream.scene.scene import Scene
+from structgstream.training.online.config import ExposureConfig
+from structgstream.training.parameters import round_straight_through
+from structgstream.training.views import View
+
+LEAST_VIEWS = 3
+"""Fewer views have no median that leaves one out."""
+REACH_PIXELS = 2
+"""Pixels of the reduced pictures around one that shows something else do not count."""
+
+
+@dataclass(frozen=True)
+class ExposureReference:
+    """Frame 0, which the light of later frames is compared with.
+
+    Args:
+        views: reduced, by view index. Cameras that were absent do not count.
+        biases: ``[3 K]`` output biases of the decoded F_c.
+    """
+
+    views: Mapping[int, View]
+    biases: Tensor
+
+
+def exposure_reference(scene: Scene, views: Sequence[View], *, config: ExposureConfig) -> ExposureReference:
+    """The reference of a stream whose decoded frame 0 is ``scene`` and has the pictures ``views``."""
+    small = {view.index: view.evidence(config.picture_scale) for view in views}
+    return ExposureReference(small, scene.mlps.color.b2.detach().clone())
+
+
+def with_exposure_of(
+    scene: Scene, views: Sequence[View], reference: ExposureReference, *, config: ExposureConfig, step: float | None
+) -> Scene:
+    """``scene`` in the light of ``views``.
+
+    Args:
+        scene: of the last frame.
+        views: of this frame.
+        reference: frame 0.
+        config: thresholds.
+        step: quantization step of F_c's weights; None for none.
+    """
+    head = scene.mlps.color
+    so_far = (head.b2 - reference.biases).reshape(-1, 3)[0]
+    found = _light_change(scene, views, reference, so_far, config)
+    least = config.least_further_change if bool(so_far.any()) else config.least_change
+    wanted = torch.where((found - so_far).abs() < least, so_far, found)
+    biases = reference.biases + wanted.repeat(len(head.b2) // 3)
+    if step is not None:
+        biases = round_straight_through(biases, step)
+    if torch.equal(wanted, so_far) or torch.equal(biases, head.b2):
+        return scene
+    return replace(scene, mlps=scene.mlps._replace(color=HeadWeights(head.w1, head.b1, head.w2, biases)))
+
+
+def _light_change(
+    scene: Scene, views: Sequence[View], reference: ExposureReference, so_far: Tensor, config: ExposureConfig
+) -> Tensor:
+    """Change ``[3]`` of the biases since frame 0; ``so_far`` if too few views tell."""
+    found = []
+    with torch.no_grad():
+        for view in views:
+            if view.index in reference.views:
+                gains, biases = scene.camera_color.gains[view.index], scene.camera_color.biases[view.index]
+                now, then = view.evidence(config.picture_scale), reference.views[view.index]
+                change = _view_change(now, then, gains, biases, so_far, config)
+                found += [] if change is None else [change]
+    return torch.stack(found).quantile(0.5, dim=0) if len(found) >= LEAST_VIEWS else so_far
+
+
+def _view_change(
+    now: View, then: View, gains: Tensor, biases: Tensor, so_far: Tensor, config: ExposureConfig
+) -> Tensor | None:
+    """The change that one camera saw (Note [Light]); None if its pictures have too little in common."""
+    colors = ((then.colors - biases) / gains).clamp(0.0, 1.0)
+    sensitivity = gains * colors * (1.0 - colors)
+    difference = now.colors - then.colors
+    other = (difference - sensitivity * so_far).abs().mean(-1) > config.same_threshold
+    for mask in (now.mask, then.mask):
+        other = other if mask is None else other | ~mask
+    width = 2 * REACH_PIXELS + 1
+    same = max_pool2d(other[None].float(), width, stride=1, padding=REACH_PIXELS)[0] < 0.5
+    squares = sensitivity.square()
+    weight = (squares * same[..., None]).sum((0, 1))
+    if not bool((weight > config.least_share * squares.sum((0, 1))).all()):
+        return None
+    return (difference * sensitivity * same[..., None]).sum((0, 1)) / weight

@@ -1,0 +1,338 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is computed from the pictures alone: training views, changed pixels, optical flow.
+
+Nothing here depends on the scene, so it is computed for the next frame while one is fitted (``lookahead``).
+
+Note [Lengths of the flow search]
+~~~~~~~~~~~~~~~~~~~~~~~~~~~~~~~~~
+What moves is as large, and moves as far, as a share of the picture. So margins, cells and the reach of the search for
+large motion are shares of the longer side. The floor of the margin is in pixels because the search compares patches of
+8 pixels.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from math import floor, log2
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from structgstream.cameras import CameraRig
+from structgstream.errors import MissingExtraError
+from structgstream.flow import ABSOLUTE, RELATIVE, block_search, dis_refinement, dis_search
+from structgstream.frames import MultiViewFrame
+from structgstream.kernels.backend import Backend
+from structgstream.training.online.config import USUAL_FLOW, FlowConfig, MotionConfig, SceneFlowConfig
+from structgstream.training.views import View, area_mean, blackened, mean_of_counting, training_views
+
+CONTEXT_SHARE, LEAST_CONTEXT_PIXELS = 1 / 40, 16
+"""Margin around the bounding box of the changed pixels, in which flow is estimated: share of the picture's longer side,
+but at least so many pixels (Note [Lengths of the flow search])."""
+LEAST_SAVING = 0.8
+"""Boxes around parts have to be together smaller than this share of the box around all."""
+CELLS, REACH_CELLS = 80, 12
+"""The search for large motion matches cells, of which so many make the longer side, and finds what has moved by so many
+of them: 15 per cent of it."""
+CONSISTENT_SHARE = 0.6
+"""Large motion is searched for where less than this share of the changed pixels has consistent flow. What has left its
+own outline leaves at most half of them."""
+CHANGED_CELLS = 1.0
+"""But at least so many cells have to have changed: less is noise, or too small to be matched."""
+REPEATED_LEVELS = 0.2
+"""Mean absolute difference, in levels of 255, below which a picture without a changed pixel is the last one once more.
+
+A frozen picture that is encoded again differs by up to 0.16 (H.264, rate factors 6 and 23, from the second repetition
+on); the noise of a camera alone by more: at least 1.2 in every camera of basketball, 2.5 in counter."""
+
+
+@dataclass(frozen=True)
+class PictureChange:
+    """Change of a training picture since the previous one.
+
+    Args:
+        changed: ``[H, W]`` bool, dilated mask of the changed pixels.
+        repeated: whether it is the previous picture once more, equal or encoded again: a frozen camera's.
+        flow: ``[h, w, 6]`` the maps of ``flow_maps.flow_map`` from the previous picture to this one, and the previous
+            picture in 0 ... 1; None if flow was not estimated.
+        far_boxes: number of boxes in which large motion was searched for (``flow_maps.FlowMaps``).
+    """
+
+    changed: Tensor
+    repeated: bool
+    flow: Tensor | None = None
+    far_boxes: int = 0
+
+
+@dataclass(frozen=True)
+class FramePictures:
+    """The training views of a frame.
+
+    Args:
+        views: in rig order, without absent cameras.
+        changes: of each of them since the previous frame, None for a camera that was absent from that; None without
+            motion selection.
+    """
+
+    views: list[View]
+    changes: list[PictureChange | None] | None
+
+
+def preprocess(
+    frame: MultiViewFrame,
+    rig: CameraRig,
+    *,
+    before: MultiViewFrame | None,
+    motion: MotionConfig,
+    start: SceneFlowConfig,
+    backend: Backend,
+) -> FramePictures:
+    """The pictures of ``frame``, and their changes since the frame ``before`` (None: without motion selection).
+
+    With fewer cameras in both frames than a primitive needs votes there is no motion selection: everything is trained.
+
+    Raises:
+        MissingExtraError: flow is needed and OpenCV is not installed.
+    """
+    views = training_views(frame, rig, backend.device)
+    if before is None or not motion.enabled:
+        return FramePictures(views, None)
+    earlier = training_views(before, rig, backend.device)
+    known = {view.index for view in earlier}
+    compared = [view for view in views if view.index in known]
+    if len(compared) < min(motion.least_views, len(rig.training)):
+        return FramePictures(views, None)
+    flow_from = flow_views(compared, frame.index, start)
+    changes = detect_changes(views, earlier, config=motion, backend=backend, flow_from=flow_from, flow=start.flow)
+    return FramePictures(views, changes)
+
+
+def flow_views(views: Sequence[View], frame_index: int, config: SceneFlowConfig) -> frozenset[int]:
+    """Indices of the views in which flow is estimated in a frame; none if the motion start is disabled."""
+    if not config.enabled:
+        return frozenset()
+    stride = -(-len(views) // max(config.views, 2))
+    return frozenset(view.index for n, view in enumerate(views) if n % stride == frame_index % stride)
+
+
+def detect_changes(
+    views: Sequence[View],
+    before: Sequence[View],
+    *,
+    config: MotionConfig,
+    backend: Backend,
+    flow_from: Collection[int] = (),
+    flow: FlowConfig = USUAL_FLOW,
+) -> list[PictureChange | None]:
+    """Change of each of ``views`` since the picture of the same camera in ``before``; None if that has none.
+
+    A camera that was absent is not compared with an older picture: what changed since then is in the scene already.
+    Pixels that either picture leaves out have not changed, and their flow has no confidence.
+
+    Args:
+        views: of a frame.
+        before: of the previous frame.
+        config: threshold of change, dilation, and size of the maps of flow (``View.evidence``).
+        backend: the compute back-end.
+        flow_from: indices of the views in which flow is estimated.
+        flow: how it is searched.
+    """
+    changes: list[PictureChange | None] = []
+    earlier = {last.index: last for last in before}
+    with torch.no_grad():
+        for view in views:
+            last = earlier.get(view.index)
+            if last is None:
+                changes.append(None)
+                continue
+            both = _both(view.mask, last.mask)
+            then, now = blackened(last.image, both), blackened(view.image, both)
+            reach = round(config.reach_pixels * view.enlargement)
+            changed = backend.changed_pixels(then, now, threshold=config.change_threshold, reach_pixels=reach)
+            changed = changed if both is None else changed & both
+            small, found, far_boxes = view.evidence(config.picture_scale).camera, None, 0
+            if view.index in flow_from:
+                size = (small.height, small.width)
+                estimated = flow_map(then, now, changed, size, mask=both, config=flow, backend=backend)
+                found, far_boxes = (
+                    torch.cat([estimated.maps, last.evidence(config.picture_scale).colors], dim=-1),
+                    estimated.far_boxes,
+                )
+            changes.append(PictureChange(changed, _is_repeated(then, now, changed, both), found, far_boxes))
+    return changes
+
+
+def _is_repeated(then: Tensor, now: Tensor, changed: Tensor, mask: Tensor | None) -> bool:
+    """Whether ``now`` is ``then`` once more; ``changed`` as in :class:`PictureChange`, ``mask`` the pixels of both."""
+    if changed.any():
+        return False
+    levels = (now.int() - then.int()).abs().float().mean(-1)
+    return float(mean_of_counting(levels, mask)) < REPEATED_LEVELS
+
+
+def _both(mask: Tensor | None, other: Tensor | None) -> Tensor | None:
+    """Pixels of both masks; None for all."""
+    if mask is None or other is None:
+        return other if mask is None else mask
+    return mask & other
+
+
+@dataclass(frozen=True)
+class FlowMaps:
+    """Flow between two pictures of one camera with confidence c, the share of consistent pixels.
+
+    Args:
+        maps: ``[h, w, 3]``: c, c flow_x and c flow_y (``kernels.operations.ConfidentFlow``).
+        far_boxes: number of boxes in which large motion was searched for.
+    """
+
+    maps: Tensor
+    far_boxes: int = 0
+
+
+def flow_map(
+    first: Tensor,
+    second: Tensor,
+    changed: Tensor,
+    size: tuple[int, int],
+    *,
+    mask: Tensor | None = None,
+    config: FlowConfig,
+    backend: Backend,
+) -> FlowMaps:
+    """Flow between two pictures of one camera.
+
+    The confidence is zero outside a box around ``changed``, or with ``config.apart`` outside boxes around its parts,
+    where these are small.
+
+    Args:
+        first: ``[H, W, 3]`` uint8.
+        second: ``[H, W, 3]`` uint8.
+        changed: ``[H, W]`` bool, where the two differ.
+        size: h and w of the maps; flow is in pixels of the pictures.
+        mask: ``[H, W]`` bool, pixels that may have confidence; None for all.
+        config: of the search.
+        backend: the compute back-end.
+
+    Raises:
+        MissingExtraError: OpenCV is not installed.
+    """
+    maps = torch.zeros(3, *changed.shape)
+    where = changed.numpy(force=True)
+    longer, level = max(where.shape), config.level_of(where.shape[1])
+    context = max(LEAST_CONTEXT_PIXELS, round(CONTEXT_SHARE * longer))
+    search = dis_search("capture", refined=False, finest_level=level)
+
+    def consistent(box: Box, flow: NDArray[np.float32], back: NDArray[np.float32]) -> Tensor:
+        counts = None if mask is None else mask[box].cpu()
+        forward, backward = torch.from_numpy(flow), torch.from_numpy(back)
+        return backend.confident_flow(forward, backward, counts, relative=RELATIVE, absolute=ABSOLUTE)
+
+    missed: list[Box] = []
+    cell = max(1, round(longer / CELLS))
+    for box in _boxes(where, context) if config.apart else _box(where, context):
+        earlier, later = _cut(first, box), _cut(second, box)
+        maps[:, *box] = found = consistent(box, search(earlier, later), search(later, earlier))
+        at = where[box]
+        if config.far and at.sum() >= CHANGED_CELLS * cell**2 and found[0].numpy()[at].mean() < CONSISTENT_SHARE:
+            missed.append(box)
+    far = _grown(missed, REACH_CELLS * cell, where.shape)
+    for box in far:
+        earlier, later = _cut(first, box), _cut(second, box)
+        flows = block_search(earlier, later, cell_pixels=cell, reach_cells=REACH_CELLS)
+        refine = dis_refinement(finest_level=level, coarsest_level=max(level, floor(log2(cell)) - 1))
+        found = consistent(box, refine(earlier, later, flows[0]), refine(later, earlier, flows[1]))
+        missing = torch.from_numpy(where[box]) & (maps[0][box] == 0.0)
+        maps[:, *box] = torch.where(missing, found, maps[:, *box])
+    return FlowMaps(area_mean(maps[None], size)[0].permute(1, 2, 0).to(first.device), len(far))
+
+
+Box = tuple[slice, slice]
+Mask = NDArray[np.bool_]
+Edges = tuple[int, int, int, int]
+"""First and end row, first and end column of a box."""
+
+
+def _cut(picture: Tensor, box: Box) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(picture[box].numpy(force=True))
+
+
+def _box(mask: Mask, context: int) -> list[Box]:
+    """Bounding box of the mask ``[H, W]`` with a margin of ``context`` pixels; none if it is empty or too small for the
+    flow search."""
+    if not mask.any():
+        return []
+    spans = []
+    for axis in (1, 0):
+        hit = np.flatnonzero(mask.any(axis))
+        low, high = int(hit[0]) - context, int(hit[-1]) + 1 + context
+        spans.append(slice(max(0, low), min(mask.shape[1 - axis], high)))
+    if min(span.stop - span.start for span in spans) < 2 * context:
+        return []
+    return [(spans[0], spans[1])]
+
+
+def _boxes(mask: Mask, context: int) -> list[Box]:
+    """Disjoint boxes with margin around the parts of the mask ``[H, W]``; one around all if that is hardly larger."""
+    one = _box(mask, context)
+    rows, columns = (-(-length // context) for length in mask.shape)
+    padded = np.zeros((rows * context, columns * context), bool)
+    padded[: mask.shape[0], : mask.shape[1]] = mask
+    # First down the columns, whose steps are long: NumPy takes ten times as long for both at once.
+    high = padded.reshape(rows, context, -1).any(1)
+    cells = np.logical_or.reduce(high.reshape(rows, columns, context), axis=2)
+    found = [_within((context * a, context * b, context * c, context * d), mask.shape) for a, b, c, d in _parts(cells)]
+    if not one or sum(map(_area, found)) > LEAST_SAVING * _area(one[0]):
+        return one
+    return [box for box in found if min(span.stop - span.start for span in box) >= 2 * context]
+
+
+def _grown(boxes: Sequence[Box], by: int, shape: tuple[int, ...]) -> list[Box]:
+    """Disjoint boxes around ``boxes`` and ``by`` pixels more on every side, within ``shape``."""
+    edges = [(rows.start - by, rows.stop + by, columns.start - by, columns.stop + by) for rows, columns in boxes]
+    return [_within(box, shape) for box in _disjoint(edges)]
+
+
+def _parts(cells: Mask) -> list[Edges]:
+    """Disjoint boxes (first and end row, first and end column) around the connected parts of ``cells`` and the eight
+    cells around each."""
+    try:
+        import cv2
+    except ImportError:
+        raise MissingExtraError("cv2", "capture") from None
+    grown = cv2.dilate(cells.astype(np.uint8), np.ones((3, 3), np.uint8))
+    _, _, stats, _ = cv2.connectedComponentsWithStats(grown, connectivity=8)
+    boxes = np.asarray(stats)[1:, :4].tolist()  # The first is what is no part.
+    return _disjoint([(top, top + height, first, first + width) for first, top, width, height in boxes])
+
+
+def _disjoint(boxes: Sequence[Edges]) -> list[Edges]:
+    """``boxes``, those that overlap replaced by one around both until none do."""
+    left, done = list(boxes), list[Edges]()
+    while left:
+        box = left.pop()
+        hit = [other for other in done if _overlap(box, other)]
+        if not hit:
+            done.append(box)
+            continue
+        done = [other for other in done if other not in hit]
+        together = np.array([box, *hit])
+        low, high = together.min(0), together.max(0)
+        left.append((int(low[0]), int(high[1]), int(low[2]), int(high[3])))
+    return sorted(done)
+
+
+def _overlap(one: Edges, other: Edges) -> bool:
+    return one[0] < other[1] and other[0] < one[1] and one[2] < other[3] and other[2] < one[3]
+
+
+def _within(edges: Edges, shape: tuple[int, ...]) -> Box:
+    """The part of a box that lies in a picture of this shape."""
+    top, bottom, left, right = edges
+    return slice(max(top, 0), min(bottom, shape[0])), slice(max(left, 0), min(right, shape[1]))
+
+
+def _area(box: Box) -> int:
+    rows, columns = box
+    return (rows.stop - rows.start) * (columns.stop - columns.start)

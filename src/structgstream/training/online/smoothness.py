@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Coherent motion: a penalty on anchors that move unlike their neighbours.
+
+Pictures do not tell every anchor's motion: along an edge, on a plain surface, or behind another anchor, what is left is
+noise, which costs bits, and which shows in views that were not trained on. Neighbours on one body move alike. So
+differences of displacement between neighbours have a price, by their length and not its square, as two bodies
+that pass each other differ much at few places.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from structgstream.cameras import Camera
+from structgstream.kernels.backend import Backend
+from structgstream.scene.scene import Scene
+from structgstream.training.neighbours import nearest_others
+from structgstream.training.online.config import SmoothnessConfig
+from structgstream.training.parameters import pixel_size
+
+
+@dataclass(frozen=True)
+class MotionSmoothness:
+    """The price of incoherent motion of ``M`` anchors.
+
+    Args:
+        weight: weight in the loss.
+        start: ``[M, 3]`` positions from which displacements are counted, scene units.
+        neighbours: ``[M, N]`` int64, rows of the anchors that each is compared with.
+        shares: ``[M, N]`` their weights, summing to one for each anchor.
+        pixel: size of a pixel, scene units.
+        slack_pixels: see :class:`SmoothnessConfig`.
+    """
+
+    weight: float
+    start: Tensor
+    neighbours: Tensor
+    shares: Tensor
+    pixel: float
+    slack_pixels: float
+
+    @classmethod
+    def of(cls, scene: Scene, cameras: Sequence[Camera], *, config: SmoothnessConfig) -> "MotionSmoothness | None":
+        """The price of displacing the anchors of ``scene``; None for none, or if no two are seen.
+
+        Args:
+            scene: at the start, usually the moving part.
+            cameras: of the training views, in scene units.
+            config: of the price.
+
+        Raises:
+            MissingExtraError: SciPy is not installed.
+        """
+        positions = scene.anchors.positions
+        if config.weight == 0.0 or len(positions) < 2:
+            return None
+        pixel = pixel_size(positions, cameras)
+        if pixel is None:
+            return None
+        rows, distances = nearest_others(positions, config.neighbours)
+        spread = config.bandwidth * distances[:, -1:].clamp(min=1e-9)
+        affinities = torch.exp(-0.5 * (distances / spread).square())
+        if config.feature_bandwidth > 0.0:
+            features = scene.features.detach()
+            features = features / features.std(0).clamp(min=1e-6)
+            apart = (features[rows] - features[:, None]).square().mean(-1)
+            affinities = affinities * torch.exp(-0.5 * apart / config.feature_bandwidth**2)
+        shares = affinities / affinities.sum(1, keepdim=True).clamp(min=1e-6)
+        return cls(config.weight, positions.detach(), rows, shares, pixel, config.slack_pixels)
+
+    def difference(self, positions: Tensor, backend: Backend) -> Tensor:
+        """Mean difference ``[]`` of the displacements at ``positions`` ``[M, 3]`` from the neighbours', pixels."""
+        displacements = (positions - self.start) / self.pixel
+        total = backend.neighbour_difference(displacements, self.neighbours, self.shares, slack=self.slack_pixels)
+        return total / len(positions)

@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What happens around each iteration of a later frame."""
+
+from dataclasses import fields, is_dataclass, replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import torch
+
+from rigs import random_scene
+from structgstream.kernels.backend import reference_backend
+from structgstream.kernels.raster_types import TileSelection, tile_grid
+from structgstream.scene.active_tiles import ActiveTiles
+from structgstream.scene.scene import Scene
+from structgstream.training.losses import GradientStatistics, LossWeights, SceneLoss
+from structgstream.training.online.config import PatchingConfig
+from structgstream.training.online.optimize import OnlineHooks, StartingPoint
+from structgstream.training.online.patching import FreeSet
+from structgstream.training.online.split import DynamicSplit
+from structgstream.training.optim import Adam, LastPass
+from structgstream.training.parameters import Parameters, parameters_of_fields
+from structgstream.training.result import Stopwatch
+from structgstream.training.views import training_views
+from worlds import moving_world
+
+CPU = torch.device("cpu")
+BACKEND = reference_backend()
+WORLD = moving_world(1)
+VIEWS = training_views(WORLD.frames[0], WORLD.rig, CPU)
+CAMERA = VIEWS[0].camera
+
+
+def hooks_of(start: StartingPoint, *, patch_at: int = 4, patches: bool = True, rest_every: int = 1) -> OnlineHooks:
+    scene = start.scene
+    parameters = Parameters.of(scene, trained=parameters_of_fields({"anchor_positions", "free"}))
+    gaussians = len(scene.anchors) * scene.anchors.offsets_per_anchor + len(scene.free)
+    population = FreeSet(
+        config=PatchingConfig(),
+        template=scene,
+        parameters=parameters,
+        adam=Adam(BACKEND, parameters.values),
+        statistics=GradientStatistics(gaussians, CPU),
+        views=start.views,
+        frame_index=1,
+        room=100,
+        backend=BACKEND,
+        generator=torch.Generator().manual_seed(0),
+    )
+    return OnlineHooks(
+        start=start,
+        parameters=parameters,
+        losses=LossWeights(),
+        rate_term=None,
+        coherence=None,
+        population=population,
+        patch_at=patch_at,
+        patches=patches,
+        last_pass=LastPass(),
+        backend=BACKEND,
+        watch=Stopwatch(),
+        rest_every=rest_every,
+    )
+
+
+def started(scene: Scene = WORLD.scene, **options: Any) -> StartingPoint:
+    return StartingPoint(scene, VIEWS, torch.zeros(len(scene.anchors) + len(scene.free), 3), **options)
+
+
+def selection(tiles: int) -> TileSelection:
+    """The first ``tiles`` tiles of a picture."""
+    mask = torch.zeros(tile_grid(CAMERA.width, CAMERA.height), dtype=torch.bool)
+    mask.view(-1)[:tiles] = True
+    return TileSelection(mask, CAMERA.width, CAMERA.height)
+
+
+def focused(changed: TileSelection | None) -> StartingPoint:
+    """A start of which the first two views show what moves, in three tiles."""
+    still = WORLD.scene.gaussians(CAMERA, BACKEND).select(torch.zeros(0, dtype=torch.int64))
+    active_tiles = {
+        view.index: ActiveTiles(selection(3), torch.zeros(CAMERA.height, CAMERA.width, 3), still, changed)
+        for view in VIEWS[:2]
+    }
+    return started(active_tiles=active_tiles)
+
+
+def iterate(hooks: OnlineHooks, iteration: int, view: int = 0) -> SceneLoss:
+    """The loss of an iteration that moves nothing, and what follows it."""
+    loss = hooks.loss(iteration, VIEWS[view])
+    hooks.after_step(iteration, VIEWS[view], loss.detached(), None)
+    return loss
+
+
+def pixels_drawn(hooks: OnlineHooks, *, view: int, visits: int) -> list[int]:
+    """The number of pixels that each visit of a view in the active draws."""
+    assert hooks.start.active_tiles is not None
+    active, found = hooks.start.active_tiles[VIEWS[view].index], []
+    for iteration in range(1, visits + 1):
+        loss = iterate(hooks, iteration, view)
+        assert loss.active is active  # Tiles that are not drawn hold their last drawing.
+        found.append(int((active.picture.sum(2) > 0).sum()))
+        active.picture.zero_()
+    return found
+
+
+def tensors(value: Any) -> list[torch.Tensor]:
+    """All tensors in a loss."""
+    if isinstance(value, torch.Tensor):
+        return [value]
+    if isinstance(value, dict):
+        return [tensor for part in value.values() for tensor in tensors(part)]
+    return [tensor for f in fields(value) for tensor in tensors(getattr(value, f.name))] if is_dataclass(value) else []
+
+
+def test_nothing_of_a_loss_keeps_its_graph_once_the_step_is_taken() -> None:
+    """What would be kept alive binds the next recording to another stream of the GPU."""
+    loss = hooks_of(started(random_scene(60, free=5, cameras=4, seed=4))).loss(1, VIEWS[0])
+    assert sum(tensor.requires_grad for tensor in tensors(loss)) > 9
+    assert not any(tensor.requires_grad for tensor in tensors(loss.detached()))
+    assert len(tensors(loss.detached())) > 15
+
+
+def test_views_that_do_not_show_what_moves_are_not_seen() -> None:
+    assert started().seen == VIEWS
+    assert focused(None).seen == VIEWS[:2]
+
+
+def test_changes_are_counted_from_the_scene_unless_another_is_given() -> None:
+    reference = random_scene(60, cameras=4, seed=5)
+    assert started().known is WORLD.scene
+    assert started(reference=reference).known is reference
+
+
+def test_tiles_without_change_are_drawn_in_one_visit_of_three() -> None:
+    hooks = hooks_of(focused(selection(1)), rest_every=3)
+    drawn = pixels_drawn(hooks, view=0, visits=6)
+    assert drawn[0] == drawn[1] == drawn[3] == drawn[4] > 0
+    assert drawn[2] == drawn[5] > drawn[0]
+    pixels_drawn(hooks, view=1, visits=1)  # Visits are counted by view.
+    assert hooks.visits == {VIEWS[0].index: 6, VIEWS[1].index: 1}
+
+
+def test_all_tiles_are_drawn_where_changes_are_not_known_or_every_visit_rests() -> None:
+    whole = pixels_drawn(hooks_of(focused(None), rest_every=3), view=0, visits=4)
+    assert len(set(whole)) == 1
+    assert pixels_drawn(hooks_of(focused(selection(1)), rest_every=1), view=0, visits=4) == whole
+
+
+def test_a_frame_is_patched_once_at_its_iteration() -> None:
+    hooks = hooks_of(started(random_scene(60, free=5, cameras=4, seed=4)), patch_at=3)
+    faint = hooks.parameters.values["free_logit_opacities"]
+    faint.data[2] = -9.0
+    for iteration in (1, 2, 3, 4):
+        iterate(hooks, iteration)
+        assert hooks.population.pruned == (iteration >= 3)
+
+
+def test_a_frame_whose_free_gaussians_stay_is_not_patched() -> None:
+    hooks = hooks_of(started(random_scene(60, free=5, cameras=4, seed=4)), patch_at=1, patches=False)
+    hooks.parameters.values["free_logit_opacities"].data[2] = -9.0
+    iterate(hooks, 1)
+    assert hooks.population.pruned == 0
+    assert len(hooks.population) == 5
+
+
+def test_counts_are_those_of_the_moving_anchors_and_of_all_free_gaussians() -> None:
+    scene = random_scene(60, free=5, cameras=4, seed=4)
+    assert hooks_of(started(scene)).counts() == (60, 5)
+    anchors = torch.arange(60) < 20
+    parted = SimpleNamespace(anchors=anchors, free=torch.arange(5) < 2)
+    split = DynamicSplit.of(scene, cast(Any, parted))
+    start = StartingPoint(split.dynamic, VIEWS, torch.zeros(22, 3), split)
+    assert hooks_of(start).counts() == (20, 5)
+
+
+def test_each_frame_ends_with_the_psnr_of_its_last_pictures() -> None:
+    hooks = hooks_of(started())
+    loss = iterate(hooks, 1)
+    assert hooks.last_pass.psnr > 30.0  # The pictures are the scene's own.
+    with torch.no_grad():
+        hooks.parameters.values["anchor_positions"] += 0.1
+    worse = iterate(hooks, 2)
+    assert worse.total > loss.total
+    assert hooks.last_pass.psnr < 30.0
+
+
+def test_prices_are_added_to_the_loss() -> None:
+    plain = hooks_of(started())
+    priced = replace(plain, rate_term=cast(Any, SimpleNamespace(price=lambda values, backend: torch.tensor(0.5))))
+    loss, unpriced = priced.loss(1, VIEWS[0]), plain.loss(1, VIEWS[0]).total
+    torch.testing.assert_close(loss.total, unpriced + 0.5)
+
+
+def test_visits_of_the_same_tiles_repeat_and_the_last_ones_are_not_worth_a_recording() -> None:
+    hooks = replace(hooks_of(focused(selection(1)), rest_every=3), iterations=14)
+    hooks.population.config = replace(hooks.population.config, spawn="off")
+    keys = []
+    for iteration in range(1, 15):  # Seven visits of each of two views.
+        keys.append(hooks.repeats(iteration, VIEWS[(iteration + 1) % 2]))
+        iterate(hooks, iteration, (iteration + 1) % 2)
+    changed, whole = (VIEWS[0].index, True, 0), (VIEWS[0].index, False, 0)
+    assert keys[::2] == [changed, changed, whole, changed, changed, whole, changed]
+    assert replace(hooks, recorded=set()).repeats(14, VIEWS[0]) is None
+    hooks.visits[VIEWS[0].index] = 2  # The next visit is of all tiles, and the one after it three visits later.
+    assert replace(hooks, recorded=set()).repeats(10, VIEWS[0]) is None
+    assert replace(hooks, recorded=set()).repeats(8, VIEWS[0]) == whole
+
+
+def test_nothing_repeats_while_gradients_are_collected_nor_across_rows_that_come_or_go() -> None:
+    hooks = replace(hooks_of(started(random_scene(60, free=5, cameras=4, seed=4)), patch_at=3), iterations=99)
+    assert [hooks.repeats(iteration, VIEWS[0]) is None for iteration in (1, 3, 4)] == [True, True, False]
+    hooks.population.config = replace(hooks.population.config, spawn="off")
+    before = hooks.repeats(3, VIEWS[0])
+    assert before is not None
+    iterate(hooks, 3)  # Nothing is faint enough to die.
+    assert hooks.repeats(4, VIEWS[0]) == before
+    hooks.patch_at = 5
+    hooks.parameters.values["free_logit_opacities"].data[2] = -9.0
+    iterate(hooks, 5)
+    assert hooks.repeats(6, VIEWS[0]) not in (None, before)

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What moves begins a frame where the pictures show it."""
+
+import torch
+
+from structgstream.kernels.backend import reference_backend
+from structgstream.training.online.config import MotionConfig, SceneFlowConfig
+from structgstream.training.online.preprocess import flow_views
+from structgstream.training.online.scene_flow import apply_scene_flow
+from structgstream.training.online.split import DynamicSplit, with_displacements
+from structgstream.training.views import training_views
+from worlds import World, moved_since, moving_world
+
+CPU = torch.device("cpu")
+BACKEND = reference_backend()
+MOTION = MotionConfig(enabled=True, picture_scale=0.5)
+SPEED = 0.08  # 2.1 pixels of the pictures below
+
+
+def world() -> World:
+    return moving_world(2, cameras=6, movers=60, speed=SPEED, width=128, height=96)
+
+
+def begun(scenery: World, *, rounds: int = 2, enabled: bool = True):
+    config = SceneFlowConfig(enabled=enabled, rounds=rounds)
+    views, before = (training_views(scenery.frames[t], scenery.rig, CPU) for t in (1, 0))
+    selection = moved_since(
+        scenery.scene, views, before, config=MOTION, backend=BACKEND, flow_from=flow_views(views, 1, config)
+    )
+    split = DynamicSplit.of(scenery.scene, selection)
+    priors = torch.zeros(len(selection.primitives), 3)
+    return split, apply_scene_flow(split, views, priors, config=config, motion=MOTION, backend=BACKEND)
+
+
+def test_anchors_begin_near_where_they_have_gone() -> None:
+    split, start = begun(world())
+    assert start.lifted > 0.5 * len(start.displacements)
+    moved = start.displacements.median(0).values
+    assert abs(float(moved[0]) - SPEED) < 0.35 * SPEED
+    assert moved[1:].abs().max() < 0.35 * SPEED
+    assert start.active_tiles, "it shows somewhere"
+    assert len(start.displacements) == len(split.dynamic.anchors)
+
+
+def test_fast_movers_are_counted_and_how_many_of_them_flow_displaces() -> None:
+    """Fast is more than an eightieth of the width: here 1.6 pixels."""
+    _, fast = begun(moving_world(2, cameras=6, movers=60, speed=2 * SPEED, width=128, height=96))
+    assert 0.5 * len(fast.displacements) < fast.fast <= len(fast.displacements)
+    assert 0.8 * fast.fast < fast.fast_lifted <= min(fast.fast, fast.lifted)
+    _, slow = begun(moving_world(2, cameras=6, movers=60, speed=0.5 * SPEED, width=128, height=96))
+    assert slow.fast == slow.fast_lifted == 0
+
+
+def test_the_second_round_acts() -> None:
+    once, twice = (begun(world(), rounds=rounds)[1] for rounds in (1, 2))
+    assert once.corrected == 0
+    assert twice.corrected > 0
+    assert not torch.equal(once.displacements, twice.displacements)
+
+
+def test_off_everything_begins_where_its_prior_says() -> None:
+    _, start = begun(world(), enabled=False)
+    assert not start.displacements.any()
+    assert start.lifted == start.corrected == 0
+    assert start.active_tiles
+
+
+def test_the_start_is_repeated_bit_for_bit() -> None:
+    assert torch.equal(begun(world())[1].displacements, begun(world())[1].displacements)
+
+
+def test_displaced_moves_anchors_and_free_gaussians() -> None:
+    scene = world().scene
+    by = torch.arange(3.0 * len(scene.anchors)).reshape(-1, 3)
+    assert torch.equal(with_displacements(scene, by).anchors.positions, scene.anchors.positions + by)
+
+
+def test_flow_is_looked_for_in_turns_where_there_are_many_views() -> None:
+    views = training_views(world().frames[0], world().rig, CPU)  # five
+    config = SceneFlowConfig(enabled=True, views=3)
+    turns = [flow_views(views, frame, config) for frame in (1, 2)]
+    assert [len(turn) for turn in turns] == [2, 3]
+    assert turns[0] | turns[1] == {view.index for view in views}
+    assert flow_views(views, 3, config) == turns[0]
+    assert len(flow_views(views, 1, SceneFlowConfig(enabled=True))) == 5
+    assert not flow_views(views, 1, SceneFlowConfig())
