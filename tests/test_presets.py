@@ -13,6 +13,7 @@ from structgstream.presets import (
     DEMO_PRESET,
     PAPER_METHOD_PRESET,
     PRESETS,
+    WITHDRAWN,
     StreamConfig,
     completed,
     from_json,
@@ -75,6 +76,17 @@ def test_a_configuration_of_an_older_version_has_the_defaults_of_what_it_lacks()
     assert completed(values) == to_json(found)
     other = {"method": "another", "seed": 1}
     assert completed(other) == other
+
+
+def test_fields_of_mechanisms_that_are_gone_are_ignored() -> None:
+    values = json.loads(json.dumps(to_json(PRESETS["compact"])))
+    for path in WITHDRAWN:
+        *parts, name = path.split(".")
+        inner = values
+        for part in parts:
+            inner = inner[part]
+        inner[name] = 0.5
+    assert from_json(values) == PRESETS["compact"]
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 """Fields of configurations, which are dataclasses of dataclasses: read from plain JSON, and checked."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -37,6 +37,15 @@ def unknown_fields(kind: Any, values: Any, path: str = "") -> Iterator[str]:
             yield f"{path}{name}"
         else:
             yield from unknown_fields(hints[name], item, f"{path}{name}.")
+
+
+def without_fields(values: Mapping[str, Any], paths: Collection[str], path: str = "") -> dict[str, Any]:
+    """``values`` without the fields at ``paths``, such as ``online.motion.tiles``."""
+    left = {name: item for name, item in values.items() if f"{path}{name}" not in paths}
+    return {
+        name: without_fields(item, paths, f"{path}{name}.") if isinstance(item, Mapping) else item
+        for name, item in left.items()
+    }
 
 
 def check_numbers(config: Any, path: str = "") -> None:

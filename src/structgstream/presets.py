@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from structgstream.cameras import CameraRig
-from structgstream.config_fields import check_numbers, holds, read_value, unknown_fields
+from structgstream.config_fields import check_numbers, holds, read_value, unknown_fields, without_fields
 from structgstream.data.denoising import DenoisingConfig
 from structgstream.data.points import PointsConfig
 from structgstream.errors import ConfigError
@@ -83,14 +83,34 @@ def to_json(config: StreamConfig) -> dict[str, Any]:
     return found
 
 
+WITHDRAWN = frozenset(
+    {
+        "initial.disturbance.view_noise",
+        "initial.disturbance.view_noise_left",
+        "initial.growth.contribution_at",
+        "initial.growth.least_contribution",
+        "online.least_gain",
+        "online.motion.full_every_frames",
+        "online.motion.least_views_share",
+        "online.motion.moved_ease",
+        "online.motion.tiles",
+        "online.motion.unseen_pixels",
+        "online.start.lift.color_bandwidth",
+    }
+)
+"""Fields of earlier versions whose mechanisms are gone. A stream that has them goes on by this version's method."""
+
+
 def from_json(values: Mapping[str, Any]) -> StreamConfig:
     """The configuration that :func:`to_json` turned into ``values``, such as a stream's header has.
 
-    Fields that ``values`` lacks, as those of an older version do, have their defaults.
+    Fields that ``values`` lacks, as those of an older version do, have their defaults; :data:`WITHDRAWN` ones are
+    ignored.
 
     Raises:
         ConfigError: there is a field that this version does not have, or a value that no field can have.
     """
+    values = without_fields(values, WITHDRAWN)
     if unknown := [*unknown_fields(StreamConfig, values)]:
         raise ConfigError(
             f"The header's configuration has the field {unknown[0]}, which this version of structgstream does not "
@@ -301,7 +321,6 @@ COMPACT = replace(
         light=ExposureConfig(enabled=True),
         motion=replace(
             MOTION.online.motion,
-            moved_ease=0.5,
             carried_share=0.4,
             residual_threshold=0.05,
             picture_scale=0.5,
