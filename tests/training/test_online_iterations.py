@@ -34,7 +34,7 @@ def hooks_of(start: StartingPoint, *, patch_at: int = 4, patches: bool = True, r
     scene = start.scene
     parameters = Parameters.of(scene, trained=parameters_of_fields({"anchor_positions", "free"}))
     gaussians = len(scene.anchors) * scene.anchors.offsets_per_anchor + len(scene.free)
-    population = FreeSet(
+    free_set = FreeSet(
         config=PatchingConfig(),
         template=scene,
         parameters=parameters,
@@ -52,7 +52,7 @@ def hooks_of(start: StartingPoint, *, patch_at: int = 4, patches: bool = True, r
         losses=LossWeights(),
         rate_term=None,
         coherence=None,
-        population=population,
+        free_set=free_set,
         patch_at=patch_at,
         patches=patches,
         last_pass=LastPass(),
@@ -151,15 +151,15 @@ def test_a_frame_is_patched_once_at_its_iteration() -> None:
     faint.data[2] = -9.0
     for iteration in (1, 2, 3, 4):
         iterate(hooks, iteration)
-        assert hooks.population.pruned == (iteration >= 3)
+        assert hooks.free_set.pruned == (iteration >= 3)
 
 
 def test_a_frame_whose_free_gaussians_stay_is_not_patched() -> None:
     hooks = hooks_of(started(random_scene(60, free=5, cameras=4, seed=4)), patch_at=1, patches=False)
     hooks.parameters.values["free_logit_opacities"].data[2] = -9.0
     iterate(hooks, 1)
-    assert hooks.population.pruned == 0
-    assert len(hooks.population) == 5
+    assert hooks.free_set.pruned == 0
+    assert len(hooks.free_set) == 5
 
 
 def test_counts_are_those_of_the_moving_anchors_and_of_all_free_gaussians() -> None:
@@ -185,14 +185,14 @@ def test_each_frame_ends_with_the_psnr_of_its_last_pictures() -> None:
 
 def test_prices_are_added_to_the_loss() -> None:
     plain = hooks_of(started())
-    priced = replace(plain, rate_term=cast(Any, SimpleNamespace(price=lambda values, backend: torch.tensor(0.5))))
+    priced = replace(plain, rate_term=cast(Any, SimpleNamespace(value=lambda values, backend: torch.tensor(0.5))))
     loss, unpriced = priced.loss(1, VIEWS[0]), plain.loss(1, VIEWS[0]).total
     torch.testing.assert_close(loss.total, unpriced + 0.5)
 
 
 def test_visits_of_the_same_tiles_repeat_and_the_last_ones_are_not_worth_a_recording() -> None:
     hooks = replace(hooks_of(focused(selection(1)), rest_every=3), iterations=14)
-    hooks.population.config = replace(hooks.population.config, spawn="off")
+    hooks.free_set.config = replace(hooks.free_set.config, spawn="off")
     keys = []
     for iteration in range(1, 15):  # Seven visits of each of two views.
         keys.append(hooks.repeats(iteration, VIEWS[(iteration + 1) % 2]))
@@ -208,7 +208,7 @@ def test_visits_of_the_same_tiles_repeat_and_the_last_ones_are_not_worth_a_recor
 def test_nothing_repeats_while_gradients_are_collected_nor_across_rows_that_come_or_go() -> None:
     hooks = replace(hooks_of(started(random_scene(60, free=5, cameras=4, seed=4)), patch_at=3), iterations=99)
     assert [hooks.repeats(iteration, VIEWS[0]) is None for iteration in (1, 3, 4)] == [True, True, False]
-    hooks.population.config = replace(hooks.population.config, spawn="off")
+    hooks.free_set.config = replace(hooks.free_set.config, spawn="off")
     before = hooks.repeats(3, VIEWS[0])
     assert before is not None
     iterate(hooks, 3)  # Nothing is faint enough to die.

@@ -36,10 +36,9 @@ def loss_of(parameters, scene, **weights):
 
 @dataclass
 class Parabola(Hooks[float, Loss]):
-    """(x - sample)^2; finished after ``until`` steps."""
+    """(x - sample)^2."""
 
     adam: Adam[str]
-    until: int = 10**9
     seen: list[tuple[str, int, float]] = field(default_factory=list)
 
     def loss(self, iteration: int, sample: float) -> Loss:
@@ -50,9 +49,6 @@ class Parabola(Hooks[float, Loss]):
     def after_step(self, iteration: int, sample: float, loss: Loss, screen_gradient: Tensor | None) -> None:
         assert screen_gradient is None
         self.seen.append(("after", iteration, self.adam.values["x"].item()))
-
-    def finished(self, iteration: int) -> bool:
-        return iteration >= self.until
 
     def counts(self) -> tuple[int, int]:
         return 3, 4
@@ -65,9 +61,9 @@ class Repeating(Parabola):
         return sample if iteration <= 7 else None
 
 
-def run(iterations: int, until: int = 10**9, **stages: int) -> tuple[int, Parabola, list[Step]]:
+def run(iterations: int, **stages: int) -> tuple[int, Parabola, list[Step]]:
     adam = Adam(reference_backend(), leaves({"x": torch.zeros(1)}))
-    hooks, steps = Parabola(adam, until), []
+    hooks, steps = Parabola(adam), []
     schedule = Schedule(iterations, lambda iteration: {"x": 0.1 * iteration}, **stages)
     done = minimize(adam, cycle([1.0, 2.0]), schedule, hooks, watch=Stopwatch(), on_step=steps.append)
     return done, hooks, steps
@@ -98,11 +94,6 @@ def test_iterations_that_are_recorded_take_the_steps_of_their_time() -> None:
             assert recorder.keys == [2.0, 1.0, 2.0, 1.0, 2.0, 1.0]  # The first iteration is not recorded.
             assert adam.steps["x"] == 9
     assert found[0] == pytest.approx(found[1], rel=1e-6)
-
-
-def test_it_ends_when_the_hooks_say_so() -> None:
-    assert run(9, until=4)[0] == 4
-    assert run(9, until=0)[0] == 0
 
 
 def test_progress_counts_all_stages_of_a_frame() -> None:
