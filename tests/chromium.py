@@ -100,7 +100,7 @@ class Tab:
             piece = os.read(self._outlet, 1 << 20)
             assert piece, "the browser is gone"
             self._buffer += piece
-        message, _, self._buffer = self._buffer.split(b"\0")
+        message, _, self._buffer = self._buffer.partition(b"\0")
         return json.loads(message)
 
     def _note(self, event: str, values: Mapping[str, Any]) -> None:

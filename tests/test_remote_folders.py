@@ -72,7 +72,7 @@ def test_addresses_without_secrets_name_their_host(address: str) -> None:
 
 def test_every_place_that_prints_an_address_leaves_secrets_out(tmp_path: Path) -> None:
     for address in SECRET_ADDRESSES:
-        nonsense = f"nonsense://{address.split('://')[2]}"
+        nonsense = f"nonsense://{address.partition('://')[2]}"
         for open_place in (open_url, ObjectFolder, CloudStore):
             with pytest.raises(StorageError) as refused:
                 open_place(nonsense)

@@ -15,7 +15,7 @@ from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, state_of, with_dynamic_fields
 from structgstream.training.online.config import OnlineConfig, online_rates
-from structgstream.training.online.select import changed_movers
+from structgstream.training.online.select import changed_primitives
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import Parameters, RoundingConfig, detached, parameters_of_fields
 
@@ -34,7 +34,7 @@ def check() -> None:
     scene = with_dynamic_fields(plain, DYNAMIC)
     assert state_of(scene)[NAME].tolist() == [[0.0]] * 40
     trained = fitted(scene)
-    assert changed_movers(scene, trained)[:40].any()
+    assert changed_primitives(scene, trained)[:40].any()
     frames = [scene, trained, fitted(trained)]
     for header in (header_for(scene, dynamic=DYNAMIC), compact_header(scene, dynamic=DYNAMIC)):
         sink = MemorySink()

@@ -24,7 +24,7 @@ def start(frame: int, *, rows: int = 7, seed: int = 0) -> TrackStart:
 
 
 def same(one: TrackStart, other: TrackStart) -> bool:
-    arrays = ("movers", "displacements", "velocities")
+    arrays = ("primitives", "displacements", "velocities")
     return one.frame == other.frame and all(np.array_equal(getattr(one, a), getattr(other, a)) for a in arrays)
 
 

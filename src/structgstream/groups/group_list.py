@@ -39,7 +39,7 @@ def read_groups(track: Path) -> Groups | None:
     if not text.endswith("\n"):
         return None
     try:
-        groups = [(int(first), int(end)) for first, _, end in (line.split(":") for line in text.split())]
+        groups = [(int(first), int(end)) for first, _, end in (line.partition(":") for line in text.split())]
     except ValueError:
         raise StreamError(f"{path} has no groups, 'first:end' a line.") from None
     borders = [0, *(end for _, end in groups)]
