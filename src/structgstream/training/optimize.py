@@ -2,7 +2,7 @@
 """The optimisation loop of all fits: a view, its loss, one Adam step.
 
 Fits differ in their hooks: the loss of a view, and the actions between steps (growing, patching, early stopping).
-``training/initial.py``, ``training/online.py`` and all peers use this loop.
+``training/initial.py``, ``training/online.py`` and the methods of studies use this loop.
 """
 
 from abc import ABC, abstractmethod
