@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReconstructGroup:
-    """Fits one group of frames from a header and a track into a segment (docs/groups.md).
+    """Fits one group of frames from a header and a track into a segment (docs/cluster.md).
 
     Configuration, picture size, first frame and held-out cameras are the header's. The same command may be given at any
     time: it goes on where it was interrupted, repairs what is damaged, and leaves a finished segment as it is.

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Join:
-    """Puts groups of frames that were fitted apart together to one stream (docs/groups.md).
+    """Puts groups of frames that were fitted apart together to one stream (docs/cluster.md).
 
     Every checksum is verified, and that the segments have one header and every frame once. What stands still at the
     border of two groups is handed over from one to the next, so that it does not flicker there.

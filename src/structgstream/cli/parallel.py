@@ -64,7 +64,7 @@ class Parallel:
     """Turns a recorded capture into a stream, groups of frames side by side.
 
     Frame 0 is fitted first, then a pass tracks what moves through all frames, and each group of frames is fitted as
-    soon as the pass has come to it (docs/groups.md). The parts are kept in OUT.parts; after Ctrl-C, a crash or a
+    soon as the pass has come to it (docs/cluster.md). The parts are kept in OUT.parts; after Ctrl-C, a crash or a
     failure the same command goes on with what is not whole there. Where a group runs does not change a byte.
 
     Example: structgstream parallel basketball -o ball.sgs --groups 30 --workers 2

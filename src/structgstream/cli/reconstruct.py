@@ -59,7 +59,7 @@ class Reconstruct:
     Example: structgstream reconstruct rig.toml -o now --live --sink segments --qualities low=-1 high=1
 
     With --init HEADER.sgs it fits one group of frames, which are joined later (reconstruct --init --help,
-    docs/groups.md):
+    docs/cluster.md):
 
     Example: structgstream reconstruct basketball --init header.sgs --track ball.track --frames 60:120 -o g60.sgs
     """

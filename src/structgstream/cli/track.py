@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Track:
-    """Follows what moves through every frame, so that groups of frames can be fitted apart (docs/groups.md).
+    """Follows what moves through every frame, so that groups of frames can be fitted apart (docs/cluster.md).
 
     TRACK holds where things are when a group begins, TRACK.groups a line a:b for each group. After Ctrl-C or a kill the
     same command goes on; a finished track is left as it is.
