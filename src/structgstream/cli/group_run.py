@@ -42,7 +42,7 @@ class ReconstructGroup:
     track: Annotated[Path | None, tyro.conf.arg(metavar="TRACK", help_behavior_hint="")] = None
     """The track of the capture; may be left out for A = 0 only."""
     iterations: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
-    """Optimisation steps of the group's first frame. Default: six times those of an online frame."""
+    """Optimisation steps of the group's first frame. Default: eleven times those of an online frame."""
     rounds: int = 3
     """Rounds of flow, births and iterations of the group's first frame."""
     device: Device = "auto"
