@@ -65,7 +65,7 @@ class Filming:
 
     def stamps(self, frames: int) -> NDArray[np.float64]:
         """What its clock shows for each of :meth:`ticks`, seconds."""
-        return (self.ticks(frames) * STEP_SECONDS - self.offset_seconds) / self.rate
+        return np.asarray((self.ticks(frames) * STEP_SECONDS - self.offset_seconds) / self.rate, np.float64)
 
     def kept(self, frames: int) -> NDArray[np.int64]:
         """Numbers of the pictures that are in the file."""

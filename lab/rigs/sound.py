@@ -66,7 +66,8 @@ class Room:
         burst = np.random.default_rng(self.seed + 1).normal(0, 1, count)
         smooth = np.hanning(4 * FINE + 1)
         burst = np.convolve(burst, smooth / np.sqrt((smooth**2).sum()), mode="same")  # below half the sample rate
-        return np.interp(since, seconds, 0.3 * burst * np.exp(-seconds / 0.009), left=0, right=0)
+        fading: Floats = np.asarray(0.3 * burst * np.exp(-seconds / 0.009), np.float64)
+        return np.interp(since, seconds, fading, left=0, right=0)
 
 
 def _images(place: tuple[float, float, float]) -> list[tuple[Floats, float]]:
