@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check viewer-test player wheel wheel-test docs clean
+.PHONY: demo test check viewer-test player wheel wheel-test docs lab-test tables clean
 
 demo: $(VENV)/.demo-ready
 	$(BIN)/structgstream demo --output demo
@@ -26,7 +26,7 @@ player:
 	scripts/build-player
 
 # A plain (not editable) install: what is tested is what a user gets. Sources are listed so that a change reinstalls.
-SOURCES := pyproject.toml CMakeLists.txt studies/pyproject.toml studies/README.md $(shell find csrc src studies/src -type f -not -path '*/__pycache__/*' -not -path '*/_native/*')
+SOURCES := pyproject.toml CMakeLists.txt $(shell find csrc src -type f -not -path '*/__pycache__/*' -not -path '*/_native/*')
 
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
@@ -36,7 +36,7 @@ $(VENV)/.demo-ready: $(SOURCES) | $(BIN)/python
 	touch $@
 
 $(VENV)/.test-ready: $(SOURCES) | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[dev]' ./studies
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[dev]'
 	touch $@ $(VENV)/.demo-ready
 
 # A wheel in dist/ that runs on other machines, tried in an empty environment. WHEEL_OPTIONS: see scripts/wheel.
@@ -54,7 +54,17 @@ docs:
 clean:
 	rm -rf $(VENV) .venv-wheel .venv-docs build dist site demo viewer/node_modules viewer/packages/*/dist viewer/packages/player/types viewer/packages/*/*.tsbuildinfo
 
-# Tables of the documents, from the results beside them.
-.PHONY: tables
-tables: $(VENV)/.test-ready
-	$(BIN)/python -m structgstream_studies.experiments results docs/ablations.md docs/compact.md docs/compact-measured.md docs/evaluation.md docs/method.md
+# The laboratory (lab/README.md): studies and measurements that neither the package nor its tests know of.
+$(VENV)/.lab-ready: $(VENV)/.test-ready $(shell find lab/studies -type f -not -path '*/__pycache__/*')
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check ./lab/studies
+	touch $@
+
+lab-test: $(VENV)/.lab-ready
+	scripts/lint $(BIN) lab
+	$(BIN)/pyright --project lab --pythonpath $(BIN)/python
+	$(BIN)/lint-imports --no-cache --config lab/studies/pyproject.toml
+	$(BIN)/python -m pytest -c lab/pytest.ini --rootdir . lab/tests
+
+# Tables of the notes, from the results beside them.
+tables: $(VENV)/.lab-ready
+	$(BIN)/python -m structgstream_studies.experiments lab/results lab/notes/ablations.md lab/notes/compact.md lab/notes/compact-measured.md lab/notes/evaluation.md lab/notes/method.md

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results as text: for the screen while a run goes on, and as the tables of docs/performance.md."""
+"""Results as text: for the screen while a run goes on, and as the tables of docs/results.md."""
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping

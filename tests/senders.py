@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``tools/senders/send.py`` for tests: what cameras send, in memory or on the loopback."""
+"""``tests/support/senders/send.py`` for tests: what cameras send, in memory or on the loopback."""
 
 import importlib
 import sys
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-FOLDER = Path(__file__).parents[1] / "tools" / "senders"
+FOLDER = Path(__file__).parent / "support" / "senders"
 
 
 def sender() -> ModuleType:

@@ -2,7 +2,7 @@
 """Every command line that a document or a help text shows is one that the program takes.
 
 Those in blocks and in help are parsed whole, by the parser of the command, and not run. Those within sentences may
-leave out what the sentence says, so there the options must exist. Programs of ``benchmarks`` and ``tools`` have to be
+leave out what the sentence says, so there the options must exist. Programs of the repository have to be
 there and to name the options that are shown.
 """
 
@@ -20,18 +20,20 @@ from typing import Any
 import pytest
 
 from structgstream.cli import app, group_run, options
-from structgstream.cli.app import COMMANDS, STUDIES
+from structgstream.cli.app import COMMANDS
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted(
     path
-    for pattern in ("*.md", "docs/*.md", "tools/**/*.md", "examples/**/*.md", "viewer/*.md", "deploy/*")
+    for pattern in ("*.md", "docs/*.md", "examples/**/*.md", "viewer/*.md", "deploy/*")
     for path in ROOT.glob(pattern)
     if path.is_file()
 )
-HOMES = {**dict.fromkeys(COMMANDS, "structgstream.cli"), **dict.fromkeys(STUDIES, "structgstream_studies.cli")}
+HOMES = dict.fromkeys(COMMANDS, "structgstream.cli")
 PROGRAM = re.compile(rf"(?:^|[\s`/=])structgstream ((?:{'|'.join(HOMES)})\b[^`]*)")
-SCRIPT = re.compile(r"python (-m (?:benchmarks|tools)[\w.]*|(?:benchmarks|tools)/[\w/]+\.py)([^`]*)")
+SCRIPT = re.compile(
+    r"python (-m (?:benchmarks|tools|tests|lab)[\w.]*|(?:benchmarks|tools|tests|lab)/[\w/]+\.py)([^`]*)"
+)
 OPTION = re.compile(r"(?<![\w-])--[a-z][\w.-]*\w")
 
 
@@ -118,7 +120,7 @@ def options_of(command: str) -> frozenset[str]:
     out = io.StringIO()
     with contextlib.redirect_stdout(out):
         app.main([command, "--help"])
-        if command in ("reconstruct", "demo", "ablate"):
+        if command in ("reconstruct", "demo"):
             app.main(["reconstruct", "--help-config"])
     return frozenset(OPTION.findall(out.getvalue()))
 
@@ -129,8 +131,8 @@ SCRIPTS = documented(lambda text: [*blocks(text), *spans(text)], SCRIPT)
 
 def test_there_is_something_to_look_at() -> None:
     assert len(BLOCKS) > 50
-    assert len(SPANS) > 20
-    assert len(SCRIPTS) > 20
+    assert len(SPANS) > 10
+    assert SCRIPTS
 
 
 @pytest.mark.parametrize("line", [*BLOCKS, *examples()])

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from structgstream.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from structgstream.api import check, evaluate, export, prepare, reconstruct
+    from structgstream.api import check, evaluate, example_clip, export, prepare, reconstruct
     from structgstream.cameras import Camera, CameraRig
     from structgstream.codec.packet_table import PacketInfo
     from structgstream.codec.packets import Packet, PacketKind, StreamHeader
@@ -72,6 +72,7 @@ _HOMES = {
     "StructGStreamError": "errors",
     "check": "api",
     "evaluate": "api",
+    "example_clip": "api",
     "export": "api",
     "open_capture": "data.open",
     "open_stream": "codec.reader",
@@ -114,6 +115,7 @@ __all__ = [
     "StructGStreamError",
     "check",
     "evaluate",
+    "example_clip",
     "export",
     "open_capture",
     "open_stream",

@@ -13,6 +13,7 @@ from typing import Literal
 
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.retention import SegmentsOptions
+from structgstream.data.clip import bundled_clip_path
 from structgstream.data.open import open_capture
 from structgstream.data.source import FrameSource, FrameStream
 from structgstream.errors import ConfigError
@@ -36,6 +37,15 @@ from structgstream.preparation.steps import Listener
 from structgstream.presets import DEFAULT_PRESET, StreamConfig, preset_named, with_budget
 from structgstream.recorder import check_output, record, segments_at, segments_folder
 from structgstream.struct_gstream import stream_pipeline
+
+
+def example_clip() -> Path:
+    """The folder of the bundled capture, for a first try: 10 cameras, 12 frames of 320x240.
+
+    Raises:
+        CaptureError: the installation lacks the clip.
+    """
+    return bundled_clip_path()
 
 
 def prepare(

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Protocols of a pipeline: a method that fits frames, and a codec that stores them.
 
-Struct-GStream with its two codecs is a pipeline (``struct_gstream.py``), every peer is another (``peers/``);
+Struct-GStream with its two codecs is a pipeline (``struct_gstream.py``); another method would be another.
 ``session.py`` runs them all.
 """
 

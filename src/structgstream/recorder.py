@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stream on the disk and the log beside it, written frame by frame: for commands, functions and studies."""
+"""A stream on the disk and the log beside it, written frame by frame: for commands and functions."""
 
 import os
 from collections.abc import Callable, Generator, Mapping

@@ -11,10 +11,9 @@ import tomllib
 from pathlib import Path
 
 import structgstream
-import structgstream_studies
 
 ROOT = Path(__file__).parents[2]
-SOURCES = sorted(path for folder in ("src", "studies/src") for path in (ROOT / folder).rglob("*.py"))
+SOURCES = sorted((ROOT / "src").rglob("*.py"))
 
 
 def test_layers() -> None:
@@ -41,7 +40,7 @@ def test_the_pictures_of_layers_are_those_of_the_contracts() -> None:
         assert drawn == stated
     whole, _ = drawn_and_stated()[0]
     modules = {module.name for module in pkgutil.iter_modules(structgstream.__path__)}
-    assert set().union(*whole) == modules - {"__main__"} | {"structgstream_studies"}
+    assert set().union(*whole) == modules - {"__main__"}
 
 
 def test_public_names_are_sorted_and_importable() -> None:
@@ -74,13 +73,6 @@ def test_architecture_names_every_package() -> None:
     assert not [name for name in packages if f"`{name}" not in text]
 
 
-def test_both_distributions_are_of_one_version() -> None:
-    projects = [tomllib.loads((ROOT / folder / "pyproject.toml").read_text())["project"] for folder in (".", "studies")]
-    assert {project["version"] for project in projects} == {structgstream.__version__}
-    assert {project["requires-python"] for project in projects} == {projects[0]["requires-python"]}
-    assert projects[1]["dependencies"] == [f"structgstream[capture,report,eval]=={structgstream.__version__}"]
-
-
 def loaded_by(imports: str, among: tuple[str, ...]) -> list[str]:
     """Which of the modules ``among`` are there after ``imports`` in a process of its own."""
     code = f"import sys, {imports}; print(*(name for name in {among!r} if name in sys.modules))"
@@ -99,7 +91,6 @@ def test_the_player_path_needs_no_optional_package() -> None:
 
 
 def test_every_module_imports() -> None:
-    for package in (structgstream, structgstream_studies):
-        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-            if not module.name.endswith(".__main__"):
-                importlib.import_module(module.name)
+    for module in pkgutil.walk_packages(structgstream.__path__, "structgstream."):
+        if not module.name.endswith(".__main__"):
+            importlib.import_module(module.name)

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 import torch
+
 from benchmarks.__main__ import NAMES, main
 from benchmarks.benchmark import Benchmark, Target, Variant, judged, run_variant
 from benchmarks.contest import Contestant, Quantity
-
 from structgstream.kernels._load import native_reason
 
 

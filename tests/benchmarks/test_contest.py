@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import pytest
 import torch
+
 from benchmarks.contest import Contestant, Quantity, check, ratios, timed
 from benchmarks.growth import slope
 

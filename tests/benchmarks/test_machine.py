@@ -2,6 +2,7 @@
 import os
 
 import pytest
+
 from benchmarks.machine import Instant, load_average, machine, others_share
 from benchmarks.roofline import Peaks, Work, line, measured_peaks
 

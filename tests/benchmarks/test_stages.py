@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 import torch
-from benchmarks.stages import staged
-from benchmarks.world import HELD_OUT, wall_rig, wall_scene
 from torch import Tensor
 
+from benchmarks.stages import staged
+from benchmarks.world import HELD_OUT, wall_rig, wall_scene
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.render import draw
 

@@ -2,8 +2,8 @@
 import numpy as np
 import pytest
 import torch
-from benchmarks.world import HELD_OUT, held_out_psnr, moved, wall_rig, wall_scene, wall_world
 
+from benchmarks.world import HELD_OUT, held_out_psnr, moved, wall_rig, wall_scene, wall_world
 from structgstream.kernels.backend import reference_backend
 
 

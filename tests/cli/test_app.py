@@ -130,7 +130,7 @@ def test_wrong_usage_of_a_command(command, capsys: pytest.CaptureFixture[str]) -
     assert capsys.readouterr().err == "structgstream: there is no preset 'x'.\n"
 
 
-@pytest.mark.parametrize("name", [*COMMANDS, *app.STUDIES])
+@pytest.mark.parametrize("name", list(COMMANDS))
 def test_every_command_has_help_with_an_example_and_no_torch(name: str) -> None:
     code = (
         f"import sys; from structgstream.cli import main; status = main(['{name}', '--help']); "
@@ -159,19 +159,6 @@ def test_an_unknown_option_is_wrong_usage() -> None:
     assert "--json" in result.stderr
 
 
-def test_a_command_of_studies_without_them_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(importlib.metadata, "entry_points", lambda *, group: [])
-    assert main(["ablate", "--help"]) == 2
-    text = capsys.readouterr().err
-    assert "'ablate' is one of structgstream-studies, which is not installed" in text
-    assert "pip install ./studies" in text
-    assert text.count("\n") == 1
-    assert main(["--help"]) == 0
-    assert "ablate" not in capsys.readouterr().out
-
-
 def test_another_distribution_brings_commands(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -192,15 +179,6 @@ def test_another_distribution_brings_commands(
     assert "\n  count        count the frames\n" in capsys.readouterr().out
     assert main(["cuont"]) == 2
     assert "Did you mean 'count'?" in capsys.readouterr().err
-
-
-def test_commands_of_other_distributions_are_looked_for_only_when_asked_for() -> None:
-    code = (
-        "import sys; from structgstream.cli import main; main(['doctor', '--help']); "
-        "print([m for m in sys.modules if m.startswith('structgstream_studies')])"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.splitlines()[-1] == "[]"
 
 
 def test_exit_status_of_the_program(tmp_path: Path) -> None:

@@ -160,7 +160,7 @@ def test_what_flickers_behind_a_mask_does_not_keep_its_surroundings_from_being_a
 
 @pytest.mark.parametrize("ahead", [False, True])
 def test_the_first_frame_alone_is_that_of_the_whole_capture(ahead: bool) -> None:
-    """So that groups share the header of a sequential run (docs/groups.md)."""
+    """So that groups share the header of a sequential run (docs/cluster.md)."""
     whole = capture(film())
     cut = section(whole, start=2, frames=1)
     (found,) = denoised(Prefetch(cut) if ahead else cut, EIGHT).frames()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The second open capture: it opens, stays small, and moves as tools/clip/README.md says."""
+"""The second open capture: it opens, stays small, and moves as lab/clip/README.md says."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -13,7 +13,7 @@ from structgstream.data.open import open_capture
 from structgstream.data.source import FrameSource
 
 THROW = Path(__file__).parents[2] / "examples" / "throw"
-# metres, as tools/clip/README.md states them: thrown, in flight, on the floor, at the second figure's hands
+# metres, as lab/clip/README.md states them: thrown, in flight, on the floor, at the second figure's hands
 BALL_CENTRES = {
     2: (0.427, -0.232, 1.218),
     5: (0.175, -0.442, 0.718),

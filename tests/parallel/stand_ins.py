@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parallel runs of commands that only look like the real ones (``benchmarks/stand_in.py``)."""
+"""Parallel runs of commands that only look like the real ones (``tests/support/stand_in.py``)."""
 
 import hashlib
 from pathlib import Path
 
-from benchmarks import stand_in
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.local import LocalEngine
 from structgstream.executors.places import Place
 from structgstream.executors.task import PYTHON
 from structgstream.parallel.driver import Job
 from structgstream.parallel.unit import Unit
+from tests.support import stand_in
 
 PROGRAM = (PYTHON, "-I", "-S", stand_in.__file__)
 

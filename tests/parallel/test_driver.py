@@ -51,7 +51,7 @@ def test_notes_say_what_each_task_took(undisturbed: Path) -> None:
 
 
 def test_inline_gives_the_same_bytes(undisturbed: Path, tmp_path: Path) -> None:
-    given = job(tmp_path, program=(PYTHON, "-m", "benchmarks.stand_in"))
+    given = job(tmp_path, program=(PYTHON, "-m", "tests.support.stand_in"))
     run(given, Parts(tmp_path / "parts"), TaskQueue(InlineEngine()))
     assert sha256(tmp_path / "out.sgs") == sha256(undisturbed / "out.sgs")
 
@@ -67,7 +67,7 @@ class ElsewhereEngine(InlineEngine):
 
 
 def test_what_tasks_on_other_machines_print_is_kept_here(tmp_path: Path) -> None:
-    given, parts = job(tmp_path, program=(PYTHON, "-m", "benchmarks.stand_in")), Parts(tmp_path / "parts")
+    given, parts = job(tmp_path, program=(PYTHON, "-m", "tests.support.stand_in")), Parts(tmp_path / "parts")
     run(given, parts, TaskQueue(ElsewhereEngine()))
     for name in ("header", "track", group_name(4, 8)):
         assert parts.log(name).read_text().startswith(f"{name} says: ")

@@ -4,15 +4,15 @@
 from pathlib import Path
 
 import pytest
-from benchmarks.flaky_store import flaky_store
 
-from benchmarks import stand_in
 from stand_ins import job, sha256, workers
 from structgstream.executors.task import Task
 from structgstream.parallel.driver import drive
 from structgstream.parallel.exchange import ObjectStore, SharedFolder
 from structgstream.parallel.object_folder import ObjectFolder
 from structgstream.parallel.parts import Parts
+from tests.support import stand_in
+from tests.support.flaky_store import flaky_store
 
 
 def plain(folder: Path) -> Path:

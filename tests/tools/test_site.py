@@ -48,7 +48,7 @@ def test_a_module_without_names_is_refused(hooks: dict[str, Any]) -> None:
         ("docs/images/clip.jpg", "README.md", "index.md", "images/clip.jpg"),
         ("ARCHITECTURE.md", "README.md", "index.md", "architecture.md"),
         ("../README.md#use-it", "docs/player.md", "player.md", "index.md#use-it"),
-        ("entropy.md", "docs/compact.md", "compact.md", "entropy.md"),
+        ("entropy.md", "docs/method.md", "method.md", "entropy.md"),
         ("#measured", "README.md", "index.md", "#measured"),
         ("https://a.example/b.md", "README.md", "index.md", "https://a.example/b.md"),
         ("../scripts/test", "docs/player.md", "player.md", "https://host.example/r/scripts/test"),

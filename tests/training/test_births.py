@@ -10,7 +10,13 @@ from structgstream.kernels.backend import reference_backend
 from structgstream.scene.color import CameraColor
 from structgstream.scene.render import draw
 from structgstream.training.online.config import SpawnConfig
-from structgstream.training.online.spawn import ViewResidual, _merge_points, outlier_mask, spawn_by_sweep, view_residual
+from structgstream.training.online.spawn import (
+    ViewResidual,
+    _merge_points,
+    outlier_mask,
+    spawn_by_sweep,
+    view_residual,
+)
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.views import View, training_views
 from worlds import moving_world

@@ -38,8 +38,6 @@ COMMANDS = {
 }
 ENTRY_POINTS = "structgstream.commands"
 """Entry-point group for other distributions' commands: packages with ``COMMANDS`` and a module with ``main`` each."""
-STUDIES = ("ablate", "compare")
-"""Commands of the distribution structgstream-studies, which is installed separately."""
 DONE, PROBLEM, USAGE, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 
 
@@ -169,11 +167,6 @@ def _run(command: str, arguments: list[str]) -> None:
     homes = dict.fromkeys(COMMANDS, "structgstream.cli")
     if command not in homes:
         homes |= {name: package.__name__ for package in _packages() for name in package.COMMANDS}
-    if command not in homes and command in STUDIES:
-        raise UsageError(
-            f"the command {command!r} is one of structgstream-studies, which is not installed; "
-            "install it with: pip install ./studies (in the repository of structgstream)"
-        )
     if command not in homes:
         near = difflib.get_close_matches(command, homes, n=1)
         hint = f" Did you mean {near[0]!r}?" if near else ""

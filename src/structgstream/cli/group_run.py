@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReconstructGroup:
-    """Fits one group of frames from a header and a track into a segment (docs/groups.md).
+    """Fits one group of frames from a header and a track into a segment (docs/cluster.md).
 
     Configuration, picture size, first frame and held-out cameras are the header's. The same command may be given at any
     time: it goes on where it was interrupted, repairs what is damaged, and leaves a finished segment as it is.
@@ -42,7 +42,7 @@ class ReconstructGroup:
     track: Annotated[Path | None, tyro.conf.arg(metavar="TRACK", help_behavior_hint="")] = None
     """The track of the capture; may be left out for A = 0 only."""
     iterations: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
-    """Optimisation steps of the group's first frame. Default: six times those of an online frame."""
+    """Optimisation steps of the group's first frame. Default: eleven times those of an online frame."""
     rounds: int = 3
     """Rounds of flow, births and iterations of the group's first frame."""
     device: Device = "auto"

@@ -20,26 +20,28 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Join:
-    """Puts groups of frames that were fitted apart together to one stream (docs/groups.md).
+    """Joins groups of frames that were fitted separately to one stream (docs/cluster.md).
 
-    Every checksum is verified, and that the segments have one header and every frame once. What stands still at the
-    border of two groups is handed over from one to the next, so that it does not flicker there.
+    Every checksum is verified, and that the segments have one header and every frame once. Static content is blended
+    at the border of two groups, so that it does not flicker there.
 
     Example: structgstream join groups/*.sgs -o ball.sgs
     """
 
-    segments: tyro.conf.Positional[tuple[Path, ...]]
-    """The segments that reconstruct --init has written, in any order."""
+    segments: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SEGMENT [SEGMENT ...]", help_behavior_hint="")
+    ]
+    """Segments that reconstruct --init has written, in any order."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
     """The stream file to write."""
     check: bool = False
     """Decode every frame of the result, too."""
     plain: bool = False
-    """Copy the packets of every group as they are, without a hand-over."""
+    """Copy the packets of every group as they are, without blending."""
     device: Device = "auto"
-    """Compute back-end of the hand-over."""
+    """Compute back-end of the blending."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
-    """Processes of one thread each that hand over. Default: one a core; a GPU has one."""
+    """Processes of one thread each that blend borders. Default: one a core; one on a GPU."""
     overwrite: bool = False
     """Replace OUT.sgs when it exists."""
 

@@ -42,7 +42,7 @@ class LiveChoice:
     """Options of cameras that send now."""
 
     live: bool = False
-    """SCENE is a rig file of cameras that send now; the stream ends after --frames, or with Ctrl-C."""
+    """FOLDER is a rig file of cameras that send now; the stream ends after --frames, or with Ctrl-C."""
     policy: Literal["latest", "every"] = "latest"
     """Live only, when training is slower than the cameras: latest takes the newest pictures, every keeps all of them in
     a queue on the disk."""

@@ -39,7 +39,8 @@ class CaptureOptions:
     every: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Use every N-th frame, from the first; the frames a second are divided by N."""
     near: Annotated[float | None, tyro.conf.arg(help_behavior_hint="")] = None
-    """Distance of the near plane, in units of the capture. Default: the capture's own, else 0.12 rig radii."""
+    """Distance of the near plane, in units of the capture. Default: the capture's own, else 0.12 times the
+    largest distance of a training camera to their centre."""
 
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif")

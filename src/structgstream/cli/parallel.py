@@ -42,10 +42,10 @@ class WorkerOptions:
     threads: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Threads of each. Default: its share of the cores; one on a cluster."""
     track_threads: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
-    """Threads of the tracking pass, which all groups wait for; more than a worker's are borrowed from the others.
-    Default: as a worker."""
+    """Threads of the tracking pass, for which all groups wait; fewer groups run meanwhile if these are more than a
+    worker's. Default: as a worker."""
     address: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT", help_behavior_hint="")] = None
-    """Head of the Ray cluster to join. Default: one that is begun here, for this run."""
+    """Head of the Ray cluster to join. Default: a cluster of this machine alone, for this run."""
 
     @property
     def chosen(self) -> ExecutorOptions:
@@ -64,8 +64,8 @@ class Parallel:
     """Turns a recorded capture into a stream, groups of frames side by side.
 
     Frame 0 is fitted first, then a pass tracks what moves through all frames, and each group of frames is fitted as
-    soon as the pass has come to it (docs/groups.md). The parts are kept in OUT.parts; after Ctrl-C, a crash or a
-    failure the same command goes on with what is not whole there. Where a group runs does not change a byte.
+    soon as the pass has come to it (docs/cluster.md). The parts are in OUT.parts; after Ctrl-C, a crash or a
+    failure the same command continues with those that are not complete. Where a group runs does not change a byte.
 
     Example: structgstream parallel basketball -o ball.sgs --groups 30 --workers 2
 
@@ -79,15 +79,15 @@ class Parallel:
     groups: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Frames of a group: a multiple of the key interval. Default: one key interval."""
     quiet: bool = False
-    """Begin each group at the frame near its border where least moves."""
+    """Move each border between groups to a frame nearby in which few pixels change."""
     odd: bool = False
-    """Allow an N that is no multiple of the key interval; each group then costs a key packet more."""
+    """Allow an N that is no multiple of the key interval; each group then costs one more key packet."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
     """compact (default), fine, fast, or tiny; fields of the configuration are options as of reconstruct."""
     quality: Annotated[float | None, tyro.conf.arg(metavar="Q", help_behavior_hint="")] = None
-    """0 is the preset's quality, 1 halves every quantization step, -1 doubles it."""
+    """0 is the preset's quality, 1 halves every quantization step, -1 doubles it; from -6 to 6."""
     device: Device = "auto"
-    """Compute back-end; auto takes the first available of cuda, cpu, reference."""
+    """Compute back-end; auto takes the first available of cuda, cpu and reference (plain PyTorch, slow)."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Random seed. Default: the preset's."""
     overwrite: bool = False

@@ -40,8 +40,8 @@ ASSUMED = (
 class Plan:
     """How long a capture would take on so many workers, how many a wanted finish needs, and how large the stream is.
 
-    Measured first: frame 0 and ten frames in two groups, on one worker of this machine (in FOLDER, kept, so that the
-    same command measures once); or an existing run of parallel. Everything else follows from a model whose assumptions
+    Measured first: frame 0 and ten frames in two groups, on one worker of this machine (in FOLDER; the same
+    command measures only once); or an existing run of parallel. Everything else follows from a model whose assumptions
     are printed.
 
     Example: structgstream plan basketball -o probe --machines 1 8 64 --finish-hours 2
@@ -58,7 +58,7 @@ class Plan:
     machines: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N [N ...]", help_behavior_hint="")] = (1, 8, 64)
     """Numbers of machines to plan for, each like this one."""
     workers: int = 1
-    """Workers of a machine, each as fast as the one that was measured, though they run side by side."""
+    """Workers that run side by side on each machine; each is taken to be as fast as the measured one alone."""
     finish_hours: Annotated[float | None, tyro.conf.arg(metavar="H", help_behavior_hint="")] = None
     """Say how many workers end within H hours."""
     groups: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None

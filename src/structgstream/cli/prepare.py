@@ -26,10 +26,10 @@ HIDDEN = tyro.conf.arg(help_behavior_hint="")
 class Prepare:
     """Turns videos of still cameras into a calibrated capture, and checks it.
 
-    VIDEOS holds CAMERA.mp4, CAMERA/anything.mp4, CAMERA/FRAME.jpg or CAMERA.jpg. The cameras are put in step and
-    calibrated (structure from motion, a board, or a calibration file beside the videos), and CAPTURE gets links to what
-    was filmed, the calibration, initial points and a report: CAPTURE/report/index.html. Nothing is re-encoded; lenses
-    are undistorted when frames are read. After Ctrl-C, or with other options, the same command does what is missing.
+    FOLDER holds CAMERA.mp4, CAMERA/anything.mp4, CAMERA/FRAME.jpg or CAMERA.jpg. The cameras are synchronised and
+    calibrated (structure from motion, a board, or a calibration file in FOLDER), and CAPTURE gets links to the videos,
+    the calibration, initial points and a report: CAPTURE/report/index.html. Nothing is re-encoded; lenses are
+    undistorted when frames are read. After Ctrl-C, or with other options, the same command does what is missing.
 
     With --check, checks a capture of any layout, writes its report, and exits with status 1 and one sentence when
     something is wrong. See docs/captures.md.
@@ -48,8 +48,8 @@ class Prepare:
     check: bool = False
     """Only check a capture."""
     calibration: Annotated[str, tyro.conf.arg(metavar="auto|sfm|board|PATH", help_behavior_hint="")] = "auto"
-    """Structure from motion, a board, or the calibration of another tool (file or folder). Default: such a file beside
-    the videos, else sfm."""
+    """Structure from motion, a board, or the calibration of another tool (file or folder). Default: such a file in
+    FOLDER, else sfm."""
     lens: Annotated[
         Literal["pinhole", "radial", "opencv", "brown", "fisheye"] | None, tyro.conf.arg(help_behavior_hint="")
     ] = None
@@ -57,17 +57,17 @@ class Prepare:
     intrinsics: Literal["own", "shared"] = "own"
     """Whether cameras share focal length and lens (sfm)."""
     refine: bool = False
-    """Adjust the calibration to the pictures; kept only if matches that were set aside fit better."""
+    """Adjust the calibration to the pictures, if matches that were set aside then fit better."""
     board: Annotated[str | None, tyro.conf.arg(metavar="BOARD", help_behavior_hint="")] = None
-    """The board, as structgstream board named it: COLUMNSxROWS:SQUARE, such as 7x5:50mm. Default: that."""
+    """The board, as structgstream board named it: COLUMNSxROWS:SQUARE, such as 7x5:50mm. Default: 7x5:50mm."""
     board_videos: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
-    """Videos in which the board is shown to the cameras. Default: VIDEOS themselves."""
+    """Videos in which the board is shown to the cameras. Default: those of FOLDER."""
     distance: Annotated[tuple[str, str, str] | None, tyro.conf.arg(metavar="A B LENGTH", help_behavior_hint="")] = None
     """Measured distance between the lenses of two cameras, such as 3.2m: the capture then is in metres."""
     synchronize: Annotated[
         Literal["auto", "csv", "stamps", "audio", "motion", "none"], tyro.conf.arg(help_behavior_hint="")
     ] = "auto"
-    """How clocks are found: by timestamps.csv beside the videos, the files' own times, sound, motion, or not at all
+    """How clocks are found: by timestamps.csv in FOLDER, the files' own times, sound, motion, or not at all
     (one signal starts all cameras). Default: csv if it is there, else sound, else motion."""
     field_of_view: Annotated[float | None, tyro.conf.arg(metavar="DEGREES", help_behavior_hint="")] = None
     """Across the undistorted pictures. Default: the largest without black borders, up to 110."""
@@ -76,7 +76,8 @@ class Prepare:
     held_out: Annotated[
         tuple[str, ...], tyro.conf.arg(metavar="auto|none|CAMERA [CAMERA ...]", help_behavior_hint="")
     ] = ("none",)
-    """Cameras to keep from training, for scores; auto takes the one best surrounded by others. Default: none."""
+    """Cameras that are not trained on, so that evaluate can score them; auto takes the one best surrounded by others.
+    Default: none."""
     near: Annotated[float | None, HIDDEN] = None
     """Distance of the near plane, in units of the capture. Default: half of the depth of the nearest points."""
     fps: Annotated[float | None, HIDDEN] = None
@@ -88,7 +89,7 @@ class Prepare:
     link: Literal["hard", "symlink", "copy"] = "hard"
     """How videos get into the capture; hard links need no room, and become copies on another file system."""
     report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
-    """With --check: folder of the report. Default: VIDEOS/report."""
+    """With --check: folder of the report. Default: FOLDER/report."""
 
 
 def main(arguments: list[str]) -> None:

@@ -58,8 +58,8 @@ class Reconstruct:
 
     Example: structgstream reconstruct rig.toml -o now --live --sink segments --qualities low=-1 high=1
 
-    With --init HEADER.sgs it fits one group of frames, which are joined later (reconstruct --init --help,
-    docs/groups.md):
+    With --init HEADER.sgs it fits one group of frames, which are joined later (reconstruct --init
+    HEADER.sgs --help; docs/cluster.md):
 
     Example: structgstream reconstruct basketball --init header.sgs --track ball.track --frames 60:120 -o g60.sgs
     """
@@ -71,10 +71,11 @@ class Reconstruct:
     """The stream file to write; with --sink segments, a folder."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
     """compact (default: small packets), fine (compact with twice the iterations), fast (compact in minutes), rig (the
-    paper on any rig), motion (as rig, trains only movers), paper-n3dv, paper-meetroom, paper-immersive, tiny (for
+    paper on any rig), motion (as rig, trains only what moves), paper-n3dv, paper-meetroom, paper-immersive, tiny (for
     tests)."""
     quality: Annotated[float | None, tyro.conf.arg(metavar="Q", help_behavior_hint="")] = None
-    """Compact streams only: 0 is the preset's quality, 1 halves every quantization step, -1 doubles it."""
+    """Compact streams only: 0 is the preset's quality, 1 halves every quantization step, -1 doubles it; from -6 to
+    6."""
     mbits: Annotated[float | None, tyro.conf.arg(metavar="R", help_behavior_hint="")] = None
     """Compact streams only: target rate in Mbit/s over every second, without the header. Default: constant quality."""
     qualities: Annotated[
@@ -83,7 +84,7 @@ class Reconstruct:
     """Several qualities of the same frames, each a folder OUT/NAME of segments with --quality Q, and a list from which
     players choose (docs/live.md). With --sink segments."""
     device: Device = "auto"
-    """Compute back-end; auto takes the first available of cuda, cpu, reference."""
+    """Compute back-end; auto takes the first available of cuda, cpu and reference (plain PyTorch, slow)."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Random seed. Default: the preset's."""
     resume: bool = False

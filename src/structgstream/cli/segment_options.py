@@ -38,7 +38,7 @@ class SegmentOptions:
     window: Annotated[float | None, tyro.conf.arg(metavar="SECONDS", help_behavior_hint="")] = None
     """Segments only: how far viewers can go back; older segments are removed. Default: everything is kept."""
     keep: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 120.0
-    """Segments only: how long a file stays after the manifest has stopped naming it."""
+    """Segments only: how long a file stays that the manifest no longer names; viewers may be about to fetch it."""
     publish: Annotated[str | None, tyro.conf.arg(metavar="URL", help_behavior_hint="")] = None
     """Segments only: copy OUT to this folder of an object store as it grows, such as s3://bucket/studio. When it cannot
     be reached, the stream goes on in OUT, and what is missing is copied later. Needs the extra cloud."""

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Track:
-    """Follows what moves through every frame, so that groups of frames can be fitted apart (docs/groups.md).
+    """Follows what moves through every frame, so that groups of frames can be fitted separately
+    (docs/cluster.md).
 
     TRACK holds where things are when a group begins, TRACK.groups a line a:b for each group. After Ctrl-C or a kill the
     same command goes on; a finished track is left as it is.
@@ -44,17 +45,17 @@ class Track:
     groups: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Frames of a group. Default: as many as from one key packet to the next."""
     quiet: bool = False
-    """Begin groups where little moves, half of N to one and a half times N apart."""
+    """Begin groups where few pixels change, half of N to one and a half times N frames apart."""
     odd: bool = False
-    """Allow an N that is no multiple of the interval of key packets; each group then costs a key packet more."""
+    """Allow an N that is no multiple of the interval of key packets; each group then costs one more key packet."""
     frames: Annotated[int | None, tyro.conf.arg(metavar="M", help_behavior_hint="")] = None
     """Number of frames. Default: all."""
     after: Annotated[Path | None, tyro.conf.arg(metavar="SEGMENT", help_behavior_hint="")] = None
-    """Begin at the end of this finished group, where things are as it has fitted them: starts for the groups after it,
-    without what tracking lost before."""
+    """Begin at the end of this finished segment, with its fitted positions, which are more exact than tracked ones: for
+    the groups after it."""
     cameras: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
-    """Most cameras to track with in a frame; of more, every second or third, in turn. Default: half of the rig, from 6
-    to 14."""
+    """Largest number of cameras for a frame; of more, every second or third is used, in turn. Default: half of the
+    rig, from 6 to 14."""
     device: Device = "auto"
     """Compute back-end."""
     overwrite: bool = False

@@ -7,7 +7,7 @@ Every camera has noise of its own in every picture, and a fit of thousands of it
 heart: it is wrong between the cameras, and in all later frames, which inherit frame 0. The mean of n pictures has
 noise of 1 / sqrt(n). A pixel is averaged over consecutive frames as long as its surroundings stay as they are in frame
 0; what moves keeps its one picture, sharp. Only the frames that everything else is built on are averaged: frame 0, and
-the first frame of a group that is fitted apart. For later frames it gained nothing (docs/compact-measured.md).
+the first frame of a group that is fitted apart. For later frames it gained nothing (lab/notes/compact-measured.md).
 """
 
 from collections.abc import Iterable, Iterator

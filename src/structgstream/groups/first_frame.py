@@ -33,7 +33,7 @@ from structgstream.training.views import View
 
 USUAL_FRAMES = 11
 """A group's first frame has the iterations of so many online frames. With fewer, births stand in for what iterations
-would have mended, which costs bytes, and late groups fall behind (docs/groups-measured.md)."""
+would have mended, which costs bytes, and late groups fall behind (lab/notes/groups-measured.md)."""
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from structgstream.training.views import area_mean
 
 TOLERANCE = 3.0 / 255.0
 """A pixel may be so far outside of what the two fits show. With less, more flickers for nothing
-(docs/groups-measured.md)."""
+(lab/notes/groups-measured.md)."""
 LEAST_EXCESS = 1.0 / 255.0
 """Mean distance beyond it, over the pixels that an anchor covers, from which on the anchor shows."""
 LEAST_PIXELS = 0.5

@@ -12,8 +12,8 @@ from structgstream.frame_report import FrameReport
 from structgstream.qualities.ladder import Quality
 
 EXPECTED_BITS = 2e6
-"""Bits a second of quality 0, where nothing is known: 1.9 and 2.9 Mbit/s in docs/compact-measured.md. One more doubles
-it."""
+"""Bits a second of quality 0, where nothing is known: 1.9 and 2.9 Mbit/s in lab/notes/compact-measured.md. One more
+doubles it."""
 LEAST_PACKETS = 5
 MOST_PACKETS = 60
 """Packets over which a rate is taken: two groups of a second, or more where frames are left out."""

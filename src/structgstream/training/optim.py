@@ -1,18 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adam, the optimisation loop of all fits, and what follows its steps.
+"""Adam, the optimisation loop of all fits (a view, its loss, one Adam step), and what follows its steps.
 
-Adam over named parameters whose rows come and go.
-
-The optimisation loop of all fits: a view, its loss, one Adam step.
-
-Fits differ in their hooks: the loss of a view, and the actions between steps (growing, patching, early stopping).
-``training/frame0/fit.py``, ``training/online/fit.py`` and all peers use this loop.
-
-The mean of a fit's last iterations (Polyak and Juditsky, 1992): it has less of the noise of single views.
-
-Early stopping of a frame's optimisation.
-
-Loss and PSNR at the end of a fit, from the last rendering of each view.
+Fits differ in their hooks: the loss of a view, and the actions between steps (growing, patching).
+``training/frame0/fit.py``, ``training/online/optimize.py`` and the methods of studies use this loop.
 """
 
 import math
