@@ -63,15 +63,16 @@ def test_earlier_pictures_and_frames_are_asked_for_where_they_are_used() -> None
         method = StructGStream(config)
         return method.needs_before, method.needs_older
 
-    def of(*, motion: bool, prior: float) -> StreamConfig:
+    def of(*, motion: bool, prior: float, ease: float) -> StreamConfig:
         online = COMPACT.online
-        selection = replace(online.motion, enabled=motion)
+        selection = replace(online.motion, enabled=motion, moved_ease=ease)
         return replace(COMPACT, online=replace(online, motion=selection, motion_prior=prior))
 
     assert asks(PAPER) == (False, False)
-    assert asks(of(motion=True, prior=0.0)) == (True, False)
-    assert asks(of(motion=True, prior=0.7)) == (True, True)
-    assert asks(of(motion=False, prior=0.5)) == (False, True)
+    assert asks(of(motion=True, prior=0.0, ease=1.0)) == (True, False)
+    assert asks(of(motion=True, prior=0.0, ease=0.5)) == (True, True)
+    assert asks(of(motion=False, prior=0.0, ease=0.5)) == (False, False)
+    assert asks(of(motion=False, prior=0.5, ease=1.0)) == (False, True)
 
 
 @pytest.mark.parametrize("environment", [False, True])

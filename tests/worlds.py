@@ -93,9 +93,10 @@ def moved_since(
     config: MotionConfig,
     backend: Backend,
     flow_from: Collection[int] = (),
+    older: Scene | None = None,
     floor: ResidualFloor | None = None,
 ) -> DynamicSelection:
     """What may move in ``scene`` between the pictures ``before`` and those of ``views``."""
     changes = detect_changes(views, before, config=config, backend=backend, flow_from=flow_from)
     measured = measure(scene, views, changes, config=config, backend=backend, floor=floor)
-    return select_dynamic(scene, measured, config=config, backend=backend)
+    return select_dynamic(scene, measured, config=config, backend=backend, older=older)

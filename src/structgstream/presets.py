@@ -92,10 +92,8 @@ WITHDRAWN = frozenset(
         "online.least_gain",
         "online.motion.full_every_frames",
         "online.motion.least_views_share",
-        "online.motion.moved_ease",
         "online.motion.tiles",
         "online.motion.unseen_pixels",
-        "online.start.lift.color_bandwidth",
     }
 )
 """Fields of earlier versions whose mechanisms are gone. A stream that has them goes on by this version's method."""
@@ -321,6 +319,7 @@ COMPACT = replace(
         light=ExposureConfig(enabled=True),
         motion=replace(
             MOTION.online.motion,
+            moved_ease=0.5,
             carried_share=0.4,
             residual_threshold=0.05,
             picture_scale=0.5,

@@ -20,6 +20,34 @@ def world() -> World:
     return moving_world(2, cameras=6, width=128, height=96)
 
 
+def evidence_of(colors: torch.Tensor, flows: torch.Tensor, views: int) -> FlowEvidence:
+    return FlowEvidence(torch.full((views, len(colors)), 5.0), flows.expand(views, -1, 2), colors)
+
+
+def test_neighbours_of_another_colour_do_not_share_a_motion() -> None:
+    """A red ball beside a hand: ball and hand have flows of their own, and lie among each other."""
+    scenery = world()
+    views = training_views(scenery.frames[1], scenery.rig, CPU)
+    generator = torch.Generator().manual_seed(0)
+    centers = 0.05 * torch.randn(40, 3, generator=generator)
+    ball = torch.arange(40) < 20
+    colors = torch.where(ball[:, None], torch.tensor([0.9, 0.1, 0.1]), torch.tensor([0.7, 0.6, 0.5]))
+    # The ball moves to the right in all pictures, the hand rests.
+    flows = torch.where(ball[:, None], torch.tensor([6.0, 0.0]), torch.tensor([0.0, 0.0]))
+
+    def lengths(bandwidth: float) -> tuple[float, float]:
+        config = LiftConfig(color_bandwidth=bandwidth)
+        found = lift_flow(
+            evidence_of(colors, flows, len(views)), centers, torch.zeros(40, 3), views, config=config, backend=BACKEND
+        ).displacements.norm(dim=1)
+        return float(found[ball].mean()), float(found[~ball].mean())
+
+    ball_alike, hand_alike = lengths(0.15)
+    ball_mixed, hand_mixed = lengths(0.0)
+    assert hand_alike < 0.05 * ball_alike
+    assert hand_alike < hand_mixed or ball_alike > ball_mixed
+
+
 def test_the_same_motion_is_lifted_alike_at_the_sizes_at_which_people_film() -> None:
     """Errors of a share of the width: at 640 pixels 1.2 of them, at 1920 pixels 3.6."""
     scenery = world()
@@ -31,7 +59,7 @@ def test_the_same_motion_is_lifted_alike_at_the_sizes_at_which_people_film() -> 
     def lifted_at(width: int) -> tuple[torch.Tensor, torch.Tensor]:
         sized = [replace(view, camera=view.camera.resized(width, width * 3 // 4)) for view in views]
         seen = (flows + 0.85 * errors) * (width / 640)
-        evidence = FlowEvidence(torch.full((len(views), 60), 5.0), seen)
+        evidence = FlowEvidence(torch.full((len(views), 60), 5.0), seen, torch.full((60, 3), 0.5))
         found = lift_flow(evidence, centers, torch.zeros(60, 3), sized, config=LiftConfig(), backend=BACKEND)
         return found.displacements, found.lifted
 
@@ -46,7 +74,7 @@ def test_the_same_motion_is_lifted_alike_at_the_sizes_at_which_people_film() -> 
 def test_without_evidence_movers_follow_their_priors() -> None:
     scenery = world()
     views = training_views(scenery.frames[1], scenery.rig, CPU)
-    nothing = FlowEvidence(torch.zeros(len(views), 4), torch.zeros(len(views), 4, 2))
+    nothing = FlowEvidence(torch.zeros(len(views), 4), torch.zeros(len(views), 4, 2), torch.zeros(4, 3))
     priors = torch.rand(4, 3)
     found = lift_flow(nothing, torch.zeros(4, 3), priors, views, config=LiftConfig(), backend=BACKEND)
     assert torch.equal(found.displacements, priors)

@@ -71,12 +71,15 @@ def test_weighed_ones_are_what_a_gaussian_covers_and_what_is_in_front_takes_from
 
 
 def test_evidence_is_a_mean_with_bounds() -> None:
-    # c, c flow_x and c flow_y of three primitives in one view.
-    sums = torch.tensor([[4.0, 8.0, -4.0], [0.1, 1.0, 1.0], [90.0, 90.0, 0.0]])
+    # c, c flow_x, c flow_y, cover, and colours times cover, of three movers in one view.
+    sums = torch.tensor(
+        [[4.0, 8.0, -4.0, 8.0, 4.0, 2.0, 0.0], [0.1, 1.0, 1.0, 1.0, 1, 1, 1], [90.0, 90, 0, 90, 0, 0, 9]]
+    )
     found = flow_evidence([sums, torch.zeros_like(sums)])
     assert found.weights[0].tolist() == [4.0, 0.0, 20.0]
     assert found.flows[0, 0].tolist() == [2.0, -1.0]
     assert not found.weights[1].any()
+    torch.testing.assert_close(found.colors[0], torch.tensor([0.5, 0.25, 0.0]))
     assert found.select(torch.tensor([2])).weights.shape == (2, 1)
 
 

@@ -71,7 +71,8 @@ def test_flow_is_looked_for_where_it_was_asked_for() -> None:
     assert found[0].flow is None
     flow = found[1].flow
     assert flow is not None
-    assert flow.shape == (16, 24, 3)
+    assert flow.shape == (16, 24, 6)
+    torch.testing.assert_close(flow[..., 3:], before[1].reduced(0.5).colors)
     assert not flow.requires_grad
 
 

@@ -11,6 +11,7 @@ from rigs import random_scene
 from structgstream.errors import ConfigError
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.free import FreeGaussians
+from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.select import changed_primitives
 from structgstream.training.online.split import DynamicSplit
@@ -70,6 +71,22 @@ def test_each_view_tells_which_gaussians_it_shows() -> None:
         visible = found.visible[view.index]
         assert 0 < visible.sum() < drawn.sum()  # Some are hidden behind others.
         assert not visible[~drawn].any()
+
+
+def test_what_moved_before_moves_more_easily() -> None:
+    strict = replace(CONFIG, least_share=0.9, moved_ease=0.2)
+    views, earlier = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (1, 0))
+
+    def found(older: Scene | None) -> torch.Tensor:
+        return moved_since(WORLD.scene, views, earlier, config=strict, backend=reference_backend(), older=older).anchors
+
+    shift = torch.zeros_like(WORLD.scene.anchors.positions)
+    shift[:20] = 0.01
+    anchors = replace(WORLD.scene.anchors, positions=WORLD.scene.anchors.positions - shift)
+    moved, first = found(replace(WORLD.scene, anchors=anchors)), found(None)
+    assert torch.equal(found(WORLD.scene), first), "nothing moved before"
+    assert moved[:20].sum() > first[:20].sum()
+    assert torch.equal(moved[20:], first[20:])
 
 
 def test_what_changed_is_told_by_row_and_by_birth() -> None:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tracking: primitives follow lifted flow through every frame, without an iteration.
 
-What carries a sequential run through large motion is its initial scene flow, not its iterations. Tracking is that
-alone, made cheap: a part of the cameras in turn, only the tiles in which pictures changed, and sums of flow at a
-quarter of the size. Flow from the last pictures to these displaces the primitives, then flow from the rendering to
-these in a part of those cameras, which bounds drift, because renderings do not forget what things look like. A few
-cameras in every frame do that better than all in every second or third. Gaussians are generated once a camera and
-frame.
+What carries a sequential run through large motion is its scene flow (``training/online/scene_flow.py``), not its
+iterations. Tracking is that alone, made cheap: a part of the cameras in turn, only the tiles in which pictures changed,
+and sums of flow at a quarter of the size. Flow from the last pictures to these displaces the primitives, then flow from
+the rendering to these in a part of those cameras, which bounds drift, because renderings do not forget what things look
+like. A few cameras in every frame do that better than all in every second or third. Gaussians are generated once a
+camera and frame.
 """
 
 from collections.abc import Mapping, Sequence
@@ -176,7 +176,7 @@ def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tra
             primitives = moving.nonzero()[:, 0]
         with watch.stage("flow between pictures"):
             views = [entry.view for entry in seen]
-            evidence = flow_evidence([entry.flows[primitives, :3] for entry in seen])
+            evidence = flow_evidence([entry.flows[primitives] for entry in seen])
             centers = primitive_centers(scene, _coverage(seen, scene))
             priors, lift = tracker.config.prior * past.velocities[primitives], tracker.lift
             found = lift_flow(evidence, centers[primitives], priors, views, config=lift, backend=tracker.backend)
@@ -201,7 +201,7 @@ def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tra
 @dataclass(frozen=True)
 class _Seen:
     """What one camera tells: its ``N`` Gaussians in changed tiles, the primitive and coverage ``[N]`` of each, votes
-    ``[E]`` sums of flow and coverage ``[E, 4]``."""
+    ``[E]`` and sums of flow ``[E, 7]``."""
 
     view: View
     tiles: TileSelection
@@ -223,15 +223,16 @@ def _seen(tracker: Tracker, scene: Scene, view: View, change: PictureChange) -> 
     part = area_mean(change.changed[None, None].float(), size)[0, 0]
     assert change.flow is not None, "estimated for all that are tracked with"
     # In the order of the evidence, then the changed part. All are zero outside the tiles, which then cost nothing.
-    maps = torch.cat([change.flow, inside[..., None], part[..., None]], dim=-1)
+    colors = change.flow[..., 3:] * inside[..., None]
+    maps = torch.cat([change.flow[..., :3], inside[..., None], colors, part[..., None]], dim=-1)
     primitives = primitive_of(gaussians, scene)
     sums = accumulate(gaussians, small.camera, maps, backend)
     sums *= _enlarged(tracker, view, size)
     moved = sum_by_primitive(sums, primitives, scene)
-    total, changed = moved[:, 3], moved[:, 4]
+    total, changed = moved[:, 3], moved[:, 7]
     votes = (changed > motion.least_pixels) & (changed > motion.least_share * total)
     of_view = ViewChange(float(change.changed.float().mean()), 0.0, repeated=change.repeated)
-    return _Seen(view, tiles, gaussians, primitives, votes, sums[:, 3], moved[:, :4], of_view)
+    return _Seen(view, tiles, gaussians, primitives, votes, sums[:, 3], moved[:, :7], of_view)
 
 
 def _occluded(motion: MotionConfig, scene: Scene, seen: Sequence[_Seen], moving: Tensor) -> Tensor:
@@ -260,7 +261,7 @@ def _occluded(motion: MotionConfig, scene: Scene, seen: Sequence[_Seen], moving:
 
 
 def _rendered_flow(tracker: Tracker, scene: Scene, seen: _Seen, velocities: Tensor) -> Tensor:
-    """Sums ``[E, 3]`` of the flow from the rendering of the displaced primitives to the picture."""
+    """Sums ``[E, 7]`` of the flow from the rendering of the displaced primitives to the picture."""
     view, backend, gaussians = seen.view, tracker.backend, seen.gaussians
     moved = replace(gaussians, means=gaussians.means + velocities[seen.primitives])
     drawn = backend.rasterize(
@@ -274,7 +275,9 @@ def _rendered_flow(tracker: Tracker, scene: Scene, seen: _Seen, velocities: Tens
     small = view.evidence(tracker.config.picture_scale)
     size = (small.camera.height, small.camera.width)
     found = flow_map(picture, view.image, counting, size, mask=counting, config=tracker.config.flow, backend=backend)
-    sums = accumulate(moved, small.camera, found.maps, backend)
+    inside = area_mean(counting[None, None].float(), size)[0, 0]
+    maps = torch.cat([found.maps, inside[..., None], small.colors * inside[..., None]], dim=-1)
+    sums = accumulate(moved, small.camera, maps, backend)
     sums *= _enlarged(tracker, view, size)
     return sum_by_primitive(sums, seen.primitives, scene)
 

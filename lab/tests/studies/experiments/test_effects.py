@@ -11,6 +11,7 @@ from structgstream.presets import COMPACT, PRESETS, RIG, to_json
 from structgstream_studies.experiments.effects import (
     BETTER_FIRST,
     CARRIED_SHARE,
+    EASED,
     WHOLE,
     effects,
     effects_sheet,
@@ -56,6 +57,7 @@ def test_what_the_switches_are() -> None:
     assert whole.start.enabled
     assert not online["compact-without-start"].start.enabled
     assert (whole.start.rounds, online["compact-one-round"].start.rounds) == (2, 1)
+    assert online["compact-colors-alike"].start.lift.color_bandwidth == 0.0 < whole.start.lift.color_bandwidth
     assert online["compact-without-residuals"].motion.residual_threshold == 0.0 < whole.motion.residual_threshold
     assert whole.rounding.free_priced
     assert not online["compact-free-unpriced"].rounding.free_priced
@@ -78,13 +80,14 @@ def test_what_the_switches_are() -> None:
 
 def test_what_is_off_is_tried_and_what_is_on_is_left_out() -> None:
     online = COMPACT.online
-    given = {"carried_share": 0.7}
-    none = {"carried_share": 0.0}
+    given = {"moved_ease": 0.3, "carried_share": 0.7}
+    none = {"moved_ease": 1.0, "carried_share": 0.0}
     on = replace(online, motion=replace(online.motion, **given))
     off = replace(online, motion=replace(online.motion, **none))
-    tried = (off, CARRIED_SHARE)
-    for whole, carried in ((on, 0.0), tried):
+    tried = (off, EASED, CARRIED_SHARE)
+    for whole, ease, carried in ((on, 1.0, 0.0), tried):
         rows = effects(replace(COMPACT, online=whole), paper=RIG)
+        assert rows["compact-memory"].config.online.motion.moved_ease == ease
         assert rows["compact-carrying"].config.online.motion.carried_share == carried
 
 

@@ -70,6 +70,9 @@ class MotionConfig:
     """Least share of changed pixels among all that a primitive covers in a view to get its vote."""
     least_views: int = 2
     """Least number of votes of a primitive that is trained: two, because one view may have changed by noise."""
+    moved_ease: float = 1.0
+    """Factor (hysteresis) on the thresholds of pixels and shares for primitives that the last frame changed. 1:
+    none."""
     carried_share: float = 0.0
     """An anchor that fewer than ``least_views`` views show is trained if at least this share of its nearest shown ones
     is: it lies in or behind what moves. 0: none."""
@@ -96,6 +99,9 @@ class LiftConfig:
     """Number of nearest primitives, including itself, whose flow a displacement is fitted to."""
     bandwidth: float = 0.7
     """Standard deviation of the Gaussian weight of a neighbour by distance, relative to the farthest neighbour's."""
+    color_bandwidth: float = 0.15
+    """Standard deviation of the Gaussian weight of a neighbour by colour difference (full scale 1), which separates
+    adjacent objects. 0: no weight by colour."""
     inlier_share: float = 0.4
     """Least share of inliers of a valid displacement, over all flow and in each agreeing view."""
     agreeing_views: int = 2

@@ -60,7 +60,7 @@ def fit_next_frame(
         pictures: of ``frame``, and their changes since the previous one for motion selection (``config.motion``;
             :func:`~structgstream.training.online.preprocess.preprocess`); without them everything is trained.
         steps: quantization steps (Note [Bins]); the parameters it names are drawn and returned quantized.
-        older: the decoded scene two frames before, for ``config.motion_prior``; None for none.
+        older: the decoded scene two frames before, if :func:`needs_older`; None for none.
         intervals: media time since the previous frame, in times of that between the two before, for the motion prior.
         floor: residuals of frame 0, for ``config.motion.residual_threshold`` and for spawning; None for none.
         light: frame 0's, for ``config.light``; None for none.
@@ -90,7 +90,7 @@ def fit_next_frame(
 
     with watch.stage("find motion"):
         measured = measure(scene, views, pictures.changes, config=config.motion, backend=backend, floor=floor)
-        selection = select_dynamic(scene, measured, config=config.motion, backend=backend)
+        selection = select_dynamic(scene, measured, config=config.motion, backend=backend, older=older)
         split = DynamicSplit.of(scene, selection)
         inliers = [views[number] for number in selection.inliers]
     with watch.stage("start motion"):
@@ -143,7 +143,7 @@ def held(scene: Scene) -> FitResult[Scene]:
 
 def needs_older(config: OnlineConfig) -> bool:
     """Whether a frame depends on the two decoded frames before it, instead of one."""
-    return config.motion_prior != 0.0
+    return config.motion_prior != 0.0 or (config.motion.enabled and config.motion.moved_ease != 1.0)
 
 
 def prior_displacements(scene: Scene, older: Scene | None, share: float) -> Tensor:

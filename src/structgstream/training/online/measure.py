@@ -32,14 +32,16 @@ class FlowEvidence:
     Args:
         weights: ``[V, E]`` pixels with consistent flow that the primitive covers, by blending weight.
         flows: ``[V, E, 2]`` mean flow over them, pixels of the full picture.
+        colors: ``[E, 3]`` mean colour of the pictures over the pixels that it covers, in 0 ... 1.
     """
 
     weights: Tensor
     flows: Tensor
+    colors: Tensor
 
     def select(self, primitives: Tensor) -> "FlowEvidence":
         """The evidence of the primitives of a mask ``[E]`` or of indices ``[e]``."""
-        return FlowEvidence(self.weights[:, primitives], self.flows[:, primitives])
+        return FlowEvidence(self.weights[:, primitives], self.flows[:, primitives], self.colors[primitives])
 
 
 def accumulate(
@@ -81,16 +83,16 @@ above the second it is clamped."""
 
 
 def flow_evidence(sums: Sequence[Tensor]) -> FlowEvidence:
-    """Evidence from the accumulated maps c, c flow_x and c flow_y of each view.
+    """Evidence from the accumulated maps c, c flow_x, c flow_y, 1, r, g and b of each view.
 
     Args:
-        sums: by view ``[E, 3]``, in pixels of a picture of the reference size.
+        sums: by view ``[E, 7]``, in pixels of a picture of the reference size.
     """
     stacked = torch.stack(list(sums))
-    weights = stacked[..., 0]
-    flows = stacked[..., 1:] / weights.clamp(min=1e-6)[..., None]
+    weights, moved, coverage, colors = stacked[..., 0], stacked[..., 1:3], stacked[..., 3], stacked[..., 4:]
+    flows = moved / weights.clamp(min=1e-6)[..., None]
     weights = torch.where(weights < FLOW_LEAST_PIXELS, 0.0, weights.clamp(max=FLOW_MOST_PIXELS))
-    return FlowEvidence(weights, flows)
+    return FlowEvidence(weights, flows, colors.sum(0) / coverage.sum(0).clamp(min=1e-6)[:, None])
 
 
 def primitive_centers(scene: Scene, coverage: Tensor) -> Tensor:
@@ -134,7 +136,7 @@ class ViewMeasurement:
         coverage: ``[M * K + F]`` pixels that each Gaussian covers by blending weight, by id (Note [Ids]).
         covered: ``[E]`` pixels that each primitive covers.
         covered_changed: ``[E]`` changed pixels among them; None for a camera that was absent from the previous frame.
-        flow_sums: ``[E, 3]`` for :func:`flow_evidence`; None if flow was not estimated.
+        flow_sums: ``[E, 7]`` for :func:`flow_evidence`; None if flow was not estimated.
         changed: mask ``[h, w]`` of the changed pixels, at ``MotionConfig.picture_scale``; None as ``covered_changed``.
         change: of the picture as a whole.
     """
@@ -225,7 +227,7 @@ def _measure_view(
         coverage,
         covered=sums[:, 0],
         covered_changed=sums[:, 1],
-        flow_sums=None if change.flow is None else sums[:, 2:],
+        flow_sums=None if change.flow is None else sums[:, [2, 3, 4, 0, 5, 6, 7]],
         changed=changed > 0.0,
         change=ViewChange(changed_share, wrong_share, repeated=change.repeated),
     )

@@ -54,8 +54,8 @@ class PictureChange:
     Args:
         changed: ``[H, W]`` bool, dilated mask of the changed pixels.
         repeated: whether it is the previous picture once more, equal or encoded again: a frozen camera's.
-        flow: ``[h, w, 3]`` the maps of :func:`flow_map` from the previous picture to this one; None if flow was not
-            estimated.
+        flow: ``[h, w, 6]`` the maps of ``flow_maps.flow_map`` from the previous picture to this one, and the previous
+            picture in 0 ... 1; None if flow was not estimated.
         far_boxes: number of boxes in which large motion was searched for (``flow_maps.FlowMaps``).
     """
 
@@ -155,7 +155,10 @@ def detect_changes(
             if view.index in flow_from:
                 size = (small.height, small.width)
                 estimated = flow_map(then, now, changed, size, mask=both, config=flow, backend=backend)
-                found, far_boxes = estimated.maps, estimated.far_boxes
+                found, far_boxes = (
+                    torch.cat([estimated.maps, last.evidence(config.picture_scale).colors], dim=-1),
+                    estimated.far_boxes,
+                )
             changes.append(PictureChange(changed, _is_repeated(then, now, changed, both), found, far_boxes))
     return changes
 

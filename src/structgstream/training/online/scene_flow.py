@@ -77,6 +77,9 @@ def lift_flow(
     spread = config.bandwidth * distances[:, -1:].clamp(min=1e-9)
     affinities = torch.exp(-0.5 * (distances / spread).square())
     neighbours = informed[near]
+    if config.color_bandwidth > 0.0:
+        apart = (evidence.colors[neighbours] - evidence.colors[:, None]).square().sum(-1)
+        affinities = affinities * torch.exp(-0.5 * apart / config.color_bandwidth**2)
     viewports = [view.camera.viewport(centers) for view in views]
     # The tolerance has a unit of one pixel at the reference size: errors of the flow of what hardly moves come from how
     # bodies bend, from occlusion and from blending, which are as large in space however many pixels show them.
@@ -244,10 +247,10 @@ def residual_flow(
             active, small = active_tiles[view.index], view.evidence(scale)
             gaussians = folded.gaussians(view.camera, backend)
             counting = torch.ones_like(flow[..., 0]) if small.mask is None else small.mask.to(flow)
-            maps = torch.cat([flow, counting[..., None]], dim=-1)
+            maps = torch.cat([flow, counting[..., None], small.colors], dim=-1)
             found = accumulate(gaussians, small.camera, maps, backend, static=active.static)
             found *= view.reference_area / counting.numel()
-            sums.append(sum_by_primitive(found[:, :3], primitive_of(gaussians, folded), folded))
+            sums.append(sum_by_primitive(found, primitive_of(gaussians, folded), folded))
             coverage[gaussians.ids] += found[:, 3]
     nothing = torch.zeros(len(dynamic.anchors) + len(dynamic.free), 3).to(dynamic.anchors.positions)
     if not seen:

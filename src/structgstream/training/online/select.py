@@ -109,6 +109,7 @@ def select_dynamic(
     *,
     config: MotionConfig,
     backend: Backend,
+    older: Scene | None = None,
 ) -> DynamicSelection:
     """The dynamic primitives of ``scene``, by what each view has measured.
 
@@ -117,8 +118,12 @@ def select_dynamic(
         measured: by :func:`~structgstream.training.online.measure.measure`, of each view.
         config: thresholds.
         backend: the compute back-end.
+        older: the scene two frames before, for ``moved_ease``; None for none.
     """
     anchors = len(scene.anchors)
+    ease = torch.ones(anchors + len(scene.free), device=scene.anchors.positions.device)
+    if older is not None:
+        ease[changed_primitives(older, scene)] = config.moved_ease
 
     view_changes = [of_view.change for of_view in measured]
     for number in outlier_candidates(view_changes):
@@ -126,11 +131,11 @@ def select_dynamic(
         view_changes[number] = replace(view_changes[number], shift_pixels=shift)
     inliers = [number for number, good in enumerate(inlier_views(view_changes)) if good]
 
-    votes, shown = torch.zeros(2, anchors + len(scene.free), dtype=torch.int64, device=scene.anchors.positions.device)
+    votes, shown = (torch.zeros_like(ease, dtype=torch.int64) for _ in range(2))
     for of_view in (measured[number] for number in inliers):
         if of_view.covered_changed is not None:
-            enough = of_view.covered_changed > config.least_pixels
-            votes += enough & (of_view.covered_changed > config.least_share * of_view.covered)
+            enough = of_view.covered_changed > config.least_pixels * ease
+            votes += enough & (of_view.covered_changed > config.least_share * ease * of_view.covered)
             shown += of_view.covered > config.least_pixels
     dynamic = votes >= config.least_views
     occluded = occluded_dynamic(

@@ -24,7 +24,7 @@ BETTER_FIRST = "paper-better-first"
 DISTURBANCE_FIELDS = tuple(f"initial.disturbance.{name}" for name in ("dropped_share", "noise_scales", "until_share"))
 LOSS_FIELDS = ("initial.losses.l1", "initial.losses.ssim")
 OFFSET_FIELDS, PAPER_OFFSETS = ("initial.offsets_per_anchor", "initial.all_drawn"), 5
-CARRIED_SHARE, OTHER_RANK = 0.4, 8
+CARRIED_SHARE, EASED, OTHER_RANK = 0.4, 0.5, 8
 """Values of switches that are off in the whole preset."""
 PAPER_ITERATIONS = 100
 
@@ -123,6 +123,9 @@ def _with_first_of(config: StreamConfig, full: StreamConfig) -> StreamConfig:
 def _of_the_gate(rows: _Rows) -> None:
     motion = rows.whole.motion
     rows.gated("without-gate", "w/o change gate", replace(motion, enabled=False), "enabled")
+    eased = EASED if motion.moved_ease == 1.0 else 1.0
+    title = "hysteresis of the gate" if eased != 1.0 else "w/o hysteresis of the gate"
+    rows.gated("memory", title, replace(motion, moved_ease=eased), "moved_ease")
     carried = CARRIED_SHARE if motion.carried_share == 0.0 else 0.0
     title = "hidden anchors are carried along" if carried else "hidden anchors stay behind"
     rows.gated("carrying", title, replace(motion, carried_share=carried), "carried_share")
@@ -155,6 +158,8 @@ def _of_the_start(rows: _Rows) -> None:
     off, single = replace(start, enabled=False), replace(start, rounds=1)
     rows.online("without-start", "w/o motion start", replace(whole, start=off), "start.enabled")
     rows.online("one-round", "motion start in one round", replace(whole, start=single), "start.rounds")
+    alike = replace(whole, start=replace(start, lift=replace(start.lift, color_bandwidth=0.0)))
+    rows.online("colors-alike", "displacements w/o weights by colour", alike, "start.lift.color_bandwidth")
     motion = replace(whole.motion, residual_threshold=0.0)
     rows.gated("without-residuals", "gate w/o residuals", motion, "residual_threshold")
 
