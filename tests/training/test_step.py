@@ -3,11 +3,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from structgstream.kernels.values import TileSelection
 
 from backends import quickest_backend
 from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
-from structgstream.kernels.raster_types import TileSelection
 from structgstream.kernels.reference_ssim import l1_ssim as reference_l1_ssim
 from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.color import CameraColor

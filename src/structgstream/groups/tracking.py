@@ -19,7 +19,7 @@ from structgstream.cameras import CameraRig, enlargement
 from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.raster_types import TileSelection
+from structgstream.kernels.values import TileSelection
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import FlowConfig, LiftConfig, MotionConfig
 from structgstream.training.online.measure import (

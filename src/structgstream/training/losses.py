@@ -22,8 +22,8 @@ import torch
 from torch import Tensor
 
 from structgstream.gaussians import Gaussians
-from structgstream.kernels.anchor_types import StructuredGaussians
 from structgstream.kernels.backend import Backend
+from structgstream.kernels.values import StructuredGaussians
 from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor

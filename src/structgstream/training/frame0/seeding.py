@@ -31,8 +31,8 @@ import torch
 from torch import Tensor
 
 from structgstream.errors import CaptureError, MissingExtraError
-from structgstream.kernels.anchor_types import HeadWeights, MLPWeights
 from structgstream.kernels.backend import Backend
+from structgstream.kernels.values import HeadWeights, MLPWeights
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
 from structgstream.scene.environment import pixel_directions

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.motion_types import Neighbors, ViewFlows
+from structgstream.kernels.values import Neighbors, ViewFlows
 from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.scene import Scene
 from structgstream.training.neighbours import nearest

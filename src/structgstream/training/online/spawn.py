@@ -20,8 +20,7 @@ from structgstream.cameras import Camera
 from structgstream.errors import MissingExtraError
 from structgstream.gaussians import concatenate
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.motion_types import SweepView
-from structgstream.kernels.raster_types import TileSelection
+from structgstream.kernels.values import SweepView, TileSelection
 from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
