@@ -19,12 +19,11 @@ def adam_step(
     step: int | Tensor,
     betas: tuple[float, float],
     eps: float,
-    rows: Tensor | None = None,
 ) -> None:
     """See ``kernels.operations.AdamStep``.
 
     Raises:
-        BackendError: a tensor is not contiguous float32, the shapes differ, or a row is out of bounds.
+        BackendError: a tensor is not contiguous float32, or the shapes differ.
     """
     for tensor in (param, exp_avg, exp_avg_sq):
         if tensor.dtype != torch.float32 or not tensor.is_contiguous() or tensor.shape != grad.shape:
@@ -32,20 +31,11 @@ def adam_step(
                 f"The cpu back-end steps contiguous float32 tensors shaped like their gradient {tuple(grad.shape)}, "
                 f"got {tensor.dtype} {tuple(tensor.shape)}; take the reference back-end for others."
             )
-    if param.numel() == 0:
-        return
     grad = grad.to(torch.float32).contiguous()
-    width = param[0].numel() if param.ndim else 1
-    count = param.numel() // width
-    if rows is not None:
-        rows = rows.to(torch.int64).contiguous()
-        count = rows.shape[0]
-        if count and (int(rows.min()) < 0 or int(rows.max()) >= param.shape[0]):
-            raise BackendError(f"Rows to step must lie in 0 ... {param.shape[0] - 1}.")
     native_library().sgs_adam_step(
-        *addresses(param, grad, exp_avg, exp_avg_sq, rows),
-        count,
-        width,
+        *addresses(param, grad, exp_avg, exp_avg_sq, None),
+        param.numel(),
+        1,
         float(lr),
         int(step),
         *betas,

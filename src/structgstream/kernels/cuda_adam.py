@@ -4,8 +4,6 @@
 import torch
 from torch import Tensor
 
-from structgstream.kernels import reference_adam
-
 
 def adam_step(
     param: Tensor,
@@ -17,12 +15,8 @@ def adam_step(
     step: int | Tensor,
     betas: tuple[float, float],
     eps: float,
-    rows: Tensor | None = None,
 ) -> None:
-    """See ``kernels.operations.AdamStep``; without host synchronisation. With ``rows`` the reference computes."""
-    if rows is not None:
-        reference_adam.adam_step(param, grad, exp_avg, exp_avg_sq, lr=lr, step=step, betas=betas, eps=eps, rows=rows)
-        return
+    """See ``kernels.operations.AdamStep``; without host synchronisation."""
     if param.numel() == 0:
         return
     torch._fused_adam_(  # pyright: ignore[reportPrivateImportUsage]

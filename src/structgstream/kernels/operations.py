@@ -337,7 +337,6 @@ class AdamStep(Protocol):
         step: number of this step, from 1; likewise.
         betas: decay of the moments.
         eps: added to the root of the corrected second moment.
-        rows: ``[r]`` int64, unique; only these rows (first dimension) are updated. None: all.
     """
 
     def __call__(
@@ -351,5 +350,4 @@ class AdamStep(Protocol):
         step: int | Tensor,
         betas: tuple[float, float],
         eps: float,
-        rows: Tensor | None = None,
     ) -> None: ...

@@ -14,15 +14,8 @@ def adam_step(
     step: int | Tensor,
     betas: tuple[float, float],
     eps: float,
-    rows: Tensor | None = None,
 ) -> None:
     """See ``kernels.operations.AdamStep``."""
-    if rows is not None:
-        values = [tensor[rows] for tensor in (param, grad, exp_avg, exp_avg_sq)]
-        adam_step(*values, lr=lr, step=step, betas=betas, eps=eps)
-        for tensor, value in zip((param, exp_avg, exp_avg_sq), (values[0], values[2], values[3])):
-            tensor[rows] = value
-        return
     lr, step = float(lr), int(step)
     exp_avg.mul_(betas[0]).add_(grad, alpha=1.0 - betas[0])
     exp_avg_sq.mul_(betas[1]).addcmul_(grad, grad, value=1.0 - betas[1])
