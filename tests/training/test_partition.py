@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from rigs import random_scene
-from structgstream.kernels._load import native_reason
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
+from structgstream.kernels.native import native_reason
 from structgstream.kernels.raster_types import TileSelection
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import draw

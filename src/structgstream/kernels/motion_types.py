@@ -43,7 +43,7 @@ class Lifted:
 
     Args:
         displacements: ``[T, 3]``.
-        inlier_share: ``[T]`` share of the flow's weight that are inliers (``kernels.operations.Lift``); 0 without flow.
+        inlier_share: ``[T]`` share of the flow's weight that are inliers (``reference_motion.lift``); 0 without flow.
         agreeing_views: ``[T]`` int64, number of views in which more than ``share`` of the weight are inliers.
     """
 

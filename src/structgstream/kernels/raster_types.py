@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Types that all rasterisers share: selections of tiles, and the result."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -84,3 +85,7 @@ class RasterOutput:
     image: Tensor
     alpha: Tensor
     radii: Tensor
+
+
+Rasterizer = Callable[..., RasterOutput]
+"""A function with the arguments of ``reference_raster.rasterize``."""
