@@ -14,7 +14,7 @@ from structgstream.cameras import Viewport
 from structgstream.gaussians import Gaussians
 from structgstream.geometry import quaternion_matrices
 from structgstream.kernels import cpu_raster, reference_raster
-from structgstream.kernels.raster_types import Rasterizer
+from structgstream.kernels.values import Rasterizer
 
 Workload = tuple[Gaussians, Viewport, Tensor]
 """The Gaussians, where they are seen from, and the gradient of the picture."""

@@ -23,7 +23,7 @@ from structgstream.gaussians import Gaussians
 from structgstream.kernels import reference_raster
 from structgstream.kernels.backend import Backend, reference_backend
 from structgstream.kernels.cuda_tiles import PairBudget
-from structgstream.kernels.raster_types import Rasterizer, RasterOutput, TileSelection
+from structgstream.kernels.values import Rasterizer, RasterOutput, TileSelection
 
 # Autograd has no threads for a GPU that is not there; for this device it works on the calling one.
 DEVICE = torch.device("meta")

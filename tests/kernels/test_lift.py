@@ -4,8 +4,8 @@
 import torch
 
 from structgstream.kernels import reference_motion
-from structgstream.kernels.motion_types import Neighbors, ViewFlows
 from structgstream.kernels.reference_motion import lift, projection_jacobians
+from structgstream.kernels.values import Neighbors, ViewFlows
 
 MOTION = torch.tensor([0.03, -0.02, 0.01], dtype=torch.float64)
 VIEWS, MOVERS = 5, 30

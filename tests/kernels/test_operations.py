@@ -18,7 +18,7 @@ from structgstream.kernels.backend import Backend, cpu_backend, cuda_backend, no
 from structgstream.kernels.cuda_library import CUDA_PROTOTYPES, KernelLibrary
 from structgstream.kernels.cuda_tiles import PairBudget
 from structgstream.kernels.native import native_reason
-from structgstream.kernels.raster_types import TileSelection, tile_grid
+from structgstream.kernels.values import TileSelection, tile_grid
 
 native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 BUILDERS = [

@@ -13,9 +13,8 @@ from splats import splats_of, viewport_of
 from structgstream.codec.entropy import decisions, rans
 from structgstream.errors import OutOfMemoryError
 from structgstream.kernels import cpu_anchors, cpu_motion, cpu_raster
-from structgstream.kernels.anchor_types import Anchors
-from structgstream.kernels.motion_types import Neighbors, ViewFlows
 from structgstream.kernels.native import native_reason
+from structgstream.kernels.values import Anchors, Neighbors, ViewFlows
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason="the native library is not built here")
 Z = torch.zeros

@@ -5,8 +5,8 @@ import numpy as np
 import torch
 
 from structgstream.flow import ABSOLUTE, RELATIVE, consistency_mask
-from structgstream.kernels.raster_types import TileSelection
 from structgstream.kernels.reference_motion import changed_pixels, confident_flow, picture_residual
+from structgstream.kernels.values import TileSelection
 
 
 def test_what_changed_and_its_surroundings() -> None:

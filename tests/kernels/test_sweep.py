@@ -8,8 +8,8 @@ import torch
 
 from rigs import arc_rig
 from structgstream.kernels import cpu_motion, reference_motion
-from structgstream.kernels.motion_types import SweepView, Swept
 from structgstream.kernels.native import native_reason
+from structgstream.kernels.values import SweepView, Swept
 
 needs_native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 SWEEPERS = [

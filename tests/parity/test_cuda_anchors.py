@@ -10,8 +10,7 @@ from torch import Tensor
 from splats import viewport_of
 from structgstream.cameras import Viewport
 from structgstream.kernels import cuda_anchors, reference_anchors, reference_raster
-from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights, StructuredGaussians
-from structgstream.kernels.raster_types import TileSelection, tile_grid
+from structgstream.kernels.values import Anchors, HeadWeights, MLPWeights, StructuredGaussians, TileSelection, tile_grid
 
 M, K, D, HIDDEN = 60, 5, 12, 16
 WIDTH, HEIGHT = 53, 41

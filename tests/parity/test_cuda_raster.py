@@ -16,7 +16,7 @@ from structgstream.cameras import Viewport
 from structgstream.kernels import cuda, reference_raster
 from structgstream.kernels.cuda_library import kernel_library
 from structgstream.kernels.cuda_tiles import PairBudget
-from structgstream.kernels.raster_types import TILE_PIXELS, Rasterizer, TileSelection, tile_grid
+from structgstream.kernels.values import TILE_PIXELS, Rasterizer, TileSelection, tile_grid
 
 WIDTH, HEIGHT, NEAR, COUNT = 41, 35, 0.2, 30
 PAIRS = 700

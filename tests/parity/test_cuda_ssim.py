@@ -16,7 +16,7 @@ from structgstream.errors import BackendError
 from structgstream.kernels import cpu_losses, cuda, reference_losses
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.native import native_reason
-from structgstream.kernels.raster_types import TileSelection, tile_grid
+from structgstream.kernels.values import TileSelection, tile_grid
 
 Loss = Callable[..., tuple[Tensor, Tensor]]
 

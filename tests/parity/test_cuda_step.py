@@ -11,9 +11,9 @@ from torch import Tensor
 
 from structgstream.cameras import Viewport
 from structgstream.kernels import cuda, cuda_anchors
-from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights
 from structgstream.kernels.backend import Backend, cuda_backend, nonblocking, reference_backend
 from structgstream.kernels.cuda_tiles import PairBudget
+from structgstream.kernels.values import Anchors, HeadWeights, MLPWeights
 
 M, K, D, HIDDEN, WIDTH, HEIGHT = 40, 4, 6, 8, 48, 40
 STEPS = 4

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from structgstream.kernels import cpu_motion, reference_motion
-from structgstream.kernels.motion_types import Lifted, Neighbors, ViewFlows
 from structgstream.kernels.native import native_library, native_reason
+from structgstream.kernels.values import Lifted, Neighbors, ViewFlows
 
 needs_native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 

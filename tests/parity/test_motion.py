@@ -7,7 +7,7 @@ import torch
 from structgstream.flow import ABSOLUTE, RELATIVE
 from structgstream.kernels import cpu_motion, reference_motion
 from structgstream.kernels.native import native_reason
-from structgstream.kernels.raster_types import TileSelection, tile_grid
+from structgstream.kernels.values import TileSelection, tile_grid
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 

@@ -9,7 +9,7 @@ from published import published_ssim
 from structgstream.errors import BackendError
 from structgstream.kernels import cpu_losses, reference_losses
 from structgstream.kernels.native import native_reason
-from structgstream.kernels.raster_types import TileSelection, tile_grid
+from structgstream.kernels.values import TileSelection, tile_grid
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from structgstream.kernels.backend import reference_backend
-from structgstream.kernels.raster_types import RasterOutput
+from structgstream.kernels.values import RasterOutput
 from structgstream.training.birth_sweep import Sweep, missing_share
 from structgstream.training.births import BirthConfig
 from structgstream.training.motion import MotionConfig

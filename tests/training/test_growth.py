@@ -5,7 +5,7 @@ import torch
 
 from rigs import random_scene
 from structgstream.gaussians import Gaussians
-from structgstream.kernels.anchor_types import StructuredGaussians
+from structgstream.kernels.values import StructuredGaussians
 from structgstream.training.growth import GrowthConfig, OpacityStatistics, grow, prunable_mask
 
 VOXEL = 0.01

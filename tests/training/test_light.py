@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.errors import ConfigError
-from structgstream.kernels.anchor_types import HeadWeights
+from structgstream.kernels.values import HeadWeights
 from structgstream.presets import COMPACT
 from structgstream.scene.scene import Scene
 from structgstream.training.light import LightConfig, light_reference, with_light_of

@@ -9,7 +9,7 @@ import torch
 
 from rigs import random_scene
 from structgstream.kernels.backend import reference_backend
-from structgstream.kernels.raster_types import TileSelection, tile_grid
+from structgstream.kernels.values import TileSelection, tile_grid
 from structgstream.scene.focus import Focus
 from structgstream.scene.scene import Scene
 from structgstream.training.early_stopping import EarlyStopping

@@ -10,7 +10,7 @@ import torch
 from rigs import random_scene
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
 from structgstream.kernels.native import native_reason
-from structgstream.kernels.raster_types import TileSelection
+from structgstream.kernels.values import TileSelection
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import draw
 from structgstream.scene.state import PAPER_DYNAMIC, state_of

@@ -12,7 +12,7 @@ from rigs import random_scene
 from structgstream import cameras
 from structgstream.cameras import Camera, CameraRig, enlargement
 from structgstream.frames import MultiViewFrame
-from structgstream.kernels.raster_types import TILE_PIXELS
+from structgstream.kernels.values import TILE_PIXELS
 from structgstream.training.coherence import CoherenceConfig, MotionCoherence
 from structgstream.training.growth import MOST_ANCHORS, GrowthConfig
 from structgstream.training.light import LightConfig, light_reference

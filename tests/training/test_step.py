@@ -7,8 +7,8 @@ import torch
 from backends import quickest_backend
 from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
-from structgstream.kernels.raster_types import TileSelection
 from structgstream.kernels.reference_losses import l1_ssim as reference_l1_ssim
+from structgstream.kernels.values import TileSelection
 from structgstream.scene.color import CameraColor
 from structgstream.scene.focus import Focus
 from structgstream.scene.render import draw

@@ -11,9 +11,8 @@ from torch import Tensor
 from structgstream.cameras import Viewport
 from structgstream.errors import BackendError, OutOfMemoryError
 from structgstream.gaussians import Gaussians
-from structgstream.kernels.anchor_types import Anchors, MLPWeights, StructuredGaussians
 from structgstream.kernels.native import addresses, members, native_library
-from structgstream.kernels.raster_types import TileSelection
+from structgstream.kernels.values import Anchors, MLPWeights, StructuredGaussians, TileSelection
 
 # The structures below mirror csrc/cpu/anchors.h, member by member.
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from structgstream.errors import BackendError
 from structgstream.kernels.native import native_library
-from structgstream.kernels.raster_types import TileSelection
+from structgstream.kernels.values import TileSelection
 
 
 @dataclass(frozen=True)

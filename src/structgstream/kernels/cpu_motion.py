@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from structgstream.errors import OutOfMemoryError
-from structgstream.kernels.motion_types import Lifted, Neighbors, SweepView, Swept, ViewFlows
 from structgstream.kernels.native import addresses, members, native_library
-from structgstream.kernels.raster_types import TileSelection
+from structgstream.kernels.values import Lifted, Neighbors, SweepView, Swept, TileSelection, ViewFlows
 
 # The structures below mirror csrc/include/structgstream.h, member by member.
 
@@ -105,18 +104,18 @@ def lift(centers: Tensor, seen: ViewFlows, neighbors: Neighbors, priors: Tensor,
     Raises:
         OutOfMemoryError: there is no memory for the terms of one target per thread.
     """
-    views, movers = seen.weights.shape
+    views, dynamic = seen.weights.shape
     targets, count = neighbors.rows.shape
-    assert centers.shape == (movers, 3), centers.shape
-    assert seen.flows.shape == (views, movers, 2), seen.flows.shape
+    assert centers.shape == (dynamic, 3), centers.shape
+    assert seen.flows.shape == (views, dynamic, 2), seen.flows.shape
     assert neighbors.affinities.shape == (targets, count), neighbors.affinities.shape
     assert priors.shape == (targets, 3), priors.shape
     assert seen.viewmats.shape == (views, 4, 4), seen.viewmats.shape
     assert seen.Ks.shape == (views, 3, 3), seen.Ks.shape
     rows = neighbors.rows.to(torch.int64).contiguous()
-    assert not targets or 0 <= int(rows.min()) <= int(rows.max()) < movers, "rows of movers"
+    assert not targets or 0 <= int(rows.min()) <= int(rows.max()) < dynamic, "rows of dynamic anchors and Gaussians"
     observed, pulls = map(_constant, (centers, *seen)), map(_constant, (neighbors.affinities, priors))
-    sizes = movers, targets, views, count
+    sizes = dynamic, targets, views, count
     found = torch.empty(targets, 3), torch.empty(targets), torch.empty(targets, dtype=torch.int64)
     if native_library().sgs_lift_flow(*observed, rows, *pulls, *sizes, share, *found, torch.get_num_threads()):
         raise OutOfMemoryError("to lift flow to displacements")
@@ -135,9 +134,9 @@ def sweep(
 ) -> Swept:
     """See ``reference_motion.sweep``."""
     assert len(pixels) == len(farthest), (pixels.shape, farthest.shape)
-    held = [[_constant(t) for t in (view.colors, view.missing, view.depths)] for view in views]
+    inputs = [[_constant(t) for t in (view.colors, view.missing, view.depths)] for view in views]
     given = (_View * len(views))()
-    for slot, view, tensors in zip(given, views, held, strict=True):
+    for slot, view, tensors in zip(given, views, inputs, strict=True):
         slot.height, slot.width = view.missing.shape
         assert view.colors.shape == (slot.height, slot.width, 3), view.colors.shape
         assert view.depths.shape == view.missing.shape, view.depths.shape
@@ -163,8 +162,8 @@ def plane_scores(
     planes, count = homographies.shape[:2]
     assert count == len(neighbours) > 0, (count, len(neighbours))
     assert window % 2 == 1, window
-    held = [neighbour.float().contiguous() for neighbour in neighbours]
-    given = (_Neighbour * count)(*((other.data_ptr(), other.shape[1], other.shape[0]) for other in held))
+    inputs = [neighbour.float().contiguous() for neighbour in neighbours]
+    given = (_Neighbour * count)(*((other.data_ptr(), other.shape[1], other.shape[0]) for other in inputs))
     picture, homographies = picture.float().contiguous(), homographies.double().contiguous()
     scores = torch.empty(planes, *picture.shape)
     if native_library().sgs_plane_scores(

@@ -13,7 +13,7 @@ from structgstream.cameras import Viewport
 from structgstream.errors import BackendError, OutOfMemoryError
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.native import native_library
-from structgstream.kernels.raster_types import RasterOutput, TileSelection
+from structgstream.kernels.values import RasterOutput, TileSelection
 
 
 class _State:

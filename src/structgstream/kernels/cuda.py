@@ -20,15 +20,14 @@ from structgstream.gaussians import Gaussians
 from structgstream.kernels.cpu_losses import Comparison
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.cuda_tiles import PairBudget, radii_reaching_tiles, tile_lists, tile_lists_in_kernels
-from structgstream.kernels.motion_types import SweepView, Swept
 from structgstream.kernels.native import addresses, members
-from structgstream.kernels.raster_types import TILE_PIXELS, RasterOutput, TileSelection, tile_grid
 from structgstream.kernels.reference_raster import (
     LOW_PASS_PIXELS,
     boxes_reaching_tiles,
     restrict_to_tiles,
     screen_low_pass,
 )
+from structgstream.kernels.values import TILE_PIXELS, RasterOutput, SweepView, Swept, TileSelection, tile_grid
 
 
 def cuda_reason() -> str | None:
@@ -272,9 +271,9 @@ def sweep(
 ) -> Swept:
     """See ``reference_motion.sweep``; float32. Results repeat bit for bit."""
     assert len(pixels) == len(farthest), (pixels.shape, farthest.shape)
-    held = [[t.detach().float().contiguous() for t in (v.colors, v.missing, v.depths, v.viewmat, v.K)] for v in views]
+    inputs = [[t.detach().float().contiguous() for t in (v.colors, v.missing, v.depths, v.viewmat, v.K)] for v in views]
     given = (_View * len(views))()
-    for slot, view, tensors in zip(given, views, held, strict=True):
+    for slot, view, tensors in zip(given, views, inputs, strict=True):
         library.check_devices(*tensors)
         slot.height, slot.width = view.missing.shape
         assert view.colors.shape == (slot.height, slot.width, 3), view.colors.shape

@@ -21,10 +21,9 @@ from torch.autograd.function import once_differentiable
 from structgstream.cameras import Viewport
 from structgstream.errors import BackendError
 from structgstream.gaussians import Gaussians
-from structgstream.kernels.anchor_types import Anchors, MLPWeights, StructuredGaussians
 from structgstream.kernels.cuda_library import KernelLibrary
-from structgstream.kernels.raster_types import TileSelection
 from structgstream.kernels.reference_anchors import visible_anchor_mask
+from structgstream.kernels.values import Anchors, MLPWeights, StructuredGaussians, TileSelection
 
 
 def generate_all_in_torch(

@@ -69,8 +69,8 @@ class KernelLibrary:
         """
         error = getattr(self.library, name)(*arguments, self.stream(device))
         if error:
-            said = self.library.sgs_cuda_error(error).decode()
-            raise BackendError(f"The CUDA kernels failed ({said}); take the cpu back-end, or report this.")
+            message = self.library.sgs_cuda_error(error).decode()
+            raise BackendError(f"The CUDA kernels failed ({message}); take the cpu back-end, or report this.")
 
     def check_devices(self, *tensors: Tensor | None) -> None:
         """Raises unless the kernels can read all of ``tensors``.
@@ -138,15 +138,15 @@ def compiled(architecture: str, *, nvcc: Path, sources: Path, cache: Path) -> Pa
             _output([str(nvcc), *flags, "-o", str(built), *map(str, units)])
             give_name(built, library)
     except OSError as error:
-        raise BackendError(f"Compiled CUDA kernels cannot be kept in {cache} ({error}); set XDG_CACHE_HOME.") from error
+        raise BackendError(f"CUDA kernels cannot be written to {cache} ({error}); set XDG_CACHE_HOME.") from error
     return library
 
 
 def _output(command: list[str]) -> str:
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode:
-        said = "\n".join((result.stderr or result.stdout).strip().splitlines()[-_LAST_LINES:])
-        raise BackendError(f"{command[0]} failed with status {result.returncode}: {said}")
+        message = "\n".join((result.stderr or result.stdout).strip().splitlines()[-_LAST_LINES:])
+        raise BackendError(f"{command[0]} failed with status {result.returncode}: {message}")
     return result.stdout
 
 

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from structgstream.kernels.cuda_library import KernelLibrary
-from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tile_grid
+from structgstream.kernels.values import TILE_PIXELS, TileSelection, tile_grid
 
 _log = logging.getLogger(__name__)
 

@@ -6,9 +6,15 @@ from torch import Tensor
 
 from structgstream.cameras import Viewport
 from structgstream.gaussians import Gaussians
-from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights, StructuredGaussians
-from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection
 from structgstream.kernels.reference_raster import LOW_PASS_PIXELS
+from structgstream.kernels.values import (
+    TILE_PIXELS,
+    Anchors,
+    HeadWeights,
+    MLPWeights,
+    StructuredGaussians,
+    TileSelection,
+)
 
 BALL_DEVIATIONS = 3.4
 """Radius of a Gaussian in standard deviations: alpha falls below 1/255 before 3.33 at any opacity."""

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from structgstream.kernels.raster_types import TileSelection
+from structgstream.kernels.values import TileSelection
 
 WINDOW_PIXELS = 11
 SIGMA_PIXELS = 1.5

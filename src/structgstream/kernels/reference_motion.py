@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d, grid_sample, interpolate, max_pool2d
 
-from structgstream.kernels.motion_types import Lifted, Neighbors, SweepView, Swept, ViewFlows
-from structgstream.kernels.raster_types import TileSelection
+from structgstream.kernels.values import Lifted, Neighbors, SweepView, Swept, TileSelection, ViewFlows
 
 
 def changed_pixels(before: Tensor, now: Tensor, *, threshold: float, reach_pixels: int) -> Tensor:
@@ -98,7 +97,7 @@ def confident_flow(flow: Tensor, back: Tensor, mask: Tensor | None, *, relative:
     return torch.where(agree, torch.cat([torch.ones(1, height, width), there]), 0.0)
 
 
-LEAST_TOLERANCE, TOLERANCE_SHARE = 1.0, 0.1
+MIN_TOLERANCE, TOLERANCE_SHARE = 1.0, 0.1
 """Tolerance of an observed flow f: the first plus the second times |f|, in the unit of f.
 
 The unit is the error of the flow of what hardly moves (``training/lifting.py``). The second covers what grows with the
@@ -133,8 +132,8 @@ def lift(centers: Tensor, seen: ViewFlows, neighbors: Neighbors, priors: Tensor,
     square of J, with the sum of the present weights.
 
     Args:
-        centers: ``[E, 3]`` of movers.
-        seen: W and f of the movers in each view.
+        centers: ``[E, 3]`` of the dynamic anchors and Gaussians.
+        seen: their W and f in each view.
         neighbours: of each target, and g.
         priors: ``[T, 3]`` displacements.
         share: as in :class:`Lifted`.
@@ -146,7 +145,7 @@ def lift(centers: Tensor, seen: ViewFlows, neighbors: Neighbors, priors: Tensor,
     total = w.sum((0, 2))
     stiffness = (w * J.square().sum((-1, -2))).sum((0, 2)) / (2.0 * total.clamp(min=1e-12))
     eye = torch.eye(3, dtype=centers.dtype, device=centers.device)
-    tolerances = LEAST_TOLERANCE + TOLERANCE_SHARE * f.norm(dim=-1)  # [V, T, N]
+    tolerances = MIN_TOLERANCE + TOLERANCE_SHARE * f.norm(dim=-1)  # [V, T, N]
     d = priors
     for scale in (None, *ROBUST_SCALES):
         now = w
@@ -175,7 +174,7 @@ SUPPORTING, CONTRADICTING = 0.3, 0.05
 """A view supports a point at pixels with ``missing`` above the first, and contradicts it below the second."""
 FRONT_SHARE = 1.03
 """A point counts as in front of the rendered depth up to this multiple of it."""
-MOST_DIFFERENCE = 0.3
+MAX_DIFFERENCE = 0.3
 MISS_COST, LONELY_COST = 0.15, 0.05
 EQUAL_COST = 0.01
 
@@ -231,9 +230,9 @@ def sweep(
         at = (row.clamp(0, height - 1).long(), column.clamp(0, width - 1).long())
         visible = inside & (depth < FRONT_SHARE * view.depths[at])
         supporting = visible & (view.missing[at] > SUPPORTING)
-        apart = (view.colors[at] - colors[:, None]).abs().mean(-1).clamp(max=MOST_DIFFERENCE)
+        mismatch = (view.colors[at] - colors[:, None]).abs().mean(-1).clamp(max=MAX_DIFFERENCE)
         supports += supporting
-        difference += supporting * apart
+        difference += supporting * mismatch
         contradictions += visible & (view.missing[at] < CONTRADICTING)
     share = contradictions / (supports + contradictions).clamp(min=1.0)
     some = supports.clamp(min=1.0)
@@ -256,7 +255,7 @@ def _middle_of_cheapest(costs: Tensor) -> tuple[Tensor, Tensor]:
     return least[:, 0], (first + last) // 2
 
 
-LEAST_DEPTH = 1e-6
+MIN_DEPTH = 1e-6
 UNSEEN = -1.0
 
 
@@ -304,7 +303,7 @@ def _warped(picture: Tensor, homography: Tensor, size: torch.Size) -> tuple[Tens
     places = torch.stack([columns.expand(*size), rows[:, None].expand(*size), torch.ones(size).to(picture)], dim=-1)
     u, v, depth = (places @ homography.T).unbind(-1)
     x, y = u / depth, v / depth
-    seen = (depth > LEAST_DEPTH) & (x >= 0.0) & (x <= width - 1) & (y >= 0.0) & (y <= height - 1)
+    seen = (depth > MIN_DEPTH) & (x >= 0.0) & (x <= width - 1) & (y >= 0.0) & (y <= height - 1)
     x, y = torch.where(seen, x, 0.0), torch.where(seen, y, 0.0)
     left, top = x.long().clamp(max=max(width - 2, 0)), y.long().clamp(max=max(height - 2, 0))
     right, bottom = (left + 1).clamp(max=width - 1), (top + 1).clamp(max=height - 1)

@@ -16,7 +16,7 @@ from torch import Tensor
 from structgstream.cameras import Viewport
 from structgstream.gaussians import Gaussians
 from structgstream.geometry import quaternion_matrices
-from structgstream.kernels.raster_types import TILE_PIXELS, Rasterizer, RasterOutput, TileSelection
+from structgstream.kernels.values import TILE_PIXELS, Rasterizer, RasterOutput, TileSelection
 
 LOW_PASS_PIXELS = 0.3
 """Variance of the low-pass, square pixels."""

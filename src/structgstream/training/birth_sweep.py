@@ -11,7 +11,7 @@ from torch.nn.functional import interpolate
 from structgstream.cameras import Camera
 from structgstream.gaussians import concatenate
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.raster_types import TileSelection
+from structgstream.kernels.values import TileSelection
 from structgstream.scene.focus import Focus
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import draw

@@ -17,8 +17,7 @@ from torch.nn.functional import interpolate
 
 from structgstream.errors import MissingExtraError
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.motion_types import SweepView
-from structgstream.kernels.raster_types import TileSelection
+from structgstream.kernels.values import SweepView, TileSelection
 from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
 from structgstream.training.residuals import ResidualFloor, box_mean

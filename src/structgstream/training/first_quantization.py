@@ -23,8 +23,8 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import CameraRig
-from structgstream.kernels.anchor_types import HeadWeights, MLPWeights
 from structgstream.kernels.backend import Backend
+from structgstream.kernels.values import HeadWeights, MLPWeights
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FIELDS, STATE_TABLE, FieldName, scene_of, state_of

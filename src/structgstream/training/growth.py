@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from structgstream.kernels.anchor_types import StructuredGaussians
+from structgstream.kernels.values import StructuredGaussians
 from structgstream.scene.anchors import AnchorCloud
 
 MOST_ANCHORS = 400_000

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.motion_types import Neighbors, ViewFlows
+from structgstream.kernels.values import Neighbors, ViewFlows
 from structgstream.training.neighbours import nearest
 from structgstream.training.observation import MotionEvidence
 from structgstream.training.views import View

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from structgstream.kernels.anchor_types import HeadWeights
+from structgstream.kernels.values import HeadWeights
 from structgstream.scene.scene import Scene
 from structgstream.training.rounding import round_straight_through
 from structgstream.training.views import View

@@ -13,7 +13,7 @@ from torch import Tensor
 from structgstream.cameras import Camera, enlargement
 from structgstream.gaussians import concatenate
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tile_grid
+from structgstream.kernels.values import TILE_PIXELS, TileSelection, tile_grid
 from structgstream.scene.focus import Focus
 from structgstream.scene.render import Rendering, draw
 from structgstream.scene.scene import Scene

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.raster_types import TileSelection
+from structgstream.kernels.values import TileSelection
 from structgstream.scene.focus import Focus
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from structgstream.gaussians import Gaussians
-from structgstream.kernels.anchor_types import StructuredGaussians
 from structgstream.kernels.backend import Backend
+from structgstream.kernels.values import StructuredGaussians
 from structgstream.scene.color import CameraColor
 from structgstream.scene.focus import Focus
 from structgstream.scene.render import Rendering, draw

@@ -18,7 +18,7 @@ from structgstream.cameras import CameraRig, enlargement
 from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.raster_types import TileSelection
+from structgstream.kernels.values import TileSelection
 from structgstream.scene.scene import Scene
 from structgstream.training.carrying import carried_anchors
 from structgstream.training.flow_maps import FlowConfig, flow_map
