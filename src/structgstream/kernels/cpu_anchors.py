@@ -11,7 +11,7 @@ from torch import Tensor
 from structgstream.cameras import Viewport
 from structgstream.errors import BackendError, OutOfMemoryError
 from structgstream.gaussians import Gaussians
-from structgstream.kernels.native import addresses, members, native_library
+from structgstream.kernels.native import addresses, constant, members, native_library
 from structgstream.kernels.values import Anchors, MLPWeights, StructuredGaussians, TileSelection
 
 # The structures below mirror csrc/cpu/anchors.h, member by member.
@@ -151,9 +151,9 @@ def visible_anchors(
     count = len(anchors.positions)
     native = _Anchors(*addresses(*tensors, None, None))
     native.offsets_per_anchor = anchors.offsets.shape[1]
-    viewmat, K = (matrix.detach().float().contiguous() for matrix in (viewport.viewmat, viewport.K))
+    viewmat, K = map(constant, (viewport.viewmat, viewport.K))
     mask = None if tiles is None else tiles.mask.contiguous()
-    sizes = None if intervals is None else intervals.detach().float().contiguous()
+    sizes = None if intervals is None else constant(intervals)
     found = torch.empty(count, dtype=torch.int64)
     seen = native_library().sgs_anchors_visible(
         *(ctypes.byref(native), count, sizes, viewmat, K, viewport.width, viewport.height, viewport.near),

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from structgstream.errors import BackendError
-from structgstream.kernels.native import native_library
+from structgstream.kernels.native import constant, native_library
 from structgstream.kernels.values import TileSelection
 
 
@@ -41,7 +41,7 @@ class Comparison:
             raise BackendError(
                 f"Two pictures [H, W, 3] of one size are expected, got {tuple(image.shape)} and {tuple(target.shape)}."
             )
-        gains, biases = (None if t is None else t.detach().float().contiguous() for t in (gains, biases))
+        gains, biases = (None if t is None else constant(t) for t in (gains, biases))
         assert (gains is None) == (biases is None)
         assert all(t is None or t.shape == (3,) for t in (gains, biases))
         assert tiles is None or (tiles.height, tiles.width) == image.shape[:2], tiles

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from structgstream.errors import OutOfMemoryError
-from structgstream.kernels.native import addresses, members, native_library
+from structgstream.kernels.native import addresses, constant, members, native_library
 from structgstream.kernels.values import Lifted, Neighbors, SweepView, Swept, TileSelection, ViewFlows
 
 # The structures below mirror csrc/include/structgstream.h, member by member.
@@ -36,10 +36,6 @@ class _View(ctypes.Structure):
 
 class _Neighbour(ctypes.Structure):
     _fields_ = (("picture", ctypes.c_void_p), *members(ctypes.c_int, "width height"))
-
-
-def _constant(tensor: Tensor) -> Tensor:
-    return tensor.detach().float().contiguous()
 
 
 def changed_pixels(before: Tensor, now: Tensor, *, threshold: float, reach_pixels: int) -> Tensor:
@@ -78,7 +74,7 @@ def picture_residual(
     assert picture.dtype == torch.uint8, picture.dtype
     assert outside is None or outside.shape == rendering.shape, (outside.shape, rendering.shape)
     assert mask is None or mask.shape == picture.shape[:2], (mask.shape, picture.shape)
-    floats = [None if t is None else _constant(t) for t in (rendering, gains, biases)]
+    floats = [None if t is None else constant(t) for t in (rendering, gains, biases)]
     bytes_ = [None if t is None else t.contiguous() for t in (picture, tiles and tiles.mask, outside, mask)]
     given = _Residual(*addresses(*floats, *bytes_), *rendering.shape[:2], *picture.shape[:2])
     found = torch.empty(picture.shape[:2])
@@ -114,7 +110,7 @@ def lift(centers: Tensor, seen: ViewFlows, neighbors: Neighbors, priors: Tensor,
     assert seen.Ks.shape == (views, 3, 3), seen.Ks.shape
     rows = neighbors.rows.to(torch.int64).contiguous()
     assert not targets or 0 <= int(rows.min()) <= int(rows.max()) < dynamic, "rows of dynamic anchors and Gaussians"
-    observed, pulls = map(_constant, (centers, *seen)), map(_constant, (neighbors.affinities, priors))
+    observed, pulls = map(constant, (centers, *seen)), map(constant, (neighbors.affinities, priors))
     sizes = dynamic, targets, views, count
     found = torch.empty(targets, 3), torch.empty(targets), torch.empty(targets, dtype=torch.int64)
     if native_library().sgs_lift_flow(*observed, rows, *pulls, *sizes, share, *found, torch.get_num_threads()):
@@ -134,7 +130,7 @@ def sweep(
 ) -> Swept:
     """See ``reference_motion.sweep``."""
     assert len(pixels) == len(farthest), (pixels.shape, farthest.shape)
-    inputs = [[_constant(t) for t in (view.colors, view.missing, view.depths)] for view in views]
+    inputs = [[constant(t) for t in (view.colors, view.missing, view.depths)] for view in views]
     given = (_View * len(views))()
     for slot, view, tensors in zip(given, views, inputs, strict=True):
         slot.height, slot.width = view.missing.shape

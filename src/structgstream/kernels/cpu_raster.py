@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 from structgstream.cameras import Viewport
 from structgstream.errors import BackendError, OutOfMemoryError
 from structgstream.gaussians import Gaussians
-from structgstream.kernels.native import native_library
+from structgstream.kernels.native import constant, native_library
 from structgstream.kernels.values import RasterOutput, TileSelection
 
 
@@ -42,16 +42,12 @@ class _View:
         return [viewport.viewmat, viewport.K, viewport.width, viewport.height, viewport.near]
 
 
-def _constant(tensor: Tensor) -> Tensor:
-    return tensor.detach().float().contiguous()
-
-
 def _intervals(gaussians: Gaussians) -> Tensor | None:
-    return None if gaussians.sampling_intervals is None else _constant(gaussians.sampling_intervals)
+    return None if gaussians.sampling_intervals is None else constant(gaussians.sampling_intervals)
 
 
 def _in_float32(viewport: Viewport) -> Viewport:
-    return viewport._replace(viewmat=_constant(viewport.viewmat), K=_constant(viewport.K))
+    return viewport._replace(viewmat=constant(viewport.viewmat), K=constant(viewport.K))
 
 
 class _Rasterize(torch.autograd.Function):
@@ -138,7 +134,7 @@ def rasterize(
         onto = onto.detach()  # An alias, because autograd marks the tensor it is given as the function's result.
     view = _View(
         _in_float32(viewport),
-        None if background is None else _constant(background),
+        None if background is None else constant(background),
         None if tiles is None else tiles.mask.contiguous(),
         n if trained is None else trained,
         _intervals(gaussians),
@@ -174,14 +170,14 @@ def picture_and_weights(
 def _weights(
     gaussians: Gaussians, viewport: Viewport, maps: Tensor, *, background: Tensor | None, image: Tensor | None
 ) -> Tensor:
-    tensors = [_constant(t) for t in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)]
-    colors = None if image is None else _constant(gaussians.colors)
+    tensors = [constant(t) for t in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)]
+    colors = None if image is None else constant(gaussians.colors)
     maps = maps.float().contiguous()
     height, width, channels = maps.shape
     assert channels > 0, maps.shape
     assert (width, height) == (viewport.width, viewport.height), maps.shape
     view = _View(
-        _in_float32(viewport), None if background is None else _constant(background), None, 0, _intervals(gaussians)
+        _in_float32(viewport), None if background is None else constant(background), None, 0, _intervals(gaussians)
     )
     weights = torch.empty(len(gaussians), channels)
     if native_library().sgs_raster_weights(

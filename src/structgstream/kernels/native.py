@@ -91,6 +91,11 @@ def addresses(*tensors: Tensor | None) -> list[int | None]:
     return [None if tensor is None else tensor.data_ptr() for tensor in tensors]
 
 
+def constant(tensor: Tensor) -> Tensor:
+    """The tensor as float32, contiguous, without gradient."""
+    return tensor.detach().float().contiguous()
+
+
 def members(of_type: Any, names: str) -> list[tuple[str, Any]]:
     """Members of one type for the ``_fields_`` of a C structure; ``names`` are separated by spaces."""
     return [(name, of_type) for name in names.split()]
