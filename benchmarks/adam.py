@@ -10,7 +10,7 @@ from torch import Tensor
 from benchmarks.benchmark import Benchmark, Growth, Variant
 from benchmarks.contest import Contestant, Quantity, Results
 from benchmarks.world import wall_scene
-from structgstream.kernels import cpu_adam, reference_adam
+from structgstream.kernels import cpu_losses, reference_losses
 from structgstream.scene.state import PAPER_DYNAMIC, fields_of, state_of
 from structgstream.training.optim import BETAS, EPS
 
@@ -61,9 +61,9 @@ def _torch_optim(anchors: int, trained: Trained, **options: bool) -> Callable[[]
 def contestants(*, anchors: int, trained: Trained) -> list[Contestant]:
     """The torch reference first, the C++, and torch's own two implementations."""
     return [
-        Contestant("torch reference, 2 threads", _stepping(reference_adam.adam_step, anchors, trained), 2),
-        Contestant("cpu, 1 thread", _stepping(cpu_adam.adam_step, anchors, trained), 1),
-        Contestant("cpu, 2 threads", _stepping(cpu_adam.adam_step, anchors, trained), 2),
+        Contestant("torch reference, 2 threads", _stepping(reference_losses.adam_step, anchors, trained), 2),
+        Contestant("cpu, 1 thread", _stepping(cpu_losses.adam_step, anchors, trained), 1),
+        Contestant("cpu, 2 threads", _stepping(cpu_losses.adam_step, anchors, trained), 2),
         Contestant("torch.optim.Adam(fused), 2 threads", _torch_optim(anchors, trained, fused=True), 2),
         Contestant("torch.optim.Adam(foreach), 2 threads", _torch_optim(anchors, trained, foreach=True), 2),
     ]

@@ -13,7 +13,7 @@ from benchmarks.contest import Contestant, Quantity, Results
 from benchmarks.roofline import Work
 from benchmarks.world import FEATURES, HIDDEN, OFFSETS_PER_ANCHOR, wall_rig, wall_scene
 from structgstream.kernels import cpu_anchors, reference_anchors
-from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights, StructuredGaussians
+from structgstream.kernels.values import Anchors, HeadWeights, MLPWeights, StructuredGaussians
 
 Trained = Literal["all", "online"]
 """``all``: as in frame 0; ``online``: the paper's dynamic set: positions, offset scales and the covariance head."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from structgstream.evaluation.environment import environment
-from structgstream.kernels._load import instruction_set, native_reason
+from structgstream.kernels.native import instruction_set, native_reason
 
 
 def machine() -> dict[str, Any]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from benchmarks.benchmark import Benchmark, Variant
 from benchmarks.contest import Contestant, Quantity, Results
-from structgstream.kernels import cpu_planes, reference_planes
+from structgstream.kernels import cpu_motion, reference_motion
 
 NEIGHBOURS, WINDOW, NOISE = 4, 5, 0.008**2
 OUTSIDE = -1e6  # Far below any grey value, so that a sample that lies partly outside is detectable.
@@ -79,8 +79,8 @@ def contestants(*, width: int, planes: int) -> list[Contestant]:
 
     return [
         Contestant("OpenCV", _with_one_opencv_thread(lambda: opencv_scores(picture, neighbours, homographies)), 1),
-        Contestant("cpu", of(cpu_planes.plane_scores), 1),
-        Contestant("torch reference", of(reference_planes.plane_scores), 1),
+        Contestant("cpu", of(cpu_motion.plane_scores), 1),
+        Contestant("torch reference", of(reference_motion.plane_scores), 1),
     ]
 
 

@@ -14,7 +14,7 @@ from structgstream.cameras import Viewport
 from structgstream.gaussians import Gaussians
 from structgstream.geometry import quaternion_matrices
 from structgstream.kernels import cpu_raster, reference_raster
-from structgstream.kernels.operations import Rasterize
+from structgstream.kernels.values import Rasterizer
 
 Workload = tuple[Gaussians, Viewport, Tensor]
 """The Gaussians, where they are seen from, and the gradient of the picture."""
@@ -42,7 +42,7 @@ def workload(splats: int, width: int, height: int) -> Workload:
     return gaussians, Viewport(torch.eye(4), K, torch.zeros(3), width, height, near=0.1), cotangent
 
 
-def forward_and_backward(rasterize: Rasterize, work: Workload) -> list[Tensor]:
+def forward_and_backward(rasterize: Rasterizer, work: Workload) -> list[Tensor]:
     """The picture and the gradients of all five inputs."""
     gaussians, viewport, cotangent = work
     inputs = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors]

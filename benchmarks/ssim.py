@@ -17,7 +17,7 @@ from torch import Tensor
 from benchmarks.benchmark import Benchmark, Growth, Target, Variant
 from benchmarks.contest import Contestant, Quantity, Results
 from benchmarks.roofline import Work
-from structgstream.kernels import cpu_ssim, reference_ssim
+from structgstream.kernels import cpu_losses, reference_losses
 
 BORDER = 5  # Half a window: what zero padding touches.
 
@@ -89,9 +89,9 @@ def contestants(*, width: int, height: int) -> list[Contestant]:
     """Torch's grouped convolution first, then the C++, then what is installed of the public ones."""
     image, target = pictures(width, height)
     found = [
-        Contestant("torch grouped convolution, 2 threads", partial(_ours, reference_ssim.l1_ssim, image, target), 2),
-        Contestant("cpu, 1 thread", partial(_ours, cpu_ssim.l1_ssim, image, target), 1),
-        Contestant("cpu, 2 threads", partial(_ours, cpu_ssim.l1_ssim, image, target), 2),
+        Contestant("torch grouped convolution, 2 threads", partial(_ours, reference_losses.l1_ssim, image, target), 2),
+        Contestant("cpu, 1 thread", partial(_ours, cpu_losses.l1_ssim, image, target), 1),
+        Contestant("cpu, 2 threads", partial(_ours, cpu_losses.l1_ssim, image, target), 2),
     ]
     if importlib.util.find_spec("pytorch_msssim") is not None:
         found.append(Contestant("pytorch-msssim, 2 threads", partial(_msssim, image, target), 2))
@@ -104,7 +104,7 @@ def contestants(*, width: int, height: int) -> list[Contestant]:
 def oracle(*, width: int, height: int) -> Results:
     """The torch form in float64."""
     image, target = pictures(width, height)
-    return _ours(reference_ssim.l1_ssim, image.double(), target.double())
+    return _ours(reference_losses.l1_ssim, image.double(), target.double())
 
 
 def natives(*, width: int, height: int) -> list[Contestant]:

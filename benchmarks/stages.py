@@ -89,5 +89,4 @@ def staged(backend: Backend, seconds: dict[str, float]) -> Backend:
         seconds.setdefault(name, 0.0)
         return run
 
-    operations = {f.name: getattr(backend, f.name) for f in fields(backend)}
-    return replace(backend, **{name: timed(name, run) for name, run in operations.items() if callable(run)})
+    return backend.with_functions(**{name: timed(name, run) for name, run in backend.functions.items()})

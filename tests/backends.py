@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The back-end of tests that are about what is computed, not by whom."""
 
-from structgstream.kernels._load import native_reason
 from structgstream.kernels.backend import Backend, BackendName, select_backend
+from structgstream.kernels.native import native_reason
 
 QUICKEST: BackendName = "cpu" if native_reason() is None else "reference"
 

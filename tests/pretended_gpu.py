@@ -23,8 +23,7 @@ from structgstream.gaussians import Gaussians
 from structgstream.kernels import reference_raster
 from structgstream.kernels.backend import Backend, reference_backend
 from structgstream.kernels.cuda_tiles import PairBudget
-from structgstream.kernels.operations import Rasterize
-from structgstream.kernels.raster_types import RasterOutput, TileSelection
+from structgstream.kernels.values import Rasterizer, RasterOutput, TileSelection
 
 # Autograd has no threads for a GPU that is not there; for this device it works on the calling one.
 DEVICE = torch.device("meta")
@@ -153,7 +152,7 @@ def moved(value: Value, device: torch.device) -> Value:
 
 
 def rasterize(
-    on_processor: Rasterize,
+    on_processor: Rasterizer,
     gaussians: Gaussians,
     viewport: Viewport,
     *,
@@ -165,7 +164,7 @@ def rasterize(
     budget: PairBudget | None = None,
     library: None = None,
 ) -> RasterOutput:
-    """See ``kernels.operations.Rasterize``; what draws is ``on_processor``, all the rest lies on ``DEVICE``."""
+    """See ``reference_raster.rasterize``; what draws is ``on_processor``, all the rest lies on ``DEVICE``."""
     here = torch.device("cpu")
     optional = [t for t in (background, screen_offsets, onto, None if tiles is None else tiles.mask) if t is not None]
     assert all(t.device == DEVICE for t in (gaussians.means, gaussians.colors, viewport.viewmat, viewport.K, *optional))
@@ -181,14 +180,11 @@ def rasterize(
     return moved(output, DEVICE)
 
 
-def pretended_gpu(on_processor: Rasterize) -> Backend:
+def pretended_gpu(on_processor: Rasterizer) -> Backend:
     """The torch parts of the cuda back-end on ``DEVICE``, with the rasteriser ``on_processor``."""
     there = partial(rasterize, on_processor)
-    return replace(
-        reference_backend(),
-        name="cuda",
-        device=DEVICE,
+    return replace(reference_backend(), name="cuda", device=DEVICE).with_functions(
         rasterize=there,
-        blending_weights=partial(reference_raster.blending_weights, there),
-        picture_and_weights=partial(reference_raster.picture_and_weights, there),
+        blending_weights=partial(reference_raster.weights_by_gradient, there),
+        picture_and_weights=partial(reference_raster.picture_and_weights_by_gradient, there),
     )

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig
-from structgstream.kernels.anchor_types import HeadWeights, MLPWeights
+from structgstream.kernels.values import HeadWeights, MLPWeights
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians

@@ -12,8 +12,8 @@ import structgstream
 from pretended_gpu import DEVICE, pretended_device, pretended_gpu, rasterize
 from small_presets import FEW_POINTS
 from structgstream.data.clip import bundled_clip_path
-from structgstream.kernels import _nvcc, cpu_raster, cuda, reference_raster
-from structgstream.kernels._load import native_reason
+from structgstream.kernels import cpu_raster, cuda, cuda_library, reference_raster
+from structgstream.kernels.native import native_reason
 from structgstream.presets import PRESETS
 
 FRAMES, SCALE = 2, 0.25
@@ -23,7 +23,7 @@ DRAWN_BY = cpu_raster.rasterize if native_reason() is None else reference_raster
 @pytest.fixture
 def backend(monkeypatch: pytest.MonkeyPatch) -> Iterator[structgstream.Backend]:
     """Iterations are those that wait for nothing, with gsplat's place taken."""
-    monkeypatch.setattr(_nvcc, "kernel_library", lambda: (None, "nothing is compiled here"))
+    monkeypatch.setattr(cuda_library, "kernel_library", lambda: (None, "nothing is compiled here"))
     monkeypatch.setattr(cuda, "rasterize", lambda *args, **options: rasterize(DRAWN_BY, *args, **options))
     with pretended_device():
         yield pretended_gpu(DRAWN_BY)

@@ -13,7 +13,7 @@ namespace structgstream {
 namespace SGS_ISA {
 namespace {
 
-// See kernels/reference_lift.py for the units and reasons.
+// See kernels/reference_motion.py for the units and reasons.
 constexpr float kLeastTolerance = 1.0f, kToleranceShare = 0.1f;
 constexpr float kRobustScales[] = {4.0f, 2.5f, 1.5f, 1.5f, 1.0f, 1.0f};
 constexpr float kInlierScale = 1.5f;

@@ -5,7 +5,7 @@
 
 namespace structgstream {
 
-// Flow in pictures, to be lifted to displacements (kernels/reference_lift.py): `movers` seen by `views`, and `targets`
+// Flow in pictures, to be lifted to displacements (kernels/reference_motion.py): `movers` seen by `views`, and `targets`
 // that follow `neighbour_count` movers each.
 struct FlowLift {
     const float *centers, *weights, *flows;      // [E,3], [V,E], [V,E,2]

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// A picture and its neighbours, as planes are swept through them (kernels/reference_planes.py).
+// A picture and its neighbours, as planes are swept through them (kernels/reference_motion.py).
 #pragma once
 
 #include <cstdint>

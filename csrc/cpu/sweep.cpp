@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Along each ray the depth at which several views see the same new thing (kernels/reference_sweep.py).
+// Along each ray the depth at which several views see the same new thing (kernels/reference_motion.py).
 
 #include <algorithm>
 #include <cmath>

@@ -14,7 +14,7 @@
 namespace structgstream {
 namespace cuda {
 
-constexpr int kTilePixels = 16;  // raster_types.TILE_PIXELS
+constexpr int kTilePixels = 16;  // values.TILE_PIXELS
 
 #ifdef __CUDACC__
 

@@ -29,7 +29,7 @@ namespace cuda {
 constexpr int kHalf = 5;
 constexpr int kTaps = 2 * kHalf + 1;
 constexpr int kChannels = 3;
-constexpr int kTile = 16;                              // pixels, as structgstream.kernels.raster_types.TILE_PIXELS
+constexpr int kTile = 16;                              // pixels, as structgstream.kernels.values.TILE_PIXELS
 constexpr int kTileNumbers = kTile * kChannels;        // numbers in a row of a tile
 constexpr int kPadded = kTileNumbers + 4;              // in memory, so that a warp reads 32 different banks
 constexpr int kRows = kTile + 2 * kHalf;               // rows that a tile's blurs read

@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* The C interface of the plane sweep on a GPU (kernels/reference_sweep.py). Plain pointers to the GPU's memory, but for
+/* The C interface of the plane sweep on a GPU (kernels/reference_motion.py). Plain pointers to the GPU's memory, but for
  * `views`, which the host reads; `stream` is a cudaStream_t. Nothing here waits for the GPU or takes memory. */
 #pragma once
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What a thread does for a point of a ray in one view, and for a ray: see kernels/reference_sweep.py.
+// What a thread does for a point of a ray in one view, and for a ray: see kernels/reference_motion.py.
 #pragma once
 
 #include <cmath>

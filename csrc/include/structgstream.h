@@ -12,7 +12,7 @@ extern "C" {
 #endif
 
 /* Which version of this interface the library has. It rises with every change of what stands in this file or in
- * cpu/anchors.h; kernels/_load.py expects the same number, so that a library of another version is refused. */
+ * cpu/anchors.h; kernels/native.py expects the same number, so that a library of another version is refused. */
 #define SGS_ABI_VERSION 7
 int sgs_abi_version(void);
 
@@ -66,7 +66,7 @@ int sgs_changed_pixels(
     const uint8_t* before, const uint8_t* now, int height, int width, float threshold, int reach, uint8_t* changed,
     int threads);
 
-/* A rendering [height,width,3] and what it is compared with (kernels/reference_residual.py): picture u8 [reduced_height,
+/* A rendering [height,width,3] and what it is compared with (kernels/reference_motion.py): picture u8 [reduced_height,
  * reduced_width, 3]; gains and biases [3] or null; tiles, a byte each, and outside u8 [height,width,3], which is shown in those
  * that are zero, or both null; mask, a byte for each pixel of the picture, or null. */
 struct sgs_residual {
@@ -77,13 +77,13 @@ struct sgs_residual {
 /* Out: found [reduced_height, reduced_width]. Returns 0, or 1 where memory does not suffice. */
 int sgs_picture_residual(const struct sgs_residual* residual, float* found);
 
-/* Flow where it agrees with the flow back (kernels/reference_flow.py). flow and back [H,W,2], mask [H,W] one byte each or
+/* Flow where it agrees with the flow back (kernels/reference_motion.py). flow and back [H,W,2], mask [H,W] one byte each or
  * null. Out: maps [3,H,W]. */
 void sgs_confident_flow(
     const float* flow, const float* back, const uint8_t* mask, int height, int width, float relative, float absolute,
     float* maps, int threads);
 
-/* Flow in pictures lifted to displacements (kernels/reference_lift.py). centers [E,3], weights [V,E], flows [V,E,2],
+/* Flow in pictures lifted to displacements (kernels/reference_motion.py). centers [E,3], weights [V,E], flows [V,E,2],
  * viewmats [V,4,4], Ks [V,3,3], near_planes [V], neighbours [T,N] rows of movers, affinities [T,N], priors [T,3]. Out:
  * displacements [T,3], inlier_share [T], agreeing_views [T]. Returns 0, or 1 where memory does not suffice. */
 int sgs_lift_flow(
@@ -92,7 +92,7 @@ int sgs_lift_flow(
     int64_t targets, int views, int neighbour_count, float share, float* displacements, float* inlier_share,
     int64_t* agreeing_views, int threads);
 
-/* A view that rays are swept through (kernels/reference_sweep.py). colors [h,w,3], missing [h,w], depths [h,w]. */
+/* A view that rays are swept through (kernels/reference_motion.py). colors [h,w,3], missing [h,w], depths [h,w]. */
 struct sgs_sweep_view {
     const float *colors, *missing, *depths;
     float viewmat[12], K[9], near_plane;
@@ -103,7 +103,7 @@ void sgs_sweep(
     const struct sgs_sweep_view* views, int view_count, int view_index, const int64_t* pixels, const float* farthest,
     int64_t count, int planes, int least_supports, float most_contradictions, float* depths, float* costs, int threads);
 
-/* A grey picture [h,w] beside another (kernels/reference_planes.py). */
+/* A grey picture [h,w] beside another (kernels/reference_motion.py). */
 struct sgs_neighbour {
     const float* picture;
     int width, height;

@@ -9,7 +9,7 @@ import torch
 from benchmarks.__main__ import NAMES, main
 from benchmarks.benchmark import Benchmark, Target, Variant, judged, run_variant
 from benchmarks.contest import Contestant, Quantity
-from structgstream.kernels._load import native_reason
+from structgstream.kernels.native import native_reason
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Timing an operation must not change what it gives, and must see its forward and its backward."""
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -54,7 +53,7 @@ def test_an_operation_is_told_its_own_forward_and_backward(monkeypatch: pytest.M
         return _Costs.apply(_Costs.apply(image, clock), clock), target  # type: ignore[return-value]
 
     seconds: dict[str, float] = {}
-    backend = staged(replace(reference_backend(), l1_ssim=costly), seconds)
+    backend = staged(reference_backend().with_functions(l1_ssim=costly), seconds)
     before = _Costs.apply(torch.zeros(2, 2, requires_grad=True), clock)
     inside, _ = backend.l1_ssim(before, torch.zeros(2, 2))
     after: Any = _Costs.apply(inside, clock)

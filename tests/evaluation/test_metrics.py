@@ -18,8 +18,8 @@ from structgstream.evaluation.metrics import (
     ssim,
     ssim_map,
 )
-from structgstream.kernels._load import native_reason
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
+from structgstream.kernels.native import native_reason
 from structgstream.scene.render import to_8bit_image
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from streams import STEPS, small_scene
 from structgstream.codec.scene.bins import dequantize, quantize
 from structgstream.groups.hand_over import FADE_FRAMES, NEIGHBOURS, HandOver
-from structgstream.kernels.anchor_types import HeadWeights
+from structgstream.kernels.values import HeadWeights
 from structgstream.scene.scene import Scene
 from structgstream.training.online.patching import IDS_PER_FRAME
 

@@ -4,7 +4,7 @@ import logging
 import pytest
 
 from structgstream.errors import BackendError
-from structgstream.kernels import _load, backend
+from structgstream.kernels import backend, native
 
 
 def test_the_reference_is_always_there() -> None:
@@ -15,7 +15,7 @@ def test_the_reference_is_always_there() -> None:
 def test_without_a_native_library_it_says_so_once_and_works(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(_load, "_loaded", lambda: (None, "The CPU kernels were not built; install a compiler."))
+    monkeypatch.setattr(native, "_loaded", lambda: (None, "The CPU kernels were not built; install a compiler."))
     monkeypatch.setattr(backend, "backend_reasons", lambda: {"cuda": "no GPU", "cpu": "not built", "reference": None})
     with caplog.at_level(logging.WARNING):
         assert backend.select_backend("auto").name == "reference"

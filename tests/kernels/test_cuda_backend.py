@@ -9,10 +9,9 @@ import pytest
 import torch
 
 from structgstream.cli import doctor
-from structgstream.kernels import _nvcc, backend, cuda, reference_anchors, reference_ssim
-from structgstream.kernels.cuda_library import KernelLibrary
+from structgstream.kernels import backend, cuda, cuda_library, reference_anchors, reference_losses
+from structgstream.kernels.cuda_library import CUDA_PROTOTYPES, KernelLibrary
 from structgstream.kernels.cuda_tiles import PairBudget
-from structgstream.kernels.prototypes import CUDA_PROTOTYPES
 
 
 @pytest.mark.parametrize("compiled", [True, False])
@@ -22,7 +21,7 @@ def test_own_operations_are_the_kernels_or_it_says_why_not(
     functions: Any = SimpleNamespace(**{name: SimpleNamespace() for name in CUDA_PROTOTYPES})
     library = KernelLibrary(functions, "cuda", lambda device: 0) if compiled else None
     monkeypatch.setattr(cuda, "cuda_reason", lambda: None)
-    monkeypatch.setattr(_nvcc, "kernel_library", lambda: (library, "this is why"))
+    monkeypatch.setattr(cuda_library, "kernel_library", lambda: (library, "this is why"))
     with caplog.at_level(logging.INFO):
         found = backend.cuda_backend()
     assert found.name == "cuda"
@@ -30,7 +29,7 @@ def test_own_operations_are_the_kernels_or_it_says_why_not(
     assert found.recorder is not None
     assert backend.nonblocking(found, PairBudget.of(1, torch.device("cpu"))).recorder is found.recorder
     assert backend.reference_backend().recorder is None
-    assert (found.l1_ssim is reference_ssim.l1_ssim) is not compiled
+    assert (found.l1_ssim is reference_losses.l1_ssim) is not compiled
     assert (found.generate_structured is reference_anchors.generate_structured) is not compiled
     assert [(record.levelno, record.getMessage()) for record in caplog.records] == [
         (logging.INFO if compiled else logging.WARNING, "this is why")
@@ -39,7 +38,7 @@ def test_own_operations_are_the_kernels_or_it_says_why_not(
 
 def test_doctor_tells_what_the_loss_runs_on(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(backend, "backend_reasons", lambda: {"cuda": None, "cpu": None, "reference": None})
-    monkeypatch.setattr(_nvcc, "find_nvcc", lambda environment: None)
+    monkeypatch.setattr(cuda_library, "find_nvcc", lambda environment: None)
     first = doctor.diagnose()["backends"][0]
     assert first["name"] == "cuda"
     assert first["advice"].startswith("L1, SSIM, anchors, sweeps and tile lists run in torch")

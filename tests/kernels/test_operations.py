@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 # pyright: reportUnnecessaryTypeIgnoreComment=true
-"""Every back-end's functions have the signatures of ``kernels.operations``, and keep to its Note [Ownership]."""
+"""Every back-end's functions have the signatures of the table, and keep to Note [Ownership] of ``kernels.backend``."""
 
 import inspect
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,33 +13,12 @@ import torch
 from torch import Tensor
 
 from rigs import arc_rig, random_scene
-from structgstream.kernels import _nvcc, cuda, cuda_anchors, operations
-from structgstream.kernels._load import native_reason
+from structgstream.kernels import cuda, cuda_anchors, cuda_library
 from structgstream.kernels.backend import Backend, cpu_backend, cuda_backend, nonblocking, reference_backend
-from structgstream.kernels.cuda_library import KernelLibrary
+from structgstream.kernels.cuda_library import CUDA_PROTOTYPES, KernelLibrary
 from structgstream.kernels.cuda_tiles import PairBudget
-from structgstream.kernels.prototypes import CUDA_PROTOTYPES
-from structgstream.kernels.raster_types import TileSelection, tile_grid
-
-PROTOCOLS = {
-    "rasterize": operations.Rasterize,
-    "blending_weights": operations.BlendingWeights,
-    "picture_and_weights": operations.PictureAndWeights,
-    "l1_ssim": operations.L1SSIM,
-    "volume": operations.Volume,
-    "excess": operations.Excess,
-    "neighbour_difference": operations.NeighbourDifference,
-    "change_bits": operations.ChangeBits,
-    "changed_pixels": operations.ChangedPixels,
-    "picture_residual": operations.PictureResidual,
-    "confident_flow": operations.ConfidentFlow,
-    "lift": operations.Lift,
-    "sweep": operations.Sweep,
-    "plane_scores": operations.PlaneScores,
-    "generate_structured": operations.GenerateStructured,
-    "adam_step": operations.AdamStep,
-}
-
+from structgstream.kernels.native import native_reason
+from structgstream.kernels.values import TileSelection, tile_grid
 
 native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 BUILDERS = [
@@ -48,44 +27,14 @@ BUILDERS = [
 ]
 
 
-def other_result(scales: Tensor, opacities: Tensor) -> Tensor:
-    return (scales.prod(1) * opacities).sum()
-
-
-def fewer_arguments(offsets: Tensor, log_scales: Tensor) -> Tensor:
-    return (offsets * log_scales[:, None]).sum()
-
-
-def other_names(offsets: Tensor, scales: Tensor, limit: float) -> Tensor:
-    return (offsets * scales[:, None]).clamp(max=limit).sum()
-
-
-def refused_by_the_type_checker(backend: Backend) -> None:
-    """Never called. An ignore that is not needed is an error here: then the type checker let a function pass."""
-    volume: operations.Volume = other_result  # pyright: ignore[reportAssignmentType]
-    excess: operations.Excess = fewer_arguments  # pyright: ignore[reportAssignmentType]
-    excess = other_names  # pyright: ignore[reportAssignmentType]
-    rasterize: operations.Rasterize = backend.l1_ssim  # pyright: ignore[reportAssignmentType]
-    Backend(
-        name="mixed",
-        device=backend.device,
-        rasterize=rasterize,
-        blending_weights=backend.rasterize,  # pyright: ignore[reportArgumentType]
-        picture_and_weights=backend.picture_and_weights,
-        l1_ssim=backend.l1_ssim,
-        volume=volume,
-        excess=excess,
-        neighbour_difference=backend.neighbour_difference,
-        change_bits=backend.change_bits,
-        changed_pixels=backend.changed_pixels,
-        picture_residual=backend.picture_residual,
-        confident_flow=backend.confident_flow,
-        lift=backend.lift,
-        sweep=backend.sweep,
-        plane_scores=backend.plane_scores,
-        generate_structured=backend.generate_structured,
-        adam_step=backend.adam_step,
-    )
+def refused_by_the_type_checker(backend: Backend, opacities: Tensor) -> None:
+    """Never called. An ignore that is not needed is an error here: then the type checker let a call pass."""
+    backend.volume(opacities)  # pyright: ignore[reportCallIssue]
+    backend.volume(opacities, 1.0)  # pyright: ignore[reportArgumentType]
+    backend.excess(opacities, opacities, bound=1.0)  # pyright: ignore[reportCallIssue]
+    backend.lifted(opacities)  # pyright: ignore[reportAttributeAccessIssue]
+    total: Tensor = backend.volume(opacities, opacities)  # pyright: ignore[reportAssignmentType]
+    del total
 
 
 @pytest.fixture
@@ -93,7 +42,7 @@ def pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     functions: Any = SimpleNamespace(**{name: SimpleNamespace() for name in CUDA_PROTOTYPES})
     library = KernelLibrary(functions, "cuda", lambda device: 0)
     monkeypatch.setattr(cuda, "cuda_reason", lambda: None)
-    monkeypatch.setattr(_nvcc, "kernel_library", lambda: (library, "compiled"))
+    monkeypatch.setattr(cuda_library, "kernel_library", lambda: (library, "compiled"))
 
 
 def cuda_without_waiting() -> Backend:
@@ -102,18 +51,25 @@ def cuda_without_waiting() -> Backend:
 
 @pytest.mark.usefixtures("pretended_gpu")
 @pytest.mark.parametrize("build", [*BUILDERS, cuda_backend, cuda_without_waiting])
-def test_signatures_are_the_protocols(build: Callable[[], Backend]) -> None:
+def test_signatures_are_those_of_the_table(build: Callable[[], Backend]) -> None:
     backend = build()
-    assert {f.name for f in fields(backend)} == PROTOCOLS.keys() | {"name", "device", "recorder"}
-    for name, protocol in PROTOCOLS.items():
-        wanted = inspect.signature(protocol.__call__)
+    assert len(Backend.operations()) == 16
+    for name, operation in Backend.operations().items():
+        wanted = inspect.signature(operation.oracle)
         found = inspect.signature(getattr(backend, name))
-        own = list(wanted.parameters.values())[1:]  # without self
-        shared = [found.parameters[parameter.name] for parameter in own]
-        assert shared == own, name
+        shared = [found.parameters[parameter] for parameter in wanted.parameters]
+        assert shared == list(wanted.parameters.values()), name
         more = found.parameters.keys() - wanted.parameters.keys()
         assert all(found.parameters[extra].default is not inspect.Parameter.empty for extra in more), name
         assert found.return_annotation == wanted.return_annotation, name
+
+
+def test_an_operation_that_the_table_lacks_or_a_back_end_lacks_is_refused() -> None:
+    backend = reference_backend()
+    with pytest.raises(AssertionError, match="lifted"):
+        backend.with_functions(lifted=backend.lift)
+    with pytest.raises(AssertionError, match="lift"):
+        replace(backend, functions={name: run for name, run in backend.functions.items() if name != "lift"})
 
 
 @pytest.mark.parametrize("build", BUILDERS)
@@ -152,7 +108,7 @@ def test_a_picture_to_draw_onto_needs_tiles(build: Callable[[], Backend]) -> Non
 
 @pytest.mark.parametrize("build", [*BUILDERS, pytest.param(None, id="nonblocking")])
 def test_anchors_that_were_looked_at_are_ascending_indices(build: Callable[[], Backend] | None) -> None:
-    backend = replace(reference_backend(), generate_structured=cuda_anchors.generate_structured)
+    backend = reference_backend().with_functions(generate_structured=cuda_anchors.generate_all_in_torch)
     backend = backend if build is None else build()
     scene, camera = random_scene(300, seed=3), next(iter(arc_rig(radius=0.6).cameras.values()))
     found = scene.structured(camera, backend)

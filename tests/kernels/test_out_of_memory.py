@@ -12,10 +12,9 @@ import torch
 from splats import splats_of, viewport_of
 from structgstream.codec.entropy import decisions, rans
 from structgstream.errors import OutOfMemoryError
-from structgstream.kernels import cpu_anchors, cpu_change, cpu_lift, cpu_planes, cpu_raster, cpu_residual
-from structgstream.kernels._load import native_reason
-from structgstream.kernels.anchor_types import Anchors
-from structgstream.kernels.motion_types import Neighbors, ViewFlows
+from structgstream.kernels import cpu_anchors, cpu_motion, cpu_raster
+from structgstream.kernels.native import native_reason
+from structgstream.kernels.values import Anchors, Neighbors, ViewFlows
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason="the native library is not built here")
 Z = torch.zeros
@@ -51,22 +50,22 @@ CALLS: dict[str, tuple[object, str, int | None, Callable[[], object]]] = {
         lambda: cpu_raster.blending_weights(SPLATS, VIEW, Z(8, 8, 1)),
     ),
     "planes": (
-        cpu_planes,
+        cpu_motion,
         "sgs_plane_scores",
         1,
-        lambda: cpu_planes.plane_scores(Z(8, 8), [Z(8, 8)], Z(1, 1, 3, 3), window=3, noise=0.1),
+        lambda: cpu_motion.plane_scores(Z(8, 8), [Z(8, 8)], Z(1, 1, 3, 3), window=3, noise=0.1),
     ),
     "residual": (
-        cpu_residual,
+        cpu_motion,
         "sgs_picture_residual",
         1,
-        lambda: cpu_residual.picture_residual(Z(8, 8, 3), Z(8, 8, 3).byte()),
+        lambda: cpu_motion.picture_residual(Z(8, 8, 3), Z(8, 8, 3).byte()),
     ),
     "lift": (
-        cpu_lift,
+        cpu_motion,
         "sgs_lift_flow",
         1,
-        lambda: cpu_lift.lift(
+        lambda: cpu_motion.lift(
             Z(1, 3),
             ViewFlows(Z(1, 1), Z(1, 1, 2), Z(1, 4, 4), Z(1, 3, 3), Z(1)),
             Neighbors(Z(1, 1).long(), Z(1, 1)),
@@ -75,10 +74,10 @@ CALLS: dict[str, tuple[object, str, int | None, Callable[[], object]]] = {
         ),
     ),
     "change": (
-        cpu_change,
+        cpu_motion,
         "sgs_changed_pixels",
         1,
-        lambda: cpu_change.changed_pixels(Z(8, 8, 3).byte(), Z(8, 8, 3).byte(), threshold=0.1, reach_pixels=1),
+        lambda: cpu_motion.changed_pixels(Z(8, 8, 3).byte(), Z(8, 8, 3).byte(), threshold=0.1, reach_pixels=1),
     ),
     "anchors": (
         cpu_anchors,

@@ -5,8 +5,8 @@ import numpy as np
 import torch
 
 from rigs import random_scene
-from structgstream.kernels.anchor_types import Anchors
 from structgstream.kernels.reference_anchors import activate_anchors
+from structgstream.kernels.values import Anchors
 
 
 def generated(scene, center, visible):

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.kernels._load import ISA_NAMES, native_library
 from structgstream.kernels.cuda_library import KernelLibrary
+from structgstream.kernels.native import ISA_NAMES, native_library
 
 SOURCES = Path(__file__).parents[2] / "csrc" / "cuda"
 
@@ -46,7 +46,7 @@ def kernels_on(request: pytest.FixtureRequest) -> Callable[[str], KernelLibrary]
     def kernels(device_type: str) -> KernelLibrary:
         if device_type == "cpu":
             return request.getfixturevalue("emulation")(0)
-        from structgstream.kernels._nvcc import kernel_library
+        from structgstream.kernels.cuda_library import kernel_library
 
         library, reason = kernel_library()
         assert library is not None, reason

@@ -6,8 +6,8 @@ import torch
 
 from parity.adam_steps import OPTIONS, steps
 from structgstream.errors import BackendError
-from structgstream.kernels import cpu_adam, reference_adam
-from structgstream.kernels._load import native_reason
+from structgstream.kernels import cpu_losses, reference_losses
+from structgstream.kernels.native import native_reason
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
@@ -17,7 +17,7 @@ def test_steps(isa: int, shape: tuple[int, ...]) -> None:
     param = torch.randn(shape)
     # Gradients of a mean over pixels are tiny, and those of unseen rows are zero.
     gradients = [torch.randn(shape) * 1e-6 * (torch.rand(shape) < 0.8) for _ in range(10)]
-    ours, exact = steps(cpu_adam, param, gradients), steps(reference_adam, param.double(), gradients)
+    ours, exact = steps(cpu_losses, param, gradients), steps(reference_losses, param.double(), gradients)
     assert torch.allclose(ours[0].double(), exact[0], rtol=1e-6, atol=1e-6)
     for moment, wanted in zip(ours[1:], exact[1:], strict=True):
         assert (moment.double() - wanted).norm() <= 1e-6 * wanted.norm()
@@ -31,42 +31,27 @@ def test_as_torch() -> None:
     for gradient in gradients:
         twin.grad = gradient
         theirs.step()
-    assert torch.allclose(steps(cpu_adam, param, gradients)[0], twin.detach(), rtol=1e-6, atol=1e-6)
-
-
-def test_selected_rows_move_and_others_stay() -> None:
-    param, rows = torch.randn(60, 2, 3), torch.tensor([1, 3, 59])
-    gradients = [torch.randn(60, 2, 3) for _ in range(3)]
-    some, every = steps(cpu_adam, param, gradients, rows), steps(cpu_adam, param, gradients)
-    others = torch.ones(60, dtype=torch.bool)
-    others[rows] = False
-    assert torch.equal(some[0][others], param[others])
-    assert (some[1][others] == 0).all()
-    assert (some[2][others] == 0).all()
-    assert all(torch.allclose(a[rows], b[rows], atol=1e-6) for a, b in zip(some, every, strict=True))
+    assert torch.allclose(steps(cpu_losses, param, gradients)[0], twin.detach(), rtol=1e-6, atol=1e-6)
 
 
 def test_bitwise_equal_for_any_number_of_threads(isa: int) -> None:
-    param, rows = torch.randn(30_000, 3), torch.arange(0, 30_000, 2)
+    param = torch.randn(30_000, 3)
     gradients = [torch.randn(30_000, 3) for _ in range(2)]
-    for selected in (None, rows):
-        results = []
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            results.append(steps(cpu_adam, param, gradients, selected))
-        for other in results[1:]:
-            assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+    results = []
+    for threads in (1, 2, 3):
+        torch.set_num_threads(threads)
+        results.append(steps(cpu_losses, param, gradients))
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
 def test_nothing_to_move() -> None:
-    assert steps(cpu_adam, torch.zeros(0, 3), [torch.zeros(0, 3)])[0].shape == (0, 3)
+    assert steps(cpu_losses, torch.zeros(0, 3), [torch.zeros(0, 3)])[0].shape == (0, 3)
 
 
 def test_what_it_cannot_step() -> None:
     param = torch.zeros(4, 3)
     with pytest.raises(BackendError, match="float64"):
-        steps(cpu_adam, param.double(), [param.double()])
+        steps(cpu_losses, param.double(), [param.double()])
     with pytest.raises(BackendError, match="contiguous"):
-        cpu_adam.adam_step(torch.zeros(3, 4).T, param, param.clone(), param.clone(), step=1, **OPTIONS)
-    with pytest.raises(BackendError, match=r"0 \.\.\. 3"):
-        steps(cpu_adam, param, [param], torch.tensor([4]))
+        cpu_losses.adam_step(torch.zeros(3, 4).T, param, param.clone(), param.clone(), step=1, **OPTIONS)

@@ -8,9 +8,8 @@ from torch import Tensor
 from splats import viewport_of
 from structgstream.errors import BackendError
 from structgstream.kernels import cpu_anchors, reference_anchors
-from structgstream.kernels._load import native_reason
-from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights, StructuredGaussians
-from structgstream.kernels.raster_types import TileSelection, tile_grid
+from structgstream.kernels.native import native_reason
+from structgstream.kernels.values import Anchors, HeadWeights, MLPWeights, StructuredGaussians, TileSelection, tile_grid
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 

@@ -10,8 +10,7 @@ from torch import Tensor
 from splats import viewport_of
 from structgstream.cameras import Viewport
 from structgstream.kernels import cuda_anchors, reference_anchors, reference_raster
-from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights, StructuredGaussians
-from structgstream.kernels.raster_types import TileSelection, tile_grid
+from structgstream.kernels.values import Anchors, HeadWeights, MLPWeights, StructuredGaussians, TileSelection, tile_grid
 
 M, K, D, HIDDEN = 60, 5, 12, 16
 WIDTH, HEIGHT = 53, 41
@@ -44,13 +43,14 @@ def camera(like: Tensor) -> Viewport:
     return viewport_of(viewmat, K, width=WIDTH, height=HEIGHT, near=0.2)
 
 
+GENERATORS = cuda_anchors.generate_all_in_torch, reference_anchors.generate_structured
+
+
 def generate(
-    module, values: list[Tensor], *, tiles: TileSelection | None = None, distance_input: bool = True
+    generator, values: list[Tensor], *, tiles: TileSelection | None = None, distance_input: bool = True
 ) -> StructuredGaussians:
     mlps = MLPWeights(*(HeadWeights(*values[i : i + 4]) for i in (5, 9, 13)))
-    return module.generate_structured(
-        Anchors(*values[:5]), mlps, camera(values[0]), distance_input=distance_input, tiles=tiles
-    )
+    return generator(Anchors(*values[:5]), mlps, camera(values[0]), distance_input=distance_input, tiles=tiles)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -60,7 +60,7 @@ def test_who_is_looked_at(device: str, tiled: bool) -> None:
     values = [value.to(device) for value in tensors(distance_input=True)]
     mask = (torch.rand(tile_grid(WIDTH, HEIGHT)) < 0.3).to(device)
     tiles = TileSelection(mask, WIDTH, HEIGHT) if tiled else None
-    ours, exact = (generate(module, values, tiles=tiles) for module in (cuda_anchors, reference_anchors))
+    ours, exact = (generate(generator, values, tiles=tiles) for generator in GENERATORS)
     assert torch.equal(ours.anchors, torch.arange(M, device=device))
     assert 0 < len(exact.anchors) < M
     assert (exact.anchors.diff() > 0).all()
@@ -71,9 +71,7 @@ def test_who_is_looked_at(device: str, tiled: bool) -> None:
 @pytest.mark.parametrize("distance_input", [True, False])
 def test_the_drawn_set_is_the_references(device: str, distance_input: bool) -> None:
     values = [value.to(device) for value in tensors(distance_input=distance_input)]
-    found, wanted = (
-        generate(module, values, distance_input=distance_input) for module in (cuda_anchors, reference_anchors)
-    )
+    found, wanted = (generate(generator, values, distance_input=distance_input) for generator in GENERATORS)
     ours, exact = found.gaussians, wanted.gaussians
     drawn = ours.opacities > 0
     assert ours.means.shape == (M * K, 3)
@@ -95,7 +93,7 @@ def test_gradients_of_the_drawn_set(device: str, trained: tuple[int, ...]) -> No
     values = [value.to(device) for value in tensors(distance_input=True)]
     for i in trained:
         values[i].requires_grad_()
-    ours, exact = (generate(module, values).gaussians for module in (cuda_anchors, reference_anchors))
+    ours, exact = (generate(generator, values).gaussians for generator in GENERATORS)
     drawn = ours.opacities > 0
     cotangents = {name: torch.randn_like(getattr(exact, name)) for name in ATTRIBUTES}
     leaves = [values[i] for i in trained]
@@ -117,8 +115,8 @@ def test_pictures_and_their_gradients() -> None:
         values[i].requires_grad_()
     weights = torch.rand(HEIGHT, WIDTH, 3, dtype=torch.float64)
     pictures, gradients = [], []
-    for module in (cuda_anchors, reference_anchors):
-        g = generate(module, values).gaussians
+    for generator in GENERATORS:
+        g = generate(generator, values).gaussians
         image = reference_raster.rasterize(g, camera(values[0])).image
         loss = (image * weights).sum() + g.scales.prod(1).sum() / (g.opacities > 0).sum()
         pictures.append(image.detach())
@@ -136,7 +134,7 @@ def test_nothing_waits_for_the_gpu() -> None:
     mlps, view = MLPWeights(*(HeadWeights(*values[i : i + 4]) for i in (5, 9, 13))), camera(values[0])
     torch.cuda.set_sync_debug_mode("error")
     try:
-        g = cuda_anchors.generate_structured(Anchors(*values[:5]), mlps, view, distance_input=True).gaussians
+        g = cuda_anchors.generate_all_in_torch(Anchors(*values[:5]), mlps, view, distance_input=True).gaussians
         torch.autograd.grad(sum(getattr(g, name).sum() for name in ATTRIBUTES), values)  # type: ignore[arg-type]
     finally:
         torch.cuda.set_sync_debug_mode("default")

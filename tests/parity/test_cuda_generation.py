@@ -13,10 +13,9 @@ from torch import Tensor
 
 from parity.test_cuda_anchors import ATTRIBUTES, HEIGHT, WIDTH, K, M, camera, tensors
 from structgstream.errors import BackendError
-from structgstream.kernels import cuda_generation, reference_anchors
-from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights, StructuredGaussians
+from structgstream.kernels import cuda_anchors, reference_anchors
 from structgstream.kernels.cuda_library import KernelLibrary
-from structgstream.kernels.raster_types import TileSelection, tile_grid
+from structgstream.kernels.values import Anchors, HeadWeights, MLPWeights, StructuredGaussians, TileSelection, tile_grid
 
 ONLINE = (0, 1, 2, 4, 9, 10, 11, 12)  # positions, both scales, features and F_c
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.needs_cuda)]
@@ -62,7 +61,7 @@ def test_the_drawn_set_is_the_references(
         reference_anchors.generate_structured, values, distance_input=distance_input, tiles=tiles, seen_from=center
     )
     found = generate(
-        partial(cuda_generation.generate_structured, library),
+        partial(cuda_anchors.generate_structured, library),
         on_device(values, library),
         distance_input=distance_input,
         tiles=there,
@@ -79,8 +78,8 @@ def test_the_drawn_set_is_the_references(
 
 def test_all_of_them_are_the_drawn_and_others_that_leave_no_trace(library: KernelLibrary) -> None:
     values = on_device(tensors(distance_input=True), library)
-    everything = generate(partial(cuda_generation.generate_all, library), values)
-    drawn = generate(partial(cuda_generation.generate_structured, library), values)
+    everything = generate(partial(cuda_anchors.generate_structured, library, every=True), values)
+    drawn = generate(partial(cuda_anchors.generate_structured, library), values)
     g = everything.gaussians
     assert g.means.shape == (M * K, 3)
     assert torch.equal(everything.anchors.cpu(), torch.arange(M))
@@ -105,7 +104,9 @@ def test_gradients(library: KernelLibrary, trained: tuple[int, ...], distance_in
         values[i].requires_grad_()
         ours[i].requires_grad_()
     exact = generate(reference_anchors.generate_structured, values, distance_input=distance_input).gaussians
-    found = generate(partial(cuda_generation.generate_all, library), ours, distance_input=distance_input).gaussians
+    found = generate(
+        partial(cuda_anchors.generate_structured, library, every=True), ours, distance_input=distance_input
+    ).gaussians
     rows = exact.ids.to(library.device_type)
     cotangents = {name: torch.randn_like(getattr(exact, name)) for name in ATTRIBUTES}
     wanted = torch.autograd.grad(
@@ -133,7 +134,7 @@ def test_anchors_at_the_centre_and_quaternions_of_length_zero(library: KernelLib
         values[i].requires_grad_()
         ours[i].requires_grad_()
     exact = generate(reference_anchors.generate_structured, values).gaussians
-    found = generate(partial(cuda_generation.generate_structured, library), ours).gaussians
+    found = generate(partial(cuda_anchors.generate_structured, library), ours).gaussians
     assert torch.equal(found.ids.cpu(), exact.ids)
     assert torch.allclose(found.quats.cpu(), exact.quats, atol=1e-5)
     assert (exact.quats.norm(dim=1) == 0).any()
@@ -149,7 +150,9 @@ def test_elements_need_no_order(emulation: Callable[[int], KernelLibrary]) -> No
     found = []
     for order in (0, 1):
         leaves = [value.clone().requires_grad_() for value in values]
-        g = generate(partial(cuda_generation.generate_all, emulation(order)), leaves, tiles=some_tiles_once()).gaussians
+        g = generate(
+            partial(cuda_anchors.generate_structured, emulation(order), every=True), leaves, tiles=some_tiles_once()
+        ).gaussians
         total = sum((getattr(g, name) * (1 + i)).sum() for i, name in enumerate(ATTRIBUTES))
         found.append([g.means.detach(), *torch.autograd.grad(total, leaves)])  # type: ignore[arg-type]
     assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
@@ -162,7 +165,7 @@ def some_tiles_once() -> TileSelection:
 
 
 def test_what_the_kernels_cannot_read(emulation: Callable[[int], KernelLibrary]) -> None:
-    generator = partial(cuda_generation.generate_structured, emulation(0))
+    generator = partial(cuda_anchors.generate_structured, emulation(0))
     with pytest.raises(BackendError, match="float32"):
         generate(generator, tensors(distance_input=True))
     elsewhere = [value.float() for value in tensors(distance_input=True)]
@@ -178,7 +181,9 @@ def test_nothing_waits_for_the_gpu(kernels_on: Callable[[str], KernelLibrary]) -
     mlps, view = MLPWeights(*(HeadWeights(*values[i : i + 4]) for i in (5, 9, 13))), camera(values[0])
     torch.cuda.set_sync_debug_mode("error")
     try:
-        g = cuda_generation.generate_all(library, Anchors(*values[:5]), mlps, view, distance_input=True).gaussians
+        g = cuda_anchors.generate_structured(
+            library, Anchors(*values[:5]), mlps, view, distance_input=True, every=True
+        ).gaussians
         torch.autograd.grad(sum(getattr(g, name).sum() for name in ATTRIBUTES), values)  # type: ignore[arg-type]
     finally:
         torch.cuda.set_sync_debug_mode("default")

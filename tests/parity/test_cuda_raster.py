@@ -14,10 +14,9 @@ from torch import Tensor
 from splats import splats_of, viewport_of
 from structgstream.cameras import Viewport
 from structgstream.kernels import cuda, reference_raster
-from structgstream.kernels._nvcc import kernel_library
+from structgstream.kernels.cuda_library import kernel_library
 from structgstream.kernels.cuda_tiles import PairBudget
-from structgstream.kernels.operations import Rasterize
-from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tile_grid
+from structgstream.kernels.values import TILE_PIXELS, Rasterizer, TileSelection, tile_grid
 
 WIDTH, HEIGHT, NEAR, COUNT = 41, 35, 0.2, 30
 PAIRS = 700
@@ -121,7 +120,7 @@ def camera(like: Tensor) -> Viewport:
     return viewport_of(torch.eye(4).to(like), K.to(like), width=WIDTH, height=HEIGHT, near=NEAR)
 
 
-def run(rasterize: Rasterize, values: list[Tensor], **options) -> tuple[list[Tensor], list[Tensor]]:
+def run(rasterize: Rasterizer, values: list[Tensor], **options) -> tuple[list[Tensor], list[Tensor]]:
     """Picture, coverage and radii, and the gradients of all inputs for fixed cotangents."""
     leaves = [value.clone().requires_grad_() for value in values]
     output = rasterize(splats_of(*leaves[:5]), camera(values[0]), screen_offsets=leaves[5], **options)
@@ -177,9 +176,7 @@ def test_with_tiles_who_reaches_none_counts_as_not_drawn_and_the_picture_is_draw
     for output, picture in zip(outputs, pictures, strict=True):
         assert output.image.data_ptr() == picture.data_ptr()
     pixels = tiles.pixels()[..., None].expand(-1, -1, 1).double()
-    shown = reference_raster.blending_weights(
-        reference_raster.rasterize, splats_of(*values[:5]), camera(values[0]), pixels
-    )
+    shown = reference_raster.blending_weights(splats_of(*values[:5]), camera(values[0]), pixels)
     everything = cuda.rasterize(splats_of(*values[:5]), camera(values[0]))
     assert 0 < (shown > 0).sum() <= (outputs[1].radii > 0).sum() < (everything.radii > 0).sum()
     assert (outputs[1].radii[shown[:, 0] > 0] > 0).all()

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from structgstream.errors import BackendError
-from structgstream.kernels import cpu_ssim, cuda_ssim, reference_ssim
-from structgstream.kernels._load import native_reason
+from structgstream.kernels import cpu_losses, cuda, reference_losses
 from structgstream.kernels.cuda_library import KernelLibrary
-from structgstream.kernels.raster_types import TileSelection, tile_grid
+from structgstream.kernels.native import native_reason
+from structgstream.kernels.values import TileSelection, tile_grid
 
 Loss = Callable[..., tuple[Tensor, Tensor]]
 
@@ -25,11 +25,11 @@ Loss = Callable[..., tuple[Tensor, Tensor]]
 def loss(request: pytest.FixtureRequest) -> Loss:
     """``l1_ssim``, of the emulation or of a GPU; it takes and gives tensors of the processor."""
     if request.param == "emulated":
-        return partial(cuda_ssim.l1_ssim, request.getfixturevalue("emulation")(0))
+        return partial(cuda.l1_ssim, request.getfixturevalue("emulation")(0))
     from structgstream.kernels.backend import cuda_backend
 
     backend = cuda_backend()
-    assert backend.l1_ssim is not reference_ssim.l1_ssim, "the kernels were not compiled"
+    assert backend.l1_ssim is not reference_losses.l1_ssim, "the kernels were not compiled"
 
     def on_gpu(value: Any) -> Any:
         if isinstance(value, TileSelection):
@@ -73,7 +73,7 @@ def test_value_and_gradient(loss: Loss, size: tuple[int, int], as_bytes: bool) -
     for weights in [(0.0, 1.0), (1.0, -0.2)]:
         l1, ssim, gradient = value_and_gradient(loss, image, target, weights)
         exact_l1, exact_ssim, exact = value_and_gradient(
-            reference_ssim.l1_ssim, image.double(), exactly(target), weights
+            reference_losses.l1_ssim, image.double(), exactly(target), weights
         )
         assert abs(l1.double() - exact_l1) < 1e-6
         assert abs(ssim.double() - exact_ssim) < 1e-6
@@ -87,7 +87,7 @@ def test_a_corrected_picture_and_some_of_its_tiles(loss: Loss, tiled: bool) -> N
     tiles = TileSelection(torch.rand(tile_grid(110, 75)) < 0.3, 110, 75) if tiled else None
     l1, ssim, gradient = value_and_gradient(loss, image, target, (1.0, -0.2), gains=gains, biases=biases, tiles=tiles)
     exact_options = {"gains": gains.double(), "biases": biases.double()}
-    oracle = partial(value_and_gradient, reference_ssim.l1_ssim, image.double(), target, (1.0, -0.2), **exact_options)
+    oracle = partial(value_and_gradient, reference_losses.l1_ssim, image.double(), target, (1.0, -0.2), **exact_options)
     exact_l1, exact_ssim, exact = oracle(tiles=tiles)
     assert abs(l1.double() - exact_l1) < 1e-6
     assert abs(ssim.double() - exact_ssim) < 1e-6
@@ -101,7 +101,7 @@ def test_tiles_mean_the_same_as_on_the_cpu(loss: Loss) -> None:
     tiles = TileSelection(torch.zeros(tile_grid(90, 60), dtype=torch.bool), 90, 60)
     tiles.mask[1, 2] = tiles.mask[3, 5] = True
     ours = value_and_gradient(loss, image, target, (1.0, -0.2), tiles=tiles)
-    theirs = value_and_gradient(cpu_ssim.l1_ssim, image, target, (1.0, -0.2), tiles=tiles)
+    theirs = value_and_gradient(cpu_losses.l1_ssim, image, target, (1.0, -0.2), tiles=tiles)
     assert all(torch.allclose(a, b, rtol=1e-4, atol=1e-8) for a, b in zip(ours, theirs, strict=True))
 
 
@@ -111,7 +111,7 @@ def test_no_gradient_is_asked_for(loss: Loss) -> None:
     with torch.no_grad():
         for chosen in (None, tiles):
             l1, ssim = loss(image, target, tiles=chosen)
-            exact = reference_ssim.l1_ssim(image, target, tiles=chosen)
+            exact = reference_losses.l1_ssim(image, target, tiles=chosen)
             assert torch.allclose(torch.stack([l1, ssim]), torch.stack(exact), atol=1e-6)
 
 
@@ -133,7 +133,7 @@ def test_within_a_phase_threads_may_run_in_any_order(emulation: Callable[[int], 
     image, target = pictures(45, 120)
     tiles = TileSelection(torch.rand(tile_grid(120, 45)) < 0.5, 120, 45)
     forth, back = (
-        value_and_gradient(partial(cuda_ssim.l1_ssim, emulation(order)), image, target, (0.8, -0.2), tiles=tiles)
+        value_and_gradient(partial(cuda.l1_ssim, emulation(order)), image, target, (0.8, -0.2), tiles=tiles)
         for order in (0, 1)
     )
     assert all(torch.equal(a, b) for a, b in zip(forth, back, strict=True))
@@ -146,4 +146,4 @@ def test_what_it_cannot_compare(loss: Loss, emulation: Callable[[int], KernelLib
     with pytest.raises(BackendError, match=r"\(8, 7, 3\)"):
         loss(image, target[:, :7])
     with pytest.raises(BackendError, match="not on meta"):
-        cuda_ssim.l1_ssim(emulation(0), image, target.to("meta"))
+        cuda.l1_ssim(emulation(0), image, target.to("meta"))

@@ -4,17 +4,16 @@ with the reference's rasteriser, on a GPU with everything real.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
 from structgstream.cameras import Viewport
-from structgstream.kernels import cuda_adam, cuda_anchors
-from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights
+from structgstream.kernels import cuda, cuda_anchors
 from structgstream.kernels.backend import Backend, cuda_backend, nonblocking, reference_backend
 from structgstream.kernels.cuda_tiles import PairBudget
+from structgstream.kernels.values import Anchors, HeadWeights, MLPWeights
 
 M, K, D, HIDDEN, WIDTH, HEIGHT = 40, 4, 6, 8, 48, 40
 STEPS = 4
@@ -105,11 +104,7 @@ def compare(ours: Fit, exact: Fit, losses: list[float], exact_losses: list[float
 
 def test_fixed_shapes_move_the_anchors_as_the_reference() -> None:
     reference = reference_backend()
-    fixed = replace(
-        reference,
-        generate_structured=cuda_anchors.generate_structured,
-        adam_step=cuda_adam.adam_step,
-    )
+    fixed = reference.with_functions(generate_structured=cuda_anchors.generate_all_in_torch, adam_step=cuda.adam_step)
     exact, ours = Fit(reference, "cpu"), Fit(fixed, "cpu")
     exact_losses = exact.run(exact.step, "cpu")
     compare(

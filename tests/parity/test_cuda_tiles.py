@@ -22,8 +22,8 @@ from structgstream.kernels.cuda_tiles import (
     tile_lists,
     tile_lists_in_kernels,
 )
-from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tile_grid
 from structgstream.kernels.reference_raster import boxes_reaching_tiles
+from structgstream.kernels.values import TILE_PIXELS, TileSelection, tile_grid
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.needs_cuda)]
 Listed = Callable[..., TileLists]

@@ -13,11 +13,10 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from splats import viewport_of
-from structgstream.kernels import cuda_adam, cuda_anchors, reference_anchors
-from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights
+from structgstream.kernels import cuda, cuda_anchors, reference_anchors
 from structgstream.kernels.cuda_tiles import tile_lists
-from structgstream.kernels.raster_types import TileSelection, tile_grid
 from structgstream.kernels.reference_raster import boxes_reaching_tiles
+from structgstream.kernels.values import Anchors, HeadWeights, MLPWeights, TileSelection, tile_grid
 
 VIEW = viewport_of(torch.eye(4), torch.tensor([[30.0, 0, 20], [0, 30, 20], [0, 0, 1]]), width=40, height=40, near=0.1)
 WAITS = ("_local_scalar_dense", "nonzero", "masked_select", "equal", "is_nonzero", "_unique2", "unique_dim")
@@ -50,7 +49,7 @@ def test_seeing_and_dressing_anchors(tiled: bool) -> None:
     values, mlps = anchors()
     tiles = TileSelection(torch.rand(tile_grid(40, 40)) < 0.5, 40, 40) if tiled else None
     with NoWaiting():
-        g = cuda_anchors.generate_structured(Anchors(*values), mlps, VIEW, distance_input=True, tiles=tiles).gaussians
+        g = cuda_anchors.generate_all_in_torch(Anchors(*values), mlps, VIEW, distance_input=True, tiles=tiles).gaussians
         total = g.means.sum() + g.quats.sum() + g.scales.sum() + g.opacities.sum() + g.colors.sum()
         torch.autograd.grad(total, [*values, *(weight for head in mlps for weight in head)])
 
@@ -68,7 +67,7 @@ def test_tile_lists_and_masks_of_pixels() -> None:
 def test_the_optimiser() -> None:
     values = [torch.randn(20, 3) for _ in range(2)] + [torch.zeros(20, 3) for _ in range(2)]
     with NoWaiting():
-        cuda_adam.adam_step(*values, lr=0.1, step=3, betas=(0.9, 0.999), eps=1e-15)
+        cuda.adam_step(*values, lr=0.1, step=3, betas=(0.9, 0.999), eps=1e-15)
 
 
 def test_what_the_other_back_ends_do_is_caught() -> None:

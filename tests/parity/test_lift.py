@@ -4,9 +4,9 @@
 import pytest
 import torch
 
-from structgstream.kernels import cpu_lift, reference_lift
-from structgstream.kernels._load import native_library, native_reason
-from structgstream.kernels.motion_types import Lifted, Neighbors, ViewFlows
+from structgstream.kernels import cpu_motion, reference_motion
+from structgstream.kernels.native import native_library, native_reason
+from structgstream.kernels.values import Lifted, Neighbors, ViewFlows
 
 needs_native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
@@ -31,7 +31,7 @@ def scenery(
     Ks = torch.tensor([[300.0, 0, 160], [0, 310.0, 120], [0, 0, 1]], dtype=torch.float64).repeat(views, 1, 1)
     near = torch.full((views,), 1.5, dtype=torch.float64)  # some movers lie before it
     motion = speed * torch.tensor([0.03, -0.02, 0.01], dtype=torch.float64)
-    jacobians = reference_lift.projection_jacobians(centers, viewmats, Ks, near)
+    jacobians = reference_motion.projection_jacobians(centers, viewmats, Ks, near)
     flows = jacobians @ motion + (0.3 + 0.05 * (speed - 1.0) * 5.0) * draw(views, movers, 2)
     weights = torch.rand(views, movers, generator=generator, dtype=torch.float64) * 5
     weights[weights < 1.0] = 0.0
@@ -68,10 +68,10 @@ def test_cpu_finds_what_the_oracle_finds(isa: int, seed: int, speed: float) -> N
     try:
         if native_library().sgs_use_isa(isa) != isa:
             pytest.skip("this processor has no such instructions")
-        found = lifted(cpu_lift, single(given))
+        found = lifted(cpu_motion, single(given))
     finally:
         native_library().sgs_use_isa(before)
-    oracle = lifted(reference_lift, given)
+    oracle = lifted(reference_motion, given)
     # Rounds feed on each other, so single precision shows in the fifth digit.
     torch.testing.assert_close(found.displacements.double(), oracle.displacements, atol=2e-5, rtol=1e-3)
     near_the_edge = (found.inlier_share.double() - oracle.inlier_share).abs() > 1e-3
@@ -86,7 +86,7 @@ def test_cpu_gives_the_same_bits_with_any_number_of_threads() -> None:
         results = []
         for count in (1, 2, 3):
             torch.set_num_threads(count)
-            results.append(lifted(cpu_lift, given))
+            results.append(lifted(cpu_motion, given))
     finally:
         torch.set_num_threads(threads)
     for other in results[1:]:
@@ -98,7 +98,7 @@ def test_cpu_gives_the_same_bits_with_any_number_of_threads() -> None:
 def test_cpu_without_evidence_keeps_the_prior() -> None:
     given = single(scenery(2))
     given["weights"] = torch.zeros_like(given["weights"])
-    found = lifted(cpu_lift, given)
+    found = lifted(cpu_motion, given)
     assert torch.equal(found.displacements, given["priors"])
     assert not found.inlier_share.any()
     assert not found.agreeing_views.any()

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from structgstream.kernels import cpu_planes, reference_planes
-from structgstream.kernels._load import native_reason
+from structgstream.kernels import cpu_motion, reference_motion
+from structgstream.kernels.native import native_reason
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 HEIGHT, WIDTH = 37, 53  # No multiple of any vector.
@@ -36,8 +36,8 @@ def test_scores(isa: int, neighbours: int, window: int) -> None:
     own, warps = picture(0), homographies(6, neighbours, behind=0.1)
     others = [picture(n + 1, 30 + n, 61 - n) for n in range(neighbours)]
     others[0] = own
-    exact = reference_planes.plane_scores(own, others, warps, window=window, noise=1e-4)
-    ours = cpu_planes.plane_scores(own, others, warps, window=window, noise=1e-4)
+    exact = reference_motion.plane_scores(own, others, warps, window=window, noise=1e-4)
+    ours = cpu_motion.plane_scores(own, others, warps, window=window, noise=1e-4)
     assert ours.shape == exact.shape == (6, HEIGHT, WIDTH)
     assert exact.std() > 0.1
     # Where a sample falls onto the edge of a picture rounding decides whether it is seen.
@@ -49,7 +49,7 @@ def test_scores(isa: int, neighbours: int, window: int) -> None:
 
 def test_a_picture_correlates_with_itself(isa: int) -> None:
     own = picture(0)
-    scores = cpu_planes.plane_scores(own, [own], torch.eye(3).repeat(1, 1, 1, 1), window=5, noise=0.0)
+    scores = cpu_motion.plane_scores(own, [own], torch.eye(3).repeat(1, 1, 1, 1), window=5, noise=0.0)
     torch.testing.assert_close(scores[0], torch.ones(HEIGHT, WIDTH), atol=1e-3, rtol=0)
 
 
@@ -58,10 +58,10 @@ def test_tiny_pictures(isa: int, size: tuple[int, int]) -> None:
     """Windows are wider than the picture: its mirror images are mirrored again."""
     own, warps = picture(0, *size), torch.eye(3).repeat(1, 2, 1, 1)
     given = own, [own, picture(1, *size)], warps
-    exact = reference_planes.plane_scores(*given, window=7, noise=1e-3)
-    torch.testing.assert_close(cpu_planes.plane_scores(*given, window=7, noise=1e-3).double(), exact, atol=1e-4, rtol=0)
+    exact = reference_motion.plane_scores(*given, window=7, noise=1e-3)
+    torch.testing.assert_close(cpu_motion.plane_scores(*given, window=7, noise=1e-3).double(), exact, atol=1e-4, rtol=0)
 
 
 def test_no_planes(isa: int) -> None:
-    found = cpu_planes.plane_scores(picture(0), [picture(1)], torch.zeros(0, 1, 3, 3), window=3, noise=1e-3)
+    found = cpu_motion.plane_scores(picture(0), [picture(1)], torch.zeros(0, 1, 3, 3), window=3, noise=1e-3)
     assert found.shape == (0, HEIGHT, WIDTH)

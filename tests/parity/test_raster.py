@@ -6,8 +6,6 @@ The scene stays away from where the definition jumps: depths are far apart, and 
 would decide which branch is taken, and the comparison would measure that instead of the kernel.
 """
 
-from functools import partial
-
 import pytest
 import torch
 from torch import Tensor
@@ -15,9 +13,9 @@ from torch import Tensor
 from splats import splats_of, viewport_of
 from structgstream.cameras import Viewport
 from structgstream.kernels import cpu_raster, cuda, reference_raster
-from structgstream.kernels._load import native_reason
-from structgstream.kernels.raster_types import TileSelection, tile_grid
+from structgstream.kernels.native import native_reason
 from structgstream.kernels.reference_raster import rasterize as reference
+from structgstream.kernels.values import TileSelection, tile_grid
 
 native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 WIDTH, HEIGHT, NEAR = 75, 53, 0.2  # No multiple of the tile.
@@ -50,6 +48,13 @@ def gaussians(count: int = 300, *, opaque: float = 0.7) -> tuple[Tensor, ...]:
         torch.rand(count, 3, generator=g, dtype=torch.float64),
         torch.zeros(count, 2, dtype=torch.float64),
     )
+
+
+def all_gradients(*args, **options):
+    """gsplat gives gradients to Gaussians that hardly any light reaches, too."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reference_raster, "MIN_GRADIENT_TRANSMITTANCE", 0.0)
+        return reference(*args, **options)
 
 
 def run(
@@ -162,8 +167,9 @@ def test_the_low_pass_of_the_training_pictures_on_the_cpu(isa: int, share: float
 @pytest.mark.needs_cuda
 @pytest.mark.parametrize("share", [0.4, 1.0, 3.0])
 def test_the_low_pass_of_the_training_pictures_on_a_gpu(share: float) -> None:
-    everything = partial(reference, least_transmittance=0.0)
-    check_against_reference(cuda.rasterize, everything, background=None, device="cuda", intervals=intervals_at(share))
+    check_against_reference(
+        cuda.rasterize, all_gradients, background=None, device="cuda", intervals=intervals_at(share)
+    )
 
 
 @native
@@ -202,8 +208,7 @@ def test_no_pixel_of_a_needle_is_skipped(isa: int, faint: bool) -> None:
 
 @pytest.mark.needs_cuda
 def test_cuda() -> None:
-    everything = partial(reference, least_transmittance=0.0)
-    check_against_reference(cuda.rasterize, everything, background=None, device="cuda")
+    check_against_reference(cuda.rasterize, all_gradients, background=None, device="cuda")
 
 
 @native
@@ -327,13 +332,13 @@ def test_tiles_draw_and_learn_as_the_whole_picture_does_there(isa: int, trained:
 def test_blending_weights(isa: int, channels: int) -> None:
     inputs = gaussians()
     maps = torch.rand(HEIGHT, WIDTH, channels, dtype=torch.float64) * safe_pixels(inputs)[..., None]
-    exact = reference_raster.blending_weights(reference, splats_of(*inputs[:5]), camera(), maps)
+    exact = reference_raster.blending_weights(splats_of(*inputs[:5]), camera(), maps)
     single = splats_of(*(value.float() for value in inputs[:5])), camera(torch.float32), maps.float()
     ours = cpu_raster.blending_weights(*single)
     assert ours.shape == exact.shape == (len(inputs[0]), channels)
     # Float32 sums of some hundreds of terms of size one: 1e-5 is 80 units in the last place.
     assert ((ours - exact).norm(dim=0) < 1e-5 * exact.norm(dim=0)).all()
-    again = reference_raster.blending_weights(cpu_raster.rasterize, *single)
+    again = reference_raster.weights_by_gradient(cpu_raster.rasterize, *single)
     assert ((ours - again).norm(dim=0) < 1e-5 * exact.norm(dim=0)).all()
 
 

@@ -7,9 +7,9 @@ from torch import Tensor
 
 from published import published_ssim
 from structgstream.errors import BackendError
-from structgstream.kernels import cpu_ssim, reference_ssim
-from structgstream.kernels._load import native_reason
-from structgstream.kernels.raster_types import TileSelection, tile_grid
+from structgstream.kernels import cpu_losses, reference_losses
+from structgstream.kernels.native import native_reason
+from structgstream.kernels.values import TileSelection, tile_grid
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
@@ -37,8 +37,8 @@ def test_value_and_gradient(isa: int, size: tuple[int, int], as_bytes: bool) -> 
         target = (target * 255).round().to(torch.uint8)
     exact_target = target if as_bytes else target.double()
     for weights in [(0.0, 1.0), (1.0, -0.2)]:
-        l1, ssim, gradient = value_and_gradient(cpu_ssim, image, target, weights)
-        exact_l1, exact_ssim, exact = value_and_gradient(reference_ssim, image.double(), exact_target, weights)
+        l1, ssim, gradient = value_and_gradient(cpu_losses, image, target, weights)
+        exact_l1, exact_ssim, exact = value_and_gradient(reference_losses, image.double(), exact_target, weights)
         assert abs(l1.double() - exact_l1) < 1e-6
         assert abs(ssim.double() - exact_ssim) < 1e-6
         assert (gradient - exact).norm() < 1e-5 * exact.norm()
@@ -50,7 +50,7 @@ def test_inside_the_border_it_is_the_published_ssim() -> None:
     margin = 12
     padded = [torch.nn.functional.pad(x, (0, 0, margin, margin, margin, margin)) for x in (image, target)]
     theirs = published_ssim(padded[0], padded[1])
-    assert cpu_ssim.ssim(padded[0], padded[1]).item() == pytest.approx(theirs.mean(), abs=1e-6)
+    assert cpu_losses.l1_ssim(padded[0], padded[1])[1].item() == pytest.approx(theirs.mean(), abs=1e-6)
 
 
 def test_bitwise_equal_for_any_number_of_threads(isa: int) -> None:
@@ -58,14 +58,14 @@ def test_bitwise_equal_for_any_number_of_threads(isa: int) -> None:
     results = []
     for threads in (1, 2, 3, 2):
         torch.set_num_threads(threads)
-        results.append(value_and_gradient(cpu_ssim, image, target, (0.8, -0.2)))
+        results.append(value_and_gradient(cpu_losses, image, target, (0.8, -0.2)))
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
 def test_equal_pictures_score_one_and_pull_nowhere() -> None:
     image, _ = pictures(20, 20)
-    l1, ssim, gradient = value_and_gradient(cpu_ssim, image, image.clone(), (1.0, -1.0))
+    l1, ssim, gradient = value_and_gradient(cpu_losses, image, image.clone(), (1.0, -1.0))
     assert l1 == 0.0
     assert ssim.item() == pytest.approx(1.0, abs=1e-6)
     assert gradient.abs().max() < 1e-6
@@ -74,15 +74,15 @@ def test_equal_pictures_score_one_and_pull_nowhere() -> None:
 def test_a_picture_that_is_not_contiguous() -> None:
     image, target = pictures(20, 24)
     turned = image.permute(1, 0, 2).contiguous().permute(1, 0, 2)
-    assert torch.equal(cpu_ssim.ssim(turned, target), cpu_ssim.ssim(image, target))
+    assert torch.equal(cpu_losses.l1_ssim(turned, target)[1], cpu_losses.l1_ssim(image, target)[1])
 
 
 def test_what_it_cannot_compare() -> None:
     image, target = pictures(8, 8)
     with pytest.raises(BackendError, match="float64"):
-        cpu_ssim.l1_ssim(image.double(), target)
+        cpu_losses.l1_ssim(image.double(), target)
     with pytest.raises(BackendError, match=r"\(8, 7, 3\)"):
-        cpu_ssim.l1_ssim(image, target[:, :7])
+        cpu_losses.l1_ssim(image, target[:, :7])
 
 
 @pytest.mark.parametrize("as_bytes", [False, True])
@@ -99,8 +99,8 @@ def test_a_corrected_picture_and_some_of_its_tiles(isa: int, as_bytes: bool, til
         l1, ssim = module.l1_ssim(x, y, gains=gains.to(x), biases=biases.to(x), tiles=tiles)
         return l1.detach(), ssim.detach(), torch.autograd.grad(l1 - 0.2 * ssim, x)[0]
 
-    l1, ssim, gradient = run(cpu_ssim, image, target)
-    exact_l1, exact_ssim, exact = run(reference_ssim, image.double(), target if as_bytes else target.double())
+    l1, ssim, gradient = run(cpu_losses, image, target)
+    exact_l1, exact_ssim, exact = run(reference_losses, image.double(), target if as_bytes else target.double())
     assert abs(l1.double() - exact_l1) < 1e-6
     assert abs(ssim.double() - exact_ssim) < 1e-6
     assert (gradient - exact).norm() < 1e-5 * exact.norm()
@@ -117,7 +117,7 @@ def test_a_corrected_picture_and_some_of_its_tiles(isa: int, as_bytes: bool, til
 def run_whole(image: Tensor, target: Tensor, gains: Tensor, biases: Tensor) -> Tensor:
     image = image.clone().requires_grad_()
     exact_target = target if target.dtype == torch.uint8 else target.double()
-    l1, ssim = reference_ssim.l1_ssim(image, exact_target, gains=gains.double(), biases=biases.double())
+    l1, ssim = reference_losses.l1_ssim(image, exact_target, gains=gains.double(), biases=biases.double())
     return torch.autograd.grad(l1 - 0.2 * ssim, image)[0]
 
 
@@ -128,7 +128,7 @@ def test_tiles_do_not_depend_on_threads() -> None:
     for threads in (1, 2, 3):
         torch.set_num_threads(threads)
         x = image.clone().requires_grad_()
-        l1, ssim = cpu_ssim.l1_ssim(x, target, tiles=tiles)
+        l1, ssim = cpu_losses.l1_ssim(x, target, tiles=tiles)
         results.append((l1, ssim, *torch.autograd.grad(l1 + ssim, x)))
     torch.set_num_threads(1)
     for other in results[1:]:

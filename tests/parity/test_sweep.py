@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from rigs import arc_rig
-from structgstream.kernels import cpu_sweep, cuda_sweep, reference_sweep
-from structgstream.kernels._load import native_reason
+from structgstream.kernels import cpu_motion, cuda, reference_motion
 from structgstream.kernels.cuda_library import KernelLibrary
-from structgstream.kernels.motion_types import SweepView, Swept
+from structgstream.kernels.native import native_reason
+from structgstream.kernels.values import SweepView, Swept
 
 needs_native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
@@ -59,15 +59,15 @@ RULES = {"planes": 17, "least_supports": 2, "most_contradictions": 0.34}
 def sweep(request: pytest.FixtureRequest, kernels_on: Callable[[str], KernelLibrary]) -> Callable[..., Swept]:
     """A sweep in float32, of the C++, of the CUDA functions on a processor, or of a GPU; on the processor's tensors."""
     if request.param == "cpu":
-        return cpu_sweep.sweep
+        return cpu_motion.sweep
     if request.param == "emulated":
-        return partial(cuda_sweep.sweep, kernels_on("cpu"))
+        return partial(cuda.sweep, kernels_on("cpu"))
     library = kernels_on("cuda")
 
     def there(given: list[SweepView], view_index: int, *tensors: torch.Tensor, **rules: Any) -> Swept:
         every: list[dict[str, Any]] = [vars(view) for view in given]
         moved = [SweepView(**{k: v.cuda() if k != "near" else v for k, v in view.items()}) for view in every]
-        found = cuda_sweep.sweep(library, moved, view_index, *(t.cuda() for t in tensors), **rules)
+        found = cuda.sweep(library, moved, view_index, *(t.cuda() for t in tensors), **rules)
         return Swept(found.depths.cpu(), found.costs.cpu())
 
     return there
@@ -76,7 +76,7 @@ def sweep(request: pytest.FixtureRequest, kernels_on: Callable[[str], KernelLibr
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_it_finds_what_the_oracle_finds(sweep: Callable[..., Swept], seed: int) -> None:
     found = sweep(views(seed, torch.float32), 1, *rays(seed, torch.float32), **RULES)
-    oracle = reference_sweep.sweep(views(seed, torch.float64), 1, *rays(seed, torch.float64), **RULES)
+    oracle = reference_motion.sweep(views(seed, torch.float64), 1, *rays(seed, torch.float64), **RULES)
     assert 0 < found.costs.isfinite().sum() < 150, "both kinds of ray"
     # A point may fall on the border of two pixels, where precision decides.
     close = torch.isclose(found.costs.double(), oracle.costs, atol=1e-4) | (found.costs.isinf() & oracle.costs.isinf())
@@ -91,7 +91,7 @@ def test_cpu_gives_the_same_bits_with_any_number_of_threads() -> None:
     try:
         for count in (1, 3):
             torch.set_num_threads(count)
-            results.append(cpu_sweep.sweep(views(3, torch.float32), 0, *rays(3, torch.float32), **RULES))
+            results.append(cpu_motion.sweep(views(3, torch.float32), 0, *rays(3, torch.float32), **RULES))
     finally:
         torch.set_num_threads(threads)
     assert torch.equal(results[0].depths, results[1].depths)
@@ -100,6 +100,6 @@ def test_cpu_gives_the_same_bits_with_any_number_of_threads() -> None:
 
 def test_the_cuda_elements_need_no_order(emulation: Callable[[int], KernelLibrary]) -> None:
     given = views(4, torch.float32), 2, *rays(4, torch.float32)
-    one, other = (cuda_sweep.sweep(emulation(order), *given, **RULES) for order in (0, 1))
+    one, other = (cuda.sweep(emulation(order), *given, **RULES) for order in (0, 1))
     assert torch.equal(one.depths, other.depths)
     assert torch.equal(one.costs, other.costs)

@@ -4,10 +4,9 @@ from dataclasses import replace
 import torch
 
 from rigs import arc_rig, random_scene
-from structgstream.kernels.anchor_types import Anchors
 from structgstream.kernels.backend import reference_backend
-from structgstream.kernels.raster_types import TileSelection, tile_grid
 from structgstream.kernels.reference_anchors import activate_anchors
+from structgstream.kernels.values import Anchors, TileSelection, tile_grid
 from structgstream.scene.render import draw
 
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from structgstream.kernels.values import RasterOutput
 
 from structgstream.kernels.backend import reference_backend
+from structgstream.kernels.values import RasterOutput
 from structgstream.training.online.config import MotionConfig, SpawnConfig
 from structgstream.training.online.spawn import Sweep, missing_share
 from structgstream.training.online.split import DynamicSplit, find_active_tiles

@@ -4,12 +4,12 @@
 from dataclasses import replace
 
 import torch
-from structgstream.kernels.values import HeadWeights, MLPWeights
 
 from backends import quickest_backend
 from rigs import arc_rig
 from structgstream.cameras import Camera
 from structgstream.kernels.backend import Backend, reference_backend
+from structgstream.kernels.values import HeadWeights, MLPWeights
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians

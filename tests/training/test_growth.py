@@ -2,10 +2,10 @@
 from dataclasses import replace
 
 import torch
-from structgstream.kernels.values import StructuredGaussians
 
 from rigs import random_scene
 from structgstream.gaussians import Gaussians
+from structgstream.kernels.values import StructuredGaussians
 from structgstream.training.frame0.densify import GrowthConfig, OpacityStatistics, grow, prunable_mask
 
 VOXEL = 0.01

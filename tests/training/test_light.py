@@ -6,9 +6,9 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from structgstream.kernels.values import HeadWeights
 
 from structgstream.errors import ConfigError
+from structgstream.kernels.values import HeadWeights
 from structgstream.presets import COMPACT
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import ExposureConfig, OnlineConfig

@@ -221,7 +221,7 @@ def test_tiles_near_change_suffice() -> None:
     def quality(**motion) -> float:
         drawn.append(0)
         config = replace(FOLLOWING, motion=replace(FOLLOWING.motion, **motion))
-        backend = replace(quickest_backend(), rasterize=counting)
+        backend = quickest_backend().with_functions(rasterize=counting)
         return psnr(
             rendered(followed(world.scene, world, 1, config=config, backend=backend).scene, world, "cam00"), truth
         )

@@ -6,10 +6,10 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import torch
-from structgstream.kernels.values import TileSelection, tile_grid
 
 from rigs import random_scene
 from structgstream.kernels.backend import reference_backend
+from structgstream.kernels.values import TileSelection, tile_grid
 from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.scene import Scene
 from structgstream.training.losses import GradientStatistics, LossWeights, SceneLoss

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from structgstream.kernels.values import TILE_PIXELS
 
 from backends import quickest_backend
 from rigs import random_scene
 from structgstream import cameras
 from structgstream.cameras import Camera, CameraRig, enlargement
 from structgstream.frames import MultiViewFrame
+from structgstream.kernels.values import TILE_PIXELS
 from structgstream.training.frame0.densify import MOST_ANCHORS, GrowthConfig
 from structgstream.training.online.config import ExposureConfig, MotionConfig, SmoothnessConfig
 from structgstream.training.online.exposure import exposure_reference

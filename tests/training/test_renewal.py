@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from structgstream.kernels._load import native_reason
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
+from structgstream.kernels.native import native_reason
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig, SpawnConfig, ThinSpawnConfig

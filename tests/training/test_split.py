@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from structgstream.kernels.values import TileSelection
 
 from rigs import random_scene
-from structgstream.kernels._load import native_reason
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
+from structgstream.kernels.native import native_reason
+from structgstream.kernels.values import TileSelection
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import draw
 from structgstream.scene.state import PAPER_DYNAMIC, state_of

@@ -3,12 +3,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from structgstream.kernels.values import TileSelection
 
 from backends import quickest_backend
 from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
-from structgstream.kernels.reference_ssim import l1_ssim as reference_l1_ssim
+from structgstream.kernels.reference_losses import l1_ssim as reference_l1_ssim
+from structgstream.kernels.values import TileSelection
 from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.color import CameraColor
 from structgstream.scene.render import draw

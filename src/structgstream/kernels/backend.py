@@ -1,115 +1,122 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compute back-ends: each is a value with a name and one function per operation.
+"""Compute back-ends: the table of their operations, and which function each back-end has for them.
 
-``reference`` is pure torch and runs anywhere, ``cpu`` is this package's C++, ``cuda`` wraps gsplat. A back-end without
-its own implementation of an operation takes another's, stated where the value is built.
+``reference`` is pure torch and runs anywhere, ``cpu`` is this package's C++, ``cuda`` is gsplat and this package's CUDA
+kernels. An operation is defined by its function in ``reference_*``: the signature, the contract, and the results that
+parity tests compare other back-ends with.
+
+Note [Ownership]
+~~~~~~~~~~~~~~~~
+The same on every back-end:
+
+- Arguments are neither changed nor aliased by results, with two exceptions. ``rasterize`` draws into ``onto`` in place:
+  the returned ``image`` shares its memory, so the next drawing into it changes both. ``adam_step`` updates ``param``
+  and its two moments in place.
+- Results belong to the caller.
+- Cameras, targets, masks and numbers get no gradient; every other tensor gets one if it requires it. ``ids``,
+  ``anchors``, ``raw_opacities`` and ``radii`` of results have no graph.
+- Indices are int64 and ascending, masks bool.
+- If memory is short a kernel raises ``OutOfMemoryError``. Tensors that a back-end does not support raise
+  ``BackendError``, which names a back-end that supports them.
 """
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from types import ModuleType
+from typing import Any, Generic, Literal, ParamSpec, TypeVar, overload
 
 import torch
 
 from structgstream.errors import BackendError
+from structgstream.kernels import reference_anchors, reference_losses, reference_motion, reference_raster
 from structgstream.kernels.cuda_graph import GraphMemory, Recorder
 from structgstream.kernels.cuda_tiles import PairBudget
-from structgstream.kernels.operations import (
-    L1SSIM,
-    AdamStep,
-    BlendingWeights,
-    ChangeBits,
-    ChangedPixels,
-    ConfidentFlow,
-    Excess,
-    GenerateStructured,
-    Lift,
-    NeighbourDifference,
-    PictureAndWeights,
-    PictureResidual,
-    PlaneScores,
-    Rasterize,
-    Sweep,
-    Volume,
-)
 
 _log = logging.getLogger(__name__)
 
 BackendName = Literal["auto", "cpu", "cuda", "reference"]
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
 
 
-@dataclass(frozen=True)
+class Operation(Generic[Parameters, Result]):
+    """A row of the table in :class:`Backend`; of a back-end it is the function that computes the operation there.
+
+    Args:
+        oracle: the pure-torch function that defines the operation.
+    """
+
+    def __init__(self, oracle: Callable[Parameters, Result]) -> None:
+        self.oracle = oracle
+        self.name = oracle.__name__
+
+    @overload
+    def __get__(self, backend: None, owner: type) -> "Operation[Parameters, Result]": ...
+    @overload
+    def __get__(self, backend: "Backend", owner: type) -> Callable[Parameters, Result]: ...
+    def __get__(self, backend: "Backend | None", owner: type) -> Any:
+        return self if backend is None else backend.functions[self.name]
+
+
+@dataclass(frozen=True, eq=False)
 class Backend:
-    """The operations that rendering and training need; ``kernels.operations`` defines the contract of each.
+    """The operations that rendering and training need, and where and by whom they are computed.
+
+    The cpu back-end has a C++ function for each. The cuda back-end runs the reference's where no comment says
+    otherwise, and without NVIDIA's compiler in place of its own kernels.
 
     Args:
         name: ``reference``, ``cpu`` or ``cuda``.
         device: of its tensors.
+        functions: for each operation's name its function, with the signature of the oracle.
         recorder: makes a recorder of iterations (``kernels.cuda_graph``); None where they are run one by one.
     """
 
     name: str
     device: torch.device
-    rasterize: Rasterize
-    blending_weights: BlendingWeights
-    picture_and_weights: PictureAndWeights
-    l1_ssim: L1SSIM
-    volume: Volume
-    excess: Excess
-    neighbour_difference: NeighbourDifference
-    change_bits: ChangeBits
-    changed_pixels: ChangedPixels
-    picture_residual: PictureResidual
-    confident_flow: ConfidentFlow
-    lift: Lift
-    sweep: Sweep
-    plane_scores: PlaneScores
-    generate_structured: GenerateStructured
-    adam_step: AdamStep
+    functions: Mapping[str, Callable[..., Any]]
     recorder: Callable[[], Recorder[Any]] | None = None
+
+    rasterize = Operation(reference_raster.rasterize)  # cuda: gsplat
+    blending_weights = Operation(reference_raster.blending_weights)  # cuda: gradients of gsplat's picture
+    picture_and_weights = Operation(reference_raster.picture_and_weights)  # cuda: gsplat
+    generate_structured = Operation(reference_anchors.generate_structured)  # cuda: own kernels
+    l1_ssim = Operation(reference_losses.l1_ssim)  # cuda: own kernels
+    volume = Operation(reference_losses.volume)
+    excess = Operation(reference_losses.excess)
+    neighbour_difference = Operation(reference_losses.neighbour_difference)
+    change_bits = Operation(reference_losses.change_bits)
+    adam_step = Operation(reference_losses.adam_step)  # cuda: torch's fused kernel
+    changed_pixels = Operation(reference_motion.changed_pixels)
+    picture_residual = Operation(reference_motion.picture_residual)
+    confident_flow = Operation(reference_motion.confident_flow)  # cuda: on the CPU, where flow is found
+    lift = Operation(reference_motion.lift)
+    sweep = Operation(reference_motion.sweep)  # cuda: own kernels
+    plane_scores = Operation(reference_motion.plane_scores)  # cuda: on the CPU
+
+    def __post_init__(self) -> None:
+        assert self.functions.keys() == self.operations().keys(), self.functions.keys() ^ self.operations().keys()
+
+    @classmethod
+    def operations(cls) -> dict[str, Operation[..., Any]]:
+        """The table: every operation by its name."""
+        return {name: row for name, row in vars(cls).items() if isinstance(row, Operation)}
+
+    def with_functions(self, **functions: Callable[..., Any]) -> "Backend":
+        """This back-end with other functions for the operations named."""
+        return replace(self, functions={**self.functions, **functions})
+
+
+def _functions_of(*modules: ModuleType) -> dict[str, Callable[..., Any]]:
+    """The modules' functions that are named as an operation."""
+    return {name: getattr(module, name) for module in modules for name in Backend.operations() if hasattr(module, name)}
 
 
 def reference_backend() -> Backend:
     """Pure torch on the CPU: slow, always available, the oracle of the others."""
-    from structgstream.kernels import (
-        reference_adam,
-        reference_anchors,
-        reference_bits,
-        reference_change,
-        reference_excess,
-        reference_flow,
-        reference_lift,
-        reference_neighbours,
-        reference_planes,
-        reference_raster,
-        reference_residual,
-        reference_ssim,
-        reference_sweep,
-        reference_volume,
-    )
-
-    return Backend(
-        name="reference",
-        device=torch.device("cpu"),
-        rasterize=reference_raster.rasterize,
-        blending_weights=partial(reference_raster.blending_weights, reference_raster.rasterize),
-        picture_and_weights=partial(reference_raster.picture_and_weights, reference_raster.rasterize),
-        l1_ssim=reference_ssim.l1_ssim,
-        volume=reference_volume.volume,
-        excess=reference_excess.excess,
-        neighbour_difference=reference_neighbours.neighbour_difference,
-        change_bits=reference_bits.change_bits,
-        changed_pixels=reference_change.changed_pixels,
-        picture_residual=reference_residual.picture_residual,
-        confident_flow=reference_flow.confident_flow,
-        lift=reference_lift.lift,
-        sweep=reference_sweep.sweep,
-        plane_scores=reference_planes.plane_scores,
-        generate_structured=reference_anchors.generate_structured,
-        adam_step=reference_adam.adam_step,
-    )
+    return Backend("reference", torch.device("cpu"), {name: row.oracle for name, row in Backend.operations().items()})
 
 
 def cpu_backend() -> Backend:
@@ -118,50 +125,16 @@ def cpu_backend() -> Backend:
     Raises:
         BackendError: the native library was not built or cannot be loaded.
     """
-    from structgstream.kernels import (
-        cpu_adam,
-        cpu_anchors,
-        cpu_bits,
-        cpu_change,
-        cpu_excess,
-        cpu_flow,
-        cpu_lift,
-        cpu_neighbours,
-        cpu_planes,
-        cpu_raster,
-        cpu_residual,
-        cpu_ssim,
-        cpu_sweep,
-        cpu_volume,
-    )
-    from structgstream.kernels._load import native_library
+    from structgstream.kernels import cpu_anchors, cpu_losses, cpu_motion, cpu_raster
+    from structgstream.kernels.native import native_library
 
     native_library()
-    return Backend(
-        name="cpu",
-        device=torch.device("cpu"),
-        rasterize=cpu_raster.rasterize,
-        blending_weights=cpu_raster.blending_weights,
-        picture_and_weights=cpu_raster.picture_and_weights,
-        l1_ssim=cpu_ssim.l1_ssim,
-        volume=cpu_volume.volume,
-        excess=cpu_excess.excess,
-        neighbour_difference=cpu_neighbours.neighbour_difference,
-        change_bits=cpu_bits.change_bits,
-        changed_pixels=cpu_change.changed_pixels,
-        picture_residual=cpu_residual.picture_residual,
-        confident_flow=cpu_flow.confident_flow,
-        lift=cpu_lift.lift,
-        sweep=cpu_sweep.sweep,
-        plane_scores=cpu_planes.plane_scores,
-        generate_structured=cpu_anchors.generate_structured,
-        adam_step=cpu_adam.adam_step,
-    )
+    return Backend("cpu", torch.device("cpu"), _functions_of(cpu_raster, cpu_anchors, cpu_losses, cpu_motion))
 
 
 def processor_backend() -> Backend:
     """The cpu back-end, or the reference where the native library was not built."""
-    from structgstream.kernels._load import native_reason
+    from structgstream.kernels.native import native_reason
 
     return cpu_backend() if native_reason() is None else reference_backend()
 
@@ -172,55 +145,33 @@ def cuda_backend() -> Backend:
     Raises:
         BackendError: no GPU, or gsplat is not installed or does not load.
     """
-    from structgstream.kernels import (
-        cuda_adam,
-        cuda_generation,
-        cuda_ssim,
-        cuda_sweep,
-        reference_anchors,
-        reference_bits,
-        reference_change,
-        reference_excess,
-        reference_lift,
-        reference_neighbours,
-        reference_raster,
-        reference_residual,
-        reference_ssim,
-        reference_sweep,
-        reference_volume,
-    )
-    from structgstream.kernels._nvcc import kernel_library
-    from structgstream.kernels.cuda import cuda_reason, rasterize
+    from structgstream.kernels import cuda, cuda_anchors, cuda_library
 
-    reason = cuda_reason()
+    reason = cuda.cuda_reason()
     if reason is not None:
         raise BackendError(reason)
-    processor = processor_backend()
-    library, sentence = kernel_library()
+    library, sentence = cuda_library.kernel_library()
     _log.log(logging.WARNING if library is None else logging.INFO, sentence)
-    drawing = partial(rasterize, library=library)
-    return Backend(
+    processor, rasterize = processor_backend(), partial(cuda.rasterize, library=library)
+    backend = replace(
+        reference_backend(),
         name="cuda",
         device=torch.device("cuda"),
-        rasterize=drawing,
-        blending_weights=partial(reference_raster.blending_weights, drawing),
-        picture_and_weights=partial(reference_raster.picture_and_weights, drawing),
-        l1_ssim=reference_ssim.l1_ssim if library is None else partial(cuda_ssim.l1_ssim, library),
-        volume=reference_volume.volume,
-        excess=reference_excess.excess,
-        neighbour_difference=reference_neighbours.neighbour_difference,
-        change_bits=reference_bits.change_bits,
-        changed_pixels=reference_change.changed_pixels,
-        picture_residual=reference_residual.picture_residual,
-        confident_flow=processor.confident_flow,
-        lift=reference_lift.lift,
-        sweep=reference_sweep.sweep if library is None else partial(cuda_sweep.sweep, library),
-        plane_scores=processor.plane_scores,
-        generate_structured=reference_anchors.generate_structured
-        if library is None
-        else partial(cuda_generation.generate_structured, library),
-        adam_step=cuda_adam.adam_step,
         recorder=GraphMemory(torch.device("cuda")).recorder,
+    ).with_functions(
+        rasterize=rasterize,
+        blending_weights=partial(reference_raster.weights_by_gradient, rasterize),
+        picture_and_weights=partial(reference_raster.picture_and_weights_by_gradient, rasterize),
+        adam_step=cuda.adam_step,
+        confident_flow=processor.confident_flow,
+        plane_scores=processor.plane_scores,
+    )
+    if library is None:
+        return backend
+    return backend.with_functions(
+        generate_structured=partial(cuda_anchors.generate_structured, library),
+        l1_ssim=partial(cuda.l1_ssim, library),
+        sweep=partial(cuda.sweep, library),
     )
 
 
@@ -235,33 +186,30 @@ def nonblocking(backend: Backend, budget: PairBudget) -> Backend:
     Raises:
         BackendError: ``backend`` is not the cuda one.
     """
-    from structgstream.kernels import cuda_anchors, cuda_generation
-    from structgstream.kernels._nvcc import kernel_library
-    from structgstream.kernels.cuda import rasterize
+    from structgstream.kernels import cuda, cuda_anchors, cuda_library
 
     if backend.name != "cuda":
         raise BackendError(f"Only the cuda back-end runs asynchronously, not {backend.name}; use it as it is.")
-    library, _ = kernel_library()
-    return replace(
-        backend,
-        rasterize=partial(rasterize, budget=budget, library=library),
-        generate_structured=cuda_anchors.generate_structured
+    library, _ = cuda_library.kernel_library()
+    return backend.with_functions(
+        rasterize=partial(cuda.rasterize, budget=budget, library=library),
+        generate_structured=cuda_anchors.generate_all_in_torch
         if library is None
-        else partial(cuda_generation.generate_all, library),
+        else partial(cuda_anchors.generate_structured, library, every=True),
     )
 
 
 def backend_reasons() -> dict[str, str | None]:
     """For each back-end the reason why it is not available here; None if it is."""
-    from structgstream.kernels._load import native_reason
     from structgstream.kernels.cuda import cuda_reason
+    from structgstream.kernels.native import native_reason
 
     return {"cuda": cuda_reason(), "cpu": native_reason(), "reference": None}
 
 
 def backend_remarks() -> dict[str, str]:
     """Remarks about available back-ends for the user: what computes the cuda back-end's own operations."""
-    from structgstream.kernels._nvcc import kernel_plan
+    from structgstream.kernels.cuda_library import kernel_plan
 
     return {"cuda": kernel_plan()[1]}
 

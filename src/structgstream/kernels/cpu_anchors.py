@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Anchors to drawable Gaussians in this package's C++; the contract is ``kernels.operations.GenerateStructured``."""
+"""Anchors to drawable Gaussians in this package's C++; ``reference_anchors`` defines the operation."""
 
 import ctypes
 from collections.abc import Sequence
@@ -11,57 +11,43 @@ from torch import Tensor
 from structgstream.cameras import Viewport
 from structgstream.errors import BackendError, OutOfMemoryError
 from structgstream.gaussians import Gaussians
-from structgstream.kernels._load import native_library
-from structgstream.kernels.anchor_types import Anchors, MLPWeights, StructuredGaussians
-from structgstream.kernels.prototypes import addresses
-from structgstream.kernels.raster_types import TileSelection
+from structgstream.kernels.native import addresses, constant, members, native_library
+from structgstream.kernels.values import Anchors, MLPWeights, StructuredGaussians, TileSelection
 
-# The structures below mirror csrc/cpu/anchors.h, field by field.
+# The structures below mirror csrc/cpu/anchors.h, member by member.
 
 
 class _Head(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_void_p) for name in ("w1", "b1", "w2", "b2")]
+    _fields_ = members(ctypes.c_void_p, "w1 b1 w2 b2")
 
 
 class _Anchors(ctypes.Structure):
     _fields_ = [
-        *[
-            (name, ctypes.c_void_p)
-            for name in ("positions", "log_offset_scales", "log_base_scales", "offsets", "features", "visible")
-        ],
+        *members(ctypes.c_void_p, "positions log_offset_scales log_base_scales offsets features visible"),
         ("heads", _Head * 3),
         ("camera_center", ctypes.c_float * 3),
-        *[
-            (name, ctypes.c_int32)
-            for name in ("visible_count", "offsets_per_anchor", "feature_size", "hidden_size", "distance_input")
-        ],
+        *members(ctypes.c_int32, "visible_count offsets_per_anchor feature_size hidden_size distance_input"),
     ]
 
 
 class _Selection(ctypes.Structure):
     _fields_ = [
-        *[(name, ctypes.c_void_p) for name in ("raw_opacities", "relu_bits", "active", "starts")],
-        ("active_count", ctypes.c_int64),
-        ("gaussian_count", ctypes.c_int64),
+        *members(ctypes.c_void_p, "raw_opacities relu_bits active starts"),
+        *members(ctypes.c_int64, "active_count gaussian_count"),
     ]
 
 
 class _Gaussians(ctypes.Structure):
-    _fields_ = [
-        (name, ctypes.c_void_p) for name in ("means", "quats", "scales", "opacities", "colors", "ids", "quat_norms")
-    ]
+    _fields_ = members(ctypes.c_void_p, "means quats scales opacities colors ids quat_norms")
 
 
 class _GaussianGradients(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_void_p) for name in ("means", "quats", "scales", "opacities", "colors")]
+    _fields_ = members(ctypes.c_void_p, "means quats scales opacities colors")
 
 
 class _AnchorGradients(ctypes.Structure):
     _fields_ = [
-        *[
-            (name, ctypes.c_void_p)
-            for name in ("positions", "log_offset_scales", "log_base_scales", "offsets", "features")
-        ],
+        *members(ctypes.c_void_p, "positions log_offset_scales log_base_scales offsets features"),
         ("heads", _Head * 3),
     ]
 
@@ -151,7 +137,7 @@ def _check(tensors: Sequence[Tensor], mlps: MLPWeights, distance_input: bool) ->
 def visible_anchors(
     anchors: Anchors, viewport: Viewport, tiles: TileSelection | None, intervals: Tensor | None = None
 ) -> Tensor:
-    """Indices ``[m]``, ascending, of the anchors in view, see ``kernels.reference_anchors.visible_anchors``.
+    """Indices ``[m]``, ascending, of the anchors in view, see ``reference_anchors.visible_anchors``.
 
     Raises:
         BackendError: a tensor of another precision.
@@ -165,19 +151,13 @@ def visible_anchors(
     count = len(anchors.positions)
     native = _Anchors(*addresses(*tensors, None, None))
     native.offsets_per_anchor = anchors.offsets.shape[1]
-    viewmat, K = (matrix.detach().float().contiguous() for matrix in (viewport.viewmat, viewport.K))
+    viewmat, K = map(constant, (viewport.viewmat, viewport.K))
     mask = None if tiles is None else tiles.mask.contiguous()
-    sizes = None if intervals is None else intervals.detach().float().contiguous()
+    sizes = None if intervals is None else constant(intervals)
     found = torch.empty(count, dtype=torch.int64)
     seen = native_library().sgs_anchors_visible(
-        ctypes.byref(native),
-        count,
-        *addresses(sizes, viewmat, K),
-        viewport.width,
-        viewport.height,
-        viewport.near,
-        *addresses(mask, found),
-        torch.get_num_threads(),
+        *(ctypes.byref(native), count, sizes, viewmat, K, viewport.width, viewport.height, viewport.near),
+        *(mask, found, torch.get_num_threads()),
     )
     if seen < 0:
         raise OutOfMemoryError("to find the anchors in view")
@@ -187,7 +167,7 @@ def visible_anchors(
 def activate_anchors(
     anchors: Anchors, mlps: MLPWeights, center: Tensor, visible: Tensor, *, distance_input: bool
 ) -> StructuredGaussians:
-    """The Gaussians of the anchors ``visible``, see ``kernels.reference_anchors.activate_anchors``.
+    """The Gaussians of the anchors ``visible``, see ``reference_anchors.activate_anchors``.
 
     Raises:
         BackendError: a tensor of another precision, or inconsistent shapes.
@@ -211,7 +191,7 @@ def generate_structured(
     seen_from: Tensor | None = None,
     sampling_intervals: Tensor | None = None,
 ) -> StructuredGaussians:
-    """See ``kernels.operations.GenerateStructured``.
+    """See ``reference_anchors.generate_structured``.
 
     Only gradients of tensors that require them are computed. Results do not depend on the number of threads.
 

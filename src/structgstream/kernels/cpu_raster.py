@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rasteriser in this package's C++; contracts: ``Rasterize``, ``BlendingWeights`` and ``PictureAndWeights``."""
+"""The rasteriser in this package's C++; ``reference_raster`` defines its operations."""
 
 import weakref
 from dataclasses import dataclass
@@ -12,9 +12,8 @@ from torch.autograd.function import once_differentiable
 from structgstream.cameras import Viewport
 from structgstream.errors import BackendError, OutOfMemoryError
 from structgstream.gaussians import Gaussians
-from structgstream.kernels._load import native_library
-from structgstream.kernels.prototypes import addresses
-from structgstream.kernels.raster_types import RasterOutput, TileSelection
+from structgstream.kernels.native import constant, native_library
+from structgstream.kernels.values import RasterOutput, TileSelection
 
 
 class _State:
@@ -37,22 +36,18 @@ class _View:
     trained: int
     intervals: Tensor | None
 
-    def arguments(self) -> list[int | float | None]:
+    def arguments(self) -> list[Tensor | int | float]:
         """The camera's arguments in the order of the C++ functions."""
         viewport = self.viewport
-        return [*addresses(viewport.viewmat, viewport.K), viewport.width, viewport.height, viewport.near]
-
-
-def _constant(tensor: Tensor) -> Tensor:
-    return tensor.detach().float().contiguous()
+        return [viewport.viewmat, viewport.K, viewport.width, viewport.height, viewport.near]
 
 
 def _intervals(gaussians: Gaussians) -> Tensor | None:
-    return None if gaussians.sampling_intervals is None else _constant(gaussians.sampling_intervals)
+    return None if gaussians.sampling_intervals is None else constant(gaussians.sampling_intervals)
 
 
 def _in_float32(viewport: Viewport) -> Viewport:
-    return viewport._replace(viewmat=_constant(viewport.viewmat), K=_constant(viewport.K))
+    return viewport._replace(viewmat=constant(viewport.viewmat), K=constant(viewport.K))
 
 
 class _Rasterize(torch.autograd.Function):
@@ -71,12 +66,10 @@ class _Rasterize(torch.autograd.Function):
         ctx.state = _State(
             native_library().sgs_raster_forward(
                 count,
-                *addresses(*gaussians),
+                *gaussians,
                 *view.arguments(),
-                *addresses(view.background, screen_offsets, view.intervals, view.tiles),
-                view.trained,
-                *addresses(image, alpha, radii),
-                torch.get_num_threads(),
+                *(view.background, screen_offsets, view.intervals, view.tiles, view.trained),
+                *(image, alpha, radii, torch.get_num_threads()),
             )
         )
         ctx.background, ctx.tracked = view.background, screen_offsets is not None
@@ -97,13 +90,10 @@ class _Rasterize(torch.autograd.Function):
         results = [torch.empty_like(tensor) for tensor in gaussians]
         count = gaussians[0].shape[0]
         offsets = image.new_empty(count, 2) if ctx.tracked else None
-        failed = native_library().sgs_raster_backward(
-            ctx.state.address,
-            count,
-            *addresses(*gaussians, ctx.background, image, alpha, given, given_alpha, *results, offsets),
-            torch.get_num_threads(),
-        )
-        if failed:
+        if native_library().sgs_raster_backward(
+            *(ctx.state.address, count, *gaussians, ctx.background, image, alpha, given, given_alpha),
+            *(*results, offsets, torch.get_num_threads()),
+        ):
             raise OutOfMemoryError("for the gradients of the Gaussians that are drawn")
         return None, None, offsets, *results
 
@@ -118,7 +108,7 @@ def rasterize(
     onto: Tensor | None = None,
     trained: int | None = None,
 ) -> RasterOutput:
-    """See ``kernels.operations.Rasterize``. Results repeat bit for bit and do not depend on the number of threads.
+    """See ``reference_raster.rasterize``. Results repeat bit for bit and do not depend on the number of threads.
 
     Raises:
         BackendError: a tensor is not float32 on the CPU.
@@ -144,7 +134,7 @@ def rasterize(
         onto = onto.detach()  # An alias, because autograd marks the tensor it is given as the function's result.
     view = _View(
         _in_float32(viewport),
-        None if background is None else _constant(background),
+        None if background is None else constant(background),
         None if tiles is None else tiles.mask.contiguous(),
         n if trained is None else trained,
         _intervals(gaussians),
@@ -157,7 +147,7 @@ def rasterize(
 
 
 def blending_weights(gaussians: Gaussians, viewport: Viewport, maps: Tensor) -> Tensor:
-    """See ``kernels.operations.BlendingWeights``; float32.
+    """See ``reference_raster.blending_weights``; float32.
 
     Raises:
         OutOfMemoryError: there is no memory for the tiles' lists of Gaussians.
@@ -168,7 +158,7 @@ def blending_weights(gaussians: Gaussians, viewport: Viewport, maps: Tensor) -> 
 def picture_and_weights(
     gaussians: Gaussians, viewport: Viewport, maps: Tensor, *, background: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """See ``kernels.operations.PictureAndWeights``; float32, in one pass.
+    """See ``reference_raster.picture_and_weights``; float32, in one pass.
 
     Raises:
         OutOfMemoryError: there is no memory for the tiles' lists of Gaussians.
@@ -180,25 +170,19 @@ def picture_and_weights(
 def _weights(
     gaussians: Gaussians, viewport: Viewport, maps: Tensor, *, background: Tensor | None, image: Tensor | None
 ) -> Tensor:
-    tensors = [_constant(t) for t in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)]
-    colors = None if image is None else _constant(gaussians.colors)
+    tensors = [constant(t) for t in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)]
+    colors = None if image is None else constant(gaussians.colors)
     maps = maps.float().contiguous()
     height, width, channels = maps.shape
     assert channels > 0, maps.shape
     assert (width, height) == (viewport.width, viewport.height), maps.shape
     view = _View(
-        _in_float32(viewport), None if background is None else _constant(background), None, 0, _intervals(gaussians)
+        _in_float32(viewport), None if background is None else constant(background), None, 0, _intervals(gaussians)
     )
     weights = torch.empty(len(gaussians), channels)
-    failed = native_library().sgs_raster_weights(
-        len(gaussians),
-        *addresses(*tensors, colors),
-        *view.arguments(),
-        *addresses(view.background, view.intervals, maps),
-        channels,
-        *addresses(weights, image),
-        torch.get_num_threads(),
-    )
-    if failed:
+    if native_library().sgs_raster_weights(
+        *(len(gaussians), *tensors, colors, *view.arguments(), view.background, view.intervals),
+        *(maps, channels, weights, image, torch.get_num_threads()),
+    ):
         raise OutOfMemoryError("for the lists of the Gaussians that each tile draws")
     return weights

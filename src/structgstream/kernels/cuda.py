@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""gsplat's CUDA rasteriser with this package's contract.
+"""Operations of the cuda back-end: gsplat's rasteriser, this package's kernels of losses and sweeps, torch's Adam.
 
 gsplat is imported only if there is a GPU: without one its import prints warnings and its functions fail when called.
 """
 
+import ctypes
 import importlib.util
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -15,15 +17,17 @@ from torch.autograd.function import once_differentiable
 
 from structgstream.cameras import Viewport
 from structgstream.gaussians import Gaussians
+from structgstream.kernels.cpu_losses import Comparison
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.cuda_tiles import PairBudget, radii_reaching_tiles, tile_lists, tile_lists_in_kernels
-from structgstream.kernels.raster_types import TILE_PIXELS, RasterOutput, TileSelection, tile_grid
+from structgstream.kernels.native import addresses, members
 from structgstream.kernels.reference_raster import (
     LOW_PASS_PIXELS,
     boxes_reaching_tiles,
     restrict_to_tiles,
     screen_low_pass,
 )
+from structgstream.kernels.values import TILE_PIXELS, RasterOutput, SweepView, Swept, TileSelection, tile_grid
 
 
 def cuda_reason() -> str | None:
@@ -48,7 +52,7 @@ def rasterize(
     budget: PairBudget | None = None,
     library: KernelLibrary | None = None,
 ) -> RasterOutput:
-    """See ``kernels.operations.Rasterize``.
+    """See ``reference_raster.rasterize``.
 
     The screen offsets are added between gsplat's projection and its rasterisation, so that their gradient is the same
     on every back-end. ``trained`` saves no work here: the other gradients are computed and dropped. With a ``budget``
@@ -198,3 +202,124 @@ def _pair_lists(
     _, pairs, ids = isect_tiles(means2d, radii, depths, TILE_PIXELS, columns, rows, packed=False, n_images=1)
     starts = isect_offset_encode(pairs, 1, columns, rows).reshape(1, rows, columns)
     return starts, ids, None if masks is None else masks[None]
+
+
+class _L1SSIM(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, library: KernelLibrary, image: Tensor, comparison: Comparison) -> tuple[Tensor, Tensor]:
+        rows, columns = tile_grid(image.shape[1], image.shape[0])
+        adjoints = image.new_empty(3, *image.shape) if ctx.needs_input_grad[1] else None
+        sums, means = image.new_empty(2, rows * columns), image.new_empty(2)
+        library.call("sgs_cuda_l1_ssim", *comparison.arguments(image), adjoints, sums, means, device=image.device)
+        ctx.library, ctx.comparison = library, comparison
+        ctx.save_for_backward(image, adjoints)
+        return means[0], means[1]
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[None, Tensor, None]:
+        to_l1, to_ssim = (gradient.contiguous() for gradient in gradients)
+        image, adjoints = ctx.saved_tensors
+        gradient = torch.empty_like(image)
+        ctx.library.call(
+            "sgs_cuda_l1_ssim_backward",
+            *(*ctx.comparison.arguments(image), adjoints, to_l1, to_ssim, gradient),
+            device=image.device,
+        )
+        return None, gradient, None
+
+
+def l1_ssim(
+    library: KernelLibrary,
+    image: Tensor,
+    target: Tensor,
+    *,
+    gains: Tensor | None = None,
+    biases: Tensor | None = None,
+    tiles: TileSelection | None = None,
+) -> tuple[Tensor, Tensor]:
+    """See ``reference_losses.l1_ssim``; float32, without host synchronisation. Results repeat bit for bit.
+
+    Raises:
+        BackendError: a precision, layout, size or device that the kernels do not support.
+    """
+    comparison = Comparison.of(image, target, gains, biases, tiles)
+    mask = None if tiles is None else tiles.mask
+    library.check_devices(image, target, gains, biases, mask)
+    return _L1SSIM.apply(library, image.contiguous(), comparison)  # type: ignore[return-value]
+
+
+class _View(ctypes.Structure):
+    """``sgs_cuda_sweep_view`` of csrc/cuda/sweep.h."""
+
+    _fields_ = (
+        *members(ctypes.c_void_p, "colors missing depths viewmat K"),
+        ("near_plane", ctypes.c_float),
+        *members(ctypes.c_int, "width height"),
+    )
+
+
+def sweep(
+    library: KernelLibrary,
+    views: Sequence[SweepView],
+    view_index: int,
+    pixels: Tensor,
+    farthest: Tensor,
+    *,
+    planes: int,
+    least_supports: int,
+    most_contradictions: float,
+) -> Swept:
+    """See ``reference_motion.sweep``; float32. Results repeat bit for bit."""
+    assert len(pixels) == len(farthest), (pixels.shape, farthest.shape)
+    inputs = [[t.detach().float().contiguous() for t in (v.colors, v.missing, v.depths, v.viewmat, v.K)] for v in views]
+    given = (_View * len(views))()
+    for slot, view, tensors in zip(given, views, inputs, strict=True):
+        library.check_devices(*tensors)
+        slot.height, slot.width = view.missing.shape
+        assert view.colors.shape == (slot.height, slot.width, 3), view.colors.shape
+        assert view.depths.shape == view.missing.shape, view.depths.shape
+        slot.colors, slot.missing, slot.depths, slot.viewmat, slot.K = addresses(*tensors)
+        slot.near_plane = view.near
+    pixels, farthest = pixels.to(torch.int64).contiguous(), farthest.float().contiguous()
+    library.check_devices(pixels, farthest)
+    votes = farthest.new_zeros(3, len(pixels), planes)
+    found = Swept(torch.empty_like(farthest), torch.empty_like(farthest))
+    library.call(
+        "sgs_cuda_sweep",
+        *(ctypes.addressof(given), len(views), view_index, pixels, farthest, len(pixels)),
+        *(planes, least_supports, most_contradictions, votes, found.depths, found.costs),
+        device=farthest.device,
+    )
+    return found
+
+
+def adam_step(
+    param: Tensor,
+    grad: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    *,
+    lr: float | Tensor,
+    step: int | Tensor,
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
+    """See ``reference_losses.adam_step``; without host synchronisation."""
+    if param.numel() == 0:
+        return
+    torch._fused_adam_(  # pyright: ignore[reportPrivateImportUsage]
+        [param],
+        [grad.to(param.dtype).contiguous()],
+        [exp_avg],
+        [exp_avg_sq],
+        [],
+        # torch.full is a kernel on the device: nothing is copied from the host.
+        [step if isinstance(step, Tensor) else torch.full((), float(step), device=param.device)],
+        lr=lr,
+        beta1=betas[0],
+        beta2=betas[1],
+        weight_decay=0.0,
+        eps=eps,
+        amsgrad=False,
+        maximize=False,
+    )

@@ -49,7 +49,7 @@ class GraphMemory:
     """A stream and memory for graphs, shared by all recorders of a back-end; reserved at the first recording.
 
     Memory of a pool goes back to the driver when its last graph is gone, so that each frame would have to ask for it
-    anew. One graph that does nothing is therefore kept.
+    anew. Therefore one graph that does nothing stays.
     """
 
     def __init__(self, device: torch.device) -> None:

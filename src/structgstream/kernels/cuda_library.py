@@ -1,15 +1,47 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The library of this package's CUDA kernels; ``kernels._nvcc`` compiles it."""
+"""This package's CUDA kernels: compiles them once per GPU architecture, caches the library, and calls its functions.
+
+The sources are installed with the package, because a wheel is seldom built on the machine that has the GPU.
+"""
 
 import ctypes
-from collections.abc import Callable
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from structgstream.errors import BackendError
-from structgstream.kernels.prototypes import CUDA_PROTOTYPES, declare
+from structgstream.kernels.native import declare
+from structgstream.whole_files import give_name
+
+CUDA_PROTOTYPES: Mapping[str, tuple[str, str]] = {
+    "sgs_cuda_l1_ssim": ("i", "pppiippppppp"),
+    "sgs_cuda_l1_ssim_backward": ("i", "pppiipppppppp"),
+    "sgs_cuda_error": ("s", "i"),
+    "sgs_cuda_anchor_inputs": ("i", "ppppppiiiipppiifpppp"),
+    "sgs_cuda_anchor_inputs_backward": ("i", "piiipppp"),
+    "sgs_cuda_anchor_outputs": ("i", "ppppiipppppppppppp"),
+    "sgs_cuda_anchor_outputs_backward": ("i", "pppiipppppppppppppppp"),
+    "sgs_cuda_sweep": ("i", "piippiiifpppp"),
+    "sgs_cuda_tile_depths": ("i", "ppipp"),
+    "sgs_cuda_tile_counts": ("i", "pppiiipp"),
+    "sgs_cuda_tile_fill": ("i", "ppppiiilppp"),
+    "sgs_cuda_tile_starts": ("i", "pppliippp"),
+    "sgs_cuda_tile_reached": ("i", "ppipiipp"),
+}
+"""For each function of csrc/cuda: result type, argument types in order (``native.TYPES``)."""
+FLAGS = ("-O3", "-std=c++17", "-shared", "-Xcompiler", "-fPIC", "--threads", "0")
+_OPERATIONS = "L1, SSIM, anchors, sweeps and tile lists"
+_LAST_LINES = 5  # of a failing compiler's output that an error quotes
 
 
 @dataclass(frozen=True)
@@ -29,7 +61,7 @@ class KernelLibrary:
     def __post_init__(self) -> None:
         declare(self.library, CUDA_PROTOTYPES)
 
-    def call(self, name: str, *arguments: int | float | None, device: torch.device) -> None:
+    def call(self, name: str, *arguments: Tensor | int | float | None, device: torch.device) -> None:
         """Launch one function.
 
         Raises:
@@ -37,8 +69,8 @@ class KernelLibrary:
         """
         error = getattr(self.library, name)(*arguments, self.stream(device))
         if error:
-            said = self.library.sgs_cuda_error(error).decode()
-            raise BackendError(f"The CUDA kernels failed ({said}); take the cpu back-end, or report this.")
+            message = self.library.sgs_cuda_error(error).decode()
+            raise BackendError(f"The CUDA kernels failed ({message}); take the cpu back-end, or report this.")
 
     def check_devices(self, *tensors: Tensor | None) -> None:
         """Raises unless the kernels can read all of ``tensors``.
@@ -56,3 +88,88 @@ class KernelLibrary:
 def cuda_stream(device: torch.device) -> int:
     """torch's current stream on ``device``."""
     return torch.cuda.current_stream(device).cuda_stream
+
+
+def source_folder() -> Path:
+    """Where the sources are installed."""
+    return Path(str(files("structgstream") / "_native" / "cuda"))
+
+
+def find_nvcc(environment: Mapping[str, str]) -> Path | None:
+    """NVIDIA's compiler: from ``CUDA_HOME`` or ``CUDA_PATH``, ``PATH``, or its default folder; None if not found."""
+    folders = [Path(environment[name]) / "bin" for name in ("CUDA_HOME", "CUDA_PATH") if environment.get(name)]
+    on_path = shutil.which("nvcc", path=environment.get("PATH", ""))
+    candidates = [folder / "nvcc" for folder in folders]
+    candidates += [Path(on_path)] if on_path else []
+    candidates.append(Path("/usr/local/cuda/bin/nvcc"))
+    return next((path for path in candidates if os.access(path, os.X_OK) and path.is_file()), None)
+
+
+def cache_folder(environment: Mapping[str, str]) -> Path:
+    """The folder of compiled libraries, in the user's cache."""
+    root = environment.get("XDG_CACHE_HOME")
+    return (Path(root) if root else Path.home() / ".cache") / "structgstream" / "cuda"
+
+
+def compiled(architecture: str, *, nvcc: Path, sources: Path, cache: Path) -> Path:
+    """Path of the library for ``architecture`` (``sm_90``), compiled unless ``cache`` has it.
+
+    Its file name is a hash of the sources, the compiler's version, the flags and the architecture. It is renamed into
+    place, so processes that compile at the same time do not see a partial file.
+
+    Raises:
+        BackendError: the sources are missing, the compiler fails, or the cache cannot be written.
+    """
+    units = sorted(sources.glob("*.cu"))
+    if not units:
+        raise BackendError(f"No CUDA sources lie in {sources}; install structgstream again.")
+    virtual = architecture.replace("sm_", "compute_")
+    flags = [*FLAGS, "-gencode", f"arch={virtual},code={architecture}"]
+    state = hashlib.sha256("\n".join([_output([str(nvcc), "--version"]), *flags]).encode())
+    for path in sorted([*units, *sources.glob("*.h")]):
+        state.update(path.name.encode() + b"\0" + path.read_bytes())
+    library = cache / f"{architecture}-{state.hexdigest()[:32]}.so"
+    if library.is_file():
+        return library
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=cache) as scratch:
+            built = Path(scratch) / library.name
+            _output([str(nvcc), *flags, "-o", str(built), *map(str, units)])
+            give_name(built, library)
+    except OSError as error:
+        raise BackendError(f"CUDA kernels cannot be written to {cache} ({error}); set XDG_CACHE_HOME.") from error
+    return library
+
+
+def _output(command: list[str]) -> str:
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if result.returncode:
+        message = "\n".join((result.stderr or result.stdout).strip().splitlines()[-_LAST_LINES:])
+        raise BackendError(f"{command[0]} failed with status {result.returncode}: {message}")
+    return result.stdout
+
+
+def kernel_plan() -> tuple[Path | None, str]:
+    """NVIDIA's compiler or None, and a sentence that says what runs the back-end's own operations. Compiles nothing."""
+    nvcc = find_nvcc(os.environ)
+    if nvcc is None:
+        return None, (
+            f"{_OPERATIONS} run in torch, which is slower than this package's kernels: nvcc was not found; install "
+            "NVIDIA's CUDA toolkit and put nvcc on PATH or set CUDA_HOME."
+        )
+    return nvcc, f"{_OPERATIONS} run in this package's kernels, compiled by {nvcc}."
+
+
+@cache
+def kernel_library() -> tuple[KernelLibrary | None, str]:
+    """The kernels for this machine's GPU or None, and the sentence of :func:`kernel_plan`. The first call compiles."""
+    nvcc, sentence = kernel_plan()
+    if nvcc is None:
+        return None, sentence
+    major, minor = torch.cuda.get_device_capability()
+    try:
+        path = compiled(f"sm_{major}{minor}", nvcc=nvcc, sources=source_folder(), cache=cache_folder(os.environ))
+        return KernelLibrary(ctypes.CDLL(str(path)), "cuda", cuda_stream), sentence
+    except (BackendError, OSError) as error:
+        return None, f"{_OPERATIONS} run in torch, which is slower than this package's kernels: {error}"

@@ -19,8 +19,7 @@ import torch
 from torch import Tensor
 
 from structgstream.kernels.cuda_library import KernelLibrary
-from structgstream.kernels.prototypes import addresses
-from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tile_grid
+from structgstream.kernels.values import TILE_PIXELS, TileSelection, tile_grid
 
 _log = logging.getLogger(__name__)
 
@@ -126,11 +125,7 @@ def radii_reaching_tiles(library: KernelLibrary, means2d: Tensor, radii: Tensor,
     drawn = torch.empty_like(means2d[:, 0], memory_format=torch.contiguous_format)
     library.call(
         "sgs_cuda_tile_reached",
-        *addresses(means2d, radii),
-        len(radii),
-        *addresses(mask),
-        *(tiles.width, tiles.height),
-        *addresses(drawn),
+        *(means2d, radii, len(radii), mask, tiles.width, tiles.height, drawn),
         device=means2d.device,
     )
     return drawn
@@ -155,29 +150,19 @@ def tile_lists_in_kernels(
     keys, pairs = torch.empty_like(depths), torch.empty(count, dtype=torch.int64, device=device)
     tiles, ids, sorted_ids = (torch.empty(capacity, dtype=torch.int32, device=device) for _ in range(3))
     starts = torch.empty(rows + 1, columns, dtype=torch.int32, device=device)
-    library.call("sgs_cuda_tile_depths", *addresses(radii, depths), count, *addresses(keys), device=device)
+    library.call("sgs_cuda_tile_depths", radii, depths, count, keys, device=device)
     order = keys.argsort(stable=True)
-    library.call(
-        "sgs_cuda_tile_counts",
-        *addresses(means2d, radii, order),
-        *(count, columns, rows),
-        *addresses(pairs),
-        device=device,
-    )
+    library.call("sgs_cuda_tile_counts", means2d, radii, order, count, columns, rows, pairs, device=device)
     ends = pairs.cumsum(0)
     library.call(
         "sgs_cuda_tile_fill",
-        *addresses(means2d, radii, order, ends),
-        *(count, columns, rows, capacity),
-        *addresses(tiles, ids),
+        *(means2d, radii, order, ends, count, columns, rows, capacity, tiles, ids),
         device=device,
     )
     sorted_tiles, by_tile = tiles.sort(stable=True)  # A stable sort keeps the order of depth in a tile.
     library.call(
         "sgs_cuda_tile_starts",
-        *addresses(sorted_tiles, by_tile, ids),
-        *(capacity, columns, rows),
-        *addresses(starts, sorted_ids),
+        *(sorted_tiles, by_tile, ids, capacity, columns, rows, starts, sorted_ids),
         device=device,
     )
     return TileLists(starts, sorted_ids, ends[-1])

@@ -6,9 +6,15 @@ from torch import Tensor
 
 from structgstream.cameras import Viewport
 from structgstream.gaussians import Gaussians
-from structgstream.kernels.anchor_types import Anchors, HeadWeights, MLPWeights, StructuredGaussians
-from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection
 from structgstream.kernels.reference_raster import LOW_PASS_PIXELS
+from structgstream.kernels.values import (
+    TILE_PIXELS,
+    Anchors,
+    HeadWeights,
+    MLPWeights,
+    StructuredGaussians,
+    TileSelection,
+)
 
 BALL_DEVIATIONS = 3.4
 """Radius of a Gaussian in standard deviations: alpha falls below 1/255 before 3.33 at any opacity."""
@@ -84,7 +90,20 @@ def generate_structured(
     seen_from: Tensor | None = None,
     sampling_intervals: Tensor | None = None,
 ) -> StructuredGaussians:
-    """See ``kernels.operations.GenerateStructured``."""
+    """The Gaussians of the anchors in a camera's view (paper, equations for mu' and Sigma').
+
+    Opacity is the tanh output; only positive ones are drawn. The scale is the base scale times a sigmoid. Culling
+    changes the cost of a rendering, never its pixels: it tests a ball that contains all Gaussians of an anchor.
+
+    Args:
+        anchors: all of the scene's.
+        mlps: the three heads; inputs are the feature (D), the direction (3) and optionally the distance (1).
+        viewport: the camera.
+        distance_input: whether the distance is an input of the heads.
+        tiles: if given, only anchors that reach one of these tiles.
+        seen_from: ``[3]`` origin of direction and distance; the viewport's centre when None.
+        sampling_intervals: ``[M]`` of the anchors, by which their balls grow for the rasteriser's low-pass.
+    """
     visible = visible_anchors(anchors, viewport, tiles, sampling_intervals)
     center = viewport.center if seen_from is None else seen_from
     return activate_anchors(anchors, mlps, center, visible, distance_input=distance_input)

@@ -16,8 +16,7 @@ from torch import Tensor
 from structgstream.cameras import Viewport
 from structgstream.gaussians import Gaussians
 from structgstream.geometry import quaternion_matrices
-from structgstream.kernels.operations import Rasterize
-from structgstream.kernels.raster_types import TILE_PIXELS, RasterOutput, TileSelection
+from structgstream.kernels.values import TILE_PIXELS, Rasterizer, RasterOutput, TileSelection
 
 LOW_PASS_PIXELS = 0.3
 """Variance of the low-pass, square pixels."""
@@ -118,10 +117,23 @@ def rasterize(
     tiles: TileSelection | None = None,
     onto: Tensor | None = None,
     trained: int | None = None,
-    least_transmittance: float | None = None,
 ) -> RasterOutput:
-    """See ``kernels.operations.Rasterize``; ``least_transmittance`` is that of gradients, 1/255 when None."""
-    least = MIN_GRADIENT_TRANSMITTANCE if least_transmittance is None else least_transmittance
+    """Draw ``N`` Gaussians (paper, equations for mu_2D, Sigma_2D and alpha blending).
+
+    A Gaussian that less than 1/255 of a pixel's light reaches is drawn there, and gets no gradient from the pixel; with
+    gsplat (``cuda``) it does. The low-pass is :func:`screen_low_pass`; it counts as a constant.
+
+    Args:
+        gaussians: to draw; their ids are not read.
+        viewport: the camera.
+        background: ``[3]``, black when None.
+        screen_offsets: ``[N, 2]`` pixels, added to the projected means; its gradient is the view-space positional
+            gradient.
+        tiles: the tiles to draw, all when None. A Gaussian that reaches none of them has radius 0.
+        onto: ``[H, W, 3]`` without gradient, contiguous, only with ``tiles``: the picture that is drawn into in
+            place (Note [Ownership]), so that the other tiles keep its pixels; they are zero when None.
+        trained: only the first ``trained`` Gaussians get gradients; all when None.
+    """
     gaussians, screen_offsets = detach_untrained(gaussians, screen_offsets, trained)
     projected = _project(gaussians, viewport, screen_offsets)
     radii = gaussians.means.new_zeros(len(gaussians), dtype=torch.float32)
@@ -139,7 +151,7 @@ def rasterize(
         for left in range(0, viewport.width, TILE_PIXELS):
             right = min(left + TILE_PIXELS, viewport.width)
             here = in_band[(low[in_band, 0] < right) & (high[in_band, 0] > left)]
-            image, alpha = _tile(projected, here, gaussians, range(left, right), range(top, bottom), least)
+            image, alpha = _tile(projected, here, gaussians, range(left, right), range(top, bottom))
             row.append(image + (1.0 - alpha)[..., None] * back)
             row_alpha.append(alpha)
         bands.append(torch.cat(row, dim=1))
@@ -176,11 +188,38 @@ def restrict_to_tiles(
     return RasterOutput(onto.copy_(torch.where(inside[..., None], image, onto)), alpha, radii)
 
 
-def blending_weights(rasterize: Rasterize, gaussians: Gaussians, viewport: Viewport, maps: Tensor) -> Tensor:
-    """See ``kernels.operations.BlendingWeights``.
+def blending_weights(gaussians: Gaussians, viewport: Viewport, maps: Tensor) -> Tensor:
+    """Sums ``[N, C]`` over the pixels of each Gaussian's blending weight times each map, without graph.
 
-    The gradient of a Gaussian's colour is the sum of its blending weights times the picture's gradient, so any
-    rasteriser gives the sums of three maps per backward pass.
+    Weights are the gradients of :func:`rasterize` by colour: those of Gaussians that hardly any light reaches are zero.
+
+    Args:
+        gaussians: to draw; their colours and ids are not read.
+        viewport: the camera.
+        maps: ``[H, W, C]`` of the viewport's size, C at least 1.
+    """
+    return weights_by_gradient(rasterize, gaussians, viewport, maps)
+
+
+def picture_and_weights(
+    gaussians: Gaussians, viewport: Viewport, maps: Tensor, *, background: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """The picture ``[H, W, 3]`` of :func:`rasterize` and the sums of :func:`blending_weights`, without graph.
+
+    Args:
+        gaussians: to draw; their ids are not read.
+        viewport: the camera.
+        maps: as for :func:`blending_weights`.
+        background: ``[3]``, black when None.
+    """
+    return picture_and_weights_by_gradient(rasterize, gaussians, viewport, maps, background=background)
+
+
+def weights_by_gradient(rasterizer: Rasterizer, gaussians: Gaussians, viewport: Viewport, maps: Tensor) -> Tensor:
+    """:func:`blending_weights` of any rasteriser.
+
+    The gradient of a Gaussian's colour is the sum of its blending weights times the picture's gradient, which gives the
+    sums of three maps per backward pass.
     """
     height, width, channels = maps.shape
     assert channels > 0, maps.shape
@@ -188,7 +227,7 @@ def blending_weights(rasterize: Rasterize, gaussians: Gaussians, viewport: Viewp
     found = []
     with torch.enable_grad():
         colors = torch.zeros_like(gaussians.means).requires_grad_()
-        output = rasterize(replace(gaussians, colors=colors), viewport)
+        output = rasterizer(replace(gaussians, colors=colors), viewport)
         for first in range(0, channels, 3):
             group = maps[..., first : first + 3]
             cotangent = torch.nn.functional.pad(group, (0, 3 - group.shape[-1]))
@@ -198,18 +237,18 @@ def blending_weights(rasterize: Rasterize, gaussians: Gaussians, viewport: Viewp
     return torch.cat(found, dim=1)
 
 
-def picture_and_weights(
-    rasterize: Rasterize,
+def picture_and_weights_by_gradient(
+    rasterizer: Rasterizer,
     gaussians: Gaussians,
     viewport: Viewport,
     maps: Tensor,
     *,
     background: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """See ``kernels.operations.PictureAndWeights``: one after the other, with any rasteriser."""
+    """:func:`picture_and_weights` of any rasteriser: one after the other."""
     with torch.no_grad():
-        image = rasterize(gaussians, viewport, background=background).image
-    return image, blending_weights(rasterize, gaussians, viewport, maps)
+        image = rasterizer(gaussians, viewport, background=background).image
+    return image, weights_by_gradient(rasterizer, gaussians, viewport, maps)
 
 
 def boxes_reaching_tiles(low: Tensor, high: Tensor, tiles: TileSelection) -> Tensor:
@@ -225,11 +264,11 @@ def boxes_reaching_tiles(low: Tensor, high: Tensor, tiles: TileSelection) -> Ten
 
 
 def _tile(
-    projected: _Projected, here: Tensor, gaussians: Gaussians, columns: range, rows: range, least: float
+    projected: _Projected, here: Tensor, gaussians: Gaussians, columns: range, rows: range
 ) -> tuple[Tensor, Tensor]:
     """Blend the Gaussians ``here``, ordered by depth, over one tile: ``[h, w, 3]`` and coverage ``[h, w]``.
 
-    Those that less than ``least`` of a pixel's light reaches get no gradient from it.
+    Those that less than ``MIN_GRADIENT_TRANSMITTANCE`` of a pixel's light reaches get no gradient from it.
     """
     like, colors = projected.means2d, gaussians.colors
     if here.numel() == 0:
@@ -243,7 +282,7 @@ def _tile(
     drawn = projected.rows[here]
     alpha = projected.opacities[here, None, None] * power.exp()
     alpha = torch.where(alpha >= MIN_ALPHA, alpha.clamp(max=MAX_ALPHA), 0.0)
-    faint = _before((1.0 - alpha.detach()).cumprod(0)) <= least
+    faint = _before((1.0 - alpha.detach()).cumprod(0)) <= MIN_GRADIENT_TRANSMITTANCE
     alpha = torch.where(faint, alpha.detach(), alpha)
     after = (1.0 - alpha).cumprod(0)
     # Transmittance decreases monotonically, so masking below the limit equals stopping there.

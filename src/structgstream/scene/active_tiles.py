@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from structgstream.gaussians import Gaussians
-from structgstream.kernels.raster_types import TileSelection
+from structgstream.kernels.values import TileSelection
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,8 @@ from torch import Tensor
 
 from structgstream.cameras import Camera
 from structgstream.gaussians import Gaussians, concatenate
-from structgstream.kernels.anchor_types import Anchors, MLPWeights, StructuredGaussians
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.raster_types import TileSelection
+from structgstream.kernels.values import Anchors, MLPWeights, StructuredGaussians, TileSelection
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
 from structgstream.scene.environment import background

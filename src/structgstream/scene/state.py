@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from structgstream.errors import ConfigError
-from structgstream.kernels.anchor_types import HeadWeights, MLPWeights
+from structgstream.kernels.values import HeadWeights, MLPWeights
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians

@@ -13,7 +13,7 @@ from structgstream.codec.entropy import reference_decisions as reference
 from structgstream.codec.entropy.models import ArithmeticState, Model
 from structgstream.codec.entropy.rans import uses_native
 from structgstream.errors import OutOfMemoryError, StreamError
-from structgstream.kernels._load import native_library
+from structgstream.kernels.native import native_library
 
 _NO_MEMORY, _DAMAGED = 1, 2
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from structgstream.codec.entropy.reference_rans import decode_lanes, encode_lanes
 from structgstream.codec.entropy.tables import COST_BITS, TOTAL, FrequencyTables, code_costs
 from structgstream.errors import OutOfMemoryError, StreamError
-from structgstream.kernels._load import native_library, native_reason
+from structgstream.kernels.native import native_library, native_reason
 
 MAX_SYMBOLS = 2**31 - 1
 LANES = (1, 4, 32)

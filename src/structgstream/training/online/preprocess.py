@@ -183,7 +183,7 @@ class FlowMaps:
     """Flow between two pictures of one camera with confidence c, the share of consistent pixels.
 
     Args:
-        maps: ``[h, w, 3]``: c, c flow_x and c flow_y (``kernels.operations.ConfidentFlow``).
+        maps: ``[h, w, 3]``: c, c flow_x and c flow_y (``Backend.confident_flow``).
         far_boxes: number of boxes in which large motion was searched for.
     """
 

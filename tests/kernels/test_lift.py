@@ -3,9 +3,9 @@
 
 import torch
 
-from structgstream.kernels import reference_lift
-from structgstream.kernels.motion_types import Neighbors, ViewFlows
-from structgstream.kernels.reference_lift import lift, projection_jacobians
+from structgstream.kernels import reference_motion
+from structgstream.kernels.reference_motion import lift, projection_jacobians
+from structgstream.kernels.values import Neighbors, ViewFlows
 
 MOTION = torch.tensor([0.03, -0.02, 0.01], dtype=torch.float64)
 VIEWS, MOVERS = 5, 30
@@ -106,7 +106,7 @@ def test_a_turning_ball_that_moves_by_40_pixels_is_lifted_whole(monkeypatch) -> 
         return float(whole.double().mean())
 
     assert lifted_share() == 1.0
-    monkeypatch.setattr(reference_lift, "TOLERANCE_SHARE", 0.0)
+    monkeypatch.setattr(reference_motion, "TOLERANCE_SHARE", 0.0)
     assert lifted_share() < 0.5, "a tolerance in pixels alone"
 
 

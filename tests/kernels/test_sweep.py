@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from rigs import arc_rig
-from structgstream.kernels import cpu_sweep, reference_sweep
-from structgstream.kernels._load import native_reason
-from structgstream.kernels.motion_types import SweepView, Swept
+from structgstream.kernels import cpu_motion, reference_motion
+from structgstream.kernels.native import native_reason
+from structgstream.kernels.values import SweepView, Swept
 
 needs_native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 SWEEPERS = [
-    pytest.param(reference_sweep.sweep, id="reference"),
-    pytest.param(cpu_sweep.sweep, id="cpu", marks=needs_native),
+    pytest.param(reference_motion.sweep, id="reference"),
+    pytest.param(cpu_motion.sweep, id="cpu", marks=needs_native),
 ]
 
 

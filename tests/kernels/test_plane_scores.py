@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from structgstream.kernels.reference_planes import plane_scores
+from structgstream.kernels.reference_motion import plane_scores
 
 SAME = torch.eye(3, dtype=torch.float64)
 

@@ -4,7 +4,7 @@
 import pytest
 import torch
 
-from structgstream.kernels.raster_types import TILE_PIXELS, TileSelection, tile_grid
+from structgstream.kernels.values import TILE_PIXELS, TileSelection, tile_grid
 
 SIZES = [(16, 16), (17, 16), (1, 1), (48, 33), (50, 47)]
 

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from structgstream.errors import BackendError
-from structgstream.kernels import _nvcc
-from structgstream.kernels.prototypes import CUDA_PROTOTYPES
+from structgstream.kernels import cuda_library
+from structgstream.kernels.cuda_library import CUDA_PROTOTYPES
 
 SOURCES = Path(__file__).parents[2] / "csrc" / "cuda"
-NVCC = _nvcc.find_nvcc(os.environ)
+NVCC = cuda_library.find_nvcc(os.environ)
 needs_nvcc = pytest.mark.skipif(NVCC is None, reason="nvcc, NVIDIA's compiler, was not found")
 
 
@@ -34,7 +34,7 @@ def pretended(folder: Path, script: str) -> Path:
 @pytest.mark.parametrize("architecture", ["sm_80", "sm_90"])
 def test_the_sources_compile(architecture: str, tmp_path: Path) -> None:
     assert NVCC is not None
-    path = _nvcc.compiled(architecture, nvcc=NVCC, sources=SOURCES, cache=tmp_path)
+    path = cuda_library.compiled(architecture, nvcc=NVCC, sources=SOURCES, cache=tmp_path)
     library = ctypes.CDLL(str(path))  # CUDA's runtime is linked in, so it loads without a GPU.
     for name in CUDA_PROTOTYPES:
         assert hasattr(library, name)
@@ -43,7 +43,7 @@ def test_the_sources_compile(architecture: str, tmp_path: Path) -> None:
 
 
 def test_the_sources_are_installed() -> None:
-    installed = _nvcc.source_folder()
+    installed = cuda_library.source_folder()
     if not installed.is_dir():
         pytest.skip("structgstream was not installed from its wheel or by cmake --install")
     assert {path.name for path in SOURCES.iterdir() if not path.name.startswith("emulate")} == {
@@ -59,14 +59,14 @@ def test_a_library_is_compiled_once_until_something_changes(tmp_path: Path) -> N
     (sources / "a.h").write_text("one")
 
     def path() -> Path:
-        return _nvcc.compiled("sm_90", nvcc=nvcc, sources=sources, cache=cache)
+        return cuda_library.compiled("sm_90", nvcc=nvcc, sources=sources, cache=cache)
 
     first = path()
     assert first.read_text() == "library\n"
     assert path() == first
     (sources / "a.h").write_text("two")
     assert path() != first
-    assert _nvcc.compiled("sm_80", nvcc=nvcc, sources=sources, cache=cache) not in (first, path())
+    assert cuda_library.compiled("sm_80", nvcc=nvcc, sources=sources, cache=cache) not in (first, path())
     assert (tmp_path / "bin" / "calls").read_text().split() == ["call"] * 3
     assert len(list(cache.iterdir())) == 3
 
@@ -74,40 +74,40 @@ def test_a_library_is_compiled_once_until_something_changes(tmp_path: Path) -> N
 def test_a_failing_compiler_is_quoted_and_leaves_nothing(tmp_path: Path) -> None:
     nvcc = pretended(tmp_path / "bin", 'echo half >"$out"; echo "unsupported GNU version" >&2; exit 2')
     with pytest.raises(BackendError, match="unsupported GNU version"):
-        _nvcc.compiled("sm_90", nvcc=nvcc, sources=SOURCES, cache=tmp_path / "cache")
+        cuda_library.compiled("sm_90", nvcc=nvcc, sources=SOURCES, cache=tmp_path / "cache")
     assert list((tmp_path / "cache").iterdir()) == []
 
 
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:
     nvcc = pretended(tmp_path / "bin", "")
     with pytest.raises(BackendError, match="No CUDA sources"):
-        _nvcc.compiled("sm_90", nvcc=nvcc, sources=tmp_path, cache=tmp_path)
+        cuda_library.compiled("sm_90", nvcc=nvcc, sources=tmp_path, cache=tmp_path)
     (tmp_path / "file").write_text("")
     with pytest.raises(BackendError, match="set XDG_CACHE_HOME"):
-        _nvcc.compiled("sm_90", nvcc=nvcc, sources=SOURCES, cache=tmp_path / "file" / "cache")
+        cuda_library.compiled("sm_90", nvcc=nvcc, sources=SOURCES, cache=tmp_path / "file" / "cache")
 
 
 def test_where_the_compiler_is_looked_for(tmp_path: Path) -> None:
     home, path = (pretended(tmp_path / name / "bin", "") for name in ("home", "path"))
-    assert _nvcc.find_nvcc({"CUDA_HOME": str(tmp_path / "home"), "PATH": str(path.parent)}) == home
-    assert _nvcc.find_nvcc({"CUDA_HOME": str(tmp_path / "nowhere"), "PATH": str(path.parent)}) == path
+    assert cuda_library.find_nvcc({"CUDA_HOME": str(tmp_path / "home"), "PATH": str(path.parent)}) == home
+    assert cuda_library.find_nvcc({"CUDA_HOME": str(tmp_path / "nowhere"), "PATH": str(path.parent)}) == path
 
 
 def test_where_libraries_are_kept(tmp_path: Path) -> None:
-    assert _nvcc.cache_folder({"XDG_CACHE_HOME": str(tmp_path)}) == tmp_path / "structgstream" / "cuda"
-    assert _nvcc.cache_folder({}) == Path.home() / ".cache" / "structgstream" / "cuda"
+    assert cuda_library.cache_folder({"XDG_CACHE_HOME": str(tmp_path)}) == tmp_path / "structgstream" / "cuda"
+    assert cuda_library.cache_folder({}) == Path.home() / ".cache" / "structgstream" / "cuda"
 
 
 @pytest.mark.parametrize("found", [False, True])
 def test_without_kernels_it_says_why(found: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     broken = pretended(tmp_path / "bin", 'echo "no host compiler" >&2; exit 1')
-    monkeypatch.setattr(_nvcc, "find_nvcc", lambda environment: broken if found else None)
-    monkeypatch.setattr(_nvcc, "source_folder", lambda: SOURCES)
-    monkeypatch.setattr(_nvcc, "cache_folder", lambda environment: tmp_path / "cache")
+    monkeypatch.setattr(cuda_library, "find_nvcc", lambda environment: broken if found else None)
+    monkeypatch.setattr(cuda_library, "source_folder", lambda: SOURCES)
+    monkeypatch.setattr(cuda_library, "cache_folder", lambda environment: tmp_path / "cache")
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (9, 0))
-    _nvcc.kernel_library.cache_clear()
-    library, sentence = _nvcc.kernel_library()
-    _nvcc.kernel_library.cache_clear()
+    cuda_library.kernel_library.cache_clear()
+    library, sentence = cuda_library.kernel_library()
+    cuda_library.kernel_library.cache_clear()
     assert library is None
     assert sentence.startswith("L1, SSIM, anchors, sweeps and tile lists run in torch")
     assert ("no host compiler" if found else "put nvcc on PATH") in sentence

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Values that operations take and give: selections of tiles, renderings, anchors, flow in many views, sweeps."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from structgstream.gaussians import Gaussians
+
+TILE_PIXELS = 16
+"""Side of a tile, pixels; parts of a picture are selected by tile."""
+
+
+def tile_grid(width: int, height: int) -> tuple[int, int]:
+    """Number of rows and columns of tiles of a picture; the last ones may be partial."""
+    return -(-height // TILE_PIXELS), -(-width // TILE_PIXELS)
+
+
+@dataclass(frozen=True)
+class TileSelection:
+    """A selection of a picture's tiles.
+
+    Args:
+        mask: ``[rows, columns]`` bool.
+        width: of the picture, pixels.
+        height: of the picture, pixels.
+    """
+
+    mask: Tensor
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        assert self.mask.dtype == torch.bool, self.mask.dtype
+        assert self.mask.shape == tile_grid(self.width, self.height), (self.mask.shape, self.width, self.height)
+
+    @classmethod
+    def of(cls, pixels: Tensor) -> "TileSelection":
+        """The tiles that hold a pixel of the mask ``[H, W]``."""
+        height, width = pixels.shape
+        rows, columns = tile_grid(width, height)
+        padded = pixels.new_zeros(rows * TILE_PIXELS, columns * TILE_PIXELS)
+        padded[:height, :width] = pixels
+        return cls(padded.reshape(rows, TILE_PIXELS, columns, TILE_PIXELS).any(3).any(1), width, height)
+
+    def pixels(self) -> Tensor:
+        """Mask ``[H, W]`` of the pixels in the selected tiles; the same tensor in every call."""
+        return self._pixels
+
+    @cached_property
+    def _pixels(self) -> Tensor:
+        rows = self.mask.repeat_interleave(TILE_PIXELS, 0)
+        return rows.repeat_interleave(TILE_PIXELS, 1)[: self.height, : self.width]
+
+    def choose(self, inside: Tensor, outside: Tensor) -> Tensor:
+        """A picture ``[H, W, 3]``: ``inside`` in the selected tiles, ``outside`` elsewhere."""
+        return torch.where(self._samples, inside, outside)
+
+    @cached_property
+    def _samples(self) -> Tensor:
+        """Mask ``[H, W, 3]``: a mask that is broadcast over the channels takes two to three times as long."""
+        return torch.stack([self._pixels] * 3, dim=-1)
+
+    def count_pixels(self) -> int:
+        """Number of pixels in the selected tiles."""
+        rows, columns = self.mask.shape
+        heights = self.mask.new_full((rows,), TILE_PIXELS, dtype=torch.int64)
+        widths = self.mask.new_full((columns,), TILE_PIXELS, dtype=torch.int64)
+        heights[-1] -= rows * TILE_PIXELS - self.height
+        widths[-1] -= columns * TILE_PIXELS - self.width
+        return int(heights @ self.mask.to(torch.int64) @ widths)
+
+
+@dataclass(frozen=True)
+class RasterOutput:
+    """One rendering.
+
+    Args:
+        image: ``[H, W, 3]``, not clamped; in tiles that were not selected zero, or the pixels of ``onto``.
+        alpha: ``[H, W]`` coverage in [0, 1]; zero in tiles that were not selected.
+        radii: ``[N]`` float32 pixels, 0 where a Gaussian was not drawn.
+    """
+
+    image: Tensor
+    alpha: Tensor
+    radii: Tensor
+
+
+Rasterizer = Callable[..., RasterOutput]
+"""A function with the arguments and the result of ``reference_raster.rasterize``."""
+
+
+class Anchors(NamedTuple):
+    """The anchor fields that the generation reads, ``M`` anchors.
+
+    Args:
+        positions: ``[M, 3]``, x_v.
+        log_offset_scales: ``[M, 3]``, log l_v.
+        log_base_scales: ``[M, 3]``, log of the largest Gaussian scale.
+        offsets: ``[M, K, 3]``, O_v.
+        features: ``[M, D]``, f_v.
+    """
+
+    positions: Tensor
+    log_offset_scales: Tensor
+    log_base_scales: Tensor
+    offsets: Tensor
+    features: Tensor
+
+
+class HeadWeights(NamedTuple):
+    """One MLP with one hidden ReLU layer: ``w1 [hidden, inputs]``, ``b1``, ``w2 [outputs, hidden]``, ``b2``."""
+
+    w1: Tensor
+    b1: Tensor
+    w2: Tensor
+    b2: Tensor
+
+
+class MLPWeights(NamedTuple):
+    """The paper's F_alpha (K outputs, tanh), F_c (3K, sigmoid) and F_Sigma (7K, no activation)."""
+
+    opacity: HeadWeights
+    color: HeadWeights
+    covariance: HeadWeights
+
+
+@dataclass(frozen=True)
+class StructuredGaussians:
+    """The Gaussians of the anchors in a camera's view.
+
+    Args:
+        gaussians: ascending by id, with unit quaternions. Rows of opacity 0 have scale 0 and are invisible; only
+            back-ends with shapes that do not depend on data return such rows.
+        anchors: ``[m]`` int64, ascending: the anchors that were evaluated, a superset of the visible ones.
+        raw_opacities: ``[m, K]`` tanh outputs of these anchors, without a graph; positive ones are drawn.
+    """
+
+    gaussians: Gaussians
+    anchors: Tensor
+    raw_opacities: Tensor
+
+
+class ViewFlows(NamedTuple):
+    """Optical flow of ``E`` dynamic anchors and free Gaussians in ``V`` views.
+
+    Args:
+        weights: ``[V, E]`` W, sums of their blending weights over the pixels with reliable flow.
+        flows: ``[V, E, 2]`` f, in a unit of which it is known to one.
+        viewmats: ``[V, 4, 4]``.
+        Ks: ``[V, 3, 3]``, pixels in that unit.
+        near: ``[V]`` distance of the near plane along z.
+    """
+
+    weights: Tensor
+    flows: Tensor
+    viewmats: Tensor
+    Ks: Tensor
+    near: Tensor
+
+
+class Neighbors(NamedTuple):
+    """The rows of :class:`ViewFlows` whose flow determines each of ``T`` targets.
+
+    Args:
+        rows: ``[T, N]`` int64, in 0 ... E - 1.
+        affinities: ``[T, N]`` g, their weights.
+    """
+
+    rows: Tensor
+    affinities: Tensor
+
+
+@dataclass(frozen=True)
+class Lifted:
+    """3D displacements fitted to optical flow.
+
+    Args:
+        displacements: ``[T, 3]``.
+        inlier_share: ``[T]`` share of the flow's weight that are inliers (``reference_motion.lift``); 0 without flow.
+        agreeing_views: ``[T]`` int64, number of views in which more than ``share`` of the weight are inliers.
+    """
+
+    displacements: Tensor
+    inlier_share: Tensor
+    agreeing_views: Tensor
+
+
+@dataclass(frozen=True)
+class SweepView:
+    """A view of the plane sweep.
+
+    Args:
+        colors: ``[h, w, 3]`` picture, 0 ... 1, colour-corrected so that views are comparable.
+        missing: ``[h, w]`` share of a pixel's neighbourhood with new content that the rendering lacks, 0 ... 1.
+        depths: ``[h, w]`` rendered depth along z; infinite where nothing is rendered.
+        viewmat: ``[4, 4]``.
+        K: ``[3, 3]`` for a picture of that size.
+        near: distance of the near plane along z.
+    """
+
+    colors: Tensor
+    missing: Tensor
+    depths: Tensor
+    viewmat: Tensor
+    K: Tensor
+    near: float
+
+
+@dataclass(frozen=True)
+class Swept:
+    """The best point of each ray.
+
+    Args:
+        depths: ``[P]`` along z; 0 for a ray without a valid point.
+        costs: ``[P]`` least cost; infinite without a valid point.
+    """
+
+    depths: Tensor
+    costs: Tensor
