@@ -66,7 +66,7 @@ def test_what_another_sweep_has_drawn_is_not_drawn_again() -> None:
         drawings.append(options["tiles"])
         return swept.backend.rasterize(*args, **options)
 
-    counted = replace(swept, backend=replace(swept.backend, rasterize=rasterize))
+    counted = replace(swept, backend=swept.backend.with_functions(rasterize=rasterize))
     known = {entry.view.index: entry for entry in found}
     for first, second in zip(found, replace(counted, known=known).missing(), strict=True):
         assert torch.equal(first.residual.missing_share, second.residual.missing_share)

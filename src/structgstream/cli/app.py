@@ -22,13 +22,13 @@ COMMANDS = {
     "prepare": "turn videos of your own cameras into a calibrated capture, and check it",
     "board": "write a calibration board to print",
     "reconstruct": "turn a capture into a stream, frame by frame",
-    "track": "follow what moves through a capture, so that groups of frames can be fitted apart",
-    "join": "put groups of frames that were fitted apart together to one stream",
+    "track": "follow what moves through a capture, so that groups of frames can be fitted separately",
+    "join": "join groups of frames that were fitted separately to one stream",
     "parallel": "turn a capture into a stream, groups of frames side by side, on one machine or many",
     "plan": "how long a capture would take, on how many machines, and how many bytes it would be",
     "evaluate": "score a stream against the held-out cameras",
     "play": "show a stream in the browser, from any angle",
-    "serve": "serve a folder of streams to viewers, live ones while they are made",
+    "serve": "serve a folder of streams to viewers, live ones while they are reconstructed",
     "token": "make an access token for a served stream",
     "render": "render a camera or a camera path to mp4 or PNG",
     "export": "write a page with a player, or frames as plain 3D Gaussians: .ply, .splat, .spz",
@@ -156,7 +156,7 @@ options:
 
 examples:
   structgstream demo
-  structgstream prepare videos -o capture
+  structgstream prepare videos -o capture --held-out auto
   structgstream reconstruct basketball -o ball.sgs --held-out 0 10 15 30
   structgstream play ball.sgs --capture basketball
   structgstream evaluate ball.sgs basketball --report ball-report

@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import UsageError
-from structgstream.cli.options import Folder, parse_options
+from structgstream.cli.options import Flag, Folder, parse_options
 from structgstream.cli.plain_text import say
 from structgstream.cli.progress import human_bytes
 
@@ -27,7 +27,7 @@ class Archive:
     """The folder that reconstruct --sink segments has written."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
     """The stream file to write."""
-    overwrite: bool = False
+    overwrite: Flag = False
     """Replace OUT.sgs when it exists."""
 
 

@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError
-from structgstream.cli.options import Device, Folder, StreamFile, parse_options
+from structgstream.cli.options import Device, Flag, Folder, StreamFile, parse_options
 from structgstream.cli.plain_text import say
 from structgstream.cli.progress import display
 from structgstream.cli.termination import Terminated, Termination
@@ -47,7 +47,7 @@ class ReconstructGroup:
     """Rounds of flow, births and iterations of the group's first frame."""
     device: Device = "auto"
     """Compute back-end."""
-    overwrite: bool = False
+    overwrite: Flag = False
     """Replace SEGMENT when it exists."""
 
 

@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import UsageError
-from structgstream.cli.options import JsonPath, StreamFile, parse_options
+from structgstream.cli.options import Flag, JsonPath, StreamFile, parse_options
 from structgstream.cli.plain_text import say
 from structgstream.cli.stream_tables import bit_rate_text, facts_table, header_table, packet_table, period_table
 
@@ -45,9 +45,9 @@ class Inspect:
     """Plot the bytes of every packet by field, and the composition of header, key and delta packets."""
     json: JsonPath = None
     """Write everything to this file, with the keys "header" and "packets"."""
-    all_packets: bool = False
+    all_packets: Flag = False
     """List every packet. Default: evenly spaced packets of a long stream."""
-    config: bool = False
+    config: Flag = False
     """Print the resolved configuration of the run."""
 
 

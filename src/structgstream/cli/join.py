@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import UsageError
-from structgstream.cli.options import Device, parse_options
+from structgstream.cli.options import Device, Flag, parse_options
 from structgstream.cli.plain_text import say
 from structgstream.cli.progress import human_bytes
 
@@ -34,15 +34,15 @@ class Join:
     """Segments that reconstruct --init has written, in any order."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
     """The stream file to write."""
-    check: bool = False
+    check: Flag = False
     """Decode every frame of the result, too."""
-    plain: bool = False
+    plain: Flag = False
     """Copy the packets of every group as they are, without blending."""
     device: Device = "auto"
     """Compute back-end of the blending."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Processes of one thread each that blend borders. Default: one a core; one on a GPU."""
-    overwrite: bool = False
+    overwrite: Flag = False
     """Replace OUT.sgs when it exists."""
 
 

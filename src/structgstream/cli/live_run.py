@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Protocol
 import tyro
 
 from structgstream.cli.app import UsageError, usage_errors
-from structgstream.cli.options import CaptureOptions
+from structgstream.cli.options import CaptureOptions, Flag
 from structgstream.cli.progress import Display, display
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ class Stoppable(Protocol):
 class LiveChoice:
     """Options of cameras that send now."""
 
-    live: bool = False
+    live: Flag = False
     """FOLDER is a rig file of cameras that send now; the stream ends after --frames, or with Ctrl-C."""
     policy: Literal["latest", "every"] = "latest"
     """Live only, when training is slower than the cameras: latest takes the newest pictures, every keeps all of them in

@@ -17,6 +17,7 @@ Options = TypeVar("Options")
 Device = Literal["auto", "cpu", "cuda", "reference"]
 Folder = Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
 StreamFile = Annotated[Path, tyro.conf.arg(metavar="STREAM")]
+Flag = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
 JsonPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 STYLE = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone)
 

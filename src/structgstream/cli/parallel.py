@@ -12,6 +12,7 @@ from structgstream.cli.app import Interrupted, UsageError, usage_errors
 from structgstream.cli.options import (
     CaptureOptions,
     Device,
+    Flag,
     Folder,
     open_selected_capture,
     parse_known_options,
@@ -78,9 +79,9 @@ class Parallel:
     """The stream file to write; on a cluster all machines see its folder at the same place."""
     groups: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Frames of a group: a multiple of the key interval. Default: one key interval."""
-    quiet: bool = False
+    quiet: Flag = False
     """Move each border between groups to a frame nearby in which few pixels change."""
-    odd: bool = False
+    odd: Flag = False
     """Allow an N that is no multiple of the key interval; each group then costs one more key packet."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
     """compact (default), fine, fast, or tiny; fields of the configuration are options as of reconstruct."""
@@ -90,7 +91,7 @@ class Parallel:
     """Compute back-end; auto takes the first available of cuda, cpu and reference (plain PyTorch, slow)."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Random seed. Default: the preset's."""
-    overwrite: bool = False
+    overwrite: Flag = False
     """Replace OUT and its parts when they exist."""
     store: Annotated[str | None, tyro.conf.arg(metavar="URL", help_behavior_hint="")] = None
     """Where the parts meet if the machines share no folder, such as s3://bucket/runs/ball. Needs the extra cloud."""

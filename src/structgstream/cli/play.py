@@ -10,8 +10,8 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import UsageError
+from structgstream.cli.options import Flag, parse_options
 from structgstream.cli.options import StreamFile as StreamPath
-from structgstream.cli.options import parse_options
 from structgstream.cli.plain_text import say
 from structgstream.errors import MissingExtraError
 
@@ -40,9 +40,9 @@ class Play:
     """The capture that it was made from, to compare with the cameras' pictures."""
     port: Annotated[int, tyro.conf.arg(help_behavior_hint="")] = 0
     """Port to listen on. Default: one that is free."""
-    browser: bool = True
+    browser: Flag = True
     """Do not open a browser."""
-    wait: bool = False
+    wait: Flag = False
     """Wait until the file exists: it is created when frame 0 is done."""
 
 

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError, usage_errors
 from structgstream.cli.interruption import interruptible
-from structgstream.cli.options import Folder, parse_options
+from structgstream.cli.options import Flag, Folder, parse_options
 from structgstream.cli.plain_text import say
 from structgstream.cli.step_display import step_display
 
@@ -45,7 +45,7 @@ class Prepare:
     """The folder of the cameras' videos or pictures; with --check, the capture."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="CAPTURE", help_behavior_hint="")] = None
     """The folder to make."""
-    check: bool = False
+    check: Flag = False
     """Only check a capture."""
     calibration: Annotated[str, tyro.conf.arg(metavar="auto|sfm|board|PATH", help_behavior_hint="")] = "auto"
     """Structure from motion, a board, or the calibration of another tool (file or folder). Default: such a file in
@@ -56,7 +56,7 @@ class Prepare:
     """Distortion to estimate; brown for phones. Default: radial by sfm, opencv by board."""
     intrinsics: Literal["own", "shared"] = "own"
     """Whether cameras share focal length and lens (sfm)."""
-    refine: bool = False
+    refine: Flag = False
     """Adjust the calibration to the pictures, if matches that were set aside then fit better."""
     board: Annotated[str | None, tyro.conf.arg(metavar="BOARD", help_behavior_hint="")] = None
     """The board, as structgstream board named it: COLUMNSxROWS:SQUARE, such as 7x5:50mm. Default: 7x5:50mm."""
@@ -84,7 +84,7 @@ class Prepare:
     """Frames a second of folders of pictures. Default: 30."""
     without: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAMERA [CAMERA ...]", help_behavior_hint="")] = ()
     """Cameras to leave out."""
-    tone: bool = False
+    tone: Flag = False
     """Estimate a tone curve for each camera, where picture profiles differ strongly; seldom worth it."""
     link: Literal["hard", "symlink", "copy"] = "hard"
     """How videos get into the capture; hard links need no room, and become copies on another file system."""

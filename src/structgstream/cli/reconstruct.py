@@ -16,6 +16,7 @@ from structgstream.cli.live_run import LiveChoice, ending_of, open_live, run_met
 from structgstream.cli.options import (
     CaptureOptions,
     Device,
+    Flag,
     Folder,
     check_ending,
     open_selected_capture,
@@ -87,11 +88,11 @@ class Reconstruct:
     """Compute back-end; auto takes the first available of cuda, cpu and reference (plain PyTorch, slow)."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Random seed. Default: the preset's."""
-    resume: bool = False
+    resume: Flag = False
     """Continue after the last whole frame of OUT. The same options give the bytes of an uninterrupted run."""
-    overwrite: bool = False
+    overwrite: Flag = False
     """Replace OUT when it exists."""
-    help_config: bool = False
+    help_config: Flag = False
     """List the fields of the configuration with the preset's values."""
     capture: CaptureOptions = field(default_factory=CaptureOptions)
     segments: SegmentOptions = field(default_factory=SegmentOptions)

@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import UsageError
-from structgstream.cli.options import Device, StreamFile, check_ending, parse_options
+from structgstream.cli.options import Device, Flag, StreamFile, check_ending, parse_options
 from structgstream.cli.plain_text import say
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class Render:
     """Duration of the path. Default: the stream's, at least 4 s; a shorter stream is played slowed, back and forth."""
     frame: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Render only this frame; a path then shows a fixed time. Default: all frames."""
-    compare: bool = False
+    compare: Flag = False
     """Truth, rendering and difference side by side."""
     device: Device = "auto"
     """Back-end that renders."""

@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import UsageError, usage_errors
-from structgstream.cli.options import Folder, parse_options
+from structgstream.cli.options import Flag, Folder, parse_options
 from structgstream.cli.plain_text import say
 from structgstream.errors import MissingExtraError
 
@@ -41,7 +41,7 @@ class Serve:
     """Port to listen on; 0 takes one that is free."""
     secret_file: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     """Secrets that access tokens are signed with, one a line; see structgstream token. Without, no token is needed."""
-    public: bool = False
+    public: Flag = False
     """Listen on any address without tokens: everyone who reaches this machine sees all streams of the folder."""
     allow_origin: Words = ()
     """Origins whose pages may read, as https://example.org, or *. Default: only pages of this server."""
@@ -49,7 +49,7 @@ class Serve:
     """Names under which the server is asked, besides those of this machine, as behind a proxy."""
     proxy: Words = ()
     """Addresses or networks of reverse proxies, whose X-Forwarded-For and X-Forwarded-Proto are believed."""
-    previews: bool = True
+    previews: Flag = True
     """Render no preview pictures; those that are files are shown."""
     requests_per_second: float = 50.0
     """Requests that an address may make in the mean; four seconds' worth at once."""

@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from structgstream.cli.app import UsageError, usage_errors
-from structgstream.cli.options import parse_options
+from structgstream.cli.options import Flag, parse_options
 
 MOST_HOURS = 24 * 366
 
@@ -28,8 +28,8 @@ class Token:
     """The server's secrets; the first one signs."""
     stream: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="STREAM", help_behavior_hint="")] = ""
     """Name of the stream, as the server lists it."""
-    every: bool = False
-    """For every stream, the list and the metrics."""
+    every: Flag = False
+    """Make a token for all streams, their list and the metrics."""
     hours: float = 2.0
     """How long it is valid."""
     address: Annotated[str, tyro.conf.arg(metavar="URL", help_behavior_hint="")] = ""

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from structgstream.cli.app import Interrupted, UsageError
-from structgstream.cli.options import Device, Folder, StreamFile, parse_options
+from structgstream.cli.options import Device, Flag, Folder, StreamFile, parse_options
 from structgstream.cli.plain_text import say
 from structgstream.cli.progress import human_bytes
 from structgstream.cli.termination import Terminated, Termination
@@ -44,9 +44,9 @@ class Track:
     """The track to write."""
     groups: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Frames of a group. Default: as many as from one key packet to the next."""
-    quiet: bool = False
+    quiet: Flag = False
     """Begin groups where few pixels change, half of N to one and a half times N frames apart."""
-    odd: bool = False
+    odd: Flag = False
     """Allow an N that is no multiple of the interval of key packets; each group then costs one more key packet."""
     frames: Annotated[int | None, tyro.conf.arg(metavar="M", help_behavior_hint="")] = None
     """Number of frames. Default: all."""
@@ -58,7 +58,7 @@ class Track:
     rig, from 6 to 14."""
     device: Device = "auto"
     """Compute back-end."""
-    overwrite: bool = False
+    overwrite: Flag = False
     """Replace TRACK when it exists."""
 
 
