@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Which of several qualities a connection can bear. */
+/** Chooses the rendition by the throughput of the connection (adaptive bit rate). */
 
 import type { Quality } from "../source/manifest.js";
 
@@ -24,7 +24,7 @@ const MOST_TRIAL_SECONDS = 320;
 /** One that could not be had for a reason that may go away is tried again. */
 const RETRY_SECONDS = 2;
 
-export class Ladder {
+export class AbrController {
   /** By rising bit rate. */
   steps: readonly Quality[];
   /** What the user wants; undefined leaves it to the connection. */

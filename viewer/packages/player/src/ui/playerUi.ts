@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** All that is to be seen of a player, put together: the picture, the controls over it, and what they do. */
+/** The user interface of a player: the picture, the controls over it, and what they do. */
 
 import type { Player } from "../player.js";
 import type { SourceDescription } from "../source/description.js";
@@ -25,7 +25,7 @@ const TINY_PIXELS = 400;
 
 type PanelName = "cameras" | "settings" | "statistics" | "help";
 
-export interface SurfaceOptions {
+export interface PlayerUiOptions {
   readonly host: HTMLElement;
   readonly canvas: HTMLCanvasElement;
   readonly player: Player;
@@ -36,7 +36,7 @@ export interface SurfaceOptions {
   readonly linkedSource: () => string | undefined;
 }
 
-export class Surface {
+export class PlayerUi {
   readonly root: HTMLElement;
   readonly compare: Compare;
   private readonly notes = new Notes();
@@ -55,7 +55,7 @@ export class Surface {
   private tickedAt: number | undefined;
   private playButton: HTMLElement | undefined;
 
-  constructor(private readonly options: SurfaceOptions) {
+  constructor(private readonly options: PlayerUiOptions) {
     const { player, canvas } = options;
     const go = (camera: RigCamera) => this.go(camera);
     this.overlay = new Overlay(go);

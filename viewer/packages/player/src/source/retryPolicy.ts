@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-/** How long readings wait for what is not there. */
+/** Waits of requests that fail, and of files that grow. */
 
-/** How long is waited before looking again, in seconds. */
-export interface Patience {
+/** Waits in seconds. */
+export interface RetryPolicy {
   /** After a connection broke; when all are used up, it failed. */
   readonly retries: readonly number[];
   /** For new bytes of a growing file: the first wait, the longest, and by how much each is longer than the last. */
@@ -13,7 +13,7 @@ export interface Patience {
   readonly stillAfter: number;
 }
 
-export const PATIENCE: Patience = {
+export const RETRY_POLICY: RetryPolicy = {
   retries: [0.5, 1, 2, 4, 8],
   firstPoll: 0.5,
   longestPoll: 10,
