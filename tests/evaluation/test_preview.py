@@ -10,6 +10,8 @@ from pictures import decoded_picture
 from rigs import random_scene
 from streams import compact_header, moved, write_stream
 from structgstream.codec.reader import StreamReader, open_stream
+from structgstream.codec.segments.manifest import MANIFEST
+from structgstream.codec.segments.mirror import MirroredStore
 from structgstream.codec.segments.sink import SegmentsSink
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.sinks import MemorySink
@@ -63,3 +65,16 @@ def test_a_disk_that_is_full_loses_the_picture_only(tmp_path: Path, monkeypatch:
     write_stream(PreviewSink(SegmentsSink(store), store), SCENES, header=compact_header(SCENES[0]))
     assert len(open_stream(tmp_path)) == len(SCENES)
     assert not (tmp_path / PREVIEW).exists()
+
+
+def test_a_published_copy_has_no_picture(tmp_path: Path) -> None:
+    folder, remote = FolderStore(tmp_path / "studio"), FolderStore(tmp_path / "remote")
+    for each in (folder, remote):
+        each.prepare()
+    mirror = MirroredStore(folder, remote)
+    mirror.claim()
+    write_stream(PreviewSink(SegmentsSink(mirror), mirror), SCENES, header=compact_header(SCENES[0]))
+    assert mirror.finish(wait_seconds=60.0) == 0
+    assert (tmp_path / "studio" / PREVIEW).exists()
+    assert (tmp_path / "remote" / MANIFEST).exists()
+    assert not (tmp_path / "remote" / PREVIEW).exists()
