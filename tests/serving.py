@@ -4,19 +4,17 @@
 import http.client
 import socket
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import uvicorn
 
-from structgstream.player.running import bound
-from structgstream.player.server import application
-from structgstream.player.stream_file import StreamFile
-from structgstream.player.truth import Truth
-from structgstream.server.listening import listening_socket, server
-from structgstream.server.settings import ServerSettings
+from structgstream.serve import app, play
+from structgstream.serve.listening import bound, server
+from structgstream.serve.stream_file import StreamFile
 
 
 @dataclass(frozen=True)
@@ -69,15 +67,14 @@ def running(server: uvicorn.Server, listening: socket.socket) -> Iterator[Served
 
 
 @contextmanager
-def hosted(settings: ServerSettings, **options: Any) -> Iterator[Served]:
+def hosted(settings: app.ServerSettings, *, clock: Callable[[], float] = time.time, **options: Any) -> Iterator[Served]:
     """The server of ``structgstream serve`` on a free port; options are those of ``server``."""
-    with running(server(settings, **options), listening_socket("127.0.0.1", 0)) as found:
+    with running(server(app.application(settings, clock=clock), **options), bound(0)) as found:
         yield found
 
 
 @contextmanager
-def served(stream: StreamFile, *, truth: Truth | None = None) -> Iterator[Served]:
+def served(stream: StreamFile, *, truth: play.Truth | None = None) -> Iterator[Served]:
     """The server of ``structgstream play`` on a free port."""
-    config = uvicorn.Config(application(stream, truth=truth), log_level="warning", access_log=False)
-    with running(uvicorn.Server(config), bound(0)) as found:
+    with running(server(play.application(stream, truth=truth)), bound(0)) as found:
         yield found

@@ -13,7 +13,7 @@ from nbclient import NotebookClient
 from streams import small_stream
 from structgstream.errors import MissingExtraError, StreamError
 from structgstream.notebook import Player
-from structgstream.player.bundle import bundle
+from structgstream.serve.pages import bundle
 
 ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "examples" / "player.ipynb"

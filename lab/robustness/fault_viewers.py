@@ -185,7 +185,7 @@ class Server:
 
     def start(self) -> str:
         """Starts it; its address, once it answers."""
-        command = [*self._command, "--no-previews", "--requests-per-second", "10000"]
+        command = self._command
         self._running = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         assert self._running.stdout is not None
         line = self._running.stdout.readline()

@@ -80,8 +80,7 @@ def process(*command: str, output: int | None = None, nice: int = 0) -> Iterator
 @contextmanager
 def serving(folder: Path, *, nice: int = 0) -> Iterator[tuple[str, int]]:
     """The server on a free port, with limits that a single address may use up; its address and its process."""
-    limits = ("--connections", "2000", "--connections-per-address", "2000", "--requests-per-second", "100000")
-    command = ("structgstream", "serve", str(folder), "--port", "0", "--no-previews", *limits)
+    command = ("structgstream", "serve", str(folder), "--port", "0", "--connections", "2000")
     with process(*command, output=subprocess.PIPE, nice=nice) as running:
         assert running.stdout is not None
         found = re.search(r"http://\S+/", running.stdout.readline())

@@ -27,8 +27,6 @@ from structgstream.exporters.frames import write_frames
 from structgstream.exporters.request import check_degree, check_low_pass, check_page, choose_frames, destination
 from structgstream.frame_report import FrameReport
 from structgstream.kernels.backend import Backend, BackendName, select_backend
-from structgstream.player.stream_file import StreamFile
-from structgstream.player.write import write_page, write_site
 from structgstream.preparation.checking.findings import CheckReport
 from structgstream.preparation.checking.folder import check_folder
 from structgstream.preparation.options import PrepareOptions
@@ -36,6 +34,7 @@ from structgstream.preparation.prepare import Preparation, prepare_capture
 from structgstream.preparation.steps import Listener
 from structgstream.presets import DEFAULT_PRESET, StreamConfig, preset_named, with_budget
 from structgstream.recorder import check_output, record, segments_at, segments_folder
+from structgstream.serve.stream_file import StreamFile, write_page, write_site
 from structgstream.struct_gstream import stream_pipeline
 
 

@@ -8,8 +8,8 @@ without Python.
 from pathlib import Path
 
 from structgstream.errors import MissingExtraError
-from structgstream.player.bundle import bundle
-from structgstream.player.stream_file import StreamFile, check_has_header
+from structgstream.serve.pages import bundle
+from structgstream.serve.stream_file import StreamFile, check_has_header
 
 try:
     import anywidget

@@ -18,6 +18,7 @@ from structgstream.codec.stored_segments import StoredSegments, resume_segments
 from structgstream.data.prefetch import read_ahead
 from structgstream.data.source import FrameStream, frame_count
 from structgstream.errors import StorageError, StreamError
+from structgstream.evaluation.preview import PreviewSink
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry
 from structgstream.frame_report import FrameReport
 from structgstream.kernels.backend import Backend
@@ -117,12 +118,14 @@ def _append_reports(
 def segments_at(
     store: Store, *, options: SegmentsOptions | None = None, clocks: Clocks | None = None
 ) -> Storage[Scene]:
-    """Segments in a store, for :func:`record`; what is there is replaced unless it is resumed."""
+    """Segments in a store, and a preview picture, for :func:`record`; a stream is replaced unless it is resumed."""
 
-    def opened(resume: bool) -> tuple[SegmentsSink, StoredSegments | None]:
+    def opened(resume: bool) -> tuple[PacketSink, StoredSegments | None]:
         if resume:
-            return resume_segments(store, options=options, clocks=clocks)
-        return SegmentsSink(store, overwrite=True, options=options, clocks=clocks), None
+            sink, found = resume_segments(store, options=options, clocks=clocks)
+        else:
+            sink, found = SegmentsSink(store, overwrite=True, options=options, clocks=clocks), None
+        return PreviewSink(sink, store), found
 
     return opened
 

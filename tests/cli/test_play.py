@@ -22,7 +22,7 @@ from streams import header_for, small_stream, write_stream
 from structgstream.cli import main
 from structgstream.codec.sinks import FileSink
 from structgstream.data.clip import bundled_clip_path
-from structgstream.player import running
+from structgstream.serve import listening
 
 STREAM = small_stream()
 PATIENCE_SECONDS = 60.0
@@ -174,7 +174,7 @@ def test_the_capture_of_another_stream_is_told(tmp_path: Path, capsys: pytest.Ca
 def test_a_missing_extra_is_told(
     tmp_path: Path, missing: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name in [name for name in sys.modules if name.startswith(("structgstream.player", missing))]:
+    for name in [name for name in sys.modules if name.startswith(("structgstream.serve", missing))]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, missing, None)  # type: ignore[arg-type]
     error = error_of([str(tmp_path / "s.sgs")], capsys, status=1)
@@ -183,9 +183,9 @@ def test_a_missing_extra_is_told(
 
 def test_a_browser_is_opened_only_where_there_is_a_screen(monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
-    monkeypatch.setattr(running.webbrowser, "open", lambda address: not opened.append(address))
-    assert not running.open_browser("http://127.0.0.1:1/", environ={"DISPLAY": ""})
+    monkeypatch.setattr(listening.webbrowser, "open", lambda address: not opened.append(address))
+    assert not listening.open_browser("http://127.0.0.1:1/", environ={"DISPLAY": ""})
     assert opened == []
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
-        assert running.open_browser("http://127.0.0.1:1/", environ={name: "x"})
+        assert listening.open_browser("http://127.0.0.1:1/", environ={name: "x"})
     assert len(opened) == 3

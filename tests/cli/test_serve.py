@@ -40,7 +40,7 @@ def serving(folder: Path, *arguments: str) -> Iterator[tuple["subprocess.Popen[b
     """The command in a process of its own, and its port."""
     printed = folder.parent / "printed"
     with printed.open("wb") as output:
-        command = [sys.executable, "-c", COMMAND, "serve", str(folder), "--port", "0", "--no-previews", *arguments]
+        command = [sys.executable, "-c", COMMAND, "serve", str(folder), "--port", "0", *arguments]
         process = subprocess.Popen(command, stdout=output, stderr=output)
     try:
         last = time.monotonic() + PATIENCE_SECONDS
@@ -126,7 +126,7 @@ def test_what_is_no_folder_of_streams(folder: Path, capsys: pytest.CaptureFixtur
 def test_a_missing_extra_is_told(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name in [name for name in sys.modules if name.startswith(("structgstream.server", "structgstream.player"))]:
+    for name in [name for name in sys.modules if name.startswith("structgstream.serve")]:
         monkeypatch.delitem(sys.modules, name)
     for name in [name for name in sys.modules if name.split(".")[0] == "uvicorn"]:
         monkeypatch.delitem(sys.modules, name)
@@ -136,7 +136,7 @@ def test_a_missing_extra_is_told(
 
 def test_the_server_needs_no_torch(folder: Path) -> None:
     code = (
-        "import sys; import structgstream.server.listening; print(*{'torch', 'numpy', 'av', 'cv2'} & set(sys.modules))"
+        "import sys; import structgstream.serve.listening; print(*{'torch', 'numpy', 'av', 'cv2'} & set(sys.modules))"
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=os.environ)
     assert found.stdout.split() == []

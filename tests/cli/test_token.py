@@ -7,7 +7,7 @@ import pytest
 
 from quick_streams import error_of
 from structgstream.cli import main, token
-from structgstream.server.tokens import EVERY_STREAM, Access, read_keys
+from structgstream.serve.tokens import EVERY_STREAM, Access, read_keys
 
 NOW = 1.7e9
 

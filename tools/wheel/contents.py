@@ -8,7 +8,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 NEEDED = (
     "structgstream/py.typed",
-    "structgstream/player/assets/player.js",
+    "structgstream/serve/assets/player.js",
     "structgstream/data/clip/cameras.json",
     "structgstream/_native/libstructgstream.so",
     *(f"structgstream/_native/cuda/{name}" for name in ("ssim.cu", "ssim.h", "ssim_phases.h", "ssim_window.h")),

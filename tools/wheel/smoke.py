@@ -67,7 +67,7 @@ def check_page(stream: Path, folder: Path) -> None:
     """The page holds the player and the stream."""
     run("export", stream, "-o", folder / "page.html")
     page = (folder / "page.html").read_text()
-    player = Path(structgstream.__file__).parent / "player" / "assets" / "player.js"
+    player = Path(structgstream.__file__).parent / "serve" / "assets" / "player.js"
     assert "<structgstream-player" in page
     assert len(page) > player.stat().st_size + stream.stat().st_size
 

@@ -17,7 +17,7 @@ from segment_folders import GrowingFolder
 from serving import hosted
 from streams import compact_header, moved, small_stream, write_stream
 from structgstream.codec.sinks import FileSink
-from structgstream.server.settings import Limits, ServerSettings
+from structgstream.serve.app import ServerSettings
 
 STREAM = small_stream(7)
 
@@ -43,7 +43,7 @@ def test_players_notice_other_bytes(tmp_path: Path) -> None:
     growing = GrowingFolder(tmp_path / "studio", STREAM)
     growing.write_all()
     right = digests(tmp_path / "studio")
-    with hosted(ServerSettings(tmp_path, previews=False)) as server:
+    with hosted(ServerSettings(tmp_path)) as server:
         address = f"{server.address}streams/studio/"
         fast = asyncio.run(play(address, fast=2, slow=1, seconds=20.0))
     for one in (*fast["fast"], *fast["slow"]):
@@ -51,7 +51,7 @@ def test_players_notice_other_bytes(tmp_path: Path) -> None:
     assert growing.manifest is not None
     file = tmp_path / "studio" / growing.manifest.segments[1].file
     file.write_bytes(file.read_bytes()[:-1] + b"x")
-    with hosted(ServerSettings(tmp_path, previews=False)) as server:
+    with hosted(ServerSettings(tmp_path)) as server:
         (one,) = asyncio.run(play(f"{server.address}streams/studio/", fast=1, slow=0, seconds=20.0))["fast"]
     assert one.wrong == [file.name]
     assert one.digest != right[7]
@@ -66,7 +66,7 @@ def test_digests_are_those_of_the_stream(tmp_path: Path) -> None:
 
 def test_fetching_counts_and_checks(tmp_path: Path) -> None:
     (tmp_path / "ball.sgs").write_bytes(STREAM)
-    settings = ServerSettings(tmp_path, previews=False, limits=Limits(burst=10**6))
+    settings = ServerSettings(tmp_path)
     with hosted(settings) as server:
         name = "streams/ball.sgs/stream.sgs"
         found = fetched(server.address, [name], connections=2, seconds=0.3)
@@ -75,7 +75,7 @@ def test_fetching_counts_and_checks(tmp_path: Path) -> None:
 
 
 def test_a_server_that_refuses_is_an_error(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
-    with hosted(ServerSettings(tmp_path, previews=False)) as server:
+    with hosted(ServerSettings(tmp_path)) as server:
         found = asyncio.run(play(f"{server.address}streams/none/", fast=1, slow=0, seconds=1.2))["fast"][0]
     assert found.frames == 0
     assert "404" in found.wrong[0]

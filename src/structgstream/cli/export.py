@@ -100,8 +100,7 @@ def main(arguments: list[str]) -> None:
 
 
 def _export_page(path: Path, output: Path, format: PageFormat) -> None:
-    from structgstream.player.stream_file import StreamFile
-    from structgstream.player.write import write_page, write_site
+    from structgstream.serve.stream_file import StreamFile, write_page, write_site
 
     stream = StreamFile(path)
     if format == "html":

@@ -16,10 +16,10 @@ from structgstream.cli.plain_text import say
 from structgstream.errors import MissingExtraError
 
 if TYPE_CHECKING:
-    from structgstream.player.stream_file import StreamFile
-    from structgstream.player.truth import Truth
+    from structgstream.serve.play import Truth
+    from structgstream.serve.stream_file import StreamFile
 
-LOOK_AGAIN_SECONDS = 0.5
+POLL_SECONDS = 0.5
 
 
 @dataclass(frozen=True)
@@ -52,11 +52,11 @@ def main(arguments: list[str]) -> None:
     if not 0 <= options.port < 65536:
         raise UsageError(f"--port {options.port} is not one of 0 to 65535.")
     try:
-        from structgstream.player.running import open_browser, run
-        from structgstream.player.server import application
+        from structgstream.serve.listening import open_browser, run, server
+        from structgstream.serve.play import application
     except ModuleNotFoundError as error:
         raise MissingExtraError(error.name or "starlette", "serve") from None
-    from structgstream.player.stream_file import StreamFile
+    from structgstream.serve.stream_file import StreamFile
 
     stream = StreamFile(options.stream)
     if options.wait:
@@ -65,7 +65,7 @@ def main(arguments: list[str]) -> None:
     truth = None if options.capture is None else _truth(options.stream, options.capture)
     growing = not stream.state()[1]
 
-    def tell(address: str) -> None:
+    def announce(address: str) -> None:
         lines = [f"{options.stream} plays at {address} (Ctrl-C ends)."]
         if growing:
             lines.append("The file has no end yet: frames appear as they are written.")
@@ -73,7 +73,7 @@ def main(arguments: list[str]) -> None:
             lines.append("There is no screen to open a browser on: open the address yourself.")
         say(Console(), *lines)
 
-    run(application(stream, truth=truth), port=options.port, on_start=tell)
+    run(server(application(stream, truth=truth)), port=options.port, on_start=announce)
 
 
 def _wait_for(stream: "StreamFile") -> None:
@@ -81,7 +81,7 @@ def _wait_for(stream: "StreamFile") -> None:
         text = f"Waiting for {stream.path}, which comes when frame 0 is done (Ctrl-C ends)."
         say(Console(stderr=True), text)
     while not stream.has_header():
-        time.sleep(LOOK_AGAIN_SECONDS)
+        time.sleep(POLL_SECONDS)
 
 
 def _truth(stream: Path, scene: Path) -> "Truth":
@@ -93,7 +93,7 @@ def _truth(stream: Path, scene: Path) -> "Truth":
     from structgstream.codec.reader import open_stream
     from structgstream.evaluation.capture import capture_of
     from structgstream.evaluation.facts import check_same_rig
-    from structgstream.player.truth import Truth
+    from structgstream.serve.play import Truth
 
     with open_stream(stream, by_index=True) as reader:
         header = reader.header

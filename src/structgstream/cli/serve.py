@@ -3,7 +3,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 from rich.console import Console
@@ -13,18 +13,18 @@ from structgstream.cli.options import Flag, Folder, parse_options
 from structgstream.cli.plain_text import say
 from structgstream.errors import MissingExtraError
 
-if TYPE_CHECKING:
-    from structgstream.server.settings import ServerSettings
+MAX_CONNECTIONS = 100_000
 
 Words = Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME [NAME ...]", help_behavior_hint="")]
 
 
 @dataclass(frozen=True)
 class Serve:
-    """Serves the streams of a folder to viewers, live ones while they are made.
+    """Serves the streams of a folder to viewers, live ones while they are reconstructed.
 
-    Listens on this machine's loopback address unless told otherwise, until Ctrl-C or SIGTERM. Streams are folders of
-    segments and files that end in .sgs; FOLDER itself may hold the segments of one.
+    Listens on the loopback address by default, until Ctrl-C or SIGTERM. Streams are folders of segments and files that
+    end in .sgs; FOLDER itself may hold the segments of one. For the public, put a reverse proxy in front of it: it adds
+    TLS, a cache, and limits on rates, connections and slow clients, which this server does not have (docs/serve.md).
 
     Example: structgstream serve streams
 
@@ -48,15 +48,9 @@ class Serve:
     server_name: Words = ()
     """Names under which the server is asked, besides those of this machine, as behind a proxy."""
     proxy: Words = ()
-    """Addresses or networks of reverse proxies, whose X-Forwarded-For and X-Forwarded-Proto are believed."""
-    previews: Flag = True
-    """Render no preview pictures; those that are files are shown."""
-    requests_per_second: float = 50.0
-    """Requests that an address may make in the mean; four seconds' worth at once."""
+    """Addresses or networks of reverse proxies, whose X-Forwarded-For and X-Forwarded-Proto are trusted."""
     connections: int = 1000
-    """Connections of all addresses."""
-    connections_per_address: int = 100
-    """Connections of one address."""
+    """Connections from which on requests are answered with 503."""
 
 
 def main(arguments: list[str]) -> None:
@@ -65,16 +59,32 @@ def main(arguments: list[str]) -> None:
     if not 0 <= options.port < 65536:
         raise UsageError(f"--port {options.port} is not one of 0 to 65535.")
     try:
-        from structgstream.server.arenas import use_one_arena
-        from structgstream.server.listening import checked_address, run
+        from structgstream.serve.app import ServerSettings, application
+        from structgstream.serve.listening import (
+            accepted_hosts,
+            checked_address,
+            checked_origins,
+            checked_proxies,
+            run,
+            server,
+        )
     except ModuleNotFoundError as error:
         raise MissingExtraError(error.name or "starlette", "serve") from None
+    from structgstream.serve.tokens import read_keys
 
+    if not 1 <= options.connections <= MAX_CONNECTIONS:
+        raise UsageError(f"--connections {options.connections} is not one of 1 to {MAX_CONNECTIONS}.")
     with usage_errors():
-        address = checked_address(options.host, guarded=options.secret_file is not None, public=options.public)
-        settings = _settings(options, address)
+        address = checked_address(options.host, tokens=options.secret_file is not None, public=options.public)
+        settings = ServerSettings(
+            folder=options.folder,
+            keys=None if options.secret_file is None else read_keys(options.secret_file),
+            origins=checked_origins(options.allow_origin),
+            hosts=accepted_hosts(address, options.server_name),
+        )
+        proxies = checked_proxies(options.proxy)
 
-    def tell(url: str) -> None:
+    def announce(url: str) -> None:
         lines = [f"The streams of {options.folder} are at {url} (Ctrl-C ends)."]
         if options.secret_file is not None:
             lines.append(f"Viewers need a token: structgstream token NAME --secret-file {options.secret_file}")
@@ -82,26 +92,5 @@ def main(arguments: list[str]) -> None:
             lines.append("Everyone who reaches this machine sees all of them.")
         say(Console(), *lines)
 
-    use_one_arena()
-    run(settings, address=address, port=options.port, on_start=tell)
-
-
-def _settings(options: Serve, address: str) -> "ServerSettings":
-    """What the options say.
-
-    Raises:
-        ConfigError: one has an invalid value.
-    """
-    from structgstream.server.listening import accepted_hosts, checked_limits, checked_origins, checked_proxies
-    from structgstream.server.settings import ServerSettings
-    from structgstream.server.tokens import read_keys
-
-    return ServerSettings(
-        folder=options.folder,
-        keys=None if options.secret_file is None else read_keys(options.secret_file),
-        origins=checked_origins(options.allow_origin),
-        hosts=accepted_hosts(address, options.server_name),
-        proxies=checked_proxies(options.proxy),
-        previews=options.previews,
-        limits=checked_limits(options.requests_per_second, options.connections, options.connections_per_address),
-    )
+    prepared = server(application(settings), proxies=proxies, connections=options.connections)
+    run(prepared, address=address, port=options.port, on_start=announce)

@@ -43,7 +43,7 @@ def main(arguments: list[str]) -> None:
         raise UsageError(f"--hours {options.hours:g} is not above 0 and at most {MOST_HOURS}, a year.")
     if bool(options.stream) == options.every:
         raise UsageError("name one stream, or say --every.")
-    from structgstream.server.tokens import EVERY_STREAM, read_keys
+    from structgstream.serve.tokens import EVERY_STREAM, read_keys
 
     with usage_errors():
         expires = int(time.time() + options.hours * 3600.0)

@@ -22,15 +22,15 @@ import { startedPipeline } from "./pipeline.js";
 import { Player, type PlayerEvents } from "./player.js";
 import { startedWorker } from "./scripts.js";
 import type { SourceDescription } from "./source/description.js";
+import { PlayerUi } from "./ui/playerUi.js";
 import { STYLES } from "./ui/styles.js";
-import { Surface } from "./ui/surface.js";
 import { type Link, linkOf, viewFrom } from "./view/link.js";
 import { viewOf } from "./view/navigator.js";
 import { QualityControl } from "./view/quality.js";
 
 interface Running {
   readonly player: Player;
-  readonly surface: Surface;
+  readonly ui: PlayerUi;
   readonly observer: ResizeObserver;
 }
 
@@ -60,7 +60,7 @@ export class StructgstreamPlayer extends HTMLElement {
     if (!this.running || before === after) return;
     if (name === "src") this.openAttribute();
     else if (name === "loop") this.running.player.setLoop(after !== null);
-    else this.applyAttributes(this.running.surface);
+    else this.applyAttributes(this.running.ui);
   }
 
   /** Opens a stream: an address, a file, or bytes. */
@@ -225,7 +225,7 @@ export class StructgstreamPlayer extends HTMLElement {
       this.startWithout(root, style, error);
       return;
     }
-    const surface = new Surface({
+    const ui = new PlayerUi({
       host: this,
       canvas,
       player,
@@ -234,20 +234,20 @@ export class StructgstreamPlayer extends HTMLElement {
       saveScreenshot: () => void this.save(),
       linkedSource: () => this.linked,
     });
-    root.replaceChildren(style, surface.root);
+    root.replaceChildren(style, ui.root);
     const observer = new ResizeObserver(() => this.resized());
     observer.observe(this);
-    this.running = { player, surface, observer };
+    this.running = { player, ui, observer };
     player.relay = this.tell;
     player.still = matchMedia("(prefers-reduced-motion: reduce)").matches;
     player.setLoop(this.hasAttribute("loop"));
-    this.applyAttributes(surface);
+    this.applyAttributes(ui);
     this.resized();
     const refused = this.link?.refused ?? [];
     this.openAttribute();
-    for (const sentence of refused) surface.say(sentence);
+    for (const sentence of refused) ui.say(sentence);
     const truth = this.getAttribute("truth");
-    if (truth !== null) surface.compare.attach(new URL(truth, document.baseURI)).catch(() => undefined);
+    if (truth !== null) ui.compare.attach(new URL(truth, document.baseURI)).catch(() => undefined);
   }
 
   /** There is no WebGL2, and a sentence says so. */
@@ -279,12 +279,12 @@ export class StructgstreamPlayer extends HTMLElement {
   private readonly tick = (): void => {
     this.ticking = requestAnimationFrame(this.tick);
     this.running?.player.tick();
-    this.running?.surface.tick();
+    this.running?.ui.tick();
   };
 
-  private applyAttributes(surface: Surface): void {
-    surface.controls = this.getAttribute("controls") !== "off";
-    surface.embed = this.hasAttribute("embed") || this.link?.embed === true;
+  private applyAttributes(ui: PlayerUi): void {
+    ui.controls = this.getAttribute("controls") !== "off";
+    ui.embed = this.hasAttribute("embed") || this.link?.embed === true;
   }
 
   private openAttribute(): void {
@@ -293,7 +293,7 @@ export class StructgstreamPlayer extends HTMLElement {
     // A link names a stream of its own origin, and no redirection leads out of it.
     if (linked !== undefined) this.open(this.sourceAt(new URL(linked), true));
     else if (own !== null) this.open(this.described(own));
-    else this.running?.surface.invite();
+    else this.running?.ui.invite();
   }
 
   private described(source: string): SourceDescription {
@@ -331,13 +331,13 @@ export class StructgstreamPlayer extends HTMLElement {
   private open(source: SourceDescription, seconds?: number): void {
     const { running, link } = this;
     if (!running) return;
-    const { player, surface } = running;
+    const { player, ui } = running;
     const at = seconds ?? link?.seconds;
     const view = link?.view;
     this.link = undefined; // a link is of the first stream only
     this.linked = this.linkable(source);
     const engine = player.load(source, at, view && ((rig) => viewFrom(view, rig.first.camera)));
-    surface.begin(source.name);
+    ui.begin(source.name);
     if (this.hasAttribute("autoplay")) engine.play();
   }
 
@@ -345,7 +345,7 @@ export class StructgstreamPlayer extends HTMLElement {
     if (!this.running) return;
     const { width, height } = this.getBoundingClientRect();
     this.running.player.resize(width * devicePixelRatio, height * devicePixelRatio);
-    this.running.surface.resize(width);
+    this.running.ui.resize(width);
   }
 
   private async save(): Promise<void> {
@@ -357,7 +357,7 @@ export class StructgstreamPlayer extends HTMLElement {
       anchor.click();
       setTimeout(() => URL.revokeObjectURL(url), 10_000);
     } catch (error) {
-      this.running?.surface.say(error instanceof Error ? error.message : String(error), true);
+      this.running?.ui.say(error instanceof Error ? error.message : String(error), true);
     }
   }
 }

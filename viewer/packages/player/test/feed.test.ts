@@ -3,7 +3,7 @@
 
 import { afterEach, beforeEach, expect, test, vi } from "vitest";
 import { ManifestFeed } from "../src/source/manifestFeed.ts";
-import { PATIENCE } from "../src/source/patience.ts";
+import { RETRY_POLICY } from "../src/source/retryPolicy.ts";
 import { LiveRun } from "./liveRun.ts";
 import { CLIP } from "./served.ts";
 
@@ -36,7 +36,7 @@ async function followed(
     asked.push({ at: (performance.now() - began) / 1000, after, match: headers.get("If-None-Match") });
     return answer(asked.at(-1)!, init!.signal!);
   };
-  const feed = new ManifestFeed("http://test/m.json?x=1", "m.json", request as typeof fetch, false, own, PATIENCE);
+  const feed = new ManifestFeed("http://test/m.json?x=1", "m.json", request as typeof fetch, false, own, RETRY_POLICY);
   const abort = new AbortController();
   const events = {
     manifest: ({ sequence }: { sequence: number }) => void told.push(`manifest ${sequence}`),

@@ -4,7 +4,7 @@
 import { existsSync, readdirSync, readFileSync } from "node:fs";
 import { readStream } from "@structgstream/core";
 import { afterEach, describe, expect, test, vi } from "vitest";
-import { Ladder } from "../src/decode/ladder.ts";
+import { AbrController } from "../src/decode/abrController.ts";
 import { Throughput } from "../src/decode/throughput.ts";
 import { Host, LiveRun, type RunOptions } from "./liveRun.ts";
 import { CLIP, type Playing, playing } from "./served.ts";
@@ -651,17 +651,17 @@ describe("qualities", () => {
 
   test("are changed by what the connection bears, and not to and fro", () => {
     const clock = { seconds: 0 };
-    const ladder = new Ladder(
+    const abr = new AbrController(
       [1e6, 4e6, 2e6].map((bits_per_second) => ({ manifest: "m.json", bits_per_second, name: `${bits_per_second}` })),
       () => clock.seconds,
     );
     const at = (seconds: number, bits: number | undefined) => {
       clock.seconds = seconds;
-      const step = ladder.wanted(bits, 1);
-      if (step !== ladder.at) ladder.change(step);
+      const step = abr.wanted(bits, 1);
+      if (step !== abr.at) abr.change(step);
       return step;
     };
-    expect(ladder.steps.map(({ name }) => name)).toEqual(["1000000", "2000000", "4000000"]);
+    expect(abr.steps.map(({ name }) => name)).toEqual(["1000000", "2000000", "4000000"]);
     expect(at(0, undefined)).toBe(0);
     expect(at(1, 9e6)).toBe(0); // not before it has held
     expect(at(5, 9e6)).toBe(1);
@@ -673,17 +673,17 @@ describe("qualities", () => {
     expect(at(20, 9e6)).toBe(0); // having fallen it waits for longer
     expect(at(35, 3e6)).toBe(0); // not enough to go up
     expect(at(35, 3.3e6)).toBe(1);
-    ladder.choice = 0;
+    abr.choice = 0;
     expect(at(36, 9e6)).toBe(0);
   });
 
   test("where a connection is hardly used the next one is tried, ever less often if in vain", () => {
     const clock = { seconds: 0 };
     const entries = [1e4, 2e5].map((bits_per_second) => ({ manifest: "m.json", bits_per_second, name: "x" }));
-    const ladder = new Ladder(entries, () => clock.seconds);
+    const abr = new AbrController(entries, () => clock.seconds);
     const at = (seconds: number, busyShare: number, bits = 2e4) => {
       clock.seconds = seconds;
-      return ladder.wanted(bits, busyShare);
+      return abr.wanted(bits, busyShare);
     };
     expect(at(9, 0.1)).toBe(0);
     expect(at(11, 0.5)).toBe(0); // it has enough to do
@@ -693,15 +693,15 @@ describe("qualities", () => {
     expect(at(28, 0.1)).toBe(0); // not there in time
     expect(at(47, 0.1)).toBe(0);
     expect(at(49, 0.1)).toBe(1);
-    ladder.change(1);
+    abr.change(1);
     expect(at(50, 0.1, 3e5)).toBe(1);
     expect(at(52, 0.1)).toBe(0); // it does not bear it
-    ladder.change(0);
+    abr.change(0);
     expect(at(91, 0.1)).toBe(0);
     expect(at(93, 0.1)).toBe(1);
-    ladder.change(1);
+    abr.change(1);
     expect(at(500, 0.1)).toBe(0); // having borne it for long
-    ladder.change(0);
+    abr.change(0);
     expect(at(509, 0.1)).toBe(0);
     expect(at(511, 0.1)).toBe(1);
   });

@@ -8,13 +8,13 @@ import { Engine } from "../src/engine/engine.ts";
 import type { EngineOptions } from "../src/engine/options.ts";
 import type { ReadReply, ReadRequest } from "../src/source/description.ts";
 import { Fetcher } from "../src/source/fetcher.ts";
-import type { Patience } from "../src/source/patience.ts";
 import type { Port } from "../src/source/port.ts";
+import type { RetryPolicy } from "../src/source/retryPolicy.ts";
 
 export const CLIP = new Uint8Array(readFileSync(new URL("./fixtures/clip.sgs", import.meta.url)));
 export const URL_OF_CLIP = "http://test/clip.sgs";
 
-export const QUICK: Patience = {
+export const QUICK: RetryPolicy = {
   retries: [0.01, 0.01],
   firstPoll: 0.01,
   longestPoll: 0.02,

@@ -3,8 +3,8 @@
 
 import type { Quality } from "../source/manifest.js";
 import { besides } from "../source/storedFile.js";
+import { AbrController } from "./abrController.js";
 import type { ByteClient } from "./byteClient.js";
-import { Ladder } from "./ladder.js";
 import type { Demand } from "./messages.js";
 import { type SegmentEvents, SegmentStream } from "./segmentStream.js";
 
@@ -27,7 +27,7 @@ const LIST_MILLISECONDS = 30_000;
 
 export class SegmentedStreams {
   private active: SegmentStream;
-  private ladder: Ladder | undefined;
+  private abr: AbrController | undefined;
   /** When the list of qualities was asked for last. */
   private listed = 0;
   /** The quality that is changed to, as soon as it can be. */
@@ -45,7 +45,7 @@ export class SegmentedStreams {
 
   /** Leaves the choice of a quality to the connection, or makes it. */
   choose(quality: number | undefined): void {
-    if (this.ladder) this.ladder.choice = quality;
+    if (this.abr) this.abr.choice = quality;
   }
 
   /**
@@ -54,25 +54,25 @@ export class SegmentedStreams {
    * @returns the stream of another quality, if frames from `next` on are of that
    */
   changed(next: number, demand: Demand, seeking: boolean): SegmentStream | undefined {
-    const { ladder, active } = this;
-    if (!ladder) return undefined;
+    const { abr, active } = this;
+    if (!abr) return undefined;
     if (active.catalog.live) this.listAgain();
     const { bitsPerSecond, busyShare } = active.loader.throughput;
-    const step = ladder.wanted(bitsPerSecond, busyShare);
+    const step = abr.wanted(bitsPerSecond, busyShare);
     if (this.pending && this.pending.step !== step) this.drop();
-    if (step === ladder.at) return undefined;
+    if (step === abr.at) return undefined;
     this.pending ??= {
       step,
-      stream: this.qualityOf(ladder.steps[step]!),
+      stream: this.qualityOf(abr.steps[step]!),
     };
     const { stream } = this.pending;
     const { catalog, store } = stream;
-    if (step > ladder.at && catalog.live && !seeking && next >= catalog.count - 1) {
+    if (step > abr.at && catalog.live && !seeking && next >= catalog.count - 1) {
       return this.atEdge(stream, next, demand) ? this.change() : undefined;
     }
     if (next >= catalog.count || !stream.chapter(next, demand.ahead)) return undefined;
     // Without the frame that is needed now there is nothing to go on with.
-    const starved = step < ladder.at && !active.store.has(next);
+    const starved = step < abr.at && !active.store.has(next);
     if (seeking || starved) return this.change();
     const key = catalog.groupStart(next) === next ? next : catalog.groupEnd(next);
     if (key >= catalog.count) return undefined;
@@ -99,7 +99,7 @@ export class SegmentedStreams {
     this.active.leave();
     this.active = stream;
     this.pending = undefined;
-    this.ladder!.change(step);
+    this.abr!.change(step);
     this.tellQualities();
     return stream;
   }
@@ -124,7 +124,7 @@ export class SegmentedStreams {
       },
       stored: () => events.stored(),
       qualities: (qualities) => {
-        if (isActive() && !this.ladder) this.begin(qualities);
+        if (isActive() && !this.abr) this.begin(qualities);
         else told.failed(`${name} leads to a list of qualities where a manifest belongs.`);
       },
       lost: (first, end, reason) => {
@@ -148,10 +148,10 @@ export class SegmentedStreams {
   }
 
   private begin(qualities: readonly Quality[]): void {
-    this.ladder = new Ladder(qualities, () => performance.now() / 1000);
+    this.abr = new AbrController(qualities, () => performance.now() / 1000);
     this.listed = performance.now();
     this.active.leave();
-    this.active = this.qualityOf(this.ladder.steps[0]!);
+    this.active = this.qualityOf(this.abr.steps[0]!);
     this.tellQualities();
   }
 
@@ -160,7 +160,7 @@ export class SegmentedStreams {
     if (now - this.listed < LIST_MILLISECONDS) return;
     this.listed = now;
     const id = this.client.manifests(this.url, this.name, {
-      qualities: (qualities) => this.ladder!.measured(qualities),
+      qualities: (qualities) => this.abr!.measured(qualities),
       manifest: () => this.client.cancel(id), // It leads to something else by now.
       end: () => {},
       failed: () => {}, // An outage is told by the stream that is played.
@@ -168,7 +168,7 @@ export class SegmentedStreams {
   }
 
   private refuse(message: string, temporary = false): void {
-    this.ladder!.refuse(this.pending!.step, temporary);
+    this.abr!.refuse(this.pending!.step, temporary);
     this.drop();
     // An outage is told by the stream that is played.
     if (!temporary) this.events.notice(message);
@@ -179,7 +179,7 @@ export class SegmentedStreams {
   }
 
   private tellQualities(): void {
-    const { steps, at } = this.ladder!;
+    const { steps, at } = this.abr!;
     this.events.qualities(
       steps.map(({ name }) => name),
       at,

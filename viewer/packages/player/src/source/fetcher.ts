@@ -8,9 +8,9 @@ import { HttpSource } from "./httpSource.js";
 import { joined } from "./joined.js";
 import { type Manifest, MOST_MANIFEST_BYTES, pageIn, type Quality } from "./manifest.js";
 import { ManifestFeed } from "./manifestFeed.js";
-import { PATIENCE, type Patience } from "./patience.js";
 import { pause } from "./pause.js";
 import type { Port } from "./port.js";
+import { RETRY_POLICY, type RetryPolicy } from "./retryPolicy.js";
 import { besides, verify } from "./storedFile.js";
 
 /** An init record or a packet that is larger is not taken. */
@@ -25,7 +25,7 @@ export class Fetcher {
   constructor(
     private readonly port: Port<ReadReply, ReadRequest>,
     private readonly request: typeof fetch,
-    private readonly patience: Patience = PATIENCE,
+    private readonly retryPolicy: RetryPolicy = RETRY_POLICY,
   ) {
     port.onmessage = ({ data }) => this.obey(data);
   }
@@ -78,7 +78,7 @@ export class Fetcher {
 
   private async feed({ id, url, name }: ReadRequest & { type: "manifests" }, signal: AbortSignal): Promise<void> {
     const { sameOrigin, own } = this.description as SourceDescription & { kind: "segments" };
-    const feed = new ManifestFeed(url, name, this.request, sameOrigin === true, own, this.patience);
+    const feed = new ManifestFeed(url, name, this.request, sameOrigin === true, own, this.retryPolicy);
     const events = {
       manifest: (manifest: Manifest) => {
         this.answered = true;
@@ -175,7 +175,7 @@ export class Fetcher {
         );
         return at;
       } catch (error) {
-        const wait = this.patience.retries[attempt++];
+        const wait = this.retryPolicy.retries[attempt++];
         const hopeless = !(error instanceof SourceError && error.temporary) || wait === undefined;
         // What never answered is told at once: a wrong address should not take half a minute to say so.
         if (signal.aborted || hopeless || !this.answered) throw error;
@@ -186,7 +186,7 @@ export class Fetcher {
   }
 
   private async follow(id: number, start: number, signal: AbortSignal): Promise<void> {
-    const { firstPoll, longestPoll, backOff, stillAfter } = this.patience;
+    const { firstPoll, longestPoll, backOff, stillAfter } = this.retryPolicy;
     const source = this.opened();
     let at = start;
     let wait = firstPoll;

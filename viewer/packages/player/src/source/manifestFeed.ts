@@ -10,8 +10,8 @@ import { SourceError } from "./byteSource.js";
 import { answered, refusal } from "./httpSource.js";
 import { joined } from "./joined.js";
 import { type Manifest, MOST_MANIFEST_BYTES, manifestIn, type Quality } from "./manifest.js";
-import type { Patience } from "./patience.js";
 import { pause } from "./pause.js";
+import type { RetryPolicy } from "./retryPolicy.js";
 
 /** A server that waits for news lets go after this at the latest; an answer that takes longer never comes. */
 const ANSWER_SECONDS = 45;
@@ -43,7 +43,7 @@ export class ManifestFeed {
     private readonly request: typeof fetch,
     private readonly sameOrigin: boolean,
     private readonly own: boolean,
-    private readonly patience: Patience,
+    private readonly retryPolicy: RetryPolicy,
   ) {}
 
   /**
@@ -53,7 +53,7 @@ export class ManifestFeed {
    * @throws SourceError the first one cannot be had, or the stream was replaced
    */
   async follow(events: FeedEvents, signal: AbortSignal): Promise<void> {
-    const { firstPoll, longestPoll, backOff, stillAfter } = this.patience;
+    const { firstPoll, longestPoll, backOff, stillAfter } = this.retryPolicy;
     let [wait, troubled, fresh] = [firstPoll, false, performance.now()];
     while (!signal.aborted) {
       if (this.isOver && performance.now() - fresh > stillAfter * 1000) return;
@@ -94,7 +94,7 @@ export class ManifestFeed {
 
   /** The longest wait for a frame that is expected soon; one that is overdue for long is asked for less often. */
   private longest(sinceNews: number): number {
-    const { firstPoll, longestPoll } = this.patience;
+    const { firstPoll, longestPoll } = this.retryPolicy;
     const pace = this.last?.frame_seconds ?? 0;
     return sinceNews > OVERDUE * pace ? longestPoll : Math.min(Math.max(pace / POLLS, firstPoll), longestPoll);
   }

@@ -28,7 +28,7 @@ const QUICK_SECONDS = 1 / 50;
 /** So many pictures in a row decide, and after a change so many are waited for. */
 const ENOUGH = 12;
 /** A scale that was too much is not tried again before so many pictures. */
-const PATIENCE = 600;
+const RETRY_AFTER = 600;
 
 export class QualityControl {
   choice: QualityChoice = { maxSplats: "auto", pixelScale: "auto" };
@@ -58,7 +58,7 @@ export class QualityControl {
     this.slow = seconds > SLOW_SECONDS ? this.slow + 1 : Math.min(this.slow, 0);
     this.quick = seconds < QUICK_SECONDS ? this.quick + 1 : 0;
     if (this.slow >= ENOUGH && this.level < SCALES.length - 1) this.change(1);
-    else if (this.quick >= PATIENCE && this.level > 0) this.change(-1);
+    else if (this.quick >= RETRY_AFTER && this.level > 0) this.change(-1);
   }
 
   private change(by: number): void {

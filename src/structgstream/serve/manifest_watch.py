@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The current manifest of a segments folder, and waiting for a newer one.
+
+Note [One watcher]
+~~~~~~~~~~~~~~~~~~
+While requests wait, one task per stream calls stat on the manifest ten times a second; other requests use its result.
+The file is read when its stat has changed. A stat younger than the resolution of the file system's clock is not
+trusted, because the file may be replaced again within the same tick.
+"""
+
+import asyncio
+import json
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Final
+
+from anyio import to_thread
+
+from structgstream.codec.segments.manifest import MANIFEST
+from structgstream.serve.files import FileStamp, OpenedFile
+from structgstream.serve.streams import ServedStream
+
+POLL_SECONDS: Final = 0.1
+TICK_NS: Final = 100_000_000
+"""Minimum age of a trusted stat."""
+MAX_MANIFEST_BYTES: Final = 8 * 10**6
+MAX_SEQUENCE: Final = 2**53
+FORMAT: Final = "structgstream-segments"
+
+
+class BrokenManifest(Exception):
+    """The file ``manifest.json`` is not a manifest; the message says why."""
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A manifest: its bytes, and the content as JSON values."""
+
+    content: bytes
+    sequence: int
+    live: bool
+    values: dict[str, Any]
+
+    def edge(self, name: str) -> float | None:
+        """A number of the newest frame; None if the manifest has none."""
+        edge = self.values.get("edge")
+        found = edge.get(name) if isinstance(edge, dict) else None
+        if isinstance(found, bool) or not isinstance(found, int | float) or not abs(found) < 2**63:
+            return None
+        return float(found)
+
+
+class ManifestWatch:
+    """The manifest of one stream (Note [One watcher]).
+
+    Args:
+        open_file: opens the file; called in a thread.
+        clock: monotonic seconds.
+    """
+
+    def __init__(
+        self, open_file: Callable[[], OpenedFile | None], *, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._open_file = open_file
+        self._clock = clock
+        self._lock = asyncio.Lock()
+        self._read_at = -float("inf")
+        self._stamp: FileStamp | None = None
+        self._found: Snapshot | str | None = None  # a text is the error in the manifest
+        self._changed = asyncio.Event()
+        self._watching: asyncio.Task[None] | None = None
+        self.waiters = 0
+
+    async def current(self) -> Snapshot | None:
+        """The manifest, at most a tenth of a second old; None if there is none.
+
+        Raises:
+            BrokenManifest: the file is no manifest.
+            OSError: the system cannot open files now.
+        """
+        async with self._lock:
+            if self._clock() - self._read_at >= POLL_SECONDS:
+                await self._poll()
+        if isinstance(self._found, str):
+            raise BrokenManifest(self._found)
+        return self._found
+
+    async def newer(self, after: int, *, seconds: float) -> Snapshot | None:
+        """The manifest when its sequence exceeds ``after`` or it changes, or the current one after ``seconds``.
+
+        That of a finished stream is returned at once.
+
+        Raises:
+            BrokenManifest: the file is no manifest.
+            OSError: the system cannot open files now.
+        """
+        self.waiters += 1  # Before the first await, so that concurrent requests see it.
+        try:
+            first = found = await self.current()
+            with suppress(TimeoutError):
+                async with asyncio.timeout(seconds):
+                    while found is first and found is not None and found.live and found.sequence <= after:
+                        changed = self._changed
+                        if self._watching is None or self._watching.done():
+                            self._watching = asyncio.create_task(self._watch())
+                        await changed.wait()
+                        found = await self.current()
+        finally:
+            self.waiters -= 1
+        return found
+
+    async def _watch(self) -> None:
+        while self.waiters:
+            async with self._lock:
+                with suppress(OSError):  # The next request raises it.
+                    await self._poll()
+            await asyncio.sleep(POLL_SECONDS)
+
+    async def _poll(self) -> None:
+        """Read the file if it has changed, and wake waiting requests."""
+        before = self._found
+        try:
+            self._stamp, self._found = await to_thread.run_sync(self._read)
+        except BrokenManifest as broken:
+            self._stamp, self._found = None, str(broken)
+        self._read_at = self._clock()
+        if self._found is not before and self._found != before:
+            changed, self._changed = self._changed, asyncio.Event()
+            changed.set()
+
+    def _read(self) -> tuple[FileStamp | None, Snapshot | str | None]:
+        opened = self._open_file()
+        if opened is None:
+            return None, None
+        with opened as file:
+            if file.stamp == self._stamp:
+                return self._stamp, self._found
+            if len(file) > MAX_MANIFEST_BYTES:
+                raise BrokenManifest(f"it has {len(file)} bytes, more than {MAX_MANIFEST_BYTES}")
+            content = file.read(0, len(file))
+        sure = time.time_ns() - file.stamp.modified_ns > TICK_NS
+        same = isinstance(self._found, Snapshot) and self._found.content == content
+        return file.stamp if sure else None, self._found if same else snapshot(content)
+
+
+def snapshot(content: bytes) -> Snapshot:
+    """The manifest in a file.
+
+    Raises:
+        BrokenManifest: it is none.
+    """
+    try:
+        values = json.loads(content)
+    except (ValueError, RecursionError):
+        raise BrokenManifest("it is no JSON") from None
+    if not isinstance(values, dict) or values.get("format") != FORMAT:
+        raise BrokenManifest(f"its format is not {FORMAT}")
+    sequence, live = values.get("sequence"), values.get("live")
+    if isinstance(sequence, bool) or not isinstance(sequence, int) or not 0 <= sequence <= MAX_SEQUENCE:
+        raise BrokenManifest(f"its sequence is not a number from 0 to {MAX_SEQUENCE}")
+    if not isinstance(live, bool):
+        raise BrokenManifest("it does not state whether the stream is live")
+    return Snapshot(content, sequence, live, values)
+
+
+class Manifests:
+    """The watchers of the streams of a server."""
+
+    def __init__(self) -> None:
+        self._watches: dict[str, ManifestWatch] = {}
+
+    def watch(self, stream: ServedStream) -> ManifestWatch:
+        """The only watcher of a stream of segments."""
+        if stream.name not in self._watches:
+            self._watches[stream.name] = ManifestWatch(lambda: stream.open(MANIFEST))
+        return self._watches[stream.name]
+
+    async def current(self, stream: ServedStream) -> Snapshot | None:
+        """The manifest of a stream of segments; None if there is none or it is broken."""
+        try:
+            return await self.watch(stream).current()
+        except BrokenManifest:
+            return None
+
+    @property
+    def waiters(self) -> dict[str, int]:
+        """Number of requests that wait for a newer manifest, by stream."""
+        return {name: watch.waiters for name, watch in self._watches.items()}

@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The player's module, the HTML pages that contain a player, and the page that lists streams.
+
+``player.js`` is one JavaScript module that ``scripts/build-player`` makes of ``viewer/packages``. It is part of the
+repository and the wheel, so that installing the package does not need Node; a test rebuilds and compares it.
+
+Note [Own origin only]
+~~~~~~~~~~~~~~~~~~~~~~
+Every page has a Content-Security-Policy that allows loading from its own origin only, the single page from nowhere. So
+neither the content of a stream nor the parameters of a link can make a browser contact a third party. Workers are blobs
+of the module itself; styles are inline, because they are in the element's shadow root.
+"""
+
+import base64
+import hashlib
+import html
+import re
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Final
+
+from structgstream.codec.container.byte_source import ByteSource
+from structgstream.errors import PlayerError
+
+MAX_PAGE_STREAM_BYTES: Final = 256 * 10**6
+"""Largest stream in a page: browsers cannot hold a string of twice this length."""
+
+_POLICY: Final = {
+    "default-src": "'none'",
+    "worker-src": "blob:",
+    "img-src": "'self' blob: data:",
+    "style-src": "'unsafe-inline'",
+    "base-uri": "'none'",
+    "form-action": "'none'",
+}
+_PLAYER_STYLE: Final = """<style>
+html,body{margin:0;height:100%;color-scheme:light dark}
+structgstream-player{width:100%;height:100%}
+</style>
+"""
+_LIST_STYLE: Final = """<style>
+:root{color-scheme:light dark;font:16px/1.5 system-ui,sans-serif}
+body{margin:0 auto;max-width:72rem;padding:1.5rem}
+h1{font-size:1.25rem;font-weight:600;margin:0 0 1rem}
+ul{list-style:none;margin:0;padding:0;display:grid;gap:1rem;grid-template-columns:repeat(auto-fill,minmax(15rem,1fr))}
+a{display:block;color:inherit;text-decoration:none;border:1px solid #8884;border-radius:.5rem;overflow:hidden}
+a:hover,a:focus-visible{border-color:currentColor}
+i{display:block;aspect-ratio:4/3;background:#8882 center/cover}
+p{margin:0;padding:.5rem .75rem;display:flex;justify-content:space-between;gap:1rem;overflow-wrap:anywhere}
+.live{color:#d22;font-weight:600}
+</style>
+"""
+REFRESH_SECONDS: Final = 60
+"""After which the list is loaded again, because streams begin and end."""
+_NO_SCRIPT: Final = "<noscript>This page plays a free-viewpoint video and needs JavaScript.</noscript>"
+
+
+def bundle_path() -> Path:
+    """The file ``player.js``.
+
+    Raises:
+        PlayerError: the installation lacks it.
+    """
+    path = Path(str(files("structgstream.serve") / "assets" / "player.js"))
+    if not path.is_file():
+        raise PlayerError(
+            "The player is missing from the installation; reinstall structgstream, or, in a clone, run "
+            "scripts/build-player."
+        )
+    return path
+
+
+def bundle() -> str:
+    """The module's source.
+
+    Raises:
+        PlayerError: the installation lacks it.
+    """
+    return bundle_path().read_text(encoding="utf-8")
+
+
+def policy(**sources: str) -> str:
+    """A Content-Security-Policy (Note [Own origin only]).
+
+    Args:
+        sources: further directives, with ``_`` for ``-``, as ``connect_src="'self'"``.
+    """
+    directives = _POLICY | {name.replace("_", "-"): value for name, value in sources.items()}
+    return "; ".join(f"{name} {value}" for name, value in directives.items())
+
+
+SERVED_POLICY: Final = {"script_src": "'self' blob:", "connect_src": "'self' blob:"}
+"""Further directives of pages that load the module and the stream from their origin."""
+
+
+def linked_page(
+    title: str, *, stream: str, module: str = "player.js", attributes: Mapping[str, str] | None = None
+) -> str:
+    """A page that loads the player and the stream, for a server.
+
+    Args:
+        title: of the window.
+        stream: address of the stream, relative to the page.
+        module: address of the player, relative to the page.
+        attributes: further ones of the element.
+    """
+    script = f'<script type="module" src="{html.escape(module)}"></script>'
+    body = f"{_element({'src': stream, **(attributes or {})})}\n{_NO_SCRIPT}"
+    return html_page(title, head=_PLAYER_STYLE + script, body=body, rules=policy(**SERVED_POLICY))
+
+
+def single_page(title: str, *, module: str, stream: ByteSource) -> bytes:
+    """A page that holds player and stream, and opens from a disk without a server.
+
+    Args:
+        title: of the window.
+        module: the player's source.
+        stream: the whole stream file.
+
+    Raises:
+        PlayerError: the stream is too long for a page.
+    """
+    if len(stream) > MAX_PAGE_STREAM_BYTES:
+        raise PlayerError(
+            f"The stream has {len(stream) / 1e6:.0f} MB, and a page holds up to {MAX_PAGE_STREAM_BYTES / 1e6:.0f}; "
+            "watch it with structgstream play, or put the folder that --format site writes on a web server."
+        )
+    inlined = inline_module(module)
+    digest = base64.b64encode(hashlib.sha256(inlined.encode()).digest()).decode()
+    rules = policy(script_src=f"'sha256-{digest}' blob:", connect_src="blob: data:")
+    data = '<script type="application/octet-stream;base64" id="stream">'
+    element = f'{_element({"src": "#stream"})}<script type="module">{inlined}</script>\n{_NO_SCRIPT}'
+    page = html_page(title, head=f"{_PLAYER_STYLE}{data}</script>", body=element, rules=rules)
+    before, after = page.split(data)
+    return b"".join((before.encode(), data.encode(), base64.b64encode(stream[:]), after.encode()))
+
+
+def inline_module(source: str) -> str:
+    """A module escaped for a ``script`` element, which ends at the first ``</script`` in any context.
+
+    In JavaScript these letters occur only in strings and regular expressions, where a backslash before the slash has no
+    effect.
+    """
+    # After <!-- a parser takes <script> and </script> for a nested pair. Our bundle never writes it.
+    assert "<!--" not in source, "an HTML comment cannot be inlined"
+    return re.sub(r"</(?=script)", r"<\\/", source, flags=re.IGNORECASE)
+
+
+def _element(attributes: Mapping[str, str]) -> str:
+    written = "".join(f' {name}="{html.escape(value)}"' for name, value in attributes.items())
+    return f"<structgstream-player{written} autoplay loop></structgstream-player>"
+
+
+def html_page(title: str, *, head: str, body: str, rules: str) -> str:
+    """A whole page.
+
+    Args:
+        title: of the window, as plain text.
+        head: further elements of the head, as HTML.
+        body: content, as HTML.
+        rules: its Content-Security-Policy.
+    """
+    return f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="{html.escape(rules, quote=False)}">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<link rel="icon" href="data:,">
+<title>{html.escape(title)}</title>
+{head}
+</head>
+<body>
+{body}
+</body>
+</html>
+"""
+
+
+def list_page(streams: Sequence[Mapping[str, Any]], *, query: str) -> str:
+    """The page of all streams.
+
+    Args:
+        streams: entries of ``streams.json``.
+        query: added to every address: empty, or ``?token=...``.
+    """
+    entries = "\n".join(_entry(stream, query) for stream in streams)
+    body = f"<h1>Streams</h1>\n<ul>\n{entries}\n</ul>" if streams else "<h1>Streams</h1>\n<p>There is none yet.</p>"
+    refresh = f'<meta http-equiv="refresh" content="{REFRESH_SECONDS}">\n'
+    return html_page("Streams", head=refresh + _LIST_STYLE, body=body, rules=policy())
+
+
+def _entry(stream: Mapping[str, Any], query: str) -> str:
+    page, preview = (html.escape(f"{stream[name]}{query}") for name in ("page", "preview"))
+    state = '<span class="live">live</span>' if stream["live"] else _duration(stream["seconds"])
+    # A background, because a missing picture would be shown as broken.
+    picture = f'<i style="background-image:url(&quot;{preview}&quot;)"></i>'
+    return f'<li><a href="{page}">{picture}<p><span>{html.escape(stream["name"])}</span>{state}</p></a></li>'
+
+
+def _duration(seconds: float | None) -> str:
+    if seconds is None:
+        return ""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"<span>{hours}:{minutes:02}:{rest:02}</span>" if hours else f"<span>{minutes}:{rest:02}</span>"

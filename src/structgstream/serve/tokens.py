@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Access tokens: ``v1.EXPIRES.SIGNATURE.STREAM``.
+
+Note [Tokens]
+~~~~~~~~~~~~~
+EXPIRES is in Unix seconds; STREAM is the name of a stream, or ``~`` for every stream and the metrics. SIGNATURE is the
+HMAC-SHA256 of both under the secret, in base64 without padding. Tokens are not stored: whoever has the secret can check
+one. A token cannot be withdrawn, so it should expire soon; all tokens of a secret end when the server is started
+without it. All characters may stand in a query and in a header without escapes.
+"""
+
+import base64
+import hashlib
+import hmac
+import re
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Final
+
+from structgstream.errors import ConfigError
+from structgstream.serve.files import is_stream_name
+
+EVERY_STREAM: Final = "~"
+MIN_SECRET_BYTES: Final = 32
+MAX_SECRET_FILE_BYTES: Final = 64 * 1024
+MAX_TOKEN_BYTES: Final = 256
+
+_TOKEN = re.compile(r"v1\.([0-9]{1,12})\.([A-Za-z0-9_-]{43})\.([A-Za-z0-9._~-]{1,128})", re.ASCII)
+_CONTEXT = b"structgstream access token v1\0"
+
+
+class Access(Enum):
+    """The result of checking a token for a stream."""
+
+    GRANTED = "granted"
+    MISSING = "no token"
+    FORGED = "not a token of this server"
+    EXPIRED = "expired"
+    OTHER_STREAM = "for another stream"
+
+
+@dataclass(frozen=True)
+class TokenKeys:
+    """Secrets: the first one signs, each is accepted, so that a secret can be replaced while its tokens are valid."""
+
+    secrets: tuple[bytes, ...]
+
+    def token(self, stream: str, *, expires_unix_seconds: int) -> str:
+        """A token for ``stream``, or for every stream with :data:`EVERY_STREAM`.
+
+        Raises:
+            ConfigError: no stream can have this name.
+        """
+        if stream != EVERY_STREAM and not is_stream_name(stream):
+            raise ConfigError(
+                f"{stream!r} is no name of a stream; expected letters, digits, dots, dashes and underscores."
+            )
+        return f"v1.{expires_unix_seconds}.{_signature(self.secrets[0], expires_unix_seconds, stream)}.{stream}"
+
+    def access(self, token: str | None, stream: str, *, unix_seconds: float) -> Access:
+        """Check ``token`` for a stream at a time; its other parts are read only if the signature is right."""
+        if not token:
+            return Access.MISSING
+        found = _TOKEN.fullmatch(token) if len(token) <= MAX_TOKEN_BYTES else None
+        if found is None:
+            return Access.FORGED
+        expires, signature, name = int(found[1]), found[2].encode(), found[3]
+        # Every secret is tried, so that the time does not depend on which one signed.
+        right = [hmac.compare_digest(signature, _signature(key, expires, name).encode()) for key in self.secrets]
+        if not any(right):
+            return Access.FORGED
+        if unix_seconds >= expires:
+            return Access.EXPIRED
+        return Access.GRANTED if name in (stream, EVERY_STREAM) else Access.OTHER_STREAM
+
+
+def _signature(secret: bytes, expires: int, stream: str) -> str:
+    digest = hmac.digest(secret, _CONTEXT + f"{expires}\0{stream}".encode("ascii"), hashlib.sha256)
+    return base64.urlsafe_b64encode(digest).rstrip(b"=").decode()
+
+
+def read_keys(path: Path) -> TokenKeys:
+    """The secrets of a file, one a line.
+
+    Raises:
+        ConfigError: the file cannot be read, has no secret, or one that can be guessed.
+    """
+    advice = f"make one with: (umask 077; openssl rand -hex 32 > {path})"
+    try:
+        with path.open("rb") as file:
+            content = file.read(MAX_SECRET_FILE_BYTES + 1)
+    except OSError as error:
+        raise ConfigError(f"The secret file {path} cannot be read ({error.strerror}); {advice}.") from None
+    if len(content) > MAX_SECRET_FILE_BYTES:
+        raise ConfigError(f"The secret file {path} has over {MAX_SECRET_FILE_BYTES} bytes; expected a secret a line.")
+    secrets = tuple(line.strip() for line in content.splitlines() if line.strip())
+    if not secrets:
+        raise ConfigError(f"The secret file {path} is empty; {advice}.")
+    short = min(map(len, secrets))
+    if short < MIN_SECRET_BYTES:
+        raise ConfigError(
+            f"A secret in {path} has {short} characters, and at least {MIN_SECRET_BYTES} are needed; {advice}."
+        )
+    return TokenKeys(secrets)

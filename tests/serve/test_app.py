@@ -1,0 +1,365 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The server of ``structgstream serve``, asked through a socket."""
+
+import hashlib
+import json
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from segment_folders import GrowingFolder
+from serving import Served, hosted
+from streams import small_stream
+from structgstream.codec.segments.manifest_json import manifest_from_json
+from structgstream.codec.segments.quality_list import ListedQuality, list_from_json, write_list
+from structgstream.serve.app import ServerSettings
+from structgstream.serve.pages import bundle
+
+STREAM = small_stream(7)
+PNG = b"\x89PNG\r\n\x1a\n not a whole picture"
+SOON_SECONDS = 0.3
+YEAR = "public, max-age=31536000, immutable"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A live stream with two segments and a part, and a file."""
+    growing = GrowingFolder(tmp_path / "studio", STREAM)
+    for _ in range(growing.frames):
+        growing.write()
+    (tmp_path / "ball.sgs").write_bytes(STREAM)
+    (tmp_path / "notes.txt").write_text("not for viewers")
+    return tmp_path
+
+
+@pytest.fixture
+def server(folder: Path) -> Iterator[Served]:
+    with hosted(ServerSettings(folder, wait_seconds=SOON_SECONDS)) as running:
+        yield running
+
+
+def test_the_list(server: Served) -> None:
+    values = json.loads(server.ask("/streams.json").body)["streams"]
+    assert [(one["name"], one["kind"], one["live"]) for one in values] == [
+        ("ball.sgs", "file", None),
+        ("studio", "segments", True),
+    ]
+    assert values[1] == {
+        "name": "studio", "kind": "segments", "live": True, "seconds": pytest.approx(6 / 30),
+        "page": "streams/studio/", "stream": "streams/studio/manifest.json", "preview": "streams/studio/preview",
+    }  # fmt: skip
+    for one in values:
+        assert server.ask(f"/{one['page']}").status == 200
+        assert server.ask(f"/{one['stream']}").status == 200
+    page = server.ask("/").body.decode()
+    for name in ("studio", "ball.sgs"):
+        assert f'href="streams/{name}/"' in page
+        assert f"url(&quot;streams/{name}/preview&quot;)" in page
+    assert "notes" not in page
+
+
+def test_a_stream_that_comes_later_is_found(server: Served, folder: Path) -> None:
+    assert server.ask("/streams/later.sgs/state").status == 404
+    (folder / "later.sgs").write_bytes(STREAM)
+    last = time.monotonic() + 20
+    while server.ask("/streams/later.sgs/state").status != 200:
+        assert time.monotonic() < last
+        time.sleep(0.1)
+
+
+def test_the_page_plays_what_is_beside_it(server: Served) -> None:
+    for name, source in (("studio", "manifest.json"), ("ball.sgs", "stream.sgs")):
+        page = server.ask(f"/streams/{name}/")
+        assert page.headers["content-type"] == "text/html; charset=utf-8"
+        assert f'src="{source}"' in page.body.decode()
+        assert 'src="../../player.js"' in page.body.decode()
+        assert "frame-ancestors 'self'" in page.headers["content-security-policy"]
+        moved = server.ask(f"/streams/{name}?t=3")
+        assert (moved.status, moved.headers["location"]) == (307, f"{name}/?t=3")
+    assert server.ask("/player.js").body.decode() == bundle()
+
+
+def test_a_player_gets_every_byte_of_the_stream(server: Served) -> None:
+    answer = server.ask("/streams/studio/manifest.json")
+    manifest = manifest_from_json(answer.body, name="it")
+    assert (len(manifest.segments), len(manifest.parts)) == (2, 1)
+    entries = [*manifest.periods, *manifest.segments, *manifest.parts]
+    content = b""
+    for entry in entries:
+        got = server.ask(f"/streams/studio/{entry.file}")
+        assert hashlib.sha256(got.body).hexdigest() == entry.sha256
+        assert got.headers["cache-control"] == YEAR
+        assert got.headers["content-type"] == "application/octet-stream"
+        content += got.body
+    assert STREAM.startswith(content)
+    assert len(STREAM) - len(content) < 500  # index and footer
+
+
+def test_an_immutable_file_has_ranges_and_a_validator(server: Served, folder: Path) -> None:
+    file = next((folder / "studio").glob("init-*"))
+    content, address = file.read_bytes(), f"/streams/studio/{file.name}"
+    etag = server.ask(address).headers["etag"]
+    assert etag == f'"{hashlib.sha256(content).hexdigest()[:16]}"'
+    part = server.ask(address, Range="bytes=10-19")
+    assert (part.status, part.body, part.headers["cache-control"]) == (206, content[10:20], YEAR)
+    assert server.ask(address, Range="bytes=10-19", If_Range=etag).body == content[10:20]
+    assert server.ask(address, Range="bytes=10-19", If_Range='"other"').body == content
+    assert server.ask(address, Range=f"bytes={len(content)}-").status == 416
+    for given in (etag, f"W/{etag}", f'"x", {etag}', "*"):
+        known = server.ask(address, If_None_Match=given)
+        assert (known.status, known.body, known.headers["etag"]) == (304, b"", etag)
+    told = server.ask(address, method="HEAD")
+    assert (told.status, told.body, told.headers["content-length"]) == (200, b"", str(len(content)))
+
+
+def test_the_manifest_has_a_validator(server: Served, folder: Path) -> None:
+    answer = server.ask("/streams/studio/manifest.json", Accept_Encoding="gzip")
+    assert answer.body == (folder / "studio" / "manifest.json").read_bytes()
+    assert not answer.headers["etag"].startswith("W/")
+    assert (answer.headers["cache-control"], answer.headers["content-type"]) == ("no-cache", "application/json")
+    for given, status in ((answer.headers["etag"], 304), (f"W/{answer.headers['etag']}", 304), ('"old"', 200)):
+        assert server.ask("/streams/studio/manifest.json", If_None_Match=given).status == status
+
+
+def test_waiting_ends_with_the_next_frame_for_everyone(tmp_path: Path) -> None:
+    growing = GrowingFolder(tmp_path / "studio", STREAM)
+    growing.write()
+    settings = ServerSettings(tmp_path, wait_seconds=30.0)
+    with hosted(settings) as server, ThreadPoolExecutor(12) as pool:
+        waiting = [pool.submit(server.ask, "/streams/studio/manifest.json?after=1") for _ in range(12)]
+        while waiters(server) < 12:
+            time.sleep(0.05)
+        assert not any(one.done() for one in waiting)
+        growing.write()
+        found = [manifest_from_json(one.result(20).body, name="it").sequence for one in waiting]
+        assert found == [2] * 12
+        # Who is behind does not wait, nor who asks a finished stream.
+        assert server.ask("/streams/studio/manifest.json?after=1").status == 200
+        growing.write_all()
+        last = manifest_from_json(server.ask("/streams/studio/manifest.json?after=99").body, name="it")
+    assert not last.live
+
+
+def waiters(server: Served) -> float:
+    lines = server.ask("/metrics").body.decode().splitlines()
+    return sum(float(line.split()[-1]) for line in lines if line.startswith("structgstream_waiters"))
+
+
+def test_waiting_ends_by_itself(server: Served) -> None:
+    address = "/streams/studio/manifest.json?after=7"
+    same = server.ask(address)
+    assert manifest_from_json(same.body, name="it").sequence == 7
+    assert server.ask(address, If_None_Match=same.headers["etag"]).status == 304
+
+
+def test_a_stream_that_begins_anew_ends_waiting(tmp_path: Path) -> None:
+    growing = GrowingFolder(tmp_path / "studio", STREAM)
+    for _ in range(3):
+        growing.write()
+    with hosted(ServerSettings(tmp_path)) as server, ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(server.ask, "/streams/studio/manifest.json?after=3")
+        while waiters(server) < 1:
+            time.sleep(0.05)
+        GrowingFolder(tmp_path / "studio", STREAM, name="another").write()
+        assert manifest_from_json(waiting.result(20).body, name="it").sequence == 1
+
+
+def test_who_goes_away_no_longer_waits(tmp_path: Path) -> None:
+    GrowingFolder(tmp_path / "studio", STREAM).write()
+    with hosted(ServerSettings(tmp_path)) as server:
+        with server.connected() as connection:
+            connection.sendall(b"GET /streams/studio/manifest.json?after=1 HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            while waiters(server) < 1:
+                time.sleep(0.05)
+        last = time.monotonic() + 20
+        while waiters(server):
+            assert time.monotonic() < last
+            time.sleep(0.05)
+
+
+def test_too_many_connections_are_told_to_come_back(tmp_path: Path) -> None:
+    GrowingFolder(tmp_path / "studio", STREAM).write()
+    with hosted(ServerSettings(tmp_path), connections=2) as server, server.connected() as connection:
+        connection.sendall(b"GET /streams/studio/manifest.json?after=1 HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        last = time.monotonic() + 20
+        while server.ask("/health").status != 503:
+            assert time.monotonic() < last
+            time.sleep(0.05)
+
+
+def test_a_head_does_not_wait(tmp_path: Path) -> None:
+    GrowingFolder(tmp_path / "studio", STREAM).write()
+    with hosted(ServerSettings(tmp_path, wait_seconds=1000.0)) as server:
+        assert server.ask("/streams/studio/manifest.json?after=9", method="HEAD").status == 200
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b'{"format": "other"}', b"[" * 100_000])
+def test_a_broken_manifest_is_told(folder: Path, content: bytes) -> None:
+    (folder / "studio" / "manifest.json").write_bytes(content)
+    with hosted(ServerSettings(folder)) as server:
+        answer = server.ask("/streams/studio/manifest.json")
+        assert (answer.status, answer.headers["cache-control"]) == (502, "no-store")
+        assert b"is no manifest" in answer.body
+        assert server.ask("/").status == 200
+        assert server.ask("/metrics").status == 200
+
+
+def test_a_growing_file_as_play_serves_it(server: Served, folder: Path) -> None:
+    address, path = "/streams/ball.sgs/stream.sgs", folder / "ball.sgs"
+    assert json.loads(server.ask("/streams/ball.sgs/state").body) == {"bytes": len(STREAM), "complete": True}
+    path.write_bytes(STREAM[:1000])
+    assert json.loads(server.ask("/streams/ball.sgs/state").body) == {"bytes": 1000, "complete": False}
+    assert server.ask(address, Range="bytes=1000-").status == 416
+    with path.open("ab") as growing:
+        growing.write(STREAM[1000:])
+    part = server.ask(address, Range="bytes=1000-")
+    assert (part.status, part.body, part.headers["cache-control"]) == (206, STREAM[1000:], "no-store")
+    assert "etag" not in part.headers
+    assert server.ask(address).body == STREAM
+    assert server.ask(address, Range="bytes=5-9", If_Range='"x"').body == STREAM
+    assert server.ask(address, method="HEAD").headers["content-length"] == str(len(STREAM))
+
+
+def test_only_what_a_stream_is_made_of_is_served(server: Served, folder: Path) -> None:
+    for name in ("secret.sgs", "part-00000001.sgs", ".new-manifest.json", "studio.metrics.json"):
+        (folder / "studio" / name).write_text("hidden")
+    for address in (
+        "/notes.txt",
+        "/streams/notes.txt/",
+        "/streams/notes.txt/stream.sgs",
+        "/streams/studio/secret.sgs",
+        "/streams/studio/part-00000001.sgs",
+        "/streams/studio/.new-manifest.json",
+        "/streams/studio/studio.metrics.json",
+        "/streams/studio/stream.sgs",
+        "/streams/ball.sgs/manifest.json",
+        "/streams/nobody/",
+        "/streams/",
+        "/streams/studio/x/y",
+    ):
+        answer = server.ask(address)
+        assert answer.status == 404, address
+        assert b"hidden" not in answer.body
+
+
+def test_a_folder_of_segments_is_one_stream(tmp_path: Path) -> None:
+    GrowingFolder(tmp_path / "studio", STREAM).write_all()
+    (tmp_path / "studio.metrics.json").write_text(json.dumps({"frames": 7}))
+    (tmp_path / "other.sgs").write_bytes(STREAM)
+    with hosted(ServerSettings(tmp_path / "studio")) as server:
+        values = json.loads(server.ask("/streams.json").body)["streams"]
+        assert [(one["name"], one["live"]) for one in values] == [("studio", False)]
+        assert server.ask("/streams/studio/manifest.json").status == 200
+        assert 'structgstream_run{name="frames",stream="studio"} 7.0' in server.ask("/metrics").body.decode()
+
+
+def test_metrics_and_health(server: Served, folder: Path) -> None:
+    run = {"frames": 7, "psnr": {"mean": 30.5}, "done": False, "cameras": ["a"], "name": "x"}
+    (folder / "studio.metrics.json").write_text(json.dumps(run))
+    (folder / "ball.metrics.json").write_text("{broken")
+    assert json.loads(server.ask("/health").body) == {"status": "ok"}
+    size = len(server.ask("/streams/studio/manifest.json").body)
+    server.ask("/streams/studio/manifest.json", method="HEAD")
+    server.ask("/nothing")
+    answer = server.ask("/metrics")
+    assert answer.headers["content-type"].startswith("text/plain; version=")
+    lines = answer.body.decode().splitlines()
+    for line in (
+        'structgstream_requests_total{kind="manifest",status="200",stream="studio"} 2.0',
+        'structgstream_requests_total{kind="other",status="404",stream=""} 1.0',
+        f'structgstream_sent_bytes_total{{stream="studio"}} {float(size)}',
+        'structgstream_live{stream="studio"} 1.0',
+        'structgstream_edge_frame{stream="studio"} 6.0',
+        'structgstream_manifest_sequence{stream="studio"} 7.0',
+        'structgstream_viewers{stream="studio"} 2.0',
+        'structgstream_run{name="frames",stream="studio"} 7.0',
+        'structgstream_run{name="psnr_mean",stream="studio"} 30.5',
+        'structgstream_run{name="done",stream="studio"} 0.0',
+        "structgstream_requests_in_progress 1.0",
+    ):
+        assert line in lines
+    assert not [line for line in lines if "nothing" in line]
+
+
+def test_a_preview_that_is_a_file_is_taken(server: Served, folder: Path) -> None:
+    (folder / "studio" / "preview.jpg").write_bytes(b"\xff\xd8\xff and so on")
+    (folder / "ball.preview.png").write_bytes(PNG)
+    jpeg = server.ask("/streams/studio/preview")
+    assert (jpeg.headers["content-type"], jpeg.body) == ("image/jpeg", b"\xff\xd8\xff and so on")
+    assert server.ask("/streams/ball.sgs/preview").body == PNG
+    assert server.ask("/streams/studio/preview", If_None_Match=jpeg.headers["etag"]).status == 304
+    (folder / "studio" / "preview.jpg").write_bytes(b"<svg onload=alert(1)>")
+    assert server.ask("/streams/studio/preview").status == 404
+    (folder / "studio" / "preview.jpg").unlink()
+    assert server.ask("/streams/studio/preview").status == 404
+    with (folder / "studio" / "preview.png").open("wb") as large:
+        large.write(PNG)
+        large.truncate(3 * 10**6)
+    assert server.ask("/streams/studio/preview").status == 404
+
+
+def test_several_qualities_of_one_stream(server: Served, folder: Path) -> None:
+    """As a run makes them, that comes while the server runs."""
+    listed = [ListedQuality(name, f"{name}/manifest.json", bits) for name, bits in (("high", 6e6), ("low", 1e6))]
+    (folder / "show").mkdir()
+    write_list(folder / "show", listed)
+    growing = {name: GrowingFolder(folder / "show" / name, STREAM) for name in ("low", "high")}
+    growing["low"].write()
+    assert server.ask("/streams/show/").status == 404, "high has no frame yet"
+    growing["high"].write()
+    last = time.monotonic() + 20
+    while server.ask("/streams/show/").status == 404:
+        assert time.monotonic() < last
+        time.sleep(0.05)  # A fast machine would ask too often.
+    assert 'src="qualities.json"' in server.ask("/streams/show/").body.decode()
+    told = server.ask("/streams/show/qualities.json")
+    assert list_from_json(told.body, name="it") == tuple(listed)
+    assert (told.headers["cache-control"], told.headers["content-type"]) == ("no-cache", "application/json")
+    assert server.ask("/streams/show/qualities.json", If_None_Match=told.headers["etag"]).status == 304
+    write_list(folder / "show", listed[::-1])
+    assert server.ask("/streams/show/qualities.json", If_None_Match=told.headers["etag"]).status == 200
+    for name in ("low", "high"):
+        manifest = manifest_from_json(server.ask(f"/streams/show/{name}/manifest.json").body, name="it")
+        part = server.ask(f"/streams/show/{name}/{manifest.parts[0].file}")
+        assert hashlib.sha256(part.body).hexdigest() == manifest.parts[0].sha256
+        assert part.headers["cache-control"] == YEAR
+    sequence = growing["low"].manifest.sequence if growing["low"].manifest else 0
+    asked = ThreadPoolExecutor(1).submit(server.ask, f"/streams/show/low/manifest.json?after={sequence}")
+    growing["low"].write()
+    assert manifest_from_json(asked.result().body, name="it").sequence == sequence + 1
+    for address in (
+        "show/manifest.json", "show/none/manifest.json", "show/low/qualities.json", "show/low/",
+        "studio/qualities.json", "studio/studio/manifest.json", "show/low/low/manifest.json",
+        "ball.sgs/low/manifest.json",
+    ):  # fmt: skip
+        assert server.ask(f"/streams/{address}").status == 404, address
+    numbers = server.ask("/metrics").body.decode()
+    assert 'structgstream_viewers{stream="show/low"}' in numbers
+    assert 'structgstream_requests_total{kind="qualities",status="200",stream="show"} 2.0' in numbers
+    (folder / "show" / "high" / "preview.png").write_bytes(PNG)
+    assert server.ask("/streams/show/preview").body == PNG
+
+
+@pytest.mark.parametrize("seconds", ["null", '"1"', "true", "NaN", "Infinity", "1e300", "[]"])
+def test_a_manifest_may_hold_anything(folder: Path, seconds: str) -> None:
+    """Values that are no numbers are left out."""
+    text = json.dumps({"format": "structgstream-segments", "sequence": 3, "live": False, "edge": {"pts_seconds": 7.5}})
+    (folder / "studio" / "manifest.json").write_text(text.replace("7.5", seconds))
+    with hosted(ServerSettings(folder)) as server:
+        (studio,) = (one for one in json.loads(server.ask("/streams.json").body)["streams"] if one["name"] == "studio")
+        assert (studio["live"], studio["seconds"]) == (False, None)
+        lines = server.ask("/metrics").body.decode().splitlines()
+        assert 'structgstream_manifest_sequence{stream="studio"} 3.0' in lines
+        assert not [line for line in lines if line.startswith("structgstream_edge_frame{")]
+
+
+def test_a_stream_that_has_been_removed(server: Served, folder: Path) -> None:
+    assert len(json.loads(server.ask("/streams.json").body)["streams"]) == 2
+    (folder / "ball.sgs").unlink()
+    (folder / "studio" / "manifest.json").unlink()
+    time.sleep(0.2)
+    assert server.ask("/streams/ball.sgs/stream.sgs").status == 404
+    assert server.ask("/streams/studio/manifest.json").status == 404

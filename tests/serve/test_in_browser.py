@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What this package makes of the player, in a real browser: the page, the served page, the site, the widget.
+
+The player itself is tested in ``viewer/packages``.
+"""
+
+import base64
+import getpass
+import os
+import shutil
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from chromium import Tab, opened_browser
+from pictures import decoded_picture
+from rigs import random_scene
+from serving import served
+from streams import compact_header, moved, write_stream
+from structgstream.codec.reader import open_stream
+from structgstream.codec.segments.store import FolderStore
+from structgstream.codec.sinks import FileSink
+from structgstream.codec.stored_segments import resume_segments
+from structgstream.data.clip import bundled_clip_path
+from structgstream.data.open import open_capture
+from structgstream.evaluation.evaluate import rendered
+from structgstream.kernels.backend import reference_backend
+from structgstream.notebook import Player
+from structgstream.serve.pages import bundle_path, linked_page
+from structgstream.serve.play import Truth
+from structgstream.serve.stream_file import StreamFile, write_page, write_site
+
+DOCS = Path(__file__).parents[2] / "docs"
+FRAMES = 6
+WIDTH, HEIGHT = 240, 160  # The cameras' own shape, larger.
+PLAYER = 'document.querySelector("structgstream-player")'
+SHOWN = f"{PLAYER}?.stats?.settled"
+
+
+@pytest.fixture(scope="module")
+def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Some hundred splats that move, a key packet at every third frame."""
+    path = tmp_path_factory.mktemp("stream") / "small.sgs"
+    scenes = [moved(random_scene(60, seed=4), step) for step in range(FRAMES)]
+    write_stream(FileSink(path), scenes, header=compact_header(scenes[0]))
+    return path
+
+
+@pytest.fixture
+def tab(tmp_path: Path) -> Iterator[Tab]:
+    with opened_browser(tmp_path) as opened:
+        yield opened
+
+
+def paused_at(tab: Tab, frame: int) -> None:
+    """Shows one frame and nothing but the picture."""
+    tab.wait_for(SHOWN)
+    tab.evaluate(f"{PLAYER}.pause(), {PLAYER}.setAttribute('controls', 'off'), {PLAYER}.seek({frame + 0.5} / 30), 1")
+    tab.wait_for(f"{SHOWN} && {PLAYER}.stats.frameIndex === {frame}")
+
+
+def decibels(picture: NDArray[np.uint8], stream: Path, frame: int) -> float:
+    """How near a picture is to what Python renders for the first training camera."""
+    reader = open_stream(stream)
+    camera = reader.header.camera(reader.header.rig.training[0])
+    wanted, _ = rendered(reader.scene(frame), camera.resized(WIDTH, HEIGHT), reference_backend())
+    assert picture.shape == wanted.shape
+    assert wanted.std() > 20  # something is there to be seen
+    return 10 * np.log10(255**2 / float(np.square(picture.astype(float) - wanted).mean()))
+
+
+def looked_through_first(tab: Tab) -> None:
+    """Looks through the first training camera, and waits for the picture."""
+    tab.evaluate(f"{PLAYER}.show({PLAYER}.cameras[1]), new Promise(requestAnimationFrame)")
+    tab.wait_for(SHOWN)
+
+
+def canvas_of(tab: Tab) -> NDArray[np.uint8]:
+    """The picture alone, without what the player says above it."""
+    png = tab.evaluate(
+        f"""{PLAYER}.screenshot().then((blob) => new Promise((resolve) => {{
+          const reader = new FileReader();
+          reader.onload = () => resolve(reader.result);
+          reader.readAsDataURL(blob);
+        }}))"""
+    )
+    return decoded_picture(base64.b64decode(png.split(",")[1]))
+
+
+def test_a_page_opens_from_the_disk(tab: Tab, stream: Path, tmp_path: Path) -> None:
+    page = tmp_path / "page #1.html"
+    write_page(page, StreamFile(stream))
+    tab.open(page.as_uri(), width=WIDTH, height=HEIGHT)
+    paused_at(tab, 4)
+    looked_through_first(tab)
+    assert decibels(tab.screenshot(), stream, 4) > 40
+    assert tab.evaluate(f"{PLAYER}.duration") == pytest.approx(FRAMES / 30)
+    assert not tab.complaints
+    assert {address.split(":")[0] for address in tab.requests} <= {"file", "blob", "data"}
+
+
+def test_the_server_plays_and_compares_and_follows(tab: Tab, stream: Path, tmp_path: Path) -> None:
+    whole = stream.read_bytes()
+    packets = open_stream(stream).packets
+    growing = tmp_path / "growing.sgs"
+    growing.write_bytes(whole[: packets[2].offset])
+    source = open_capture(bundled_clip_path(), frames=2)
+    with served(StreamFile(growing), truth=Truth(source, ("cam01", "cam02"))) as server:
+        tab.open(server.address, width=WIDTH, height=HEIGHT)
+        tab.wait_for(f"{SHOWN} && {PLAYER}.stats.frameIndex === 1")
+        growing.write_bytes(whole)
+        tab.wait_for(f"{PLAYER}.stats.frameIndex > 1")
+        paused_at(tab, 5)
+        looked_through_first(tab)
+        assert decibels(canvas_of(tab), stream, 5) > 40
+        assert not tab.complaints
+        assert all(address.startswith((server.address, "blob:", "data:")) for address in tab.requests)
+        assert f"{server.address}truth.json" in tab.requests
+
+
+def test_a_site_plays_from_a_server_that_knows_nothing(tab: Tab, stream: Path, tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    write_site(site, StreamFile(stream))
+    handler = partial(Quiet, directory=str(site))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        tab.open(f"http://127.0.0.1:{server.server_address[1]}/", width=WIDTH, height=HEIGHT)
+        paused_at(tab, 3)
+        looked_through_first(tab)
+        assert decibels(canvas_of(tab), stream, 3) > 40
+        server.shutdown()
+    assert not tab.complaints
+
+
+@contextmanager
+def python_host(root: Path) -> Iterator[str]:
+    """The standard library's server of files."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(root))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_address[1]}/"
+        server.shutdown()
+
+
+@contextmanager
+def nginx_host(root: Path) -> Iterator[str]:
+    """nginx with the configuration of docs/segments.md."""
+    program = shutil.which("nginx")
+    if program is None:
+        pytest.skip("there is no nginx on this machine")
+    work = root.parent / "nginx"
+    work.mkdir()
+    documented = (DOCS / "segments.md").read_text().split("```nginx\n")[1].split("```")[0]
+    site = documented.replace("root /srv;", f"root {root};")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    user = f"user {getpass.getuser()};" if os.geteuid() == 0 else ""
+    places = "".join(
+        f"{kind}_temp_path {work}/{kind};" for kind in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
+    )
+    page = f"location / {{ root {root}; types {{ text/html html; text/javascript js; }} }}"
+    (work / "nginx.conf").write_text(
+        f"{user} daemon off; pid {work}/pid; events {{}} http {{ access_log off; {places} "
+        f"server {{ listen 127.0.0.1:{port}; {page}\n{site} }} }}"
+    )
+    running = subprocess.Popen([program, "-c", str(work / "nginx.conf"), "-e", str(work / "errors")])
+    try:
+        while running.poll() is None:
+            with suppress(OSError):
+                socket.create_connection(("127.0.0.1", port), 1).close()
+                break
+            time.sleep(0.05)
+        yield f"http://127.0.0.1:{port}/"
+    finally:
+        running.terminate()
+        running.wait(20)
+
+
+@pytest.mark.parametrize("host", [python_host, nginx_host])
+def test_segments_play_from_a_host_of_files_while_they_are_written(
+    tab: Tab, stream: Path, tmp_path: Path, host: Callable[[Path], AbstractContextManager[str]]
+) -> None:
+    root, reader = tmp_path / "root", open_stream(stream)
+    store = FolderStore(root / "streams" / "live")
+    store.prepare()
+    sink, _ = resume_segments(store)
+    sink.open(reader.header)
+    packets = [[*reader.group(index)][-1] for index in range(FRAMES)]
+    for packet in packets[:2]:
+        sink.write(packet)
+    page = linked_page("live", stream="streams/live/manifest.json", attributes={"autoplay": ""})
+    (root / "index.html").write_text(page)
+    (root / "player.js").write_bytes(bundle_path().read_bytes())
+    with host(root) as address:
+        tab.open(f"{address}index.html", width=WIDTH, height=HEIGHT)
+        tab.wait_for(f"{SHOWN} && {PLAYER}.stats.frameIndex === 1 && {PLAYER}.live")
+        for packet in packets[2:4]:  # the first of them is a key, so that a segment is closed
+            sink.write(packet)
+            tab.wait_for(f"{SHOWN} && {PLAYER}.stats.frameIndex === {packet.index}")
+        sink.close()
+        tab.wait_for(f"{PLAYER}.live === false")
+        again, _ = resume_segments(store)
+        again.open(reader.header)
+        for packet in packets[4:]:
+            again.write(packet)
+        tab.wait_for(f"{SHOWN} && {PLAYER}.live && {PLAYER}.stats.frameIndex === {FRAMES - 1}")
+        again.close()
+        looked_through_first(tab)
+        assert decibels(canvas_of(tab), stream, FRAMES - 1) > 40
+    assert not tab.complaints
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    """A server of files, without ranges, that writes no log."""
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Says nothing."""
+
+
+def test_the_widget_shows_a_stream_and_another_and_goes(tab: Tab, stream: Path, tmp_path: Path) -> None:
+    widget = Player(stream, height_pixels=HEIGHT)
+    module = base64.b64encode(str(widget.get_state()["_esm"]).encode()).decode()
+    data = base64.b64encode(widget.stream).decode()
+    (tmp_path / "empty.html").write_text('<!doctype html><link rel="icon" href="data:,"><style>body{margin:0}</style>')
+    tab.open((tmp_path / "empty.html").as_uri(), width=WIDTH, height=HEIGHT)
+    tab.evaluate(
+        f"""(async () => {{
+          const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+          const url = URL.createObjectURL(new Blob([bytes("{module}")], {{ type: "text/javascript" }}));
+          const listeners = globalThis.listeners = new Map();
+          const stream = new DataView(bytes("{data}").buffer);
+          const values = globalThis.values = {{ stream, height_pixels: {HEIGHT} }};
+          const model = {{
+            get: (name) => values[name],
+            on: (name, listener) => listeners.set(name, listener),
+            off: (name, listener) => listeners.get(name) === listener && listeners.delete(name),
+          }};
+          const el = document.createElement("div");
+          const again = document.createElement("div");
+          const widget = (await import(url)).default;
+          globalThis.end = await widget.render({{ model, el }});
+          await (await import(url + "#again")).default.render({{ model: {{ ...model, on() {{}} }}, el: again }});
+          await new Promise((resolve) => setTimeout(resolve, 100));
+          document.body.append(el); // a notebook may put it into the page later
+        }})()"""
+    )
+    paused_at(tab, 2)
+    looked_through_first(tab)
+    assert decibels(canvas_of(tab), stream, 2) > 40
+    tab.evaluate(f"{PLAYER}.seek(0), listeners.get('change:stream')(), 1")
+    tab.wait_for(f"{SHOWN} && {PLAYER}.stats.frameIndex === 0")
+    tab.evaluate("values.height_pixels = 100, listeners.get('change:height_pixels')(), 1")
+    assert tab.evaluate(f"{PLAYER}.getBoundingClientRect().height") == 100
+    assert tab.evaluate(f"end(), {PLAYER} === null && listeners.size === 0")
+    assert not tab.complaints

@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The player's module, the pages that contain it and their policy, and the list of streams."""
+
+import base64
+import gzip
+import hashlib
+import html
+import re
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from streams import small_stream
+from structgstream.errors import PlayerError
+from structgstream.serve import pages
+from structgstream.serve.pages import (
+    REFRESH_SECONDS,
+    bundle,
+    bundle_path,
+    inline_module,
+    linked_page,
+    list_page,
+    single_page,
+)
+
+STREAM = small_stream()
+PLAYING = {"autoplay": None, "loop": None}
+
+
+class Elements(HTMLParser):
+    """Tags with their attributes, and the content of scripts as a browser takes it."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: list[tuple[str, str]] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        if self.tags:
+            self.texts.append((self.tags[-1][0], data))
+
+    def of(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+    def text(self, tag: str) -> str:
+        return "".join(text for name, text in self.texts if name == tag)
+
+    def policy(self) -> dict[str, str]:
+        (rules,) = (m["content"] for m in self.of("meta") if m.get("http-equiv") == "Content-Security-Policy")
+        assert rules is not None
+        return dict(rule.split(" ", 1) for rule in rules.split("; "))
+
+
+def scripts(text: str) -> list[tuple[str, str]]:
+    """Attributes and content of every script element, by the rule that its first end tag ends it."""
+    return re.findall(r"<script([^>]*)>(.*?)</script", text, re.DOTALL | re.IGNORECASE)
+
+
+def test_a_page_holds_player_and_stream() -> None:
+    module = 'export const end = "</script>"; /* </SCRIPT */'
+    text = single_page("a clip", module=module, stream=STREAM).decode()
+    (data, stored), (kind, inlined) = scripts(text)
+    assert 'id="stream"' in data
+    assert "application/octet-stream;base64" in data
+    assert base64.b64decode(stored, validate=True) == STREAM
+    assert kind == ' type="module"'
+    assert inlined == 'export const end = "<\\/script>"; /* <\\/SCRIPT */'
+    assert Elements(text).of("structgstream-player") == [{"src": "#stream", **PLAYING}]
+
+
+def test_nothing_in_a_page_runs_but_the_player_and_nothing_is_fetched() -> None:
+    text = single_page("a clip", module=bundle(), stream=STREAM).decode()
+    rules = Elements(text).policy()
+    inlined = scripts(text)[1][1]
+    digest = base64.b64encode(hashlib.sha256(inlined.encode()).digest()).decode()
+    assert rules["script-src"].split() == [f"'sha256-{digest}'", "blob:"]
+    assert rules["default-src"] == "'none'"
+    assert rules["worker-src"] == "blob:"
+    assert set(rules["connect-src"].split()) == {"blob:", "data:"}
+    assert rules["base-uri"] == rules["form-action"] == "'none'"
+    allowed = {"'none'", "'self'", "'unsafe-inline'", "blob:", "data:", f"'sha256-{digest}'"}
+    assert {source for sources in rules.values() for source in sources.split()} <= allowed
+
+
+def test_a_page_for_a_server_loads_from_its_own_origin_only() -> None:
+    found = Elements(linked_page("a clip", stream="stream.sgs"))
+    assert [script["src"] for script in found.of("script")] == ["player.js"]
+    assert found.of("structgstream-player") == [{"src": "stream.sgs", **PLAYING}]
+    rules = found.policy()
+    assert rules["connect-src"] == "'self' blob:"
+    assert rules["script-src"] == "'self' blob:"
+    addresses = [value for _, attributes in found.tags for name, value in attributes.items() if name in ("src", "href")]
+    assert set(addresses) == {"player.js", "stream.sgs", "data:,"}
+
+
+HOSTILE = ["</title><script>alert(1)</script>", '"><img src=x onerror=alert(1)>', "<!--", "{{7*7}}", "a & b"]
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_names_stay_text(text: str) -> None:
+    plain = linked_page("a", stream="b", attributes={"truth": "c"})
+    found = Elements(linked_page(text, stream=text, attributes={"truth": text}))
+    assert [tag for tag, _ in found.tags] == [tag for tag, _ in Elements(plain).tags]
+    assert found.text("title").strip() == text
+    assert found.of("structgstream-player") == [{"src": text, "truth": text, **PLAYING}]
+    assert html.escape(text) in single_page(text, module="", stream=STREAM).decode()
+
+
+def test_a_module_that_ends_its_element_is_escaped_and_a_comment_refused() -> None:
+    assert inline_module("a</script b</Script>c</ script") == "a<\\/script b<\\/Script>c</ script"
+    with pytest.raises(AssertionError, match="comment"):
+        inline_module("x = '<!-- <script>'")
+
+
+def test_the_bundle_can_be_inlined() -> None:
+    assert "</script" not in inline_module(bundle()).lower()
+
+
+def test_a_stream_that_is_too_long_for_a_page_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pages, "MAX_PAGE_STREAM_BYTES", len(STREAM) - 1)
+    with pytest.raises(PlayerError, match="structgstream play"):
+        single_page("a clip", module="", stream=STREAM)
+
+
+ROOT = Path(__file__).parents[2]
+NO_NODE = 3
+MAX_COMPRESSED_BYTES = 72_000
+
+
+def test_it_is_what_its_sources_give() -> None:
+    """Builds it again, where there is Node, and compares the bytes."""
+    result = subprocess.run([ROOT / "scripts" / "build-player", "--check"], capture_output=True, text=True, check=False)
+    if result.returncode == NO_NODE:
+        pytest.skip(f"the player cannot be built here: {result.stdout.strip()}")
+    assert result.returncode == 0, result.stdout + result.stderr
+    packaged = ROOT / "src" / "structgstream" / "serve" / "assets" / "player.js"
+    assert bundle_path().read_bytes() == packaged.read_bytes()
+
+
+def test_it_is_small() -> None:
+    assert len(gzip.compress(bundle().encode(), 9)) <= MAX_COMPRESSED_BYTES
+
+
+def test_it_states_its_licence_and_asks_nobody_for_anything() -> None:
+    source = bundle()
+    assert source.startswith("// SPDX-License-Identifier: Apache-2.0")
+    addresses = {word for word in source.replace('"', " ").replace("`", " ").replace("'", " ").split() if "://" in word}
+    assert all("www.w3.org" in address for address in addresses), addresses  # names of XML, never fetched
+
+
+def test_an_installation_without_it_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pages, "files", lambda _: tmp_path)
+    with pytest.raises(PlayerError, match="reinstall structgstream"):
+        bundle()
+
+
+class Seen(HTMLParser):
+    """Elements with their attributes, and the texts of a page's body."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: list[str] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_data(self, data: str) -> None:
+        if data.strip():
+            self.texts.append(data.strip())
+
+    def all(self, tag: str, attribute: str) -> list[str]:
+        return [found for name, given in self.elements if name == tag and (found := given.get(attribute))]
+
+
+def listed(name: str, live: bool | None, seconds: float | None) -> dict[str, object]:
+    """An entry of streams.json, as far as the page needs it."""
+    base = f"streams/{name}/"
+    return {"name": name, "live": live, "seconds": seconds, "page": base, "preview": f"{base}preview"}
+
+
+STREAMS = [
+    listed("studio", True, 12.0),
+    listed("ball.sgs", None, None),
+    listed("done", False, 3725.4),
+    listed("short", False, 59.6),
+]
+
+
+def test_every_address_carries_the_query() -> None:
+    seen = Seen(list_page(STREAMS, query="?token=v1.2.x"))
+    assert seen.all("a", "href") == [f"streams/{one['name']}/?token=v1.2.x" for one in STREAMS]
+    pictures = [re.fullmatch(r'background-image:url\("(.*)"\)', style) for style in seen.all("i", "style")]
+    assert [found and found[1] for found in pictures] == [f"streams/{s['name']}/preview?token=v1.2.x" for s in STREAMS]
+
+
+def test_live_streams_and_lengths_of_others() -> None:
+    texts = Seen(list_page(STREAMS, query="")).texts
+    shown = texts[texts.index("studio") :]
+    assert shown == ["studio", "live", "ball.sgs", "done", "1:02:05", "short", "1:00"]
+
+
+def test_a_list_without_streams_says_so_and_looks_again() -> None:
+    page = list_page([], query="")
+    assert "There is none yet." in Seen(page).texts
+    assert "<ul>" not in page
+    assert f'<meta http-equiv="refresh" content="{REFRESH_SECONDS}">' in page
+    assert "There is none yet." not in list_page(STREAMS, query="")
+
+
+@pytest.mark.parametrize("hostile", ['"><script>alert(1)</script>', "a&b<i>", "'x'"])
+def test_names_and_queries_are_texts(hostile: str) -> None:
+    """Names are checked before; the page does not rely on it."""
+    seen = Seen(list_page([listed(hostile, None, None)], query=f"?token={hostile}"))
+    assert hostile in seen.texts
+    assert seen.all("a", "href") == [f"streams/{hostile}/?token={hostile}"]
+    assert not any(tag == "script" for tag, _ in seen.elements)

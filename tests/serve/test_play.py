@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The server of ``structgstream play``, asked through a socket."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pictures import decoded_picture
+from serving import Served, served
+from streams import small_stream
+from structgstream.data.clip import bundled_clip_path
+from structgstream.data.open import open_capture
+from structgstream.serve.pages import bundle
+from structgstream.serve.play import Truth
+from structgstream.serve.stream_file import StreamFile
+
+STREAM = small_stream(6)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> StreamFile:
+    path = tmp_path / "name <&>.sgs"
+    path.write_bytes(STREAM)
+    return StreamFile(path)
+
+
+@pytest.fixture
+def server(file: StreamFile) -> Iterator[Served]:
+    with served(file) as running:
+        yield running
+
+
+def test_the_page_the_player_and_the_state(server: Served) -> None:
+    page = server.ask("/")
+    assert page.status == 200
+    assert page.headers["content-type"] == "text/html; charset=utf-8"
+    assert "<title>name &lt;&amp;&gt;.sgs</title>" in page.body.decode()
+    assert 'src="stream"' in page.body.decode()
+    assert "truth" not in page.body.decode()
+    module = server.ask("/player.js")
+    assert module.headers["content-type"].startswith("text/javascript")
+    assert module.body.decode() == bundle()
+    assert json.loads(server.ask("/state").body) == {"bytes": len(STREAM), "complete": True}
+    assert json.loads(server.ask("/truth.json").body) == []
+    assert server.ask("/truth/cam00/0.jpg").status == 404
+
+
+def test_ranges_and_what_is_beyond_the_end(server: Served) -> None:
+    whole = server.ask("/stream")
+    assert (whole.status, whole.body) == (200, STREAM)
+    assert whole.headers["accept-ranges"] == "bytes"
+    part = server.ask("/stream", Range="bytes=100-299")
+    assert (part.status, part.body) == (206, STREAM[100:300])
+    assert part.headers["content-range"] == f"bytes 100-299/{len(STREAM)}"
+    assert part.headers["content-length"] == "200"
+    assert server.ask("/stream", Range="bytes=-24").body == STREAM[-24:]
+    over = server.ask("/stream", Range=f"bytes={len(STREAM) - 3}-{len(STREAM) + 99}")
+    assert (over.status, over.body) == (206, STREAM[-3:])
+    beyond = server.ask("/stream", Range=f"bytes={len(STREAM)}-")
+    assert (beyond.status, beyond.body) == (416, b"")
+    assert beyond.headers["content-range"] == f"bytes */{len(STREAM)}"
+    assert server.ask("/stream", Range="bytes=0-1,4-5").status == 200
+
+
+def test_a_growing_file_is_asked_for_again_and_again(server: Served, file: StreamFile) -> None:
+    file.path.write_bytes(STREAM[:1000])
+    seen, frames = b"", [1500, 1501, 2600, len(STREAM)]
+    for size in frames:
+        answer = server.ask("/stream", Range=f"bytes={len(seen)}-")
+        assert answer.status == 206
+        seen += answer.body
+        assert server.ask("/stream", Range=f"bytes={len(seen)}-").status == 416
+        assert json.loads(server.ask("/state").body) == {"bytes": len(seen), "complete": False}
+        with file.path.open("ab") as growing:
+            growing.write(STREAM[len(seen) : size])
+    assert seen + server.ask("/stream", Range=f"bytes={len(seen)}-").body == STREAM
+    assert json.loads(server.ask("/state").body) == {"bytes": len(STREAM), "complete": True}
+
+
+def test_nothing_of_a_growing_file_is_cached_and_no_validator_restarts_a_download(server: Served) -> None:
+    for path in ("/", "/player.js", "/state", "/stream", "/truth.json"):
+        headers = server.ask(path).headers
+        assert headers["cache-control"] == "no-store"
+        assert not {"etag", "last-modified"} & headers.keys()
+    # Without a validator of ours nobody can know which version a part belongs to, so all of it is sent.
+    assert server.ask("/stream", Range="bytes=5-9", If_Range='"x"').body == STREAM
+
+
+def test_head_tells_and_sends_nothing(server: Served) -> None:
+    for headers, length in (({}, len(STREAM)), ({"Range": "bytes=1-10"}, 10)):
+        answer = server.ask("/stream", method="HEAD", **headers)
+        assert answer.body == b""
+        assert answer.headers["content-length"] == str(length)
+    assert server.ask("/stream", method="HEAD", Range="bytes=99999999-").status == 416
+    assert server.ask("/stream", method="POST").status == 405
+
+
+def test_a_file_that_goes_away_and_comes_back(server: Served, file: StreamFile) -> None:
+    file.path.unlink()
+    for path in ("/stream", "/state"):
+        gone = server.ask(path)
+        assert gone.status == 404
+        assert b"No such file or directory" in gone.body
+    file.path.write_bytes(STREAM[:2000])
+    assert server.ask("/stream").body == STREAM[:2000]
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", "localhost.evil", "", "["]
+)
+def test_another_name_for_this_machine_is_refused(server: Served, host: str) -> None:
+    for path in ("/", "/stream", "/player.js", "/truth/cam00/0.jpg"):
+        answer = server.ask(path, Host=host)
+        assert answer.status == 400
+        assert STREAM[:8] not in answer.body
+
+
+def test_names_of_this_machine_are_welcome(server: Served) -> None:
+    for host in ("localhost", f"localhost:{server.port}", "127.0.0.1", "LOCALHOST:8000"):
+        assert server.ask("/state", Host=host).status == 200
+
+
+def test_other_origins_may_not_read_and_the_page_loads_from_its_own_only(server: Served) -> None:
+    for path in ("/", "/stream", "/player.js", "/state", "/nothing"):
+        headers = server.ask(path, Origin="https://evil.example").headers
+        assert "access-control-allow-origin" not in headers
+    assert server.ask("/stream").headers["cross-origin-resource-policy"] == "same-origin"
+    rules = dict(rule.split(" ", 1) for rule in server.ask("/").headers["content-security-policy"].split("; "))
+    assert rules["default-src"] == "'none'"
+    assert rules["connect-src"] == "'self' blob:"
+    assert rules["frame-ancestors"] == "'self'"
+    assert "http" not in " ".join(rules.values())
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/../../etc/passwd",
+        "/stream/../../../etc/passwd",
+        "/%2e%2e/%2e%2e/etc/passwd",
+        "/player.js/../server.py",
+        "/assets/player.js",
+        "/truth/../../../../etc/passwd",
+        "/truth/..%2f..%2f..%2fetc%2fpasswd/0.jpg",
+        "/truth/cam00/../../../etc/passwd.jpg",
+        "//etc/passwd",
+    ],
+)
+def test_addresses_name_no_files(tmp_path: Path, path: str) -> None:
+    file = tmp_path / "s.sgs"
+    file.write_bytes(STREAM)
+    source = open_capture(bundled_clip_path(), scale=0.25, frames=1)
+    with served(StreamFile(file), truth=Truth(source, ("cam00",))) as server:
+        answer = server.ask(path)
+    assert answer.status == 404
+    assert b"root:" not in answer.body
+
+
+def test_pictures_of_the_capture(tmp_path: Path) -> None:
+    file = tmp_path / "s.sgs"
+    file.write_bytes(STREAM)
+    source = open_capture(bundled_clip_path(), frames=3)
+    names = tuple(source.rig)
+    with served(StreamFile(file), truth=Truth(source, names)) as server:
+        assert 'truth="truth.json"' in server.ask("/").body.decode()
+        assert json.loads(server.ask("/truth.json").body) == list(names)
+        answer = server.ask(f"/truth/{names[3]}/2.jpg")
+        for missing in (f"{names[3]}/3", f"{names[3]}/-1", "nobody/0", f"{names[3]}/x", f"{names[3]}/1e0"):
+            assert server.ask(f"/truth/{missing}.jpg").status == 404
+    assert (answer.status, answer.headers["content-type"]) == (200, "image/jpeg")
+    picture = decoded_picture(answer.body)
+    taken = list(source.frames())[2].images[names[3]]
+    assert picture.shape == taken.shape
+    assert np.abs(picture.astype(int) - taken).mean() < 3

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A file that grows, and pages written from it."""
+
+from pathlib import Path
+
+import pytest
+
+from streams import small_stream
+from structgstream.codec.container.records import FOOTER, FOOTER_MAGIC
+from structgstream.codec.reader import StreamReader, open_stream
+from structgstream.errors import StorageError, StreamError
+from structgstream.serve.pages import bundle, single_page
+from structgstream.serve.stream_file import StreamFile, check_has_header, write_page, write_site
+
+STREAM = small_stream()
+HEADER_BYTES = StreamReader(STREAM).header_bytes
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> StreamFile:
+    return StreamFile(tmp_path / "s.sgs")
+
+
+def test_it_begins_with_its_header_and_is_complete_with_its_footer(file: StreamFile) -> None:
+    assert not file.has_header()
+    for length in (0, 5, 12, 13, HEADER_BYTES - 1, HEADER_BYTES, HEADER_BYTES + 3, len(STREAM) - 1, len(STREAM)):
+        file.path.write_bytes(STREAM[:length])
+        assert file.has_header() == (length >= HEADER_BYTES)
+        assert file.state() == (length, length == len(STREAM))
+
+
+@pytest.mark.parametrize(
+    "end",
+    [
+        FOOTER.pack(0, FOOTER_MAGIC),
+        FOOTER.pack(2**63, FOOTER_MAGIC),
+        FOOTER.pack(len(STREAM) - 1, FOOTER_MAGIC),
+        FOOTER.pack(HEADER_BYTES, FOOTER_MAGIC),
+        FOOTER.pack(len(STREAM) - 40, b"SGSINDEY"),
+    ],
+)
+def test_a_footer_that_points_to_no_index_is_none(file: StreamFile, end: bytes) -> None:
+    file.path.write_bytes(STREAM[: -FOOTER.size] + end)
+    assert not file.state()[1]
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"", "is empty; expected a stream made by structgstream reconstruct"),
+        (b"hello, this is no stream", "is not a structgstream file"),
+        (STREAM[:10], "cut at byte 10"),
+        (STREAM[: HEADER_BYTES - 1], f"cut at byte {HEADER_BYTES - 1}, within the record that begins at byte 12"),
+        (STREAM[:8] + b"\x09\x00" + STREAM[10:], "version 9.0"),
+    ],
+)
+def test_what_cannot_be_shown_is_told(file: StreamFile, data: bytes, words: str) -> None:
+    file.path.write_bytes(data)
+    with pytest.raises(StreamError, match=words):
+        file.check()
+    with pytest.raises(StreamError, match=words):
+        check_has_header(data, "memory")
+
+
+def test_a_missing_file_is_told(file: StreamFile) -> None:
+    with pytest.raises(StreamError, match=r"No such file or directory"):
+        file.check()
+
+
+@pytest.fixture
+def stream(tmp_path: Path) -> StreamFile:
+    path = tmp_path / "clip.sgs"
+    path.write_bytes(STREAM)
+    return StreamFile(path)
+
+
+def test_a_page(stream: StreamFile, tmp_path: Path) -> None:
+    path = tmp_path / "new" / "clip.html"
+    assert write_page(path, stream) == path.stat().st_size
+    assert path.read_bytes() == single_page("clip", module=bundle(), stream=STREAM)
+
+
+def test_a_site(stream: StreamFile, tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    size_bytes = write_site(site, stream)
+    assert sorted(entry.name for entry in site.iterdir()) == ["index.html", "player.js", "stream.sgs"]
+    assert size_bytes == sum(entry.stat().st_size for entry in site.iterdir())
+    assert (site / "player.js").read_text() == bundle()
+    assert 'src="stream.sgs"' in (site / "index.html").read_text()
+    with open_stream(site / "stream.sgs") as reader:
+        assert reader.complete
+
+
+def test_a_site_never_replaces_its_own_stream(tmp_path: Path) -> None:
+    path = tmp_path / "stream.sgs"
+    path.write_bytes(STREAM)
+    with pytest.raises(StorageError, match="is the stream itself"):
+        write_site(tmp_path, StreamFile(path))
+    assert path.read_bytes() == STREAM
+
+
+def test_what_cannot_be_shown_is_not_written(stream: StreamFile, tmp_path: Path) -> None:
+    stream.path.write_bytes(STREAM[:100])
+    for writing in (write_page, write_site):
+        with pytest.raises(StreamError, match="cut at byte 100"):
+            writing(tmp_path / "out", stream)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["clip.sgs"]
