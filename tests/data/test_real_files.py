@@ -22,7 +22,7 @@ from structgstream.data.timeline import picture_slots
 from structgstream.data.transfer import HLG, PQ, high_range_to_srgb
 from structgstream.data.video import synchronised
 from structgstream.data.video_index import scan_videos
-from structgstream.errors import CalibrationError, CaptureError, StructGStreamError
+from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.footage import find_footage
 
 RIG = small_rig(3)
@@ -265,27 +265,3 @@ def test_a_picture_beside_the_folder_of_videos_is_no_camera(tmp_path: Path, capl
     with caplog.at_level(logging.WARNING):
         assert find_footage(tmp_path).cameras == tuple(RIG)
     assert "left out" in caplog.text
-
-
-@pytest.mark.parametrize("ending", [".jpg", ".png", ".tiff", ".webp", ".bmp", ".mp4", ".mkv", ".ts", ".avi"])
-def test_mutated_and_truncated_files_are_read_or_refused(tmp_path: Path, ending: str) -> None:
-    rng = np.random.default_rng(1)
-    file = tmp_path / f"cam00{ending}"
-    if ending in (".mp4", ".mkv", ".ts", ".avi"):
-        encode(file, frames=6, codec="mpeg4" if ending == ".avi" else "libx264")
-    else:
-        cv2.imwrite(str(file), rng.integers(0, 255, (24, 32, 3), np.uint8))
-    whole = file.read_bytes()
-    for _ in range(8):
-        content = bytearray(whole)
-        for at in rng.integers(0, len(content), 5):
-            content[at] = rng.integers(256)
-        file.write_bytes(bytes(content[: rng.integers(1, len(content))] if rng.random() < 0.4 else content))
-        try:
-            if ending in (".mp4", ".mkv", ".ts", ".avi"):
-                footage = find_footage(tmp_path)
-                list(footage.pictures("cam00", range(len(footage.stamps("cam00")))))
-            else:
-                read_picture(file)
-        except StructGStreamError:
-            continue

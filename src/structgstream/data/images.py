@@ -300,24 +300,33 @@ def is_cut_jpeg(data: bytes) -> bool:
 
 
 def _converted_heif(path: Path, data: bytes) -> bytes:
-    """A picture of HEIC or AVIF as PNG.
+    """A picture of HEIC or AVIF as PNG, turned as it is shown.
 
     Raises:
-        CaptureError: it cannot be decoded.
-        MissingExtraError: the library that reads it is not installed.
+        CaptureError: it cannot be decoded, or what reads it is not installed.
     """
+    is_avif = data[8:12] in (b"avif", b"avis")
+    needs = "AVIF, which needs Pillow 11.3 or later" if is_avif else "HEIC, which needs the Python package pillow-heif"
+    missing = CaptureError(f"The picture {path} is {needs}; install it, or convert the pictures to JPEG or PNG.")
     try:
-        import pillow_heif  # pyright: ignore[reportMissingImports]
+        if is_avif:
+            from PIL import Image, features
+
+            if not features.check("avif"):
+                raise missing
+            image = Image.open(io.BytesIO(data))
+        else:
+            import pillow_heif  # pyright: ignore[reportMissingImports]
+
+            image = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=True).to_pillow()
+        pixels = np.asarray(image.convert("RGBA" if "A" in image.getbands() else "RGB"))
     except ImportError:
-        raise CaptureError(
-            f"The picture {path} is HEIC or AVIF, which needs the Python package pillow-heif; install it, or convert "
-            "the pictures to JPEG or PNG."
-        ) from None
-    try:
-        image = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=True).to_pillow().convert("RGB")
-    except (ValueError, OSError, EOFError, RuntimeError):
+        raise missing from None
+    except CaptureError:
+        raise
+    except Exception:  # a damaged one can raise anything
         raise _undecodable(path, data) from None
-    return bytes(opencv().imencode(".png", np.asarray(image)[..., ::-1])[1])
+    return bytes(opencv().imencode(".png", pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])[1])
 
 
 def _picture(path: Path, camera: Camera, bits: int, turn: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:

@@ -35,7 +35,7 @@ class Unreadable(ValueError):
 
 
 BROKEN = (
-    OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, ArithmeticError, EOFError, RecursionError,
+    OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, EOFError, RecursionError,
     struct.error, zipfile.BadZipFile,
 )  # fmt: skip
 """What reading a broken file raises."""
