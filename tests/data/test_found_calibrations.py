@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibrations and frames where tools leave them: which are found, together, and with which cameras."""
 
+import json
 import logging
 import shutil
+import unicodedata
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,6 +51,10 @@ def model(folder: Path) -> None:
         pytest.param("dense/images/CAM/FRAME.png", lambda path: model(path / "dense/sparse"), id="dense"),
         pytest.param("dense/0/images/CAM/FRAME.png", lambda path: model(path / "dense/0/sparse"), id="dense-0"),
         pytest.param("images/CAM/FRAME.png", lambda path: calibrated(path / "calibration"), id="one-folder-apart"),
+        pytest.param("Images/CAM/FRAME.ppm", lambda path: model(path / "sparse/0"), id="capitals"),
+        pytest.param("input/CAM/FRAME.png", lambda path: model(path / "sparse/0"), id="another-name"),
+        pytest.param("data/images/CAM/FRAME.png", lambda path: model(path / "sparse/0"), id="two-below"),
+        pytest.param("a/b/images/CAM/FRAME.png", lambda path: model(path / "a/b/sparse/0"), id="two-too-high"),
     ],
 )
 def test_folders_of_pictures(tmp_path: Path, pattern: str, calibrate: Callable[[Path], None]) -> None:
@@ -91,6 +98,78 @@ def test_a_folder_per_camera_with_its_own_file(tmp_path: Path) -> None:
         (tmp_path / f"{name}.mp4").rename(tmp_path / name / "DCIM/100GOPRO/GX010001.MP4")
         (tmp_path / f"{name}.yml").rename(tmp_path / name / "config.yml")
     check_opens(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "keys", ["cameraMatrix distCoeffs R T", "M D R T", "cam_K cam_dist cam_R cam_t", "K dist rot_mat tvecs"]
+)
+@pytest.mark.parametrize("form", ["yml", "plain.yaml", "json", "list.yaml"])
+def test_spellings_of_opencv_files(tmp_path: Path, keys: str, form: str) -> None:
+    def matrix(value: Any) -> dict[str, Any]:
+        rows = np.atleast_2d(value)
+        return {
+            "type_id": "opencv-matrix",
+            "rows": len(rows),
+            "cols": rows.shape[1],
+            "dt": "d",
+            "data": rows.ravel().tolist(),
+        }
+
+    entries = {}
+    for truth in truths():
+        values = dict(zip(keys.split(), (truth.K, truth.dist, truth.R, truth.T), strict=True))
+        text = f"%YAML:1.0\n---\nimage_size: [{WIDTH}, {HEIGHT}]\n"
+        if form == "yml":
+            (tmp_path / f"{truth.name}.yml").write_text(text + "".join(opencv_matrix(*pair) for pair in values.items()))
+        elif form == "json":
+            content = {
+                "image_size": {"width": WIDTH, "height": HEIGHT},
+                **{key: matrix(own) for key, own in values.items()},
+            }
+            (tmp_path / f"{truth.name}.json").write_text(json.dumps(content))
+        else:
+            entries[truth.name] = {
+                "size": [WIDTH, HEIGHT],
+                **{key: np.array(own).tolist() for key, own in values.items()},
+            }
+            if form == "plain.yaml":
+                (tmp_path / f"{truth.name}.yaml").write_text(json.dumps(entries[truth.name]))
+    if form == "list.yaml":
+        cameras = [{"name": name, **entry} for name, entry in entries.items()]
+        (tmp_path / "rig.yaml").write_text(json.dumps({"cameras": cameras}))
+    found = read_calibrated(tmp_path)
+    assert found is not None
+    for truth, camera in zip(truths(), found.cameras, strict=True):
+        assert (camera.name, camera.size) == (truth.name, (WIDTH, HEIGHT))
+        np.testing.assert_allclose(camera.viewmat[:3], np.column_stack([truth.R, truth.T]), atol=1e-9)
+
+
+def test_what_file_servers_and_systems_leave_is_no_picture(tmp_path: Path) -> None:
+    pictures(tmp_path, "images/CAM/FRAME.png")
+    model(tmp_path / "sparse/0")
+    for stray in (
+        "@eaDir/thumb.jpg",
+        "cam00/@eaDir/000000.png/SYNOPHOTO.jpg",
+        "cam00/000003.png/a.png",
+        "__MACOSX/a.png",
+    ):
+        write_picture(tmp_path / "images" / stray, picture(7, 7))
+    check_opens(tmp_path)
+
+
+def test_names_may_have_their_letters_taken_apart(tmp_path: Path) -> None:
+    names = tuple(f"Kämera {number}" for number in range(3))
+    write_videos(tmp_path, [unicodedata.normalize("NFD", name) for name in names], frames=2)
+    write_text_model(tmp_path, RIG, [(f"{name}.png", camera) for name, camera in zip(names, RIG, strict=True)])
+    check_opens(tmp_path, names=names)
+
+
+def test_calibrated_cameras_without_pictures_are_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    pictures(tmp_path, "images/CAM/FRAME.png")
+    write_text_model(tmp_path / "sparse/0", RIG, [(f"{name}/{frame}.png", name) for name in RIG for frame in range(2)])
+    shutil.rmtree(tmp_path / "images/cam02")
+    check_opens(tmp_path, names=NAMES[:2])
+    assert "has no pictures of camera 'cam02/0.png'" in caplog.text
 
 
 def test_calibrations_that_differ_are_refused(tmp_path: Path) -> None:

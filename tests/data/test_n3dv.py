@@ -105,7 +105,7 @@ def test_other_proportions_are_refused(tmp_path: Path) -> None:
 def test_one_pose_per_video(tmp_path: Path) -> None:
     write_n3dv(tmp_path)
     (tmp_path / "cam03.mp4").unlink()
-    with pytest.raises(CalibrationError, match=r"4 poses, .* 3 mp4 files"):
+    with pytest.raises(CalibrationError, match=r"4 poses, .* 3 videos"):
         open_n3dv(tmp_path)
 
 

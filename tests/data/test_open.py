@@ -17,6 +17,7 @@ from captures import (
     write_picture,
     write_shared_intrinsics,
     write_text_model,
+    write_videos,
 )
 from structgstream.cameras import CameraRig
 from structgstream.data.open import LAYOUTS, open_capture
@@ -97,3 +98,37 @@ def test_folders_that_hold_no_capture(tmp_path: Path) -> None:
     assert LAYOUTS in str(caught.value)
     with pytest.raises(CaptureError, match="is a file"):
         open_capture(tmp_path / "holiday.jpg")
+
+
+@pytest.mark.parametrize("part", ["images", "images/cam00", "sparse", "sparse/0"])
+def test_the_folder_of_a_capture_is_named_where_a_part_of_it_is_given(tmp_path: Path, part: str) -> None:
+    rig = small_rig(3)
+    for name in rig:
+        write_picture(tmp_path / f"images/{name}/0.png", picture(0, 0))
+    write_text_model(tmp_path / "sparse/0", rig, [(f"{name}/0.png", name) for name in rig])
+    with pytest.raises(CaptureError, match=f"give .*{tmp_path}"):
+        open_capture(tmp_path / part)
+
+
+def test_what_is_not_read_is_named(tmp_path: Path) -> None:
+    (tmp_path / "cam00").mkdir()
+    (tmp_path / "cam00/0.dng").write_bytes(b"")
+    with pytest.raises(CaptureError, match=r"cam00/0\.dng is of a kind that is not read: convert"):
+        open_capture(tmp_path)
+    write_videos(tmp_path, ["cam00", "cam01"], frames=2)
+    with pytest.raises(CaptureError, match=r"no calibration; it holds .* structgstream prepare"):
+        open_capture(tmp_path)
+    (tmp_path / "rig.json").write_text("{}")
+    with pytest.raises(CaptureError, match=r"no calibration that is known here; it holds .*rig\.json"):
+        open_capture(tmp_path)
+
+
+@pytest.mark.parametrize("write", [write_clip, write_n3dv])
+@pytest.mark.parametrize("place", ["NAME.MKV", "videos/NAME.mov", "NAME/DCIM/100GOPRO/GX010001.MP4"])
+def test_videos_of_any_container_and_place(tmp_path: Path, write: Callable[[Path], CameraRig], place: str) -> None:
+    rig = write(tmp_path)
+    for name in rig:
+        file = tmp_path / place.replace("NAME", name)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / f"{name}.mp4").rename(file)  # what it is stands within, not in its name
+    assert list(open_capture(tmp_path).rig) == list(rig)

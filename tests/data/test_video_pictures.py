@@ -28,7 +28,8 @@ def track_of(folder: Path, *, noisy: bool = False) -> VideoTrack:
 
 def read(track: VideoTrack, stamps: list[int | None], *, size: tuple[int, int] = SIZE) -> tuple[list, Damages]:
     damages: Damages = []
-    found = list(pictures_at(track, stamps, size=size, on_damage=lambda *told: damages.append(told)))
+    shown = pictures_at(track, stamps, size=size, on_damage=lambda *told: damages.append(told))
+    found = [None if one is None else one[0] for one in shown]
     return found, damages
 
 

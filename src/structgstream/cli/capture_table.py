@@ -23,14 +23,13 @@ def describe_capture(path: Path) -> dict[str, Any]:
     Raises:
         CaptureError: it cannot be opened.
     """
-    from structgstream.data.open import FORMATS, open_capture
+    from structgstream.data.open import layout_of, open_capture
 
     with _warnings() as remarks:
         source = open_capture(path)
-        layout = next(opens.__name__ for recognizes, opens in FORMATS if recognizes(path.resolve()))
         cameras = {name: _camera(source, name) for name in source.rig}
     return {
-        "layout": layout.removeprefix("open_").replace("_", " "),
+        "layout": layout_of(path),
         "fps": source.fps,
         "frames": len(source),
         "held_out": sorted(source.rig.held_out),

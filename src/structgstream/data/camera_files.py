@@ -16,7 +16,7 @@ import logging
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from structgstream.data.folder_files import REPORT, by_stem, files_of, is_hidden
+from structgstream.data.folder_files import REPORT, by_stem, files_of, is_hidden, name_of
 from structgstream.data.images import PICTURE_SUFFIXES
 from structgstream.data.timeline import natural
 from structgstream.data.video_index import VIDEO_SUFFIXES
@@ -25,22 +25,34 @@ from structgstream.errors import CaptureError
 log = logging.getLogger(__name__)
 
 REDUCED = ("images_2", "images_4", "images_8")
-# In the order in which they are looked through; hdVideos and hdImgs are the CMU Panoptic toolbox's, the synchronized
-# ones FreeMoCap's.
-ROOTS = ("frames", "images", "videos", "hdVideos", "hdImgs", "synchronized_videos", "", *REDUCED)
-NO_CAMERAS = (*ROOTS, "masks", "board", "recordings", "calibration", "annotated_videos", "work", REPORT)
+ROOTS = ("frames", "images", "videos", "hdvideos", "hdimgs", "synchronized_videos", "", *REDUCED)
+"""In the order in which they are looked through, in lower case; hdVideos and hdImgs are the CMU Panoptic toolbox's, the
+synchronized ones FreeMoCap's."""
+NO_TAKES = ("masks", "board", "recordings", "calibration", "annotated_videos", "work", REPORT)
+NO_CAMERAS = (*ROOTS, *NO_TAKES)
 """Folders that are no camera's and no frame's: of ``masks.py``, of the check, and of the tools that calibrate."""
+UNREAD = frozenset({
+    ".3fr", ".arw", ".bag", ".braw", ".cr2", ".cr3", ".dng", ".exr", ".gif", ".hdr", ".insv", ".jxl", ".mcap", ".nef",
+    ".orf", ".r3d", ".raf", ".raw", ".rw2", ".svo", ".svo2", ".tga",
+})  # fmt: skip
+"""What cameras write that is not read here."""
 INSIDE = ("images", "data", "DCIM")
 """What lies between the folder of a camera or a frame and its files."""
 RECORDINGS = "recordings"
 """Where caliscope has a folder for each take."""
 
 
-def folders_of(root: Path) -> list[Path]:
+def roots_of(path: Path) -> list[Path]:
+    """The folders of :data:`ROOTS` that are there, ``path`` among them, in that order, however they are capitalised."""
+    found = {entry.name.lower(): entry for entry in sorted(path.iterdir()) if entry.is_dir()} | {"": path}
+    return [found[name] for name in ROOTS if name in found]
+
+
+def folders_of(root: Path, *, without: Collection[str] = NO_CAMERAS) -> list[Path]:
     """The folders in ``root`` that may be of cameras or frames, in natural order of their names."""
     if not root.is_dir():
         return []
-    found = (entry for entry in root.iterdir() if not is_hidden(entry) and entry.name not in NO_CAMERAS)
+    found = (entry for entry in root.iterdir() if not is_hidden(entry) and entry.name.lower() not in without)
     return sorted((entry for entry in found if entry.is_dir()), key=lambda entry: natural(entry.name))
 
 
@@ -64,7 +76,7 @@ def videos_in(root: Path) -> dict[str, Path]:
         return {}
     if found := by_stem(files_of(root, VIDEO_SUFFIXES)):
         return found
-    filmed = {folder.name: filmed_folder(folder, VIDEO_SUFFIXES) for folder in folders_of(root)}
+    filmed = {name_of(folder): filmed_folder(folder, VIDEO_SUFFIXES) for folder in folders_of(root)}
     files = {name: files_of(folder, VIDEO_SUFFIXES) for name, folder in filmed.items() if folder is not None}
     if any(len(own) > 1 for own in files.values()):
         return {}
@@ -73,22 +85,38 @@ def videos_in(root: Path) -> dict[str, Path]:
 
 def pictures_in(root: Path) -> dict[str, dict[str, Path]]:
     """The pictures of each folder of ``root``, of a camera or of a frame, by their names without suffix."""
-    filmed = {folder.name: filmed_folder(folder, PICTURE_SUFFIXES) for folder in folders_of(root)}
+    filmed = {name_of(folder): filmed_folder(folder, PICTURE_SUFFIXES) for folder in folders_of(root)}
     return {name: by_stem(files_of(own, PICTURE_SUFFIXES)) for name, own in filmed.items() if own is not None}
 
 
-def other_roots(where: Path) -> Iterator[Path]:
-    """Folders of videos below ``where`` that have no name of :data:`ROOTS`: takes.
+def other_roots(where: Path, *, pictures: bool = False) -> Iterator[Path]:
+    """Folders of videos, or of folders of pictures, up to two below ``where`` and of other names: takes.
 
     Raises:
         CaptureError: there are several, and none says which is meant.
     """
-    takes = [folder for parent in (where, where / RECORDINGS) for folder in folders_of(parent)]
-    takes = [folder for folder in takes if len(files_of(folder, VIDEO_SUFFIXES)) > 1]
+    below = folders_of(where) + folders_of(where / RECORDINGS)
+    below += [inner for folder in folders_of(where, without=NO_TAKES) for inner in folders_of(folder, without=NO_TAKES)]
+    found = {folder: pictures_in(folder) if pictures else files_of(folder, VIDEO_SUFFIXES) for folder in below}
+    takes = [folder for folder, own in found.items() if len(own) > 1]
     if len(takes) > 1:
         names = ", ".join(str(take.relative_to(where)) for take in takes[:4])
+        what = "pictures in several folders ({}); expected those of one take, a folder per camera."
+        if not pictures:
+            what = "videos in several folders ({}); expected those of one take, a video per camera."
         raise CaptureError(
-            f"{where} has videos in several folders ({names}); expected those of one take, a video per camera. Give "
-            "the folder of one take; if these are cameras, join the chapters of each to one file."
+            f"{where} has {what.format(names)} Give the folder of one take; if these are cameras, join the chapters of "
+            "each to one file."
         )
     yield from takes
+
+
+def unread_files(where: Path) -> str:
+    """What cameras wrote in ``where``, or up to three folders below, that is not read here, for messages."""
+    files = (file for depth in range(4) for file in where.glob("*/" * depth + "*") if file.suffix.lower() in UNREAD)
+    if (file := next(files, None)) is None:
+        return ""
+    return (
+        f"; {file.relative_to(where)} is of a kind that is not read: convert pictures to PNG or JPEG, videos to H.264 "
+        "or HEVC in mp4, keeping the time of each frame"
+    )

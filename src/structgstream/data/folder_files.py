@@ -3,6 +3,7 @@
 
 from collections.abc import Collection, Iterable
 from pathlib import Path
+from unicodedata import normalize
 
 from structgstream.errors import CaptureError
 
@@ -10,9 +11,21 @@ REPORT = "report"
 """The folder that the check of a capture leaves in it, whose pictures are no camera's."""
 
 
+SYSTEM = frozenset({"__MACOSX", "@eaDir", "#recycle", "$RECYCLE.BIN", "System Volume Information", "lost+found"})
+"""Folders that file servers, archives and systems leave, with pictures of their own."""
+
+
 def is_hidden(path: Path) -> bool:
     """Whether a file is none that was filmed: macOS leaves a ``._NAME`` beside each NAME on file systems of cards."""
-    return path.name.startswith(".")
+    return path.name.startswith(".") or path.name in SYSTEM
+
+
+def name_of(path: Path) -> str:
+    """The name of a folder, or of a file without its suffix, as a camera's: letters with marks composed, as in texts.
+
+    File systems of macOS take them apart.
+    """
+    return normalize("NFC", path.name if path.is_dir() else path.stem)
 
 
 def files_of(folder: Path, suffixes: Collection[str]) -> list[Path]:
@@ -21,7 +34,8 @@ def files_of(folder: Path, suffixes: Collection[str]) -> list[Path]:
     Raises:
         CaptureError: one is a link to a file that is not there.
     """
-    found = sorted(file for file in folder.iterdir() if file.suffix.lower() in suffixes and not is_hidden(file))
+    named = (file for file in folder.iterdir() if file.suffix.lower() in suffixes and not is_hidden(file))
+    found = sorted(file for file in named if not file.is_dir())
     for file in found:
         check_link(file)
     return found
@@ -48,10 +62,10 @@ def by_stem(files: Iterable[Path]) -> dict[str, Path]:
     """
     found: dict[str, Path] = {}
     for file in files:
-        if file.stem in found:
+        if (name := name_of(file)) in found:
             raise CaptureError(
-                f"{found[file.stem].name} and {file.name} in {file.parent} are of one name, {file.stem!r}; expected "
-                "one file of each: move the other out of the folder."
+                f"{found[name].name} and {file.name} in {file.parent} are of one name, {name!r}; expected one file of "
+                "each: move the other out of the folder."
             )
-        found[file.stem] = file
+        found[name] = file
     return found

@@ -24,12 +24,11 @@ from structgstream.data.calibration_files import (
     transforms,
     zju_mocap,
 )
-from structgstream.data.camera_files import NO_CAMERAS, ROOTS, pictures_in, videos_in
+from structgstream.data.camera_files import NO_CAMERAS, folders_of, pictures_in, roots_of, videos_in
 from structgstream.data.colmap import find_model, read_model
-from structgstream.data.folder_files import files_of, is_hidden
+from structgstream.data.folder_files import files_of
 from structgstream.data.images import PICTURE_SUFFIXES
 from structgstream.data.posed import Calibration, PosedCamera
-from structgstream.data.timeline import natural
 from structgstream.errors import CalibrationError
 
 log = logging.getLogger(__name__)
@@ -134,17 +133,15 @@ def calibration_below(path: Path) -> Path | None:
 
 def inner_folders(path: Path) -> list[Path]:
     """The folders in ``path`` that may hold calibrations, in natural order."""
-    skipped = {*NO_CAMERAS, *ROOTS, "sparse", "sparse_"} - {"calibration"}
-    entries = (entry for entry in path.iterdir() if not is_hidden(entry) and entry.name not in skipped)
-    return sorted((entry for entry in entries if entry.is_dir()), key=lambda entry: natural(entry.name))
+    return folders_of(path, without={*NO_CAMERAS, "sparse", "sparse_"} - {"calibration"})
 
 
 def _is_capture(folder: Path) -> bool:
     """Whether a folder with a calibration holds frames, and not what the calibration was made from."""
     if "calib" in folder.name.lower():
         return False
-    roots = [folder / root for root in ROOTS]
-    stills = [folder / root for root in ("images", "") if (folder / root).is_dir()]
+    roots = roots_of(folder)
+    stills = [root for root in roots if root == folder or root.name.lower() == "images"]
     if any(len(videos_in(root)) > 1 or len(pictures_in(root)) > 1 for root in roots):
         return True
     beside = pictures_in(folder.parent)

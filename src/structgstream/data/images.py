@@ -4,6 +4,8 @@
 import io
 import logging
 import os
+import struct
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -20,8 +22,12 @@ from structgstream.data.timeline import common_slots, instants_of, natural
 from structgstream.errors import CalibrationError, CaptureError, MissingExtraError
 from structgstream.frames import MultiViewFrame
 
-PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".heic", ".heif", ".avif"})
+PICTURE_SUFFIXES = frozenset({
+    ".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".heic", ".heif", ".avif", ".jfif",
+    ".jpe", ".jp2", ".pgm", ".ppm",
+})  # fmt: skip
 HEIF_BRANDS = frozenset({b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1", b"avif", b"avis"})
+TIFF_ORIENTATION = 0x0112  # the tag
 OPAQUE = 0.98
 """Share of opacity from which on a pixel counts."""
 
@@ -117,9 +123,18 @@ def common_pictures(
         training: names of the cameras that are not held out; None for all.
 
     Raises:
-        CaptureError: see :func:`~structgstream.data.timeline.common_slots`.
+        CaptureError: see :func:`~structgstream.data.timeline.common_slots`; or a camera shares no instant with another.
     """
     keys = instants_of({camera: list(pictures) for camera, pictures in files.items()})
+    taken = Counter(key for own in keys.values() for key in own.values())
+    alone = [camera for camera, own in keys.items() if own and all(taken[key] == 1 for key in own.values())]
+    if len(keys) > 1 and alone:
+        other = next(camera for camera in keys if camera != alone[0])
+        raise CaptureError(
+            f"The pictures of cameras {alone[0]!r} ({next(iter(keys[alone[0]]))}, ...) and {other!r} "
+            f"({next(iter(keys[other]), 'none')}, ...) of {where} have no names and no numbers in common, so it is not "
+            "known which are of one instant; name those of one instant alike (000000.png)."
+        )
     named = {keys[camera][instant]: instant for camera, pictures in files.items() for instant in pictures}
     files = {
         camera: {named[keys[camera][instant]]: file for instant, file in pictures.items()}
@@ -158,7 +173,10 @@ def read_picture_and_mask(path: Path, *, bits: int = 16) -> tuple[NDArray[np.uin
     stored = stored_picture(path)
     mask = None
     if stored.ndim == 3 and stored.shape[2] == 4:
-        opaque = stored[..., 3] >= OPAQUE * np.iinfo(stored.dtype).max
+        alpha, most = stored[..., 3], int(np.iinfo(stored.dtype).max)
+        if stored.dtype == np.uint16 and not alpha.max() >> bits:
+            most = (1 << bits) - 1
+        opaque = alpha >= OPAQUE * most
         mask = None if opaque.all() else opaque
         stored = np.ascontiguousarray(stored[..., :3])
     if stored.dtype == np.uint16:
@@ -206,7 +224,9 @@ def _may_be_deep(path: Path) -> bool:
             head = file.read(25)
     except OSError as error:
         raise CaptureError(f"The picture {path} cannot be read ({error.strerror}); restore it.") from None
-    return head[24:25] == b"\x10" if head[:8] == b"\x89PNG\r\n\x1a\n" else head[:2] in (b"II", b"MM")
+    if head[:8] == b"\x89PNG\r\n\x1a\n":
+        return head[24:25] == b"\x10"
+    return head[:2] in (b"II", b"MM", b"P5", b"P6", b"\xff\x4f") or head[4:8] == b"jP  "
 
 
 def stored_picture(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
@@ -225,6 +245,8 @@ def stored_picture(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
     if not data or is_cut_jpeg(data):
         raise _undecodable(path, data)
     # Calibrations are made on the stored pixels, so a rotation tag must not turn them.
+    if data[:4] in (b"II*\0", b"MM\0*"):
+        data = _upright_tiff(data)
     jpeg = data[:2] == b"\xff\xd8"
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION if jpeg else cv2.IMREAD_UNCHANGED
     try:
@@ -248,6 +270,21 @@ def _undecodable(path: Path, data: bytes) -> CaptureError:
     )
 
 
+def _upright_tiff(data: bytes) -> bytes:
+    """The same file with the orientation 1, since OpenCV turns pictures of TIFF whatever it is asked for."""
+    order = "<" if data[:2] == b"II" else ">"
+    changed = bytearray(data)
+    try:
+        (at,) = struct.unpack_from(f"{order}I", data, 4)
+        (count,) = struct.unpack_from(f"{order}H", data, at)
+        for entry in range(at + 2, at + 2 + 12 * count, 12):
+            if struct.unpack_from(f"{order}H", data, entry)[0] == TIFF_ORIENTATION:
+                struct.pack_into(f"{order}H", changed, entry + 8, 1)
+    except struct.error:
+        return data  # cut, which the decoder notices
+    return bytes(changed)
+
+
 def is_cut_jpeg(data: bytes) -> bool:
     """Whether a JPEG ends before its picture does. It decodes all the same, grey below the cut.
 
@@ -263,24 +300,33 @@ def is_cut_jpeg(data: bytes) -> bool:
 
 
 def _converted_heif(path: Path, data: bytes) -> bytes:
-    """A picture of HEIC or AVIF as PNG.
+    """A picture of HEIC or AVIF as PNG, turned as it is shown.
 
     Raises:
-        CaptureError: it cannot be decoded.
-        MissingExtraError: the library that reads it is not installed.
+        CaptureError: it cannot be decoded, or what reads it is not installed.
     """
+    is_avif = data[8:12] in (b"avif", b"avis")
+    needs = "AVIF, which needs Pillow 11.3 or later" if is_avif else "HEIC, which needs the Python package pillow-heif"
+    missing = CaptureError(f"The picture {path} is {needs}; install it, or convert the pictures to JPEG or PNG.")
     try:
-        import pillow_heif  # pyright: ignore[reportMissingImports]
+        if is_avif:
+            from PIL import Image, features
+
+            if not features.check("avif"):
+                raise missing
+            image = Image.open(io.BytesIO(data))
+        else:
+            import pillow_heif  # pyright: ignore[reportMissingImports]
+
+            image = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=True).to_pillow()
+        pixels = np.asarray(image.convert("RGBA" if "A" in image.getbands() else "RGB"))
     except ImportError:
-        raise CaptureError(
-            f"The picture {path} is HEIC or AVIF, which needs the Python package pillow-heif; install it, or convert "
-            "the pictures to JPEG or PNG."
-        ) from None
-    try:
-        image = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=True).to_pillow().convert("RGB")
-    except (ValueError, OSError, EOFError, RuntimeError):
+        raise missing from None
+    except CaptureError:
+        raise
+    except Exception:  # a damaged one can raise anything
         raise _undecodable(path, data) from None
-    return bytes(opencv().imencode(".png", np.asarray(image)[..., ::-1])[1])
+    return bytes(opencv().imencode(".png", pixels[..., [2, 1, 0, 3][: pixels.shape[2]]])[1])
 
 
 def _picture(path: Path, camera: Camera, bits: int, turn: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:

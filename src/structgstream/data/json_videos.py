@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Folders with ``cameras.json`` and one mp4 per camera, in two dialects.
+"""Folders with ``cameras.json`` and one video per camera, in two dialects.
 
 The package's own, which the bundled clip uses: ``{"width", "height", "fps", "frames", "near", "held_out":
 [names], "cameras": {name: {"K": 3x3, "viewmat": 4x4 world to camera}}}`` with ``name.mp4``.
@@ -18,7 +18,7 @@ import numpy as np
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_names
 from structgstream.data.calibration_files.reading import positive
-from structgstream.data.folder_files import by_stem, files_of
+from structgstream.data.camera_files import roots_of, videos_in
 from structgstream.data.text_files import BROKEN, mapping, pixels, read_json, reason, whole
 from structgstream.data.timeline import natural
 from structgstream.data.video import VideoSource, synchronised
@@ -42,7 +42,7 @@ def open_json_videos(path: Path) -> VideoSource:
     """
     file = path / FILE
     rig, fps, stated_frames = read_cameras(file)
-    videos = by_stem(files_of(path, (".mp4",)))
+    videos = next(filter(None, map(videos_in, roots_of(path))), {})
     check_names(list(rig), sorted(videos, key=natural), calibration=file, pictures=path)
     source = synchronised(scan_videos({name: videos[name] for name in rig}), rig, where=path, fps=fps)
     if len(source) < stated_frames:

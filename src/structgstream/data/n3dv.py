@@ -28,9 +28,8 @@ from structgstream.cameras import Camera, CameraRig
 from structgstream.data.aligned_points import aligned_points
 from structgstream.data.calibration import calibrated_camera, calibrated_rig
 from structgstream.data.calibration_files.reading import read_array, readable
-from structgstream.data.camera_files import pictures_in
+from structgstream.data.camera_files import pictures_in, roots_of, videos_in
 from structgstream.data.colmap import find_model, read_model
-from structgstream.data.folder_files import by_stem, files_of
 from structgstream.data.pair_matches import PairMatcher
 from structgstream.data.pose_check import PoseCheckConfig, confirmed_share
 from structgstream.data.posed import Calibration, PosedCamera, intrinsics, rigid
@@ -66,12 +65,12 @@ def open_n3dv(path: Path) -> FrameSource:
         CalibrationError: broken poses, not one pose per video, or a video of other proportions than its pose.
     """
     poses = _read_poses(path / POSES)
-    videos = by_stem(files_of(path, (".mp4",)))
-    pictures = {} if videos else pictures_in(path)
+    videos = next(filter(None, map(videos_in, roots_of(path))), {})
+    pictures = {} if videos else next(filter(None, map(pictures_in, roots_of(path))), {})
     names = sorted(videos or pictures, key=natural)
     if len(names) != len(poses):
         raise CalibrationError(
-            f"{path / POSES} has {len(poses)} poses, {path} has {len(names)} {'mp4 files' if videos else 'cameras'}; "
+            f"{path / POSES} has {len(poses)} poses, {path} has {len(names)} {'videos' if videos else 'cameras'}; "
             "expected one pose per camera, in sorted order."
         )
     tracks = scan_videos({name: videos[name] for name in names}) if videos else {}

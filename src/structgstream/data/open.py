@@ -4,11 +4,13 @@
 import logging
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
 from structgstream.cameras import CameraRig
 from structgstream.data.calibration import with_near
+from structgstream.data.camera_files import ROOTS, pictures_in, roots_of, unread_files, videos_in
 from structgstream.data.colmap import find_model
 from structgstream.data.found_calibrations import (
     calibration_below,
@@ -23,12 +25,12 @@ from structgstream.data.json_videos import open_json_videos, recognizes_json_vid
 from structgstream.data.masks import FOLDER, with_masks
 from structgstream.data.n3dv import open_n3dv, recognizes_n3dv
 from structgstream.data.panoptic import open_panoptic, recognizes_panoptic
-from structgstream.data.posed_capture import open_posed
+from structgstream.data.posed_capture import NoFrames, open_posed
 from structgstream.data.prepared import open_prepared, recognizes_prepared
 from structgstream.data.source import FrameSource
 from structgstream.data.transforms_capture import open_transforms, recognizes_transforms
 from structgstream.data.wrappers import WithoutPoints, WithRig, resized, section
-from structgstream.errors import CaptureError, ConfigError
+from structgstream.errors import CaptureError, ConfigError, StructGStreamError
 
 log = logging.getLogger(__name__)
 
@@ -46,10 +48,12 @@ LAYOUTS = """Supported layouts:
 A calibration may lie one folder below, as calibration/ beside videos/; so may the whole capture, as COLMAP's dense/."""
 
 AUTO = "auto"
-DENSE = "dense"  # of COLMAP, which may have a folder for each model in it
+PARTS = frozenset({*ROOTS, "sparse", "sparse_", "calibration"})
+"""Names of folders of a capture, in lower case."""
+CALIBRATION_SUFFIXES = frozenset({".json", ".npy", ".npz", ".toml", ".xml", ".yaml", ".yml"})
 
 
-def _open_posed(path: Path) -> FrameSource:
+def open_calibrated(path: Path) -> FrameSource:
     """Pictures or videos with the calibration in the same folder, or one folder below."""
     folder = path if has_calibration(path) else calibration_below(path)
     calibration = None if folder is None else read_calibration(folder)
@@ -63,10 +67,10 @@ FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path], FrameSource]], ...
     (recognizes_json_videos, open_json_videos),
     (recognizes_n3dv, open_n3dv),
     (recognizes_immersive, open_immersive),
-    (lambda path: find_model(path) is not None, _open_posed),
+    (lambda path: find_model(path) is not None, open_calibrated),
     (recognizes_transforms, open_transforms),
-    (recognizes_calibrated, _open_posed),
-    (lambda path: calibration_below(path) is not None, _open_posed),
+    (recognizes_calibrated, open_calibrated),
+    (lambda path: calibration_below(path) is not None, open_calibrated),
 )
 
 
@@ -96,9 +100,12 @@ def open_capture(
         CaptureError: the folder is missing, empty or of an unknown layout, or its content is broken.
         ConfigError: an argument is invalid.
     """
-    source = _recognized(Path(path))
+    folder, opens = _located(Path(path))
+    if folder != Path(path).resolve():
+        log.warning("%s is no capture, but holds one, which is opened: %s", path, folder)
+    source = _opened(folder, opens)
     sized = selected(source, held_out=held_out, scale=scale, near=near)
-    if recognizes_prepared(Path(path)) and not sized.rig.held_out <= source.rig.held_out:
+    if opens is open_prepared and not sized.rig.held_out <= source.rig.held_out:
         sized = WithoutPoints(sized)  # its points come from pictures of a camera that is held out now
     return section(sized, start=start, frames=frames, every=every)
 
@@ -144,25 +151,66 @@ def _opener(path: Path) -> Callable[[Path], FrameSource] | None:
     return next((opens for recognises, opens in FORMATS if recognises(path)), None)
 
 
-def _recognized(path: Path) -> FrameSource:
+def _opened(folder: Path, opens: Callable[[Path], FrameSource]) -> FrameSource:
+    try:
+        return with_masks(opens(folder), folder / FOLDER)
+    except NoFrames:
+        if (above := _above(folder)) is None:
+            raise
+        raise CaptureError(
+            f"{folder} holds the calibration of a capture alone; give the folder of the capture, {above}."
+        ) from None
+
+
+def layout_of(path: Path) -> str:
+    """The layout of the capture that :func:`open_capture` opens, in words.
+
+    Raises:
+        CaptureError: the folder is missing, empty or of an unknown layout.
+    """
+    return _located(path)[1].__name__.removeprefix("open_").replace("_", " ")
+
+
+def _located(path: Path) -> tuple[Path, Callable[[Path], FrameSource]]:
+    """The folder of the capture that is in ``path``, which may be the same, and what opens it."""
     if not path.exists():
         raise CaptureError(f"The capture {path} does not exist; give the folder that holds it.")
     if not path.is_dir():
         raise CaptureError(f"The capture {path} is a file; give the folder that holds it.\n{LAYOUTS}")
     path = path.resolve()  # a name, even for "."
     if (opens := _opener(path)) is not None:
-        return with_masks(opens(path), path / FOLDER)
-    inner = [folder for folder in inner_folders(path) if _opener(folder) is not None]
-    if not inner and (path / DENSE).is_dir():
-        inner = [folder for folder in inner_folders(path / DENSE) if _opener(folder) is not None]
+        return path, opens
+    below = inner_folders(path)
+    inner = [folder for folder in below if _opener(folder) is not None]
+    inner = inner or [own for folder in below for own in inner_folders(folder) if _opener(own) is not None]
     if len(inner) == 1:
-        log.warning("%s is no capture, but holds one, which is opened: %s", path, inner[0])
-        return _recognized(inner[0])
+        return _located(inner[0])
     if inner:
-        names = ", ".join(folder.name for folder in inner[:4])
+        names = ", ".join(str(folder.relative_to(path)) for folder in inner[:4])
         raise CaptureError(f"{path} holds several captures ({names}); give the folder of one.")
     content = sorted(entry.name for entry in path.iterdir())
     if not content:
         raise CaptureError(f"The capture {path} is an empty folder.\n{LAYOUTS}")
+    if (above := _above(path)) is not None:
+        raise CaptureError(f"{path} has no calibration; the capture is the folder above it: give {above}.")
     shown = ", ".join(content[:6]) + (", ..." if len(content) > 6 else "")
-    raise CaptureError(f"The folder {path} has no supported layout; it holds {shown}.\n{LAYOUTS}")
+    if any(Path(name).suffix.lower() in CALIBRATION_SUFFIXES for name in content):
+        why = f"no calibration that is known here; it holds {shown}{unread_files(path)}"
+    elif any(videos_in(root) or pictures_in(root) for root in roots_of(path)):
+        why = f"no calibration; it holds {shown}. structgstream prepare calibrates videos and pictures"
+    else:
+        why = f"no supported layout; it holds {shown}{unread_files(path)}"
+    raise CaptureError(f"The folder {path} has {why}.\n{LAYOUTS}")
+
+
+def _above(path: Path) -> Path | None:
+    """The capture of which ``path`` is a folder, up to three above; None where there is none."""
+    for inside, folder in zip((path, *path.parents), path.parents[:3]):
+        with suppress(OSError, StructGStreamError):
+            if (
+                inside.name.lower() in PARTS
+                and _opener(folder) is not None
+                and any(videos_in(root) or pictures_in(root) for root in roots_of(folder))
+            ):
+                return folder
+    return None

@@ -44,7 +44,10 @@ class PoseCheckConfig:
 
     Args:
         matches: how matches are found.
-        pairs: most pairs of neighbours tested.
+        pairs: most pairs of neighbours tested: all of rigs up to 150 cameras, since a camera of which no pair is tested
+            is not checked.
+        neighbors: of each camera, in pairs.
+        more_neighbors: of cameras that look suspicious.
         violation_share: distance to the epipolar line of the poses, as a share of the picture's width, above which a
             match violates them; a match triangulated behind a camera violates them too.
         min_parallax_degrees: smallest angle between the rays at which a point behind a camera counts.
@@ -52,19 +55,18 @@ class PoseCheckConfig:
         min_matches: least number of good matches for a verdict.
         pair_share: a pair contradicts the poses if a larger share of its matches violates them: of
             right poses 0 to 0.14, of exchanged ones most.
-        empty_share: share of the pairs of neighbours without matches above which poses are suspicious: neighbours of
-            wrong poses see other things.
         max_suspects: poses are rejected if a larger share of the cameras is suspicious.
     """
 
     matches: MatchConfig = MatchConfig()
-    pairs: int = 12
+    pairs: int = 200
+    neighbors: int = 2
+    more_neighbors: int = 4
     violation_share: float = 0.01
     min_parallax_degrees: float = 0.3
     max_share: float = 0.6
     min_matches: int = 100
     pair_share: float = 0.3
-    empty_share: float = 0.3
     max_suspects: float = 0.5
 
 
@@ -79,7 +81,7 @@ class PoseCheck:
         pairs: number of pairs of cameras they come from.
         conclusive: whether ``min_matches`` is reached.
         suspects: cameras without which no pair contradicts the poses; empty where all is right.
-        unmatched: cameras without a match to any neighbour, if these are so many that the poses are suspicious.
+        unmatched: cameras without a match to any neighbour, as neighbours by wrong poses see other things.
     """
 
     median_epipolar_error_pixels: float
@@ -107,9 +109,8 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig, *, config: PoseCheckConfi
     if check.conclusive and not doubted:
         return check
     if check.conclusive and not _contradicted(check, len(given), config):
-        more = [
-            pair for pair in _pairs(given, replace(config, pairs=2 * config.pairs)) if {*doubted}.intersection(pair)
-        ]
+        wider = replace(config, neighbors=config.more_neighbors)
+        more = [pair for pair in _pairs(given, wider) if {*doubted}.intersection(pair)]
         check = _judge(given, matcher.matches([*dict.fromkeys([*_pairs(given, config), *more])]), config)
         if not _contradicted(check, len(given), config):
             _warn(check, len(given))
@@ -191,7 +192,7 @@ def reinterpreted(cameras: Mapping[str, Camera], change: Callable[[Tensor], Tens
 
 def _pairs(cameras: Mapping[str, Camera], config: PoseCheckConfig) -> list[Pair]:
     """Pairs of neighbours, spread over the rig."""
-    pairs = unique_pairs(neighbor_views(cameras, count=2, distance=viewing_distance(cameras)))
+    pairs = unique_pairs(neighbor_views(cameras, count=config.neighbors, distance=viewing_distance(cameras)))
     chosen = np.linspace(0, len(pairs) - 1, min(len(pairs), config.pairs)).round().astype(int)
     return [pairs[index] for index in chosen]
 
@@ -233,8 +234,7 @@ def _judge(
     judged = {pair: verdict for pair, verdict in verdicts.items() if verdict.total}
     bad = {pair for pair, verdict in judged.items() if verdict.violating > config.pair_share * verdict.total}
     matched = {name for pair in judged for name in pair}
-    empty = [pair for pair in verdicts if pair not in judged]
-    unmatched = {name for pair in empty for name in pair} - matched
+    unmatched = {name for pair in verdicts for name in pair} - matched
     return PoseCheck(
         float(np.median(np.concatenate([verdict.errors for verdict in judged.values()]))),
         sum(verdict.violating for verdict in judged.values()) / total,
@@ -242,7 +242,7 @@ def _judge(
         len(judged),
         total >= config.min_matches,
         _suspects(bad, judged),
-        tuple(sorted(unmatched, key=natural)) if len(empty) > config.empty_share * len(verdicts) else (),
+        tuple(sorted(unmatched, key=natural)),
     )
 
 

@@ -68,6 +68,8 @@ def rigid(rotation: ArrayLike, translation: ArrayLike) -> NDArray[np.float64]:
     turned, moved = np.array(rotation, dtype=np.float64), np.array(translation, dtype=np.float64).reshape(-1)
     if turned.size == 3:
         turned = rotation_matrix(turned.reshape(3))
+    elif turned.shape == (9,):
+        turned = turned.reshape(3, 3)
     if turned.shape != (3, 3) or moved.shape != (3,):
         raise Unreadable(f"a rotation of shape {turned.shape} and a translation of shape {moved.shape}")
     matrix = np.eye(4)

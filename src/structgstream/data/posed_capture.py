@@ -24,7 +24,7 @@ import numpy as np
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_names, listed
-from structgstream.data.camera_files import REDUCED, ROOTS, other_roots, pictures_in, videos_in
+from structgstream.data.camera_files import REDUCED, other_roots, pictures_in, roots_of, unread_files, videos_in
 from structgstream.data.exif import read_exif
 from structgstream.data.folder_files import by_stem, files_of
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, common_pictures
@@ -71,32 +71,39 @@ def open_posed(
         CaptureError: no pictures or videos, or not of the calibrated cameras.
         CalibrationError: a camera without calibration, one that moves, or pictures of other proportions.
     """
+
+    def pictured(root: Path, files: Pictures, *, partial: bool) -> FrameSource:
+        files = _posed(files, calibration, root) if partial else files
+        filmed = of_pictures(path, files, _poses(calibration, files), root=root, calibration=calibration, fps=fps)
+        return undistort(*filmed, target=target)
+
     for root in chain(_roots(path), other_roots(path)):
         if videos := videos_in(root):
             partial = not complete or calibration.unposed
             videos = _posed(videos, calibration, root) if partial else videos
             return undistort(*_of_videos(path, videos, root=root, calibration=calibration), target=target)
         if folders := pictures_in(root):
-            files, poses = _layout(folders, calibration, root)
-            files = _posed(files, calibration, root) if calibration.unposed else files
-            filmed = of_pictures(path, files, poses, root=root, calibration=calibration, fps=fps)
-            return undistort(*filmed, target=target)
-    for root in (path / name for name in ("images", *REDUCED, "")):
-        if root.is_dir() and (pictures := by_stem(files_of(root, PICTURE_SUFFIXES))):
+            return pictured(root, _layout(folders, calibration), partial=bool(calibration.unposed))
+    for root in roots_of(path):
+        known = root == path or root.name.lower() in ("images", *REDUCED)
+        if known and (stills := by_stem(files_of(root, PICTURE_SUFFIXES))):
             # Structure from motion often leaves out some photos.
-            stills = _posed({name: {"0": file} for name, file in pictures.items()}, calibration, root)
-            poses = _poses(calibration, stills)
-            filmed = of_pictures(path, stills, poses, root=root, calibration=calibration, fps=fps)
-            return undistort(*filmed, target=target)
-    raise CaptureError(
+            return pictured(root, {name: {"0": file} for name, file in stills.items()}, partial=True)
+    for root in other_roots(path, pictures=True):
+        return pictured(root, _layout(pictures_in(root), calibration), partial=bool(calibration.unposed))
+    raise NoFrames(
         f"{path} has the calibration {calibration.where} but no frames; expected images/CAMERA/FRAME.ext, "
-        "frames/FRAME/CAMERA.ext, images/CAMERA.ext, CAMERA.mp4 or CAMERA/anything.mp4."
+        f"frames/FRAME/CAMERA.ext, images/CAMERA.ext, CAMERA.mp4 or CAMERA/anything.mp4{unread_files(path)}."
     )
+
+
+class NoFrames(CaptureError):
+    """A folder has a calibration, and neither pictures nor videos."""
 
 
 def _roots(path: Path) -> list[Path]:
     """The folders to look through, in order; videos before pictures that are stills of the same cameras."""
-    roots = [path / name for name in ROOTS]
+    roots = roots_of(path)
     pictures = {root: found for root in roots if (found := pictures_in(root))}
     videos = {root: found for root in roots if (found := videos_in(root))}
     first = next((root for root in roots if root in pictures or root in videos), None)
@@ -194,25 +201,25 @@ def _orientation(file: Path, posed: PosedCamera, calibration: Calibration) -> in
     return orientation if calibration.turned_by_exif else 1
 
 
-def _layout(folders: Pictures, calibration: Calibration, root: Path) -> tuple[Pictures, dict[str, PosedCamera]]:
+def _layout(folders: Pictures, calibration: Calibration) -> Pictures:
     """Folders per camera or per frame: whichever gives every camera one pose, and the more cameras."""
     per_frame: dict[str, dict[str, Path]] = {}
     for folder, pictures in folders.items():
         for stem, file in pictures.items():
             per_frame.setdefault(stem, {})[folder] = file
-    found: list[tuple[Pictures, dict[str, PosedCamera]]] = []
+    found: list[tuple[int, Pictures]] = []
     reasons: list[CalibrationError] = []
     names = [_parts(posed.name) for posed in calibration.cameras]
     in_frames = any(len(parts) == 1 or not folders.keys().isdisjoint(parts[:-1]) for parts in names)
     for files in (folders, per_frame) if in_frames else (folders,):
         try:
-            found.append((files, _poses(calibration, files)))
+            found.append((len(_poses(calibration, files)), files))
         except CalibrationError as error:
             reasons.append(error)
-    files, poses = max(found, key=lambda candidate: len(candidate[1]), default=({}, {}))
-    if not poses and reasons:
+    count, files = max(found, key=lambda candidate: candidate[0], default=(0, folders))
+    if not count and reasons:
         raise reasons[0]
-    return (files, poses) if poses else (folders, {})
+    return files if count else folders
 
 
 def _poses(calibration: Calibration, cameras: Collection[str]) -> dict[str, PosedCamera]:
@@ -295,7 +302,9 @@ def _check(
     if poses:
         check_names(poses, sorted(pictured, key=natural), calibration=calibration.where, pictures=root)
         used = {posed.name for posed in poses.values()}
-        idle = [posed.name for posed in calibration.cameras if posed.name not in used and not _is_file(posed.name)]
+        unused = [posed.name for posed in calibration.cameras if posed.name not in used]
+        missing = [name for name in unused if poses.keys().isdisjoint(_parts(name))]
+        idle = list({_parts(name)[:-1] if _is_file(name) else name: name for name in reversed(missing)}.values())[::-1]
         numbered = {name: posed.name for name, posed in poses.items() if name not in (*_parts(posed.name), posed.name)}
         if numbered and not _by_word(list(numbered.values()), list(numbered)):
             pairs = ", ".join(f"{name} is {own!r}" for name, own in sorted(numbered.items())[:3])

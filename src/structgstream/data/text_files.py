@@ -11,6 +11,7 @@ import os
 import re
 import struct
 import tomllib
+import unicodedata
 import zipfile
 from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE, BOM_UTF32_BE, BOM_UTF32_LE
 from collections.abc import Collection
@@ -34,7 +35,7 @@ class Unreadable(ValueError):
 
 
 BROKEN = (
-    OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, ArithmeticError, EOFError, RecursionError,
+    OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, EOFError, RecursionError,
     struct.error, zipfile.BadZipFile,
 )  # fmt: skip
 """What reading a broken file raises."""
@@ -42,6 +43,8 @@ BROKEN = (
 
 def read_text(file: Path) -> str:
     """The text of a file in UTF-8, UTF-16 or UTF-32, with or without a byte order mark; lines end with ``\\n``.
+
+    Letters with marks are composed, as :func:`~structgstream.data.folder_files.name_of` has them.
 
     Raises:
         Unreadable: it is in another encoding.
@@ -56,7 +59,7 @@ def read_text(file: Path) -> str:
     except UnicodeDecodeError as error:
         place = f"byte {error.start + len(mark)}"
         raise Unreadable(f"it is no Unicode text from {place} on; save it as UTF-8") from None
-    return text.replace("\r\n", "\n").replace("\r", "\n")
+    return unicodedata.normalize("NFC", text.replace("\r\n", "\n").replace("\r", "\n"))
 
 
 def read_json(file: Path) -> Any:
@@ -162,6 +165,7 @@ def reason(error: Exception) -> str:
 def path_parts(text: str) -> tuple[str, ...]:
     """The parts of a path of any system: of ``C:\\data\\cam0\\1.png`` they are ``data``, ``cam0`` and ``1.png``."""
     plain = re.sub(r"^(file://|[A-Za-z]:(?=[\\/]))", "", text.strip()).replace("\\", "/")
+    plain = unicodedata.normalize("NFC", plain)
     return tuple(part for part in PurePosixPath(plain).parts if part not in ("/", "//"))
 
 
@@ -203,10 +207,10 @@ class NamedFiles:
             for entry in path.parent.iterdir() if path.parent.is_dir() else ():
                 found.setdefault(_stem(entry, self._suffixes), []).append(entry)
         same = self._listings[path.parent].get(_stem(path, self._suffixes), [])
-        exact = next((entry for entry in same if entry.name == path.name), None)
+        exact = next((entry for entry in same if unicodedata.normalize("NFC", entry.name) == path.name), None)
         others = [entry for entry in same if entry.suffix.lower() in self._suffixes]
         return exact or (others[0] if len(others) == 1 else None)
 
 
 def _stem(path: Path, suffixes: Collection[str]) -> str:
-    return path.stem if path.suffix.lower() in suffixes else path.name
+    return unicodedata.normalize("NFC", path.stem if path.suffix.lower() in suffixes else path.name)

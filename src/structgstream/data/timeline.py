@@ -43,14 +43,25 @@ def instants_of(stems: Mapping[str, Sequence[str]]) -> dict[str, dict[str, str]]
     """By camera and name of a picture, a key of its instant that all cameras share.
 
     Numbers are compared whatever their padding. Where a camera then shares no name with another and its names differ in
-    their last number alone, that number counts, whatever stands before it (``00_00_00000012``).
+    one number alone, that number counts, whatever stands around it (``00_00_00000012``, ``000012_left``).
     """
     keys = {name: _distinct({stem: re.sub(r"\d+", _unpadded, stem) for stem in own}) for name, own in stems.items()}
     taken = Counter(key for own in keys.values() for key in own.values())
     if len(keys) < 2 or all(any(taken[key] > 1 for key in own.values()) for own in keys.values()):
         return keys
-    numbered = {name: _last_numbers(own) for name, own in stems.items()}
-    return {name: own or keys[name] for name, own in numbered.items()} if all(numbered.values()) else keys
+    numbered = {name: _running_numbers(own) for name, own in stems.items()}
+    if not all(numbered.values()):
+        return keys
+    words = {name: re.sub(r"[\W\d_]+", "", own[0].replace(name, "")) for name, own in stems.items()}
+    if len(set(words.values())) > 1:
+        first = next(iter(words))
+        other = next(name for name in words if words[name] != words[first])
+        log.warning(
+            "The pictures of cameras %r (%s) and %r (%s) have other names, and are matched by their numbers alone; if "
+            "these are not of one count, name pictures of one instant alike",
+            first, stems[first][0], other, stems[other][0],
+        )  # fmt: skip
+    return numbered
 
 
 def _unpadded(digits: re.Match[str]) -> str:
@@ -62,13 +73,18 @@ def _distinct(keys: dict[str, str]) -> dict[str, str]:
     return keys if len(set(keys.values())) == len(keys) else {stem: stem for stem in keys}
 
 
-def _last_numbers(stems: Sequence[str]) -> dict[str, str]:
-    """The last number of each name, where the names differ in nothing else; else nothing."""
-    parts = {stem: re.fullmatch(r"(.*?)(\d+)(\D*)", stem) for stem in stems}
-    found = {stem: (part.group(1), str(int(part.group(2))), part.group(3)) for stem, part in parts.items() if part}
-    same = {(before, after) for before, _, after in found.values()}
-    numbers = {stem: number for stem, (_, number, _) in found.items()}
-    return numbers if len(found) == len(stems) == len(set(numbers.values())) and len(same) == 1 else {}
+def _running_numbers(stems: Sequence[str]) -> dict[str, str]:
+    """The number in each name that counts, where the names differ in nothing else; else nothing."""
+    parts = [re.split(r"(\d+)", stem) for stem in stems]
+    if len({len(own) for own in parts}) != 1:
+        return {}
+    differing = [place for place, column in enumerate(zip(*parts)) if len(set(column)) > 1]
+    if len(stems) == 1:
+        differing = [len(parts[0]) - 2]
+    if len(differing) != 1 or differing[0] % 2 == 0 or differing[0] < 0:
+        return {}
+    numbers = {stem: str(int(own[differing[0]])) for stem, own in zip(stems, parts)}
+    return numbers if len(set(numbers.values())) == len(stems) else {}
 
 
 def picture_slots(pictures: Mapping[str, Sequence[Path]]) -> dict[str, NDArray[np.intp]]:

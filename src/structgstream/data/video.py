@@ -16,7 +16,7 @@ from structgstream.cameras import CameraRig
 from structgstream.data.instants import Placed, measured_rate, origin_of, place, tell_time_error
 from structgstream.data.timeline import Clock, common_slots
 from structgstream.data.video_index import VideoTrack
-from structgstream.data.video_pictures import pictures_at
+from structgstream.data.video_pictures import Mask, Picture, pictures_at
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.frames import MultiViewFrame
 
@@ -68,14 +68,16 @@ class VideoSource:
             pool = stack.enter_context(ThreadPoolExecutor(min(len(self.rig), os.cpu_count() or 1), "videos"))
             for index in range(start, len(self)):
                 pictures = zip(self.rig, pool.map(_next, decoders), strict=True)
-                present = {name: picture for name, picture in pictures if picture is not None}
-                yield MultiViewFrame(index, index / self.fps, present)
+                present = {name: shown for name, shown in pictures if shown is not None}
+                images = {name: picture for name, (picture, _) in present.items()}
+                masks = {name: mask for name, (_, mask) in present.items() if mask is not None}
+                yield MultiViewFrame(index, index / self.fps, images, masks=masks)
 
     def resized(self, rig: CameraRig) -> "VideoSource":
         """The same frames at the sizes of ``rig``, resampled by area while the colours are converted."""
         return replace(self, rig=rig)
 
-    def _pictures(self, name: str, start: int) -> Generator[NDArray[np.uint8] | None]:
+    def _pictures(self, name: str, start: int) -> Generator[tuple[Picture, Mask | None] | None]:
         track, camera = self.tracks[name], self.rig[name]
 
         def tell(lost: int, following: int | None, reason: str) -> None:
@@ -92,7 +94,7 @@ class VideoSource:
         return pictures_at(track, self.stamps[name][start:], size=(camera.width, camera.height), on_damage=tell)
 
 
-def _next(pictures: Iterator[NDArray[np.uint8] | None]) -> NDArray[np.uint8] | None:
+def _next(pictures: Iterator[tuple[Picture, Mask | None] | None]) -> tuple[Picture, Mask | None] | None:
     return next(pictures)
 
 

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 VIDEO_SUFFIXES = frozenset({
     ".mp4", ".mov", ".m4v", ".3gp", ".360", ".mkv", ".webm", ".avi", ".ts", ".mts", ".m2ts", ".mpg", ".mpeg", ".mxf",
-    ".nut", ".flv", ".asf", ".wmv", ".ogv", ".ogg",
+    ".nut", ".flv", ".asf", ".wmv", ".ogv", ".ogg", ".y4m", ".h264", ".264", ".h265", ".265", ".hevc",
 })  # fmt: skip
 PROGRESSIVE = 1  # the largest AVFieldOrder of pictures that are not fields; 0 is unknown
 # The upper left of a display matrix (ISO/IEC 14496-12) and the quarter turns counterclockwise that it stands for.
@@ -97,7 +97,7 @@ def open_video(path: Path) -> "InputContainer":
     """
     av = load_av()
     try:
-        container = av.open(str(path))
+        container = av.open(str(path), metadata_errors="replace")
     except FileNotFoundError:
         raise CaptureError(f"The video {path} is missing; restore the file.") from None
     except PermissionError:
@@ -157,7 +157,10 @@ def _scan(path: Path) -> VideoTrack:
         except av.error.FFmpegError as error:
             raise CaptureError(f"The video {path} is damaged ({error.strerror}); copy or record it again.") from None
         whole = sum(not packet.is_corrupt for packet in packets)
-        if not whole or len(packets) < stream.frames or (packets[-1].is_corrupt and not packets[-1].is_keyframe):
+        count = len(packets)
+        if packets and container.format.name == "avi" and packets[-1].dts is not None:
+            count = packets[-1].dts + 1  # an empty packet stands for a frame that the recorder dropped
+        if not whole or count < stream.frames or (packets[-1].is_corrupt and not packets[-1].is_keyframe):
             raise CaptureError(
                 f"The video {path} is truncated: its index announces {stream.frames or 'some'} frames, "
                 f"{whole} are there; copy or record it again."
@@ -173,7 +176,7 @@ def _scan(path: Path) -> VideoTrack:
         seconds = float(stream.time_base)
         if not started:  # Some recorders mark no key frame, or write none.
             first = _first_of(path)
-        origin = stamps[0] if stamps and container.format.name == "avi" else 0
+        origin = stamps[0] - (packets[0].dts or 0) if stamps and container.format.name == "avi" else 0
         stamps = _decodable(path, stamps, first, seconds)
         turns = _quarter_turns(path, stream, first)
         size = (stream.height, stream.width) if turns % 2 else (stream.width, stream.height)

@@ -16,27 +16,34 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.images import OPAQUE, reduced_mask
 from structgstream.data.transfer import BT2020, HIGH_RANGE, high_range_to_srgb, transfer_of
 from structgstream.data.video_index import VideoTrack, load_av, open_video, video_stream
 
 if TYPE_CHECKING:
+    from av.container import InputContainer
     from av.video.frame import VideoFrame
     from av.video.reformatter import VideoReformatter
+    from av.video.stream import VideoStream
 
 Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 Damage = Callable[[int, int | None, str], None]
 """Called with the time stamps, in ticks, of the first frame that is lost and of the next key frame, and the reason."""
 
 # Values of libswscale and of ISO/IEC 23091-2 that the bindings name differently from version to version.
 AREA, BICUBIC, FULL_CHROMA, ACCURATE_ROUNDING = 0x20, 0x4, 0x2000, 0x40000
 BT709, BT601, FULL_RANGE, LIMITED_RANGE = 1, 5, 2, 1
+VPX = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 MATRICES = {1: BT709, 4: 4, 5: BT601, 6: BT601, 7: 7, 9: 9, 10: 9}
 
 
 def pictures_at(
     track: VideoTrack, stamps: Sequence[int | None], *, size: tuple[int, int], on_damage: Damage
-) -> Generator[Picture | None]:
-    """For each of ``stamps`` the picture ``[H, W, 3]`` sRGB, or None.
+) -> Generator[tuple[Picture, Mask | None] | None]:
+    """For each of ``stamps`` the picture ``[H, W, 3]`` sRGB and where it is opaque, ``[H, W]``, or None.
+
+    The second is None where all is opaque.
 
     Args:
         track: the video.
@@ -51,7 +58,7 @@ def pictures_at(
             if ready is None or ready.pts != stamp:
                 yield None
                 continue
-            yield _shown(ready, reformatter, track, size)
+            yield _shown(ready, reformatter, track, size), _opaque(ready, track, size)
             ready = next(decoded, None)
 
 
@@ -115,10 +122,12 @@ class _Run:
         with open_video(self.track.path) as container:
             stream = video_stream(container)
             stream.codec_context.thread_count = 1  # the cameras are the parallelism
+            # AVI states the order in which frames are decoded, and they come in that in which they are shown.
+            reordered = container.format.name == "avi" and stream.codec_context.has_b_frames
             try:
                 if begin is not None:
                     container.seek(begin, stream=stream, backward=True)
-                for frame in container.decode(stream):
+                for frame in _frames_from_key(container, stream, any_frame=not self.track.keyframes):
                     if frame.pts is None or frame.pts < (stamps[0] if begin is None else begin):
                         continue  # cut by the container's edit list, or before the key frame
                     if not self.met and begin is not None and frame.pts > begin:
@@ -126,12 +135,29 @@ class _Run:
                         return
                     if not self.met:
                         self.expected, self.met = 0 if begin is None else bisect_left(stamps, begin), True
+                    if reordered and self.expected < len(stamps):
+                        frame.pts = stamps[self.expected]
                     if self.expected == len(stamps) or frame.pts != stamps[self.expected] or frame.is_corrupt:
                         return
                     self.expected += 1
                     yield frame
             except av.error.FFmpegError as error:
                 self.reason = str(error.strerror)
+
+
+def _frames_from_key(container: "InputContainer", stream: "VideoStream", *, any_frame: bool) -> Generator["VideoFrame"]:
+    """The frames from the first key frame on: some decoders end at packets before it.
+
+    Those of VP8 and VP9 with alpha are decoded by libvpx, where it is built in, as others leave it out.
+    """
+    decoder, vpx = stream.codec_context, VPX.get(stream.codec_context.name)
+    has_alpha = "1" in (value for key, value in stream.metadata.items() if key.lower() == "alpha_mode")
+    if has_alpha and vpx in load_av().codecs_available:
+        decoder = load_av().CodecContext.create(vpx, "r")
+    for packet in container.demux(stream):
+        any_frame = any_frame or packet.is_keyframe
+        if any_frame:
+            yield from decoder.decode(packet)
 
 
 def _key_before(track: VideoTrack, stamp: int) -> int | None:
@@ -146,6 +172,14 @@ def _shown(frame: "VideoFrame", reformatter: "VideoReformatter", track: VideoTra
         return srgb(frame, reformatter, width=size[0], height=size[1])
     width, height = size[::-1] if track.quarter_turns % 2 else size
     return np.ascontiguousarray(np.rot90(srgb(frame, reformatter, width=width, height=height), track.quarter_turns))
+
+
+def _opaque(frame: "VideoFrame", track: VideoTrack, size: tuple[int, int]) -> Mask | None:
+    """Where the picture is opaque, as it is shown, at ``size``; None where it is everywhere."""
+    if not any(component.is_alpha for component in frame.format.components):
+        return None
+    opaque = frame.to_ndarray(format="rgba")[..., 3] >= OPAQUE * 255
+    return None if opaque.all() else reduced_mask(np.rot90(opaque, track.quarter_turns), size)
 
 
 def srgb(frame: "VideoFrame", reformatter: "VideoReformatter", *, width: int, height: int) -> NDArray[np.uint8]:

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.audio import read_audio
-from structgstream.data.camera_files import NO_CAMERAS, ROOTS, filmed_folder, other_roots
-from structgstream.data.folder_files import check_link, files_of, is_hidden
+from structgstream.data.camera_files import NO_CAMERAS, UNREAD, filmed_folder, other_roots, roots_of
+from structgstream.data.folder_files import check_link, files_of, is_hidden, name_of
 from structgstream.data.images import PICTURE_SUFFIXES, read_picture, significant_bits
 from structgstream.data.picture_size import picture_size
 from structgstream.data.prepared import preprocess
@@ -36,9 +36,7 @@ _log = logging.getLogger(__name__)
 
 PICTURE_FPS = 30.0  # folders of pictures state no rate
 WORTH_SEEKING = 60  # frames; closer ones are decoded in one pass
-FILMED = VIDEO_SUFFIXES | PICTURE_SUFFIXES | {
-    ".360", ".3gp", ".avi", ".dng", ".heic", ".insv", ".m2ts", ".mpeg", ".mpg", ".mts", ".mxf", ".wmv",
-}  # fmt: skip
+FILMED = VIDEO_SUFFIXES | PICTURE_SUFFIXES | UNREAD
 """What a camera may have written, also in ways that are not read here."""
 CHAPTER = re.compile(r"(G[HLPSX]\d\d|GOPR)", re.IGNORECASE)  # of a GoPro, GX010001 and GX020001
 LAYOUTS = "CAMERA.mp4, CAMERA/anything.mp4, CAMERA/FRAME.jpg or CAMERA.jpg"
@@ -126,9 +124,9 @@ class Footage:
 
         stamps = [track.stamps[index] for index in indices]
         with closing(pictures_at(track, stamps, size=(track.width, track.height), on_damage=tell)) as pictures:
-            for picture in pictures:
-                assert picture is not None, "what is lost was told"
-                yield picture
+            for shown in pictures:
+                assert shown is not None, "what is lost was told"
+                yield shown[0]
 
     def audio(self, name: str) -> tuple[NDArray[np.float32], float] | None:
         """Mono samples ``[N]`` and their rate in hertz; sample 0 is at time 0 of the stamps. None without sound.
@@ -178,11 +176,11 @@ def find_footage(where: Path, *, picture_fps: float | None = None) -> Footage:
     if not where.is_dir():
         kind = "a file" if where.exists() else "missing"
         raise CaptureError(f"{where} is {kind}; give the folder that holds the cameras' videos ({LAYOUTS}).")
-    found = {root: _found(root) for root in (where / name for name in ("", *ROOTS)) if root.is_dir()}
+    found = {root: _found(root) for root in (where, *roots_of(where))}
     # A stray picture or preview beside the folder of the videos is no take: two cameras come before one.
     root = next((root for least in (2, 1) for root, files in found.items() if len(files) >= least), None)
     if root is None or len(found[root]) < 2:
-        root = next(other_roots(where), root)
+        root = next(other_roots(where), None) or next(other_roots(where, pictures=True), root)
     if root is not None:
         files = found.get(root) or _found(root)
         if root != where:
@@ -248,7 +246,7 @@ def _found(root: Path) -> dict[str, Path]:
         several: list[tuple[Path, list[Path]]] = []
         for entry in entries:
             file = entry if entry.is_file() and entry.suffix.lower() in suffixes else None
-            if entry.is_dir() and entry.name not in NO_CAMERAS:
+            if entry.is_dir() and entry.name.lower() not in NO_CAMERAS:
                 file = filmed_folder(entry, suffixes)
                 if file is not None and suffixes is VIDEO_SUFFIXES:
                     files = files_of(file, suffixes)
@@ -258,7 +256,7 @@ def _found(root: Path) -> dict[str, Path]:
                         continue
             if file is None:
                 continue
-            name = entry.stem if entry.is_file() else entry.name
+            name = name_of(entry)
             if name in found:
                 raise CaptureError(
                     f"{found[name].name} and {file.name} in {root} are both of camera {name!r}; expected one file per "
@@ -293,7 +291,7 @@ def _check_left(root: Path, found: Mapping[str, Path]) -> None:
                 "time of each frame.",
                 entry, taken,
             )  # fmt: skip
-        if not entry.is_dir() or entry.name in NO_CAMERAS or found.get(entry.name, root).is_relative_to(entry):
+        if not entry.is_dir() or entry.name.lower() in NO_CAMERAS or found.get(entry.name, root).is_relative_to(entry):
             continue
         if not any(entry.iterdir()):
             raise CaptureError(

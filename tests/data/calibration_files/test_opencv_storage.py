@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from structgstream.data.calibration_files.opencv_storage import is_storage, read_storage
+from structgstream.data.calibration_files.opencv_storage import may_be_storage, read_storage
 from structgstream.data.text_files import Unreadable
 
 MATRIX = np.arange(6.0).reshape(2, 3)
@@ -34,7 +34,7 @@ def written(path: Path) -> Path:
 @pytest.mark.parametrize("name", ["rig.yml", "rig.yaml", "rig.xml"])
 def test_every_kind_of_value_comes_back(tmp_path: Path, name: str) -> None:
     file = written(tmp_path / name)
-    assert is_storage(file)
+    assert may_be_storage(file)
     found = read_storage(file)
     assert set(found) == {"K", "count", "error", "name", "list", "inner"}
     np.testing.assert_array_equal(found["K"], MATRIX)
@@ -44,9 +44,9 @@ def test_every_kind_of_value_comes_back(tmp_path: Path, name: str) -> None:
 
 
 def test_other_files(tmp_path: Path) -> None:
-    for content in (b"", b"cameras: 1\n", b"{}", b"\xff\xfe"):
-        (tmp_path / "x.yml").write_bytes(content)
-        assert not is_storage(tmp_path / "x.yml")
+    for name, content in (("x.yml", b""), ("x.xml", b"<a/>"), ("x.json", b"{}"), ("x.yml", b"\xff\xfe")):
+        (tmp_path / name).write_bytes(content)
+        assert not may_be_storage(tmp_path / name)
     (tmp_path / "x.yml").write_text("%YAML:1.0\n---\nK: !!opencv-matrix\n   rows: 3\n   cols: [\n")
     with pytest.raises(Unreadable, match="it is not YAML at line 6"):
         read_storage(tmp_path / "x.yml")

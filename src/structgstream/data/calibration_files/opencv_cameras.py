@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from structgstream.data.calibration_files.easymocap import EXTRINSICS, INTRINSICS
-from structgstream.data.calibration_files.opencv_storage import is_storage, read_storage
+from structgstream.data.calibration_files.opencv_storage import may_be_storage, read_storage
 from structgstream.data.calibration_files.reading import LARGEST_BYTES, NoPose, calibration_of
 from structgstream.data.lenses import fisheye_lens, from_integer_centers, opencv_lens
 from structgstream.data.posed import Calibration, PosedCamera, rigid
@@ -25,23 +25,29 @@ EXPECTED = (
     "Intrinsics, Distortion and CameraMatrix (3x4)"
 )
 SPELLINGS: Mapping[str, tuple[str, ...]] = {
-    "K": ("intrinsics", "intrinsic", "intrinsicmatrix", "cameramatrix", "cammatrix", "kmatrix", "matrix", "mtx", "k"),
-    "distortion": (
-        "distortion", "distortioncoefficients", "distortioncoeffs", "distortionvector", "distcoeffs", "distcoefs",
-        "distcoef", "dist", "d",
-    ),
-    "rotation": ("rotation", "rotationmatrix", "rotationvector", "rmatrix", "rmat", "rot", "rvec", "r"),
-    "translation": ("translation", "translationvector", "tvector", "trans", "tvec", "t"),
-    "pose": ("cameramatrix", "extrinsics", "extrinsic", "extrinsicmatrix", "viewmatrix", "viewmat", "w2c", "rt"),
-    "inverse pose": ("cameraposematrix",),
+    "K": ("intrinsic", "k", "m", ""),
+    "distortion": ("distortion", "dist", "d"),
+    "rotation": ("rotation", "rot", "r"),
+    "translation": ("translation", "trans", "t"),
+    "pose": ("extrinsic", "view", "rt", ""),
+    "inverse pose": ("camerapose", "c2w", "2world", "toworld"),
     "width": ("imagewidth", "imgwidth", "framewidth", "width", "w"),
     "height": ("imageheight", "imgheight", "frameheight", "height", "h"),
     "size": ("imagesize", "imgsize", "size", "resolution"),
+    "name": ("name", "id", "serial"),
     "fisheye": ("fisheyemodel", "fisheye", "distortiontype"),
 }  # fmt: skip
-"""Keys without marks between words and in lower case; of several the first counts."""
-SHAPES = {"K": ((3, 3),), "pose": ((3, 4), (4, 4)), "inverse pose": ((3, 4), (4, 4))}
-SUFFIXES = (".xml", ".yml", ".yaml")
+"""Keys without marks between words, without :data:`FILLING` and in lower case; of several the first counts."""
+FILLING = re.compile(
+    r"world2cam(era)?|worldtocam(era)?|w2c|camera(?!pose)|cam(?!erapose)|matrix|mat|mtx|vector|vec|coefficients?|coeffs?|coefs?|"
+    r"param(eter)?s?|s$"
+)
+SHAPES = {
+    "K": {(3, 3): (3, 3), (9,): (3, 3)},
+    **{key: {(3, 4): (3, 4), (12,): (3, 4), (4, 4): (4, 4), (16,): (4, 4)} for key in ("pose", "inverse pose")},
+}
+"""What a matrix may look like, as a list or as rows, and what it is then."""
+SUFFIXES = (".xml", ".yml", ".yaml", ".json")
 
 
 def find(folder: Path) -> Iterator[tuple[Path, ...]]:
@@ -63,7 +69,7 @@ def _files(folder: Path) -> tuple[Path, ...]:
         return ()
     holding, broken = [], []
     for file in files:
-        if file.name in (INTRINSICS, EXTRINSICS) or file.stat().st_size > LARGEST_BYTES or not is_storage(file):
+        if file.name in (INTRINSICS, EXTRINSICS) or file.stat().st_size > LARGEST_BYTES or not may_be_storage(file):
             continue
         try:
             if _tables(file):
@@ -102,14 +108,22 @@ def _tables(file: Path) -> dict[str, dict[str, Any]]:
     content = read_storage(file)
     if _value(content, "K") is not None:
         return {"": content}
-    return {key: value for key, value in content.items() if isinstance(value, dict) and _value(value, "K") is not None}
+    named: list[tuple[Any, Any]] = list(content.items())
+    for group in content.values():  # such as ``cameras``
+        if isinstance(group, dict):
+            named += group.items()
+        elif isinstance(group, list):
+            named += ((_value(one, "name"), one) for one in group if isinstance(one, dict))
+    return {str(key): one for key, one in named if isinstance(one, dict) and _value(one, "K") is not None}
 
 
 def _camera(name: str, content: dict[str, Any]) -> PosedCamera:
     K = _value(content, "K")
     if K is None:
-        raise KeyError(" or ".join(SPELLINGS["K"][:4]))
-    width, height, size = (_value(content, key) for key in ("width", "height", "size"))
+        raise KeyError("camera_matrix or intrinsics or K")
+    size = _value(content, "size")
+    width, height = (_value(size if isinstance(size, dict) else content, key) for key in ("width", "height"))
+    size = None if isinstance(size, dict) else size
     if size is None and width is not None and height is not None and number(width) > 0 and number(height) > 0:
         size = (width, height)
     coefficients = _value(content, "distortion")
@@ -142,8 +156,16 @@ def _pose(content: dict[str, Any]) -> np.ndarray:
 
 def _value(content: dict[str, Any], key: str) -> Any:
     """The first value that is spelled as ``key`` and has its shape; None where there is none."""
-    plain = {re.sub(r"[^a-z0-9]", "", name.lower()): value for name, value in content.items()}
-    for spelling in SPELLINGS[key]:
-        if (value := plain.get(spelling)) is not None and (key not in SHAPES or np.shape(value) in SHAPES[key]):
-            return value
-    return None
+    plain = [(FILLING.sub("", re.sub(r"[^a-z0-9]", "", name.lower())), value) for name, value in content.items()]
+    values = [value for spelling in SPELLINGS[key] for name, value in plain if name == spelling and value is not None]
+    if key not in SHAPES:
+        return next(iter(values), None)
+    shaped = ((value, SHAPES[key].get(_shape(value))) for value in values)
+    return next((np.reshape(np.array(value, np.float64), shape) for value, shape in shaped if shape is not None), None)
+
+
+def _shape(value: Any) -> tuple[int, ...]:
+    try:
+        return np.shape(value)
+    except ValueError:  # rows of unequal length
+        return ()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads what OpenCV's ``FileStorage`` writes, YAML or XML: matrices as arrays, all else as text, lists and names.
+"""Reads what OpenCV's ``FileStorage`` writes, YAML, XML or JSON: matrices as arrays, all else as text, lists and names.
 
 OpenCV's own reader writes beyond its memory where a file states another size of a matrix than it holds, and its YAML is
 of a header and a type that other readers do not know.
@@ -13,19 +13,21 @@ from typing import Any
 
 import numpy as np
 
-from structgstream.data.text_files import Unreadable, mapping, number, read_text, whole
+from structgstream.data.text_files import Unreadable, mapping, number, read_json, read_text, whole
 from structgstream.errors import MissingExtraError
 
 MOST_ENTRIES = 1_000_000  # of a matrix
 
 
-def is_storage(file: Path) -> bool:
-    """Whether a file begins as one of these."""
+def may_be_storage(file: Path) -> bool:
+    """Whether a file may be one of these, or plain YAML of the same keys."""
     try:
-        head = read_text(file)[:400].lstrip()
+        text = read_text(file)
     except (OSError, Unreadable):
         return False
-    return head.startswith("%YAML") or "<opencv_storage" in head
+    if file.suffix.lower() == ".json":
+        return '"opencv-matrix"' in text
+    return "<opencv_storage" in text[:400] or (file.suffix.lower() != ".xml" and len(text) > 0)
 
 
 def read_storage(file: Path) -> dict[str, Any]:
@@ -37,7 +39,9 @@ def read_storage(file: Path) -> dict[str, Any]:
         MissingExtraError: PyYAML is not installed.
     """
     text = read_text(file)
-    return _of_xml(text) if "<opencv_storage" in text[:400] else mapping(_value(parsed_yaml(text)))
+    if "<opencv_storage" in text[:400]:
+        return _of_xml(text)
+    return mapping(_value(read_json(file) if text.lstrip().startswith("{") else parsed_yaml(text)))
 
 
 def parsed_yaml(text: str) -> Any:

@@ -6,6 +6,7 @@ Intrinsics stand at the top or with a frame: ``fl_x``, ``fl_y``, ``cx``, ``cy``,
 ``transforms_test.json`` is held out.
 """
 
+import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,8 +22,11 @@ from structgstream.data.posed import Calibration, PosedCamera, intrinsics
 from structgstream.data.text_files import NamedFiles, Unreadable, mapping, number, path_parts, pixels, read_json
 from structgstream.errors import CalibrationError
 
-WHOLE, TRAIN, TEST = "transforms.json", "transforms_train.json", "transforms_test.json"
+WHOLE, TRAIN = "transforms.json", "transforms_train.json"
+TEST, VALIDATION = "transforms_test.json", "transforms_val.json"
 EXPECTED = "frames with file_path and transform_matrix, and fl_x, cx, cy, w and h or camera_angle_x"
+log = logging.getLogger(__name__)
+
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 OPENCVS = ("OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
 FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
@@ -63,6 +67,8 @@ def read_shots(files: tuple[Path, ...]) -> list[Shot]:
         CalibrationError: they are broken, or a lens is not known here.
     """
     shots = []
+    if (files[0].parent / VALIDATION).is_file():
+        log.warning("%s: the pictures of %s are left out", files[0].parent, VALIDATION)
     for file in files:
         with readable(file, EXPECTED):
             content = mapping(read_json(file))
