@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import UsageError
-from structgstream.cli.options import Device, parse_options
+from structgstream.cli.options import Device, check_ending, parse_options
 from structgstream.cli.plain_text import say
 from structgstream.cli.progress import human_bytes
 
@@ -28,7 +28,7 @@ class Join:
     Example: structgstream join groups/*.sgs -o ball.sgs
     """
 
-    segments: tyro.conf.Positional[tuple[Path, ...]]
+    segments: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SEGMENT [SEGMENT ...]")]
     """The segments that reconstruct --init has written, in any order."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
     """The stream file to write."""
@@ -48,6 +48,7 @@ def main(arguments: list[str]) -> None:
     """Writes the file, and prints what was handed over and its size."""
     options = parse_options(Join, "join", arguments=arguments)
     output = options.output
+    check_ending(output, ".sgs", command="join")
     if not options.segments:
         raise UsageError("join needs the segments of a stream.")
     if output.exists() and not options.overwrite:

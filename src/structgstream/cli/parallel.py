@@ -13,6 +13,7 @@ from structgstream.cli.options import (
     CaptureOptions,
     Device,
     Folder,
+    check_ending,
     open_selected_capture,
     parse_known_options,
     resolve_config,
@@ -78,9 +79,9 @@ class Parallel:
     """The stream file to write; on a cluster all machines see its folder at the same place."""
     groups: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Frames of a group: a multiple of the key interval. Default: one key interval."""
-    quiet: bool = False
-    """Begin each group at the frame near its border where least moves."""
-    odd: bool = False
+    split_at_low_motion: bool = False
+    """Begin each group at the key frame near its border where least moves, instead of at equal distances."""
+    allow_unaligned: bool = False
     """Allow an N that is no multiple of the key interval; each group then costs a key packet more."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
     """compact (default), fine, fast, or tiny; fields of the configuration are options as of reconstruct."""
@@ -101,6 +102,7 @@ class Parallel:
 def main(arguments: list[str]) -> None:
     """Runs with a display of all groups."""
     options, rest = parse_known_options(Parallel, "parallel", arguments=arguments)
+    check_ending(options.output, ".sgs", command="parallel")
     from structgstream.presets import with_budget  # after --help, which needs no torch
 
     config, preset = resolve_config(options.preset, rest, command="parallel", seed=options.seed)
@@ -148,7 +150,7 @@ def _check(options: Parallel, config: "StreamConfig", parts: "Parts") -> None:
     from structgstream.struct_gstream import stream_pipeline
 
     source = open_selected_capture(options.scene, options.capture)
-    if options.groups is not None and not options.odd:
+    if options.groups is not None and not options.allow_unaligned:
         check_length(options.groups, key_interval=stream_pipeline(config).codec.key_interval(source.fps))
     parts.check()
     check_output(options.output, may_exist=options.overwrite or bool(parts.notes), resume=False)
@@ -206,8 +208,8 @@ def _job(options: Parallel, rest: list[str]) -> "Job":
     header += [] if capture.held_out is None else ["--held-out", *capture.held_out]
     track = [
         *_words("groups", options.groups),
-        *(["--quiet"] if options.quiet else []),
-        *(["--odd"] if options.odd else []),
+        *(["--split-at-low-motion"] if options.split_at_low_motion else []),
+        *(["--allow-unaligned"] if options.allow_unaligned else []),
     ]
     unit = Unit(
         str(options.scene.absolute()),

@@ -40,7 +40,7 @@ class Play:
     """The capture that it was made from, to compare with the cameras' pictures."""
     port: Annotated[int, tyro.conf.arg(help_behavior_hint="")] = 0
     """Port to listen on. Default: one that is free."""
-    browser: bool = True
+    browser: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = True
     """Do not open a browser."""
     wait: bool = False
     """Wait until the file exists: it is created when frame 0 is done."""

@@ -49,10 +49,10 @@ class Serve:
     """Names under which the server is asked, besides those of this machine, as behind a proxy."""
     proxy: Words = ()
     """Addresses or networks of reverse proxies, whose X-Forwarded-For and X-Forwarded-Proto are believed."""
-    previews: bool = True
-    """Render no preview pictures; those that are files are shown."""
+    previews: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = True
+    """Do not render preview pictures; those that exist as files are shown."""
     requests_per_second: float = 50.0
-    """Requests that an address may make in the mean; four seconds' worth at once."""
+    """Requests a second of an address, on average; up to four seconds' worth at once."""
     connections: int = 1000
     """Connections of all addresses."""
     connections_per_address: int = 100

@@ -29,7 +29,7 @@ class Token:
     stream: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="STREAM", help_behavior_hint="")] = ""
     """Name of the stream, as the server lists it."""
     every: bool = False
-    """For every stream, the list and the metrics."""
+    """Make the token for every stream, the list and the metrics."""
     hours: float = 2.0
     """How long it is valid."""
     address: Annotated[str, tyro.conf.arg(metavar="URL", help_behavior_hint="")] = ""
