@@ -170,6 +170,15 @@ def _shown_size(file: Path, orientation: int) -> tuple[int, int]:
     return (height, width) if orientation >= 5 else (width, height)
 
 
+def orientations(calibration: Calibration, firsts: Mapping[str, Path]) -> dict[str, int]:
+    """The EXIF orientation by which each calibrated camera's pictures are turned, by its first picture.
+
+    Raises:
+        CalibrationError: neither the calibration nor the size of the pictures decides.
+    """
+    return {name: _orientation(firsts[name], posed, calibration) for name, posed in _poses(calibration, firsts).items()}
+
+
 def _orientation(file: Path, posed: PosedCamera, calibration: Calibration) -> int:
     """The EXIF orientation by which a camera's pictures are turned: that of the pictures that were calibrated.
 
