@@ -71,7 +71,7 @@ def open_posed(
         CaptureError: no pictures or videos, or not of the calibrated cameras.
         CalibrationError: a camera without calibration, one that moves, or pictures of other proportions.
     """
-    for root in chain(_roots(path), other_roots(path)):
+    for root in chain(filmed_roots(path), other_roots(path)):
         if videos := videos_in(root):
             partial = not complete or calibration.unposed
             videos = _posed(videos, calibration, root) if partial else videos
@@ -94,7 +94,7 @@ def open_posed(
     )
 
 
-def _roots(path: Path) -> list[Path]:
+def filmed_roots(path: Path) -> list[Path]:
     """The folders to look through, in order; videos before pictures that are stills of the same cameras."""
     roots = [path / name for name in ROOTS]
     pictures = {root: found for root in roots if (found := pictures_in(root))}
