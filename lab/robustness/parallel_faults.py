@@ -60,7 +60,7 @@ def job_in(folder: Path, *, real: bool) -> Job:
     """Three real groups of four frames, or twenty that only look so."""
     folder.mkdir(parents=True, exist_ok=True)
     if real:
-        track = ("--groups", "4", "--odd")
+        track = ("--groups", "4", "--allow-unaligned")
         unit = Unit(
             str(bundled_clip_path()),
             header=("--preset", "tiny", "--scale", "0.25"),

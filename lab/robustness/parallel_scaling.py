@@ -98,7 +98,7 @@ def whole_run(row: str, folder: Path) -> dict[str, object]:
     unit = Unit(
         str(bundled_clip_path()),
         header=("--preset", "tiny"),
-        track=("--groups", "2", "--odd"),
+        track=("--groups", "2", "--allow-unaligned"),
         device=("--device", "cpu"),
     )
     parts = Parts(folder / "parts")

@@ -14,6 +14,7 @@ from typing import Generic
 from structgstream.codec.container.periods import Period
 from structgstream.codec.container.records import MAX_PERIODS
 from structgstream.codec.encoder import Encoded
+from structgstream.codec.header import check_picture_sizes
 from structgstream.codec.packet_table import PacketInfo
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
 from structgstream.data.denoising import denoised
@@ -47,6 +48,7 @@ class Session(Generic[State, Memory]):
         on_step: called after every optimisation step.
 
     Raises:
+        CalibrationError: the pictures of a camera are larger than a stream allows.
         ConfigError: the stream to resume was made with another configuration or from another capture, or a target rate
             cannot be kept.
     """
@@ -62,6 +64,7 @@ class Session(Generic[State, Memory]):
         metadata: Mapping[str, object] | None = None,
         on_step: StepListener | None = None,
     ) -> None:
+        check_picture_sizes(source.rig)
         self._source = denoised(source, pipeline.denoising, at=pipeline.denoised)
         self._sink = sink
         self._pipeline = pipeline

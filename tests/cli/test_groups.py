@@ -18,7 +18,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with ``header.sgs``, ``track``, and segments ``g0.sgs`` and ``g2.sgs``."""
     folder = tmp_path_factory.mktemp("groups")
     assert main(["reconstruct", CLIP, "-o", str(folder / "header.sgs"), "--frames", "1", *QUARTER]) == 0
-    assert main([*track(folder), "--groups", "2", "--odd", "--frames", "4"]) == 0
+    assert main([*track(folder), "--groups", "2", "--allow-unaligned", "--frames", "4"]) == 0
     for line in (folder / "track.groups").read_text().split():
         assert main(group(folder, line)) == 0
     return folder
@@ -46,7 +46,7 @@ def test_a_shell_loop_makes_an_ordinary_stream(made: Path, tmp_path: Path, capsy
 
 
 def test_commands_given_again_say_that_all_is_done(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([*track(made), "--groups", "2", "--odd", "--frames", "4"]) == 0
+    assert main([*track(made), "--groups", "2", "--allow-unaligned", "--frames", "4"]) == 0
     assert "2 groups in" in capsys.readouterr().out
     assert main(group(made, "2:4")) == 0
     assert "is finished" in capsys.readouterr().out

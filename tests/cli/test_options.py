@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """What options come to: the part of a capture, and a configuration edited by paths."""
 
+import json
 from pathlib import Path
 
 import pytest
 
-from structgstream.cli.app import UsageError
+from structgstream.cli.app import UsageError, main
+from structgstream.cli.join import Join
 from structgstream.cli.options import (
+    RENAMED,
     CaptureOptions,
     check_ending,
     open_selected_capture,
@@ -75,10 +78,51 @@ def test_a_field_that_there_is_not_ends_the_command_with_its_name(capsys: pytest
     assert "--online.iteratons" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", ["a.mov", "a.WEBM", "b/a.gif", "a.jpg", "-", "~/a", "a.ply"])
+@pytest.mark.parametrize("name", ["a.mov", "a.WEBM", "b/a.gif", "a.jpg", "a.ply", "a.sgs", "a.json"])
 def test_an_output_of_a_kind_that_is_not_written_is_refused(name: str) -> None:
     with pytest.raises(UsageError, match="-o"):
         check_ending(Path(name), ".mp4", ".png", command="render")
+
+
+def test_no_command_writes_a_file_of_another_kind(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for arguments in (
+        ["archive", "x", "-o", "a.mp4"],
+        ["join", "x.sgs", "-o", "a.html"],
+        ["parallel", "x", "-o", "a.ply"],
+        ["export", "x.sgs", "-o", "a.mov", "--format", "ply"],
+        ["evaluate", "x.sgs", "x", "--json", "x.sgs"],
+        ["evaluate", "x.sgs", "x", "--report", "a.html"],
+        ["inspect", "x.sgs", "--json", "x.sgs"],
+        ["prepare", "x", "-o", "a.mp4"],
+        ["board", "-o", "a.png"],
+        ["track", "x", "--init", "h.sgs", "-o", "h.sgs"],
+    ):
+        assert main(arguments) == 2
+        assert "writes no ." in capsys.readouterr().err
+
+
+def test_a_path_is_what_a_shell_makes_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    options = parse_options(Join, "join", arguments=["~/a.sgs", "b.sgs", "-o", "~/c.sgs"])
+    assert options.segments == (tmp_path / "a.sgs", Path("b.sgs"))
+    assert options.output == tmp_path / "c.sgs"
+    with pytest.raises(UsageError, match="output '-' would be a file"):
+        parse_options(Join, "join", arguments=["a.sgs", "-o", "-"])
+    with pytest.raises(UsageError, match="no user"):
+        parse_options(Join, "join", arguments=["a.sgs", "-o", "~no-such-user/a"])
+
+
+def test_json_to_standard_output_is_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "--json", "-"]) == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out).keys() == {"environment", "backends", "packages"}
+    assert "back-end" in printed.err
+
+
+@pytest.mark.parametrize(("old", "new"), RENAMED.items())
+def test_an_option_of_before_is_refused_with_its_new_name(old: str, new: str) -> None:
+    with pytest.raises(UsageError, match=f"{old} is called {new} now"):
+        parse_options(Join, "join", arguments=["a.sgs", "-o", "b.sgs", old])
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.PNG", "folder", "take.2026-11-27"])

@@ -16,7 +16,7 @@ from structgstream.owned_folders import MARKER, Owner
 from structgstream.parallel.object_folder import ObjectFolder
 from structgstream.parallel.parts import PURPOSE, Parts
 
-GROUPS = ["--frames", "6", "--groups", "2", "--odd", "--executor", "inline"]
+GROUPS = ["--frames", "6", "--groups", "2", "--allow-unaligned", "--executor", "inline"]
 pytestmark = pytest.mark.usefixtures("quick_tiny")
 
 
@@ -87,7 +87,7 @@ def snapshot(folder: Path) -> dict[str, bytes]:
     return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-@pytest.mark.parametrize("more", [[], ["--overwrite"], ["--overwrite", "--groups", "2", "--odd"]])
+@pytest.mark.parametrize("more", [[], ["--overwrite"], ["--overwrite", "--groups", "2", "--allow-unaligned"]])
 @pytest.mark.parametrize(
     ("capture", "whose", "status", "said"),
     [

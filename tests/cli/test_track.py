@@ -61,7 +61,12 @@ def test_what_is_asked_for_is_tracked(
     words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     asked = tracks(monkeypatch)
-    assert main([*words, "--groups", "7", "--odd", "--quiet", "--cameras", "9", "--frames", "11"]) == 0
+    assert (
+        main(
+            [*words, "--groups", "7", "--allow-unaligned", "--split-at-low-motion", "--cameras", "9", "--frames", "11"]
+        )
+        == 0
+    )
     ((source, options),) = asked
     assert len(source) == 11
     assert (options.length, options.quiet, options.after, options.tracking.cameras) == (7, True, None, 9)
@@ -112,7 +117,7 @@ def test_overwrite_removes_what_is_there_and_nothing_else_does(
     ("given", "status", "said"),
     [
         (["--groups", "7"], 2, "one every 30 frames"),
-        (["--groups", "0", "--odd"], 2, "0"),
+        (["--groups", "0", "--allow-unaligned"], 2, "0"),
         (["--cameras", "1"], 2, "--cameras must be at least 2, got 1."),
         (["--after", "absent.sgs"], 1, "Cannot read absent.sgs"),
     ],

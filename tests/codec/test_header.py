@@ -12,8 +12,8 @@ import zstandard
 from streams import header_for, small_scene
 from structgstream.codec.container.blocks import pack_raw_block
 from structgstream.codec.container.init_record import MAX_JSON_BYTES
-from structgstream.codec.header import pack_header, unpack_header
-from structgstream.errors import StreamError
+from structgstream.codec.header import check_picture_sizes, pack_header, unpack_header
+from structgstream.errors import CalibrationError, StreamError
 from structgstream.scene.state import STATE_TABLE
 
 
@@ -72,6 +72,7 @@ EDITS: dict[str, Callable[[dict[str, Any]], object]] = {
     "too many values": lambda d: d["similarity"]["center"].append(0),
     "invalid for input": lambda d: d["cameras"][0]["K"].pop(),
     "each side must be 1 to 65535": lambda d: d["cameras"][0].update(width=2**31),
+    "pixels of a picture must be at most 67108864": lambda d: d["cameras"][0].update(width=8192, height=8193),
     "48.0x32": lambda d: d["cameras"][0].update(width=48.0),
     "used once": lambda d: d["cameras"].append(d["cameras"][0]),
     "camera names": lambda d: d["cameras"][0].update(name=5),
@@ -113,6 +114,15 @@ def test_a_description_that_no_reader_would_unpack_is_not_written() -> None:
     long = replace(header_for(small_scene(1)), metadata={"note": "a" * MAX_JSON_BYTES})
     with pytest.raises(StreamError, match=f"at most {MAX_JSON_BYTES} are allowed; leave out metadata or cameras"):
         pack_header(long)
+
+
+def test_a_rig_that_no_reader_would_draw_is_refused_before_training() -> None:
+    rig = header_for(small_scene(1)).rig
+    name = next(iter(rig))
+    large = replace(rig, cameras={**rig.cameras, name: replace(rig[name], width=65_535, height=65_535)})
+    with pytest.raises(CalibrationError, match=f"camera '{name}' have 65535x65535 pixels.*--scale 0.5"):
+        check_picture_sizes(large)
+    check_picture_sizes(replace(rig, cameras={**rig.cameras, name: replace(rig[name], width=8192, height=8192)}))
 
 
 @pytest.mark.parametrize("value", ["yes", 1, None])

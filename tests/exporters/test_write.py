@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from exporters.plain import some
-from structgstream.errors import StorageError
+from structgstream.errors import StorageError, StreamError
 from structgstream.exporters.formats import FORMATS, Format
 from structgstream.exporters.write import write_gaussians
+from structgstream.similarity import Similarity
 
 
 @pytest.mark.parametrize("format", FORMATS)
@@ -25,3 +26,12 @@ def test_a_full_disk_leaves_the_old_file(format: Format, tmp_path: Path) -> None
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert path.read_bytes() == b"old"
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("scale", [1e-300, 1e300])
+def test_values_that_no_file_can_hold_are_refused(format: Format, scale: float, tmp_path: Path) -> None:
+    gaussians = some().in_capture_units(Similarity((0.0, 0.0, 0.0), scale))
+    with pytest.raises(StreamError, match="Gaussians are infinite, zero or no numbers.*inspect shows the similarity"):
+        write_gaussians(tmp_path / "set", gaussians, format=format)
+    assert not [*tmp_path.iterdir()]

@@ -11,9 +11,12 @@ from pathlib import Path
 import pytest
 
 from structgstream.parallel import object_folder, staged
+from structgstream.parallel.exchange import ObjectStore
 from structgstream.parallel.object_folder import ObjectFolder
+from structgstream.parallel.parts import Parts
 from structgstream.parallel.pieces import folder_of, last_pieces, piece_name
 from structgstream.parallel.staged import Staging
+from structgstream.parallel.unit import Unit
 
 ATTEMPT = "000001-0123abcd"
 
@@ -37,8 +40,10 @@ def staging(store: ObjectFolder, tmp_path: Path) -> Staging:
 
 def run(store: ObjectFolder, script: str, *flags: str) -> int:
     """The status of a command whose first word is the folder of this machine."""
-    words = ["--store", store.url, "--name", "task", *flags, "--", "sh", "-c", script, staged.HERE]
-    return staged.run(staged.parsed(words))
+    words = ["--name", "task", *flags, "--", "sh", "-c", script, staged.HERE]
+    with pytest.MonkeyPatch.context() as variables:
+        variables.setenv(staged.STORE, store.url)
+        return staged.run(staged.parsed(words))
 
 
 def grown(store: ObjectFolder, name: str, *, have: int = 0) -> bytes:
@@ -144,11 +149,11 @@ def test_a_finished_file_is_not_one_that_grows(store: ObjectFolder, staging: Sta
 
 
 def test_a_command_that_is_killed_ends_this_process_the_same_way(store: ObjectFolder, tmp_path: Path) -> None:
-    words = ["--store", store.url, "--name", "task", "--grows", "t", "--", "sh", "-c"]
+    words = ["--name", "task", "--grows", "t", "--", "sh", "-c"]
     script = 'printf abc > "$0/t.partial"; kill -9 $$'
     done = subprocess.run(
         [sys.executable, "-m", "structgstream.parallel.staged", *words, script, staged.HERE],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        env={**os.environ, staged.STORE: store.url, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         check=False,
     )
     assert done.returncode == -signal.SIGKILL
@@ -176,7 +181,8 @@ def test_a_disk_of_this_machine_without_room_is_a_sentence(
 
     store.write("a", b"a")
     monkeypatch.setattr(os, "fsync", full)
-    monkeypatch.setattr(sys, "argv", ["staged", "--store", store.url, "--name", "task", "--needs", "a", "--", "true"])
+    monkeypatch.setenv(staged.STORE, store.url)
+    monkeypatch.setattr(sys, "argv", ["staged", "--name", "task", "--needs", "a", "--", "true"])
     assert staged.main() == 1
     error = capsys.readouterr().err
     assert error.startswith("structgstream: ")
@@ -186,7 +192,8 @@ def test_a_disk_of_this_machine_without_room_is_a_sentence(
 def test_a_store_that_cannot_be_used_is_a_sentence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["staged", "--store", "nonsense://a", "--name", "task", "--", "true"])
+    monkeypatch.setenv(staged.STORE, "nonsense://a")
+    monkeypatch.setattr(sys, "argv", ["staged", "--name", "task", "--", "true"])
     assert staged.main() == 1
     error = capsys.readouterr().err
     assert error.startswith("structgstream: nonsense://a cannot be used as a store (")
@@ -195,5 +202,19 @@ def test_a_store_that_cannot_be_used_is_a_sentence(
 
 def test_without_a_command_nothing_is_run(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        staged.parsed(["--store", "file:///a", "--name", "task"])
+        staged.parsed(["--name", "task"])
     assert "command" in capsys.readouterr().err
+
+
+def test_the_url_of_the_store_is_on_no_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may hold credentials, and every user of a machine sees command lines."""
+    url = f"file://{tmp_path / 'secret'}"
+    parts = Parts(tmp_path / "a.parts")
+    unit = Unit("capture")
+    exchange = ObjectStore(ObjectFolder(url), parts, cut=unit.cut)
+    task = exchange.header(unit.header_task(parts))
+    assert not any("secret" in word for word in task.command)
+    assert task.environment[staged.STORE] == url
+    monkeypatch.delenv(staged.STORE, raising=False)
+    with pytest.raises(SystemExit):
+        staged.parsed(["--name", "task", "--", "true"])

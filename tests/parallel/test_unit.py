@@ -38,12 +38,12 @@ def after(command: tuple[str, ...], word: str) -> list[str]:
 
 
 def test_the_tracking_pass_is_what_was_asked_for(tmp_path: Path, parts: Parts) -> None:
-    task = unit(tmp_path, frames=40, track=("--groups", "8", "--quiet")).track_task(parts)
+    task = unit(tmp_path, frames=40, track=("--groups", "8", "--split-at-low-motion")).track_task(parts)
     parts.header.parent.mkdir(parents=True)
     parts.header.touch()
     found = parse_options(Track, "track", arguments=after(task.command, "track"))
     assert (found.scene, found.init, found.output) == (tmp_path / "capture", parts.header, parts.track)
-    assert (found.frames, found.groups, found.quiet, found.device) == (40, 8, True, "cpu")
+    assert (found.frames, found.groups, found.split_at_low_motion, found.device) == (40, 8, True, "cpu")
     assert (task.name, task.result, task.log) == ("track", str(parts.track), parts.log("track"))
     assert not task.environment
 

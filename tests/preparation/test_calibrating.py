@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from captures import write_video
 from filmed import ring
 from rooms import write_room
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
-from structgstream.data.posed import Calibration
+from structgstream.data.posed import Calibration, PosedCamera
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibrating import (
     check_complete,
@@ -130,6 +131,25 @@ def test_the_calibration_of_another_tool_is_for_these_pictures(tmp_path: Path) -
     write_video(tmp_path / "cam03.mp4", [np.zeros((120, 160, 3), np.uint8)])
     with pytest.raises(CalibrationError, match="cam03"):
         from_other_tool(calibration, find(tmp_path))
+
+
+@pytest.mark.parametrize(("by_exif", "reason"), [(True, "turn them without loss"), (None, "export the pictures")])
+def test_a_calibration_of_turned_pictures_is_refused_for_stored_ones(
+    tmp_path: Path, by_exif: bool | None, reason: str
+) -> None:
+    """As OpenCV's tools calibrate them; `reconstruct` turns such pictures, a prepared capture does not."""
+    exif = Image.Exif()
+    exif[0x112] = 3
+    cameras = tuple(
+        PosedCamera(name, np.eye(4), np.array([[8.0, 0, 4], [0, 8.0, 3], [0, 0, 1]]), (8, 6), Pinhole())
+        for name in "abc"
+    )
+    for camera in cameras:
+        Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / f"{camera.name}.jpg", exif=exif)
+    calibration = Calibration(tmp_path / "intri.yml", cameras, turned_by_exif=by_exif)
+    with pytest.raises(CalibrationError, match=reason):
+        from_other_tool(calibration, find(tmp_path))
+    assert len(from_other_tool(replace(calibration, turned_by_exif=False), find(tmp_path)).cameras) == 3
 
 
 def find(where: Path) -> Footage:

@@ -172,6 +172,15 @@ def test_the_folder_above_the_videos(tmp_path: Path, caplog: pytest.LogCaptureFi
     caplog.clear()
 
 
+def test_stills_beside_the_take_are_left_out_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_videos(tmp_path / "videos", ["a", "b"], frames=2)
+    for name in "ab":
+        write_picture(tmp_path / "images" / name / "0.png", picture(0, 0))
+    with caplog.at_level(logging.WARNING):
+        assert find_footage(tmp_path).path("a") == tmp_path / "videos" / "a.mp4"
+    assert "one picture of each camera" in caplog.text
+
+
 def test_cards_that_were_copied_whole(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_videos(tmp_path / name / "DCIM/100GOPRO", ["GX010001"], frames=2)

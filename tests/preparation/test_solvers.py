@@ -103,7 +103,7 @@ def test_pictures_are_of_the_same_moments(tmp_path: Path) -> None:
     footage = filmed(tmp_path)
     clocks = {name: Clock(index * 2 / 30) for index, name in enumerate(NAMES)}
     shots = matched_pictures(footage, Clocks(clocks, "none", ""), PrepareOptions(instants=3))
-    seen = {name: [round((float(shot.mean()) - 20 - index) / 10) for shot in preprocess(shots, name)]
+    seen = {name: [round((float(shot.mean()) - 20 - index) / 10) for shot in pictures_of(shots, name)]
             for index, name in enumerate(NAMES)}  # fmt: skip
     assert len(seen["a"]) == 3
     assert [[a - b for a, b in zip(seen["a"], seen[name], strict=True)] for name in NAMES] == [
@@ -113,7 +113,7 @@ def test_pictures_are_of_the_same_moments(tmp_path: Path) -> None:
     ]
 
 
-def preprocess(shots: object, name: str) -> list[np.ndarray]:
+def pictures_of(shots: object, name: str) -> list[np.ndarray]:
     found = shots[name]  # type: ignore[index]
     return [np.asarray(one) for one in (found if isinstance(found, list) else list(found))]
 

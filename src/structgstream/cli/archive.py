@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import UsageError
-from structgstream.cli.options import Flag, Folder, parse_options
+from structgstream.cli.options import Flag, Folder, check_ending, parse_options
 from structgstream.cli.plain_text import say
 from structgstream.cli.progress import human_bytes
 
@@ -35,6 +35,7 @@ def main(arguments: list[str]) -> None:
     """Writes the file and prints its size."""
     options = parse_options(Archive, "archive", arguments=arguments)
     output = options.output
+    check_ending(output, ".sgs", command="archive")
     if output.exists() and not options.overwrite:
         raise UsageError(f"{output} exists; replace it with --overwrite, or choose another name.")
     from structgstream.codec.segments.archive import write_archive

@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import usage_errors
-from structgstream.cli.options import parse_options
+from structgstream.cli.options import check_ending, parse_options
 from structgstream.cli.plain_text import say
 
 
@@ -41,6 +41,7 @@ class BoardCommand:
 def main(arguments: list[str]) -> None:
     """Writes the board and says how to name it to prepare."""
     options = parse_options(BoardCommand, "board", arguments=arguments)
+    check_ending(options.output, ".pdf", command="board")
     from structgstream.preparation.calibration.board_page import write_board_pdf
     from structgstream.preparation.options import board_text, parse_board
 

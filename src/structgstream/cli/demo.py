@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError
-from structgstream.cli.options import Device, parse_known_options, resolve_config
+from structgstream.cli.options import Device, check_ending, parse_known_options, resolve_config
 from structgstream.cli.plain_text import say
 from structgstream.cli.tables import quality_text, report_tables
 
@@ -40,14 +40,15 @@ class Demo:
     scale: float = 1.0
     """Size of the pictures relative to the clip's."""
     device: Device = "auto"
-    """What computes."""
+    """Compute back-end."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
-    """Default: fast."""
+    """Preset of the configuration. Default: fast."""
 
 
 def main(arguments: list[str]) -> None:
     """Runs the demo."""
     options, rest = parse_known_options(Demo, "demo", arguments=arguments)
+    check_ending(options.output, command="demo", folder=True)
     if options.output.exists() and not options.output.is_dir():
         raise UsageError(f"--output is a folder, and {options.output} is a file.")
     from structgstream.data.clip import bundled_clip_path

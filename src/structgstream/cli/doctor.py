@@ -6,10 +6,9 @@ import importlib.util
 from dataclasses import dataclass
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
-from structgstream.cli.options import JsonPath, parse_options
+from structgstream.cli.options import JsonPath, check_ending, parse_options, write_json_output
 from structgstream.cli.tables import compact_table, literal_cells, name_value_table
 
 # Import name, distribution, extra, what it is for.
@@ -36,18 +35,15 @@ class Doctor:
     """
 
     json: JsonPath = None
-    """Write the result to this file."""
+    """Write the result to this file; - is standard output."""
 
 
 def main(arguments: list[str]) -> None:
     """Examines the machine and prints the result."""
     options = parse_options(Doctor, "doctor", arguments=arguments)
-    from structgstream.evaluation.report import write_json
-
+    check_ending(options.json, ".json", command="doctor", option="--json")
     found = diagnose()
-    if options.json is not None:
-        write_json(options.json, found)
-    console = Console()
+    console = write_json_output(options.json, found)
     machine = name_value_table()
     for name, value in found["environment"].items():
         machine.add_row(*literal_cells(name, "-" if value is None else str(value)))

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from structgstream.cli.options import Device, Folder, JsonPath, StreamFile, parse_options
+from structgstream.cli.options import (
+    Device,
+    Folder,
+    JsonPath,
+    StreamFile,
+    check_ending,
+    parse_options,
+    write_json_output,
+)
 from structgstream.cli.plain_text import say
 from structgstream.cli.tables import quality_text, report_tables
 
@@ -40,7 +48,7 @@ class Evaluate:
     )
     """Cameras to score. Default: the held-out ones."""
     json: JsonPath = None
-    """Write every number to this file (keys: docs/evaluation.md)."""
+    """Write every number to this file, - is standard output (keys: docs/evaluation.md)."""
     report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
     """Write report.json and a page of the worst frames, plots over time and a contact sheet into this folder."""
     metrics: Literal["all", "basic"] = "all"
@@ -54,9 +62,11 @@ class Evaluate:
 def main(arguments: list[str]) -> None:
     """Evaluates and prints a table."""
     options = parse_options(Evaluate, "evaluate", arguments=arguments)
+    check_ending(options.json, ".json", command="evaluate", option="--json")
+    check_ending(options.report, command="evaluate", option="--report", folder=True)
     from structgstream.codec.reader import open_stream
     from structgstream.evaluation.capture import capture_of, stored_capture
-    from structgstream.evaluation.report import as_json, write_json
+    from structgstream.evaluation.report import as_json
     from structgstream.kernels.backend import select_backend
 
     reader = open_stream(options.stream)
@@ -72,9 +82,7 @@ def main(arguments: list[str]) -> None:
         lpips_weights=options.lpips_weights,
         stored=stored_capture(reader.header, options.scene, frames=len(reader.packets)),
     )
-    if options.json is not None:
-        write_json(options.json, as_json(report))
-    console = Console()
+    console = write_json_output(options.json, as_json(report))
     console.print(report_tables(report, title=options.stream.name))
     if options.report is not None:
         say(console, f"Report: {options.report}")

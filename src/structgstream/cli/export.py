@@ -10,10 +10,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from structgstream.cli.app import usage_errors
-from structgstream.cli.options import Device, StreamFile, parse_options
+from structgstream.cli.options import Device, StreamFile, check_ending, parse_options
 from structgstream.cli.plain_text import say
 from structgstream.cli.progress import human_bytes
-from structgstream.exporters.formats import Format, PageFormat
+from structgstream.exporters.formats import FORMATS, Format, PageFormat
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,7 @@ class Export:
 def main(arguments: list[str]) -> None:
     """Exports and prints the path of the result."""
     options = parse_options(Export, "export", arguments=arguments)
+    check_ending(options.output, *(f".{name}" for name in (*FORMATS, "html")), command="export", folder=True)
     from structgstream.exporters.request import check_degree, check_low_pass, check_page, choose_frames, destination
 
     frame, frames = options.frame, options.frames

@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError
-from structgstream.cli.options import Device, Flag, Folder, StreamFile, parse_options
+from structgstream.cli.options import Device, Flag, Folder, StreamFile, check_ending, parse_options
 from structgstream.cli.plain_text import say
 from structgstream.cli.progress import display
 from structgstream.cli.termination import Terminated, Termination
@@ -54,6 +54,7 @@ class ReconstructGroup:
 def main(arguments: list[str]) -> None:
     """Reconstructs with a progress display."""
     options = parse_options(ReconstructGroup, "reconstruct", arguments=arguments)
+    check_ending(options.output, ".sgs", command="reconstruct --init")
     matched = re.fullmatch(r"(\d+):(\d+)", options.frames)
     if matched is None:
         raise UsageError(f"--frames {options.frames} with --init; a group is A:B, such as --frames 60:120.")

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
-from rich.console import Console
 
 from structgstream.cli.app import UsageError
-from structgstream.cli.options import Flag, JsonPath, StreamFile, parse_options
+from structgstream.cli.options import Flag, JsonPath, StreamFile, check_ending, parse_options, write_json_output
 from structgstream.cli.plain_text import say
 from structgstream.cli.stream_tables import bit_rate_text, facts_table, header_table, packet_table, period_table
 
@@ -44,7 +43,8 @@ class Inspect:
     plot: Annotated[Path | None, tyro.conf.arg(metavar="PATH.png", help_behavior_hint="")] = None
     """Plot the bytes of every packet by field, and the composition of header, key and delta packets."""
     json: JsonPath = None
-    """Write everything to this file, with the keys "header" and "packets"."""
+    """Write everything to this file, with the keys "header" and "packets"; - is standard
+    output."""
     all_packets: Flag = False
     """List every packet. Default: evenly spaced packets of a long stream."""
     config: Flag = False
@@ -55,6 +55,7 @@ def main(arguments: list[str]) -> None:
     """Reads the file and prints."""
     options = parse_options(Inspect, "inspect", arguments=arguments)
     plot = options.plot
+    check_ending(options.json, ".json", command="inspect", option="--json")
     if plot is not None and plot.suffix.lower() not in PICTURES:
         raise UsageError(f"{plot} is no name for a picture; its ending must be one of {', '.join(PICTURES)}.")
     if options.stream.is_dir() and not (options.stream / "manifest.json").exists():
@@ -62,17 +63,14 @@ def main(arguments: list[str]) -> None:
         return
     from structgstream.codec.reader import open_stream
     from structgstream.evaluation.byte_count import packet_rows
-    from structgstream.evaluation.report import write_json
     from structgstream.evaluation.run_log import read_log
 
     with open_stream(options.stream) as reader:
         rows = packet_rows(reader)
         content = describe_stream(reader, rows, log=read_log(options.stream))
-        if options.json is not None:
-            write_json(options.json, content)
+        console = write_json_output(options.json, content)
         if plot is not None:
             draw_byte_plot(plot, reader, rows, name=options.stream.name)
-    console = Console()
     if options.config:
         console.print_json(json.dumps(content["header"]["config"]))
         return
@@ -93,14 +91,11 @@ def main(arguments: list[str]) -> None:
 
 def _print_capture(options: Inspect) -> None:
     from structgstream.cli.capture_table import capture_tables, describe_capture
-    from structgstream.evaluation.report import write_json
 
     if options.plot is not None or options.config or options.all_packets:
         raise UsageError("--plot, --config and --all-packets are of streams; of a capture only --json can be given.")
     content = describe_capture(options.stream)
-    if options.json is not None:
-        write_json(options.json, content)
-    console = Console()
+    console = write_json_output(options.json, content)
     for table in capture_tables(options.stream.resolve().name, content):
         console.print(table)
 

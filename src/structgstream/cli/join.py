@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import UsageError
-from structgstream.cli.options import Device, Flag, parse_options
+from structgstream.cli.options import Device, Flag, check_ending, parse_options
 from structgstream.cli.plain_text import say
 from structgstream.cli.progress import human_bytes
 
@@ -50,6 +50,7 @@ def main(arguments: list[str]) -> None:
     """Writes the file, and prints what was handed over and its size."""
     options = parse_options(Join, "join", arguments=arguments)
     output = options.output
+    check_ending(output, ".sgs", command="join")
     if not options.segments:
         raise UsageError("join needs the segments of a stream.")
     if output.exists() and not options.overwrite:

@@ -39,7 +39,7 @@ class Stoppable(Protocol):
 
 @dataclass(frozen=True)
 class LiveChoice:
-    """Options of cameras that send now."""
+    """Options of live cameras."""
 
     live: Flag = False
     """FOLDER is a rig file of cameras that send now; the stream ends after --frames, or with Ctrl-C."""
@@ -47,9 +47,9 @@ class LiveChoice:
     """Live only, when training is slower than the cameras: latest takes the newest pictures, every keeps all of them in
     a queue on the disk."""
     queue_gigabytes: float = 10.0
-    """Live only: room of the queue of every."""
+    """Live only: disk space for the queue of --policy every."""
     record: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
-    """Live only: keep what the cameras send, as a capture that can be reconstructed again."""
+    """Live only: record what the cameras send, as a capture that can be reconstructed again."""
 
     def check(self, scene: Path) -> None:
         """Check the options of a run that is not live.

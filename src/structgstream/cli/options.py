@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Options that several commands share, and how they are parsed."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import tyro
+from rich.console import Console
 
 from structgstream.cli.app import UsageError, usage_errors
 
@@ -18,7 +20,7 @@ Device = Literal["auto", "cpu", "cuda", "reference"]
 Folder = Annotated[Path, tyro.conf.arg(metavar="FOLDER")]
 StreamFile = Annotated[Path, tyro.conf.arg(metavar="STREAM")]
 Flag = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
-JsonPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
+JsonPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH|-", help_behavior_hint="")]
 STYLE = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone)
 
 
@@ -29,8 +31,8 @@ class CaptureOptions:
     held_out: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="CAMERA [CAMERA ...]", help_behavior_hint="")] = (
         None
     )
-    """Cameras to keep from training; auto: the one best surrounded by others. Default: those that the layout holds
-    out."""
+    """Cameras to keep from training; auto: the one best surrounded by others. Default: those that the capture's
+    layout holds out."""
     scale: float = 1.0
     """Size of the pictures relative to the stored ones, in (0, 1]."""
     start: int = 0
@@ -46,36 +48,99 @@ class CaptureOptions:
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif")
 VIDEOS = (".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".mpg", ".ts")
-OTHER_MEDIA = frozenset({*PICTURES, *VIDEOS, ".html", ".ply", ".splat", ".spz"})
-"""Endings of pictures, videos and exports, of which a command writes some."""
+KNOWN_ENDINGS = frozenset({*PICTURES, *VIDEOS, ".html", ".json", ".pdf", ".ply", ".sgs", ".splat", ".spz"})
+"""Endings of pictures, videos, exports and streams, of which a command writes some."""
+RENAMED = {"--quiet": "--split-at-low-motion", "--odd": "--allow-unaligned"}
+"""Options of before, and what they are called now."""
+STANDARD_OUTPUT = "-"
+"""As the value of ``--json``."""
 
 
-def check_ending(output: Path, *endings: str, command: str) -> None:
+def check_ending(output: Path | None, *endings: str, command: str, option: str = "-o", folder: bool = False) -> None:
     """Check that a name does not ask for a kind of file that the command does not write.
 
     Args:
-        output: the file or folder to write.
-        endings: of :data:`OTHER_MEDIA`, those that the command writes.
+        output: the file or folder to write; None for none.
+        endings: of :data:`KNOWN_ENDINGS`, those that the command writes.
         command: for the message.
+        option: which names the output.
+        folder: whether another name gives a folder.
 
     Raises:
-        UsageError: it does, or it is "-" or begins with "~", which only a shell resolves.
+        UsageError: it does.
     """
-    if str(output) == "-" or (output.parts[:1] and output.parts[0].startswith("~")):
-        raise UsageError(f"-o {output} would be a file or folder of that very name; give a path.")
-    if (ending := output.suffix.lower()) in OTHER_MEDIA.difference(endings):
-        written = f"it writes {', '.join(endings)}, or" if endings else "it writes a stream, .sgs, or"
-        raise UsageError(f"{command} writes no {ending}, got -o {output}; {written} a folder for another name.")
+    if output is not None and (ending := output.suffix.lower()) in KNOWN_ENDINGS.difference(endings):
+        written = " or ".join([*endings, *(["a folder of another name"] if folder else [])])
+        raise UsageError(f"{command} writes no {ending}, got {option} {output}; it writes {written}.")
+
+
+def checked_paths(options: Options) -> Options:
+    """Options, also those in groups, with ``~`` in paths expanded as a shell does it.
+
+    Raises:
+        UsageError: a path is ``-``, which is standard output for ``--json`` only, or ``~`` of a user there is not.
+    """
+    return replace(options, **{one.name: _checked(getattr(options, one.name), one.name) for one in fields(options)})  # type: ignore[type-var]
+
+
+def _checked(value: object, name: str) -> object:
+    if isinstance(value, tuple):
+        return tuple(_checked(one, name) for one in value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return checked_paths(value)
+    if not isinstance(value, Path) or (str(value) == STANDARD_OUTPUT and name == "json"):
+        return value
+    if str(value) == STANDARD_OUTPUT:
+        raise UsageError(f"{name} '-' would be a file or folder of that very name; give a path.")
+    try:
+        return value.expanduser()
+    except RuntimeError:
+        raise UsageError(f"there is no user for {value}; give the path in full.") from None
+
+
+def write_json_output(path: Path | None, content: Mapping[str, Any]) -> Console:
+    """Writes ``--json``: nothing for None, to standard output for ``-``.
+
+    Returns:
+        The console for everything else that is printed: standard error where JSON goes to standard output.
+
+    Raises:
+        StorageError: the file cannot be written.
+    """
+    from structgstream.evaluation.report import json_text, write_json
+
+    if path is None:
+        return Console()
+    if str(path) == STANDARD_OUTPUT:
+        print(json_text(content), end="", flush=True)
+        return Console(stderr=True)
+    write_json(path, content)
+    return Console()
 
 
 def parse_options(kind: type[Options], command: str, *, arguments: list[str]) -> Options:
-    """The options of a command; prints and exits on ``--help`` or wrong usage."""
-    return tyro.cli(kind, prog=f"structgstream {command}", args=arguments, config=STYLE)
+    """The options of a command; prints and exits on ``--help`` or wrong usage.
+
+    Raises:
+        UsageError: an option was renamed, or a path cannot be meant (:func:`checked_paths`).
+    """
+    _check_renamed(arguments)
+    return checked_paths(tyro.cli(kind, prog=f"structgstream {command}", args=arguments, config=STYLE))
 
 
 def parse_known_options(kind: type[Options], command: str, *, arguments: list[str]) -> tuple[Options, list[str]]:
     """As :func:`parse_options`, and the arguments that are no options of the command itself."""
-    return tyro.cli(kind, prog=f"structgstream {command}", args=arguments, config=STYLE, return_unknown_args=True)
+    _check_renamed(arguments)
+    options, rest = tyro.cli(
+        kind, prog=f"structgstream {command}", args=arguments, config=STYLE, return_unknown_args=True
+    )
+    return checked_paths(options), rest
+
+
+def _check_renamed(arguments: list[str]) -> None:
+    for argument in arguments:
+        if (name := argument.partition("=")[0]) in RENAMED:
+            raise UsageError(f"{name} is called {RENAMED[name]} now.")
 
 
 def resolve_config(

@@ -14,6 +14,7 @@ from structgstream.cli.options import (
     Device,
     Flag,
     Folder,
+    check_ending,
     open_selected_capture,
     parse_known_options,
     resolve_config,
@@ -79,9 +80,9 @@ class Parallel:
     """The stream file to write; on a cluster all machines see its folder at the same place."""
     groups: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Frames of a group: a multiple of the key interval. Default: one key interval."""
-    quiet: Flag = False
+    split_at_low_motion: Flag = False
     """Move each border between groups to a frame nearby in which few pixels change."""
-    odd: Flag = False
+    allow_unaligned: Flag = False
     """Allow an N that is no multiple of the key interval; each group then costs one more key packet."""
     preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
     """compact (default), fine, fast, or tiny; fields of the configuration are options as of reconstruct."""
@@ -102,6 +103,7 @@ class Parallel:
 def main(arguments: list[str]) -> None:
     """Runs with a display of all groups."""
     options, rest = parse_known_options(Parallel, "parallel", arguments=arguments)
+    check_ending(options.output, ".sgs", command="parallel")
     from structgstream.presets import with_budget  # after --help, which needs no torch
 
     config, preset = resolve_config(options.preset, rest, command="parallel", seed=options.seed)
@@ -149,7 +151,7 @@ def _check(options: Parallel, config: "StreamConfig", parts: "Parts") -> None:
     from structgstream.struct_gstream import stream_pipeline
 
     source = open_selected_capture(options.scene, options.capture)
-    if options.groups is not None and not options.odd:
+    if options.groups is not None and not options.allow_unaligned:
         check_length(options.groups, key_interval=stream_pipeline(config).codec.key_interval(source.fps))
     parts.check()
     check_output(options.output, may_exist=options.overwrite or bool(parts.notes), resume=False)
@@ -207,8 +209,8 @@ def _job(options: Parallel, rest: list[str]) -> "Job":
     header += [] if capture.held_out is None else ["--held-out", *capture.held_out]
     track = [
         *_words("groups", options.groups),
-        *(["--quiet"] if options.quiet else []),
-        *(["--odd"] if options.odd else []),
+        *(["--split-at-low-motion"] if options.split_at_low_motion else []),
+        *(["--allow-unaligned"] if options.allow_unaligned else []),
     ]
     unit = Unit(
         str(options.scene.absolute()),

@@ -10,13 +10,16 @@ from rich.console import Console
 
 from structgstream.cli.app import UsageError, usage_errors
 from structgstream.cli.options import (
+    STANDARD_OUTPUT,
     CaptureOptions,
     Device,
     Folder,
     JsonPath,
+    check_ending,
     open_selected_capture,
     parse_known_options,
     resolve_config,
+    write_json_output,
 )
 from structgstream.cli.plain_text import say
 from structgstream.cli.progress import human_bytes
@@ -70,7 +73,7 @@ class Plan:
     device: Device = "auto"
     """Compute back-end of the probe."""
     json: JsonPath = None
-    """Write all numbers to this file."""
+    """Write all numbers to this file; - is standard output."""
     capture: CaptureOptions = field(default_factory=CaptureOptions)
 
 
@@ -79,6 +82,7 @@ def main(arguments: list[str]) -> None:
     options, rest = parse_known_options(Plan, "plan", arguments=arguments)
     if (options.run is None) == (options.output is None):
         raise UsageError("give either -o FOLDER for a probe, or --run OUT.parts of an existing run.")
+    check_ending(options.json, ".json", command="plan", option="--json")
     config, _ = resolve_config(options.preset, rest, command="plan", seed=None)
     from structgstream.parallel.cost import Work
     from structgstream.parallel.measured import measured_in
@@ -89,7 +93,9 @@ def main(arguments: list[str]) -> None:
         work = Work(options.length or len(source), options.groups or interval, interval)
         if options.workers < 1 or min(options.machines, default=0) < 1:
             raise UsageError("--machines and --workers count from 1.")
-    console = Console()
+    if options.run is None and str(options.json) == STANDARD_OUTPUT:
+        raise UsageError("--json - needs --run: a probe prints to standard output what it does.")
+    console = Console(stderr=str(options.json) == STANDARD_OUTPUT)
     folder = options.run if options.run is not None else _probe(options, rest, console)
     _report(options, work, source, measured_in(folder), console)
 
@@ -103,7 +109,7 @@ def _probe(options: Plan, rest: list[str], console: Console) -> Path:
     stream = options.output / "probe.sgs"
     capture = options.capture
     words = ["parallel", str(options.scene), "-o", str(stream), "--frames", str(PROBE_FRAMES)]
-    words += ["--groups", str(PROBE_GROUP), "--odd", "--workers", "1", "--device", options.device]
+    words += ["--groups", str(PROBE_GROUP), "--allow-unaligned", "--workers", "1", "--device", options.device]
     words += [] if options.preset is None else ["--preset", options.preset]
     words += [] if capture.held_out is None else ["--held-out", *capture.held_out]
     words += ["--scale", str(capture.scale), "--start", str(capture.start), "--every", str(capture.every)]
@@ -117,7 +123,6 @@ def _probe(options: Plan, rest: list[str], console: Console) -> Path:
 
 
 def _report(options: Plan, work: "Work", source: "FrameSource", found: "Measured", console: Console) -> None:
-    from structgstream.evaluation.report import write_json
     from structgstream.parallel.cost import estimate, sequential_seconds, serial_seconds, stream_bytes, workers_for
 
     costs = found.costs
@@ -147,7 +152,7 @@ def _report(options: Plan, work: "Work", source: "FrameSource", found: "Measured
         facts |= {"sequential_seconds": alone, "serial_seconds": serial}
         facts["estimates"] = [{"machines": count, **asdict(each)} for count, each in estimates]
         facts["wanted"] = None if wanted is None else asdict(wanted)
-        write_json(options.json, facts)
+        write_json_output(options.json, facts)
 
 
 def _live(rate: float, fps: float) -> str:

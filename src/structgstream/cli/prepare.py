@@ -11,7 +11,7 @@ from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError, usage_errors
 from structgstream.cli.interruption import interruptible
-from structgstream.cli.options import Flag, Folder, parse_options
+from structgstream.cli.options import Flag, Folder, check_ending, parse_options
 from structgstream.cli.plain_text import say
 from structgstream.cli.step_display import step_display
 
@@ -72,7 +72,7 @@ class Prepare:
     field_of_view: Annotated[float | None, tyro.conf.arg(metavar="DEGREES", help_behavior_hint="")] = None
     """Across the undistorted pictures. Default: the largest without black borders, up to 110."""
     size: Annotated[str | None, tyro.conf.arg(metavar="WxH", help_behavior_hint="")] = None
-    """Size of the undistorted pictures. Default: that of the videos."""
+    """Size of the undistorted pictures. Default: the size of the videos."""
     held_out: Annotated[
         tuple[str, ...], tyro.conf.arg(metavar="auto|none|CAMERA [CAMERA ...]", help_behavior_hint="")
     ] = ("none",)
@@ -95,6 +95,8 @@ class Prepare:
 def main(arguments: list[str]) -> None:
     """Prepares or checks, with a display of the steps."""
     options = parse_options(Prepare, "prepare", arguments=arguments)
+    check_ending(options.output, command="prepare", folder=True)
+    check_ending(options.report, command="prepare", option="--report", folder=True)
     if options.check == (options.output is not None):
         raise UsageError(
             "--check looks at a capture that is there, so it takes no --output."
@@ -138,7 +140,7 @@ def _chosen(options: Prepare) -> "PrepareOptions":
     from structgstream.preparation.options import METHODS, PrepareOptions, parse_board, parse_distance, parse_size
 
     return PrepareOptions(
-        calibration=options.calibration if options.calibration in METHODS else Path(options.calibration),
+        calibration=options.calibration if options.calibration in METHODS else Path(options.calibration).expanduser(),
         lens=options.lens,
         intrinsics=options.intrinsics,
         refine=options.refine,

@@ -109,7 +109,7 @@ def main(arguments: list[str]) -> None:
     if "--help-config" in arguments:
         _print_config(arguments)
     options, rest = parse_known_options(Reconstruct, "reconstruct", arguments=arguments)
-    check_ending(options.output, command="reconstruct")
+    check_ending(options.output, ".sgs", command="reconstruct", folder=True)
     if options.resume and options.overwrite:
         raise UsageError("--resume keeps the file and --overwrite replaces it: choose one.")
     config, preset = resolve_config(options.preset, rest, command="reconstruct", seed=options.seed)

@@ -64,8 +64,7 @@ class Render:
 def main(arguments: list[str]) -> None:
     """Renders and prints the path of the result."""
     options = parse_options(Render, "render", arguments=arguments)
-    if options.output is not None:
-        check_ending(options.output, ".mp4", ".png", command="render")
+    check_ending(options.output, ".mp4", ".png", command="render", folder=True)
     if options.compare and (options.scene is None or options.path is not None):
         raise UsageError("--compare needs the capture's folder after the stream, and a camera, not a --path.")
     if options.scene is not None and not options.compare:

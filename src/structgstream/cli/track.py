@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from structgstream.cli.app import Interrupted, UsageError
-from structgstream.cli.options import Device, Flag, Folder, StreamFile, parse_options
+from structgstream.cli.options import Device, Flag, Folder, StreamFile, check_ending, parse_options
 from structgstream.cli.plain_text import say
 from structgstream.cli.progress import human_bytes
 from structgstream.cli.termination import Terminated, Termination
@@ -33,7 +33,7 @@ class Track:
 
     Example: structgstream track basketball --init header.sgs -o ball.track --groups 60
 
-    Example: structgstream track basketball --init header.sgs -o ball.track --groups 60 --quiet
+    Example: structgstream track basketball --init header.sgs -o ball.track --groups 60 --split-at-low-motion
     """
 
     scene: tyro.conf.Positional[Folder]
@@ -44,9 +44,9 @@ class Track:
     """The track to write."""
     groups: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Frames of a group. Default: as many as from one key packet to the next."""
-    quiet: Flag = False
+    split_at_low_motion: Flag = False
     """Begin groups where few pixels change, half of N to one and a half times N frames apart."""
-    odd: Flag = False
+    allow_unaligned: Flag = False
     """Allow an N that is no multiple of the interval of key packets; each group then costs one more key packet."""
     frames: Annotated[int | None, tyro.conf.arg(metavar="M", help_behavior_hint="")] = None
     """Number of frames. Default: all."""
@@ -65,6 +65,7 @@ class Track:
 def main(arguments: list[str]) -> None:
     """Tracks with a progress bar, and lists the groups."""
     options = parse_options(Track, "track", arguments=arguments)
+    check_ending(options.output, command="track")
     from structgstream.cli.app import usage_errors
     from structgstream.groups.base import GroupBase
     from structgstream.groups.boundaries import check_length
@@ -79,7 +80,7 @@ def main(arguments: list[str]) -> None:
     base = GroupBase.read(options.init)
     length = base.key_interval if options.groups is None else options.groups
     with usage_errors():
-        if not options.odd or length < 1:
+        if not options.allow_unaligned or length < 1:
             check_length(length, key_interval=base.key_interval)
     if options.cameras is not None and options.cameras < 2:
         raise UsageError(f"--cameras must be at least 2, got {options.cameras}.")
@@ -90,7 +91,7 @@ def main(arguments: list[str]) -> None:
             path.unlink(missing_ok=True)
     options.output.parent.mkdir(parents=True, exist_ok=True)
     after = None if options.after is None else open_segment(options.after)
-    chosen = TrackOptions(length, options.quiet, after, TrackConfig(cameras=options.cameras))
+    chosen = TrackOptions(length, options.split_at_low_motion, after, TrackConfig(cameras=options.cameras))
     spent = _track(options.output, source, base, chosen, backend)
     _say(options.output, len(source), spent)
 

@@ -20,6 +20,8 @@ from structgstream.scene.state import STATE_TABLE, FieldName
 from structgstream.similarity import Similarity
 
 MAX_IMAGE_SIDE = 65_535
+MAX_IMAGE_PIXELS = 2**26
+"""8192 x 8192: more than any camera's video, and 0.8 GB as floats, so that a small file cannot fill the memory."""
 _LEAST_STEP = 2.0**-64
 
 
@@ -27,8 +29,10 @@ def pack_header(header: StreamHeader) -> bytes:
     """The payload of an init record.
 
     Raises:
+        CalibrationError: a camera has more pixels than the format allows.
         StreamError: the description is too long, or, with codec ``compact``, a field is not quantized.
     """
+    check_picture_sizes(header.rig)
     description = {
         "cameras": [
             {
@@ -62,6 +66,21 @@ def pack_header(header: StreamHeader) -> bytes:
         if f.name in part
     ]
     return pack_init(description, blocks)
+
+
+def check_picture_sizes(rig: CameraRig) -> None:
+    """Check that a stream can have these cameras, which costs nothing before training.
+
+    Raises:
+        CalibrationError: the pictures of a camera are larger than the format allows.
+    """
+    for name in rig:
+        width, height = rig[name].width, rig[name].height
+        if max(width, height) > MAX_IMAGE_SIDE or width * height > MAX_IMAGE_PIXELS:
+            raise CalibrationError(
+                f"The pictures of camera {name!r} have {width}x{height} pixels; a stream holds cameras of at most "
+                f"{MAX_IMAGE_PIXELS} pixels and {MAX_IMAGE_SIDE} a side: use smaller pictures (--scale 0.5)."
+            )
 
 
 def unpack_header(payload: bytes) -> StreamHeader:
@@ -150,6 +169,8 @@ def _camera(entry: dict[str, Any]) -> Camera:
     width, height = entry["width"], entry["height"]
     if not all(type(size) is int and 0 < size <= MAX_IMAGE_SIDE for size in (width, height)):
         raise ValueError(f"a picture of {width}x{height} pixels; each side must be 1 to {MAX_IMAGE_SIDE}")
+    if width * height > MAX_IMAGE_PIXELS:
+        raise ValueError(f"a picture of {width}x{height}; the pixels of a picture must be at most {MAX_IMAGE_PIXELS}")
     return Camera(
         viewmat=torch.tensor([_number(value) for value in entry["viewmat"]], dtype=torch.float64).reshape(4, 4),
         K=torch.tensor([_number(value) for value in entry["K"]], dtype=torch.float64).reshape(3, 3),

@@ -77,7 +77,7 @@ def open_posed(
         filmed = of_pictures(path, files, _poses(calibration, files), root=root, calibration=calibration, fps=fps)
         return undistort(*filmed, target=target)
 
-    for root in chain(_roots(path), other_roots(path)):
+    for root in chain(filmed_roots(path), other_roots(path)):
         if videos := videos_in(root):
             partial = not complete or calibration.unposed
             videos = _posed(videos, calibration, root) if partial else videos
@@ -101,7 +101,7 @@ class NoFrames(CaptureError):
     """A folder has a calibration, and neither pictures nor videos."""
 
 
-def _roots(path: Path) -> list[Path]:
+def filmed_roots(path: Path) -> list[Path]:
     """The folders to look through, in order; videos before pictures that are stills of the same cameras."""
     roots = roots_of(path)
     pictures = {root: found for root in roots if (found := pictures_in(root))}
@@ -175,6 +175,15 @@ def of_pictures(
 def _shown_size(file: Path, orientation: int) -> tuple[int, int]:
     width, height = picture_size(file)
     return (height, width) if orientation >= 5 else (width, height)
+
+
+def orientations(calibration: Calibration, firsts: Mapping[str, Path]) -> dict[str, int]:
+    """The EXIF orientation by which each calibrated camera's pictures are turned, by its first picture.
+
+    Raises:
+        CalibrationError: neither the calibration nor the size of the pictures decides.
+    """
+    return {name: _orientation(firsts[name], posed, calibration) for name, posed in _poses(calibration, firsts).items()}
 
 
 def _orientation(file: Path, posed: PosedCamera, calibration: Calibration) -> int:

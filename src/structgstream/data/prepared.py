@@ -189,7 +189,7 @@ def camera_of(viewmat: Any, K: Any, size: Sequence[int]) -> Camera:
     return Camera(pose, torch.from_numpy(np.array(K, np.float64).reshape(3, 3)), width, height)
 
 
-def preprocess(folder: Path) -> tuple[Path, ...]:
+def pictures_of(folder: Path) -> tuple[Path, ...]:
     """The pictures of a camera's folder, in the order of their names.
 
     Raises:
@@ -202,7 +202,7 @@ def _of_folders(
     path: Path, files: Mapping[str, Path], rig: CameraRig, capture: PreparedCapture, points: NDArray[np.float64] | None
 ) -> ImageSource:
     """Folders of pictures at the capture's rate; clocks shift them by whole frames, and what lacks is absent."""
-    found = {name: preprocess(folder) for name, folder in files.items()}
+    found = {name: pictures_of(folder) for name, folder in files.items()}
     if empty := [name for name, pictures in found.items() if not pictures]:
         raise CaptureError(f"The folder {files[empty[0]]} of camera {empty[0]!r} has no pictures; restore them.")
     shifts = {name: round(capture.cameras[name].clock.offset_seconds * capture.fps) for name in rig}

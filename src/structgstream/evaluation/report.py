@@ -236,4 +236,9 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     Raises:
         StorageError: the file cannot be written.
     """
-    write_whole(path, f"{json.dumps(content, indent=1, allow_nan=False)}\n".encode(), new_folder=True)
+    write_whole(path, json_text(content).encode(), new_folder=True)
+
+
+def json_text(content: Mapping[str, Any]) -> str:
+    """``content`` as JSON with a line end."""
+    return f"{json.dumps(content, indent=1, allow_nan=False)}\n"

@@ -16,7 +16,7 @@ def check_length(length: int, *, key_interval: int) -> None:
         near = max(1, round(length / key_interval)) * key_interval
         raise ConfigError(
             f"Groups of {length} frames cost a key packet each, because the stream has one every {key_interval} frames "
-            f"(key_interval_seconds); take {near}, or another multiple, or add --odd to pay for them."
+            f"(key_interval_seconds); take {near}, or another multiple, or add --allow-unaligned to pay for them."
         )
 
 

@@ -15,7 +15,7 @@ from structgstream.owned_folders import MARKER, Owner
 from structgstream.parallel.object_folder import ObjectFolder
 from structgstream.parallel.parts import OURS, Parts
 from structgstream.parallel.pieces import last_pieces
-from structgstream.parallel.staged import HERE
+from structgstream.parallel.staged import HERE, STORE
 from structgstream.parallel.unit import CutsTrack
 from structgstream.whole_files import partial_path, write_whole
 
@@ -160,5 +160,6 @@ class ObjectStore:
     def _staged(self, task: Task, files: Sequence[str]) -> Task:
         folder = str(self._parts.folder)
         inner = (word.replace(folder, HERE) for word in task.command)
-        outer = (*STAGED, "--store", self._store.url, "--name", task.name, "--run", self._parts.run, *files, "--")
-        return replace(task, command=(*outer, *inner))
+        outer = (*STAGED, "--name", task.name, "--run", self._parts.run, *files, "--")
+        environment = {**task.environment, STORE: self._store.url}
+        return replace(task, command=(*outer, *inner), environment=environment)

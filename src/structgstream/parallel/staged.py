@@ -26,6 +26,8 @@ from structgstream.whole_files import partial_path, write_whole
 
 HERE = "{here}"
 """In a word of the command: the folder of this machine."""
+STORE = "STRUCTGSTREAM_STORE"
+"""The variable with the URL of the store. It may hold credentials, and every user of a machine sees command lines."""
 SCRATCH = "STRUCTGSTREAM_SCRATCH"
 """The variable that names a folder for files of this machine; without it, that of temporary files."""
 PURPOSE = "scratch files of a task"
@@ -114,9 +116,8 @@ def scratch_folder(options: argparse.Namespace) -> Path:
 
 
 def parsed(arguments: Sequence[str]) -> argparse.Namespace:
-    """The command line; what follows ``--`` is the command."""
+    """The command line, and the store's URL from :data:`STORE`; what follows ``--`` is the command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--store", required=True, metavar="URL")
     parser.add_argument("--name", required=True, help="of the task")
     parser.add_argument("--run", default="", help="what tells one beginning of the run from the next")
     for flag, text in (
@@ -127,7 +128,11 @@ def parsed(arguments: Sequence[str]) -> argparse.Namespace:
     ):
         parser.add_argument(f"--{flag}", action="append", default=[], metavar="NAME", help=text)
     parser.add_argument("command", nargs="+")
-    return parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
+    options.store = os.environ.get(STORE)
+    if not options.store:
+        parser.error(f"the variable {STORE} has no URL of a store")
+    return options
 
 
 def main() -> int:

@@ -11,7 +11,7 @@ import numpy as np
 from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera
 from structgstream.data.posed import Calibration
-from structgstream.data.posed_capture import filmed_by
+from structgstream.data.posed_capture import filmed_by, orientations
 from structgstream.data.prepared import LENSES, camera_of, lens_model
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.coordinates import with_distance
@@ -104,8 +104,16 @@ def from_other_tool(calibration: Calibration, footage: Footage) -> SolvedCalibra
     """The cameras of a calibration that is there, for these pictures.
 
     Raises:
-        CalibrationError: it is of other cameras, or of pictures of another size.
+        CalibrationError: it is of other cameras, of pictures of another size, or of pictures that are turned as their
+            EXIF orientation says, while a prepared capture has them as they are stored.
     """
+    turns = orientations(calibration, {name: files[0] for name, files in footage.stills.items()})
+    if turned := [name for name, turn in turns.items() if turn != 1]:
+        raise CalibrationError(
+            f"{calibration.where} is for pictures that are turned as their EXIF orientation says, and those of "
+            f"{listed(turned)} are stored otherwise; turn them without loss (exiftran -a, jpegtran), so that they are "
+            "stored upright, or give the folder with the calibration to reconstruct as it is."
+        )
     sizes = {name: footage.size(name) for name in footage.cameras}
     filmed = filmed_by(calibration, sizes, root=footage.where)
     points = np.empty((0, 3)) if calibration.points is None else calibration.points

@@ -21,11 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.audio import read_audio
-from structgstream.data.camera_files import NO_CAMERAS, UNREAD, filmed_folder, other_roots, roots_of
+from structgstream.data.camera_files import NO_CAMERAS, UNREAD, filmed_folder, other_roots
 from structgstream.data.folder_files import check_link, files_of, is_hidden, name_of
 from structgstream.data.images import PICTURE_SUFFIXES, read_picture, significant_bits
 from structgstream.data.picture_size import picture_size
-from structgstream.data.prepared import preprocess
+from structgstream.data.posed_capture import filmed_roots
+from structgstream.data.prepared import pictures_of
 from structgstream.data.timeline import natural, picture_slots
 from structgstream.data.video import measured_fps
 from structgstream.data.video_index import VIDEO_SUFFIXES, VideoTrack, open_video, scan_videos, video_stream
@@ -176,7 +177,7 @@ def find_footage(where: Path, *, picture_fps: float | None = None) -> Footage:
     if not where.is_dir():
         kind = "a file" if where.exists() else "missing"
         raise CaptureError(f"{where} is {kind}; give the folder that holds the cameras' videos ({LAYOUTS}).")
-    found = {root: _found(root) for root in (where, *roots_of(where))}
+    found = {root: _found(root) for root in dict.fromkeys(filmed_roots(where)) if root.is_dir()}
     # A stray picture or preview beside the folder of the videos is no take: two cameras come before one.
     root = next((root for least in (2, 1) for root, files in found.items() if len(files) >= least), None)
     if root is None or len(found[root]) < 2:
@@ -224,7 +225,7 @@ def _runs(indices: Sequence[int]) -> list[list[int]]:
 def _footage(where: Path, files: Mapping[str, Path], picture_fps: float) -> Footage:
     videos = {name: file for name, file in files.items() if file.suffix.lower() in VIDEO_SUFFIXES}
     stills = {
-        name: preprocess(file) if file.is_dir() else (file,) for name, file in files.items() if name not in videos
+        name: pictures_of(file) if file.is_dir() else (file,) for name, file in files.items() if name not in videos
     }
     if videos and stills:
         video, still = next(iter(videos)), next(iter(stills))

@@ -61,7 +61,7 @@ def _of_prepared(folder: Path) -> Calibration:
         filmed = camera.filmed.camera
         size = (filmed.width, filmed.height)
         cameras.append(PosedCamera(name, filmed.viewmat.numpy(), filmed.K.numpy(), size, camera.filmed.lens))
-    return Calibration(folder / PREPARED, tuple(cameras), held_out=sorted(capture.held_out))
+    return Calibration(folder / PREPARED, tuple(cameras), held_out=sorted(capture.held_out), turned_by_exif=False)
 
 
 def _of_cameras(file: Path) -> Calibration:

@@ -34,7 +34,7 @@ def focals_told(focals: Mapping[str, float], footage: Footage) -> str:
 def turns_told(footage: Footage) -> str:
     """Which cameras' pictures are to be turned to be seen upright (Exif), in words; empty for none.
 
-    Calibrations are of pixels as they are stored, so pictures are never turned: that is said, not done.
+    A prepared capture has pixels as they are stored, so pictures are never turned: that is said, not done.
 
     Raises:
         CaptureError: a picture cannot be read.

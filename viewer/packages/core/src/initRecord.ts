@@ -12,6 +12,7 @@ import { AS_THEY_ARE, decodedFields } from "./staticFields.js";
 
 const LENGTH_BYTES = 4;
 const MAX_IMAGE_SIDE = 65535;
+const MAX_IMAGE_PIXELS = 2 ** 26;
 const LEAST_STEP = 2 ** -64;
 const RIGID = 1e-3;
 
@@ -85,13 +86,15 @@ function cameraOf(value: unknown): Camera {
   const viewmat = numbers(entry.viewmat, 16, "viewmat");
   const K = numbers(entry.K, 9, "K");
   if (!isRotation([0, 4, 8].map((row) => viewmat.slice(row, row + 3)))) throw wrong("viewmat", "rigid");
+  const [width, height] = [imageSide(entry.width), imageSide(entry.height)];
+  if (width * height > MAX_IMAGE_PIXELS) throw wrong("the pixels of a picture", `at most ${MAX_IMAGE_PIXELS}`);
   if (K[0]! <= 0 || K[4]! <= 0) throw wrong("focal lengths", "positive");
   return {
     name: text(entry.name, "a camera's name"),
     viewmat,
     K,
-    width: imageSide(entry.width),
-    height: imageSide(entry.height),
+    width,
+    height,
     near: positive(entry.near, "near"),
     heldOut: flag(entry.held_out, "held_out"),
   };

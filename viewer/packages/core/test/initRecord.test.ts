@@ -59,6 +59,7 @@ test.each<[string, (d: Description) => void]>([
   ["held_out must be true or false", (d) => Object.assign(d.cameras[0], { held_out: undefined })],
   ["side of a picture must be 1 to 65535", (d) => Object.assign(d.cameras[0], { width: 65536 })],
   ["side of a picture must be 1 to 65535", (d) => Object.assign(d.cameras[0], { height: 1.5 })],
+  ["pixels of a picture must be at most 67108864", (d) => Object.assign(d.cameras[0], { width: 8192, height: 8193 })],
   ["K must be 9 numbers", (d) => d.cameras[0].K.pop()],
   ["focal lengths must be positive", (d) => d.cameras[0].K.fill(0)],
   ["viewmat must be a list", (d) => Object.assign(d.cameras[0], { viewmat: {} })],
