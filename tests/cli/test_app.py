@@ -197,4 +197,4 @@ def test_paths_that_cannot_work_are_told(stream: Path, tmp_path: Path, capsys: p
     assert str(tmp_path / "no") in error_of(["inspect", str(tmp_path / "no")], capsys, status=1)
     (tmp_path / "text").write_text("hello, this is no stream at all")
     assert "text" in error_of(["evaluate", str(tmp_path / "text"), CLIP], capsys, status=1)
-    assert "is a file" in error_of(["demo", "--output", str(stream)], capsys, status=2)
+    assert "demo writes no .sgs" in error_of(["demo", "--output", str(stream)], capsys, status=2)
