@@ -10,6 +10,7 @@ import pytest
 from captures import HEIGHT, WIDTH, numbers, picture, write_video
 from structgstream.data.video_index import VideoTrack, scan_videos
 from structgstream.data.video_pictures import pictures_at
+from structgstream.errors import CaptureError
 
 SIZE = (WIDTH, HEIGHT)
 FRAMES = 16  # in groups of four
@@ -55,9 +56,17 @@ def test_pictures_have_the_size_that_is_asked_for(tmp_path: Path) -> None:
     (half,), _ = read(track, [track.stamps[9]], size=(WIDTH // 2, HEIGHT // 2))
     assert half.shape == (HEIGHT // 2, WIDTH // 2, 3)
     assert numbers(half) == (3, 9)
-    (turned,), _ = read(replace(track, quarter_turns=1), [track.stamps[9]], size=(SIZE[1], SIZE[0]))
+    (turned,), _ = read(replace(track, quarter_turns=1, width=HEIGHT, height=WIDTH), [track.stamps[9]], size=SIZE[::-1])
     assert turned.shape == (WIDTH, HEIGHT, 3)
     assert numbers(np.ascontiguousarray(np.rot90(turned, -1))) == (3, 9)
+
+
+def test_a_video_whose_size_changes_is_refused_where_it_does(tmp_path: Path) -> None:
+    track = replace(track_of(tmp_path), width=2 * WIDTH, height=2 * HEIGHT)  # As its first frames may have had.
+    with pytest.raises(
+        CaptureError, match=f"changes its size from {2 * WIDTH}x{2 * HEIGHT} to {WIDTH}x{HEIGHT} at 0.3"
+    ):
+        read(track, [track.stamps[9]])
 
 
 @pytest.mark.parametrize("share", [0.6, 0.97])

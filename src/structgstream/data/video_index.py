@@ -169,8 +169,9 @@ def _scan(path: Path) -> VideoTrack:
         stamps = sorted(packet.pts for packet in shown if packet.pts is not None)
         if len(stamps) != len(shown) or stream.time_base is None:
             raise CaptureError(
-                f"The video {path} has frames without time stamps, so it cannot be synchronised; "
-                "remux it to a container that stores them (mp4, mkv)."
+                f"The video {path} has frames without time stamps (the first of them is number "
+                f"{next((n for n, packet in enumerate(shown) if packet.pts is None), 0)} in the file), so it cannot be "
+                "synchronised; write it again with times from 0 on, as mp4 or mkv."
             )
         keys = [packet.pts for packet in packets if packet.is_keyframe and packet.pts is not None]
         seconds = float(stream.time_base)

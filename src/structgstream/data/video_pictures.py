@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from structgstream.data.images import OPAQUE, reduced_mask
 from structgstream.data.transfer import BT2020, HIGH_RANGE, high_range_to_srgb, transfer_of
 from structgstream.data.video_index import VideoTrack, load_av, open_video, video_stream
+from structgstream.errors import CaptureError
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -167,10 +168,22 @@ def _key_before(track: VideoTrack, stamp: int) -> int | None:
 
 
 def _shown(frame: "VideoFrame", reformatter: "VideoReformatter", track: VideoTrack, size: tuple[int, int]) -> Picture:
-    """The picture as it is shown, at ``size``."""
+    """The picture as it is shown, at ``size``.
+
+    Raises:
+        CaptureError: it has another size than the video's first ones, so the calibration cannot be of both.
+    """
+    turned = track.quarter_turns % 2
+    width, height = (frame.height, frame.width) if turned else (frame.width, frame.height)
+    if (width, height) != (track.width, track.height):
+        seconds = ((frame.pts or 0) - track.origin) * track.tick_seconds
+        raise CaptureError(
+            f"The video {track.path} changes its size from {track.width}x{track.height} to {width}x{height} at "
+            f"{seconds:.3f} s, and a camera has one; end the take before it (--frames), or film again."
+        )
     if not track.quarter_turns:
         return srgb(frame, reformatter, width=size[0], height=size[1])
-    width, height = size[::-1] if track.quarter_turns % 2 else size
+    width, height = size[::-1] if turned else size
     return np.ascontiguousarray(np.rot90(srgb(frame, reformatter, width=width, height=height), track.quarter_turns))
 
 
