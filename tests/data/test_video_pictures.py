@@ -56,7 +56,9 @@ def test_pictures_have_the_size_that_is_asked_for(tmp_path: Path) -> None:
     (half,), _ = read(track, [track.stamps[9]], size=(WIDTH // 2, HEIGHT // 2))
     assert half.shape == (HEIGHT // 2, WIDTH // 2, 3)
     assert numbers(half) == (3, 9)
-    (turned,), _ = read(replace(track, quarter_turns=1, width=HEIGHT, height=WIDTH), [track.stamps[9]], size=SIZE[::-1])
+    (turned,), _ = read(
+        replace(track, quarter_turns=1, width=HEIGHT, height=WIDTH), [track.stamps[9]], size=(HEIGHT, WIDTH)
+    )
     assert turned.shape == (WIDTH, HEIGHT, 3)
     assert numbers(np.ascontiguousarray(np.rot90(turned, -1))) == (3, 9)
 
