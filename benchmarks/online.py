@@ -98,7 +98,7 @@ def contestants(
             _fitting("a part moves, everything fitted", here, native, everything, compared=False),
         ]
     if contest == "pictures":
-        whole = replace(motion, motion=replace(motion.motion, tiles=False))
+        whole = replace(motion, motion=replace(motion.motion, margin_pixels=max(width, height)))  # reaches all tiles
         return [
             _fitting("following motion, whole pictures", here, native, whole),
             _fitting("following motion", here, native, motion),

@@ -73,9 +73,10 @@ class ToneCurve:
 
     @cached_property
     def table(self) -> NDArray[np.uint8]:
-        """``[256, 3]``: what each value of a picture becomes."""
+        """``[256, 3]``: what each value of a picture becomes; it nowhere falls, whatever rounding does."""
         levels = np.repeat(np.arange(256)[:, None] / 255, CHANNELS, 1)
-        return np.rint(self(levels) * 255).clip(0, 255).astype(np.uint8)
+        values = np.maximum.accumulate(self(levels), axis=0)
+        return np.rint(values * 255).clip(0, 255).astype(np.uint8)
 
     def apply(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """A picture ``[H, W, 3]`` through the curve."""
