@@ -46,3 +46,10 @@ def test_anchors_behind_the_camera_are_culled() -> None:
     moved = replace(scene.anchors, positions=behind)
     scene = replace(scene, anchors=moved)
     assert scene.structured(camera, reference_backend()).anchors.numel() == 0
+
+
+def test_anchors_are_appended_with_every_column_that_they_have() -> None:
+    cloud = replace(random_scene(5).anchors, appearance=torch.rand(5, 3))
+    both = cloud.select(torch.arange(2)).append(cloud.select(torch.arange(2, 5)))
+    for name in ("positions", "log_offset_scales", "log_base_scales", "offsets", "features", "appearance"):
+        assert torch.equal(getattr(both, name), getattr(cloud, name)), name

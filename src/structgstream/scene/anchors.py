@@ -3,6 +3,7 @@
 
 from dataclasses import dataclass, fields
 
+import torch
 from torch import Tensor
 
 from structgstream.gaussians import row_indices
@@ -54,6 +55,10 @@ class AnchorCloud:
         for name, column in columns.items():
             column[rows] = getattr(other, name)
         return AnchorCloud(**columns)
+
+    def append(self, other: "AnchorCloud") -> "AnchorCloud":
+        """These anchors and then those of ``other``, which has the same columns."""
+        return AnchorCloud(**{name: torch.cat([rows, getattr(other, name)]) for name, rows in self._columns().items()})
 
     def _columns(self) -> dict[str, Tensor]:
         return {f.name: column for f in fields(self) if (column := getattr(self, f.name)) is not None}

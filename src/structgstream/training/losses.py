@@ -1,11 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loss of a view, and the view-space gradients that come of it.
-
-The terms of the training loss (paper, equations for L, L_vol, L_init and L_dist).
-
-The loss of one view, computed in every iteration of every fit.
-
-View-space positional gradients, collected by id.
+"""The loss of a view (paper, equations for L, L_vol, L_init and L_dist) and its view-space gradients.
 
 Note [View-space units]
 ~~~~~~~~~~~~~~~~~~~~~~~

@@ -1,17 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tensors that are trained, their quantization while they are, and the rate term.
-
-Quantization-aware training: dynamic values are quantized while they are trained.
+"""A scene as the tensors that are trained, their quantization while they are, and the rate term.
 
 Note [Bins]
 ~~~~~~~~~~~
 A dynamic value is sent as an integer bin times a step. Leaves are continuous, renderings use the quantized values, and
 gradients pass the rounding unchanged (straight-through). Bins are absolute, so differences between frames are exact
-integers and errors do not accumulate.
-
-A scene as the tensors that the optimiser trains, and back.
-
-The rate term of the loss: a price on changing bins since the last frame (Note [Bins]).
+integers and errors do not accumulate. The rate term is what changes of bins since the previous frame cost.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence

@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a fit reports: its result, its steps, and its seconds by stage.
-
-Seconds by stage.
-
-Result and progress of fitting one frame.
-"""
+"""What a fit reports: its result, its steps, and its seconds by stage."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where frame 0 starts: anchors at points, the environment, or an earlier scene.
-
-Initialisation of frame 0: anchors from points, random MLPs.
+"""Where frame 0 starts: anchors at points with random MLPs, the environment, or an earlier period's scene.
 
 Note [Dead outputs]
 ~~~~~~~~~~~~~~~~~~~
@@ -10,16 +8,12 @@ are drawn and get a gradient, as with a ReLU. With random weights about half of 
 every anchor, because all features start equal, and an output that no anchor draws stays dead: of K = 5, one to four
 survive, depending on the seed. ``all_drawn`` avoids this: a smaller K, with all outputs initially positive.
 
-Least-squares fit of a scene's environment (``scene/environment.py``) to the training pictures of frame 0.
-
 Note [Honest coverage]
 ~~~~~~~~~~~~~~~~~~~~~~
 With a black background the optimiser represents dark surfaces by transparency. Coverage then does not distinguish dark
 surfaces from unobserved regions, and an environment would shine through dark doors and hair. With a random background
 colour in every iteration (``InitialConfig.random_background``) only opaque surfaces can match the pictures, so what
 stays transparent is unobserved.
-
-The scene of a frame as the start of another period's first frame: anchors only, everything trainable again.
 """
 
 import math
@@ -185,7 +179,7 @@ def warm_start(scene: Scene, *, cell: float) -> Scene:
     scene = scene.with_folded_appearance()
     anchors = scene.anchors
     if len(scene.free):
-        anchors = _joined(anchors, _anchors_of(scene.free, anchors, cell))
+        anchors = anchors.append(_anchors_of(scene.free, anchors, cell))
     return replace(scene, anchors=anchors, free=FreeGaussians.empty(anchors.positions), environment=None)
 
 
@@ -203,20 +197,10 @@ def _anchors_of(free: FreeGaussians, anchors: AnchorCloud, cell: float) -> Ancho
     means = sums / count[:, None]
     # A Gaussian is at most as large as the base scale, and half of it on average.
     log_scales = (means[:, 3:] + np.log(2.0)).expand(-1, 3)
-    return AnchorCloud(
+    return replace(
+        anchors.select(nearest(means[:, :3], anchors.positions, 1)[0][:, 0]),  # with what else an anchor has
         positions=means[:, :3].contiguous(),
         log_offset_scales=log_scales.contiguous(),
         log_base_scales=log_scales.contiguous(),
         offsets=means.new_zeros(len(unique), anchors.offsets_per_anchor, 3),
-        features=anchors.features[nearest(means[:, :3], anchors.positions, 1)[0][:, 0]],
-    )
-
-
-def _joined(first: AnchorCloud, second: AnchorCloud) -> AnchorCloud:
-    return AnchorCloud(
-        positions=torch.cat([first.positions, second.positions]),
-        log_offset_scales=torch.cat([first.log_offset_scales, second.log_offset_scales]),
-        log_base_scales=torch.cat([first.log_base_scales, second.log_base_scales]),
-        offsets=torch.cat([first.offsets, second.offsets]),
-        features=torch.cat([first.features, second.features]),
     )

@@ -22,8 +22,8 @@ class FlowConfig:
     finest_level: int = 1
     """Of the search's pyramid: 0 is the size of the pictures, 1 half of it."""
     least_width: int = 240
-    """Where the finest level would be narrower than this, pixels, a finer one is searched: in small pictures what moves
-    is small, too."""
+    """Pixels. If the finest level is narrower than this, the search goes on to a finer one: in small pictures what
+    moves is small, too."""
     apart: bool = False
     """Search in a box for each part of a picture that changed, instead of one around all: quicker where things move far
     from each other."""
@@ -56,7 +56,7 @@ class MotionConfig:
     """
 
     enabled: bool = False
-    """Train only primitives (paper: False, everything is trained)."""
+    """Train only dynamic anchors and free Gaussians (paper: False, everything is trained)."""
     change_threshold: float = 0.05
     """A pixel has changed if its mean absolute difference to the previous picture over 3 x 3 pixels and the channels
     (full scale 1) exceeds this; above the sensors' noise."""
@@ -79,12 +79,12 @@ class MotionConfig:
     picture_scale: float = 0.25
     """Scale of width and height, relative to the reference size, of the pictures on which coverage is computed."""
     margin_pixels: int = 8
-    """Tiles within this many pixels of moving Gaussians are drawn too, so that these get gradients where they move."""
+    """Tiles within this many pixels of dynamic Gaussians are drawn too, so that these get gradients where they move."""
     rest_every: int = 1
-    """Tiles in which nothing has changed are drawn only every this many times that a view is. 1: always."""
+    """Unchanged tiles are rendered only in every n-th iteration of a view. 1: always."""
     tiles_around: int = -1
     """Tiles (16 pixels) farther than this many tiles from one in which something has changed are not drawn, though
-    moving Gaussians reach them. -1: all are."""
+    dynamic Gaussians reach them. -1: all are."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.carried_share <= 1.0:
@@ -126,11 +126,11 @@ class SceneFlowConfig:
 
 @dataclass(frozen=True)
 class ThinSpawnConfig:
-    """A second sweep, for thin and faint content such as a stream of water, in frames in which the first bears nothing.
+    """A second sweep for thin, faint content such as a stream of water, in frames in which the first spawns nothing.
 
     Its fields replace those of the same names of :class:`SpawnConfig`: finer pictures, every ray, lower thresholds. By
-    these rules something large would be born of many small Gaussians, which follow it worse than few large ones do and
-    cost more.
+    these rules something large would become many small Gaussians, which follow it worse than few large ones and cost
+    more.
     """
 
     enabled: bool = False
@@ -142,9 +142,9 @@ class ThinSpawnConfig:
     least_hits: int = 3
     most: int = 150
     crowded: Literal["coarser", "none", "small-clusters"] = "none"
-    """Thin content is little. Where more would be born, what moves is not where it should be, as in a throw: births in
-    its place follow it worse and cost more than what they stand for. A group of frames that is fitted apart lacks what
-    the frames before it would have borne: its first frames bear what lies in small clusters."""
+    """Thin content needs few Gaussians. More candidates mean that dynamic anchors are misplaced, as in a throw: new
+    Gaussians in their place follow worse and cost more. A group of frames that is fitted separately lacks what earlier
+    frames would have spawned: its first frames spawn what lies in small clusters."""
     most_missing_share: float = 0.02
     """Of the pictures 0.0005 lack something where a pitcher pours. More is light that changed."""
 
@@ -177,11 +177,11 @@ class SpawnConfig:
     most: int = 5000
     """Largest number of births per frame: more than who walks in needs, since below that number all of it is haze."""
     crowded: Literal["coarser", "none", "small-clusters"] = "coarser"
-    """Where there would be more than ``most``: births in larger voxels, none, or those in the smallest clusters."""
+    """Where there would be more than ``most``: Gaussians in larger voxels, none, or those in the smallest clusters."""
     most_missing_share: float = 0.25
-    """If a larger share of the pictures is missing there are no births: the light changed, or a camera moved."""
+    """If a larger share of the pictures is missing nothing is spawned: the light changed, or a camera moved."""
     size: float = 0.7
-    """Standard deviation at birth, in units of the distance between neighbouring swept rays."""
+    """Standard deviation of a new Gaussian, in units of the distance between neighbouring swept rays."""
     opacity: float = 0.7
     blame_share: float = 0.5
     """A free Gaussian is an outlier in a view if more than this share of its pixels is wrong."""

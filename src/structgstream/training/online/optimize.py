@@ -69,7 +69,7 @@ class StartingPoint:
 
     @property
     def known(self) -> Scene:
-        """What changes and motion are counted from."""
+        """The scene against which changes and displacements are penalised."""
         return self.scene if self.reference is None else self.reference
 
     @property
@@ -271,7 +271,7 @@ class OnlineHooks(Hooks[View, SceneLoss]):
     recorded: set[Hashable] = field(default_factory=set)
 
     def loss(self, iteration: int, sample: View) -> SceneLoss:
-        active = self._active(sample)
+        active = self._active_tiles_of(sample)
         loss = view_loss(
             self.parameters.scene(self.start.scene),
             sample,
@@ -284,9 +284,9 @@ class OnlineHooks(Hooks[View, SceneLoss]):
             background=None if active is None else active.background,
         )
         # Tiles that are not drawn now hold their last drawing.
-        return self._with_rate(replace(loss, active=active))
+        return self._with_regularizers(replace(loss, active=active))
 
-    def _with_rate(self, loss: SceneLoss) -> SceneLoss:
+    def _with_regularizers(self, loss: SceneLoss) -> SceneLoss:
         values = self.parameters.values
         if self.coherence is not None:
             difference = self.coherence.difference(values["anchor_positions"], self.backend)
@@ -295,12 +295,12 @@ class OnlineHooks(Hooks[View, SceneLoss]):
             return loss
         return replace(loss, total=loss.total + self.rate_term.value(values, self.backend))
 
-    def _active(self, sample: View) -> ActiveTiles | None:
+    def _active_tiles_of(self, sample: View) -> ActiveTiles | None:
         return None if self.start.active_tiles is None else self.start.active_tiles[sample.index]
 
     def _alternates(self, sample: View) -> bool:
         """Whether some visits of the view are without the tiles in which nothing has changed."""
-        active = self._active(sample)
+        active = self._active_tiles_of(sample)
         return active is not None and active.changed is not None and self.rest_every > 1
 
     def _rests(self, sample: View) -> bool:
@@ -313,7 +313,7 @@ class OnlineHooks(Hooks[View, SceneLoss]):
 
     def repeats(self, iteration: int, sample: View) -> Hashable | None:
         """Visits of a view that draw the same tiles, until rows of free Gaussians come or go."""
-        active, alternates, rests = self._active(sample), self._alternates(sample), self._rests(sample)
+        active, alternates, rests = self._active_tiles_of(sample), self._alternates(sample), self._rests(sample)
         key = sample.index, rests, self.free_set.version
         if key not in self.recorded:
             # The other visits of a view follow each other; those of all tiles are ``rest_every`` visits apart.

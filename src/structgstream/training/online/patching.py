@@ -1,10 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pruning and spawning of free Gaussians by gradients, as in the paper.
-
-Global patching with free Gaussians (paper, section Global Free 3DGs Patching Strategy).
-
-Pruning and spawning of free Gaussians during a frame's optimisation.
-"""
+"""Pruning and spawning of free Gaussians by gradients (paper, section Global Free 3DGs Patching Strategy)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

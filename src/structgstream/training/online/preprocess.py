@@ -54,9 +54,9 @@ class PictureChange:
     Args:
         changed: ``[H, W]`` bool, dilated mask of the changed pixels.
         repeated: whether it is the previous picture once more, equal or encoded again: a frozen camera's.
-        flow: ``[h, w, 6]`` the maps of ``flow_maps.flow_map`` from the previous picture to this one, and the previous
+        flow: ``[h, w, 6]`` the maps of :func:`flow_map` from the previous picture to this one, and the previous
             picture in 0 ... 1; None if flow was not estimated.
-        far_boxes: number of boxes in which large motion was searched for (``flow_maps.FlowMaps``).
+        far_boxes: number of boxes in which large motion was searched for (:class:`FlowMaps`).
     """
 
     changed: Tensor
@@ -109,7 +109,7 @@ def preprocess(
 
 
 def flow_views(views: Sequence[View], frame_index: int, config: SceneFlowConfig) -> frozenset[int]:
-    """Indices of the views in which flow is estimated in a frame; none if the motion start is disabled."""
+    """Indices of the views in which flow is estimated in a frame; none if the scene flow is disabled."""
     if not config.enabled:
         return frozenset()
     stride = -(-len(views) // max(config.views, 2))

@@ -226,7 +226,7 @@ def residual_flow(
         views: in which flow is estimated.
         active_tiles: by view index, with up-to-date renderings; views without one are skipped.
         scale: of the pictures on which flow is summed by blending weights.
-        config: of the motion start.
+        config: of the scene flow.
         backend: the compute back-end.
     """
     seen = [view for view in views if view.index in active_tiles]

@@ -75,13 +75,13 @@ class DynamicSelection:
     Args:
         anchors: mask ``[M]`` of dynamic anchors.
         free: mask ``[F]`` of dynamic free Gaussians.
-        visible: by index of each inliers view, mask ``[M * K + F]`` (Note [Ids]) of the visible Gaussians.
-        inliers: positions of the views that are no outliers (``trust``); only their votes count.
+        visible: by index of each inlier view, mask ``[M * K + F]`` (Note [Ids]) of the visible Gaussians.
+        inliers: positions of the views that are no outliers (Note [Outlier views]); only their votes count.
         scene_cut: whether most pictures changed everywhere, so that motion cannot be segmented.
         evidence: optical flow of all primitives, if it was estimated.
         views_with_flow: indices of the views with flow.
         centers: ``[M + F, 3]`` visible centres of all primitives, if flow was estimated.
-        changed: by index of each inliers view that is compared with an earlier picture, mask ``[h, w]`` of its changed
+        changed: by index of each inlier view that is compared with an earlier picture, mask ``[h, w]`` of its changed
             pixels at ``MotionConfig.picture_scale``.
         occluded_count: how many of the dynamic anchors are occluded (Note [Occluded anchors]).
     """
@@ -222,16 +222,16 @@ def _usual_change(changes: Sequence[ViewChange]) -> float:
 
 
 NEIGHBOURS = 8
-"""Number of nearest shown anchors that a unseen one is compared with."""
+"""Number of nearest visible anchors that one which too few views see is compared with."""
 
 
 def occluded_dynamic(positions: Tensor, dynamic: Tensor, shown: Tensor, *, share: float) -> Tensor:
-    """Mask ``[M]`` of the unseen anchors of whose nearest shown ones at least ``share`` move.
+    """Mask ``[M]`` of the anchors that too few views see and of whose nearest visible ones at least ``share`` move.
 
     Args:
         positions: ``[M, 3]`` scene units.
         dynamic: mask ``[M]`` of the anchors that move by their own votes.
-        shown: mask ``[M]`` of the anchors that enough views show to tell; the others are unseen.
+        shown: mask ``[M]`` of the anchors that enough views see to vote; the others are occluded.
         share: 0 to 1; 0: none is.
 
     Raises:

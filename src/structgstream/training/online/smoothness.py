@@ -3,8 +3,8 @@
 
 Pictures do not tell every anchor's motion: along an edge, on a plain surface, or behind another anchor, what is left is
 noise, which costs bits, and which shows in views that were not trained on. Neighbours on one body move alike. So
-differences of displacement between neighbours have a price, by their length and not its square, as two bodies
-that pass each other differ much at few places.
+differences of displacement between neighbours are penalised by their length and not its square (like L1), as two
+bodies that pass each other differ much at few places.
 """
 
 from collections.abc import Sequence

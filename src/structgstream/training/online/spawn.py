@@ -116,13 +116,13 @@ def outlier_mask(coverage: Tensor, wrong: Tensor, *, least_pixels: float, config
 
 @dataclass(frozen=True)
 class Spawned:
-    """What a sweep bears.
+    """Gaussians spawned by one sweep.
 
     Args:
         free: the new free Gaussians.
-        refused_count: how many more it would have borne, had they not been more than ``SpawnConfig.most``; always 0
-            where births are coarser then (``SpawnConfig.crowded``).
-        merged_count: how many more it would have borne, had they not been made coarser for that reason.
+        refused_count: how many more there were, if these are more than ``SpawnConfig.most``; always 0
+            where Gaussians are coarser then (``SpawnConfig.crowded``).
+        merged_count: how many more there would be, had they not been made coarser for that reason.
     """
 
     free: FreeGaussians
@@ -334,10 +334,10 @@ class Sweep:
     known: Mapping[int, Missing] = field(default_factory=dict)
 
     def missing(self, *, blames: bool = True) -> list[Missing]:
-        """Missing pixels of every view, none outside its active.
+        """Missing pixels of every view, none outside its active tiles.
 
         Args:
-            blames: whether free Gaussians will be blamed for wrong pixels, which then have to be right too.
+            blames: whether outliers will be pruned by wrong pixels, which then must be rendered again as well.
         """
         # The pictures are from before the second round: tiles without missing pixels then are assumed to have none.
         found = [self._before(view, wrong=blames) for view in self.views]
