@@ -427,11 +427,13 @@ describe.skipIf(!executable)("the player in a browser", () => {
     const page = await open();
     await shows(page, 0);
     const places = await ask(page, async (player) => {
-      player.show("cam07", 1.5);
+      player.show("cam07", 6); // Seconds: a browser that draws in software shows few pictures of a short flight.
       const found: number[] = [];
-      for (let i = 0; i < 12; i++) {
+      for (let i = 0; i < 90; i++) {
         await new Promise((resolve) => setTimeout(resolve, 200));
         found.push(player.camera!.viewmat[3]!);
+        const [place, ...before] = found.slice(-6).reverse();
+        if (i >= 30 && before.every((other) => other === place)) break;
       }
       return found;
     });
