@@ -264,7 +264,7 @@ MOTION = replace(
     RIG,
     online=replace(RIG.online, motion=MotionConfig(enabled=True)),
 )
-"""As RIG, but only movers are trained. F_Sigma is held, because still anchors depend on it."""
+"""As RIG, but only dynamic primitives are trained. F_Sigma is fixed, because static anchors depend on it."""
 
 COMPACT = replace(
     MOTION,

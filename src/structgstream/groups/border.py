@@ -59,7 +59,7 @@ def moving_at_border(
 ) -> Tensor | None:
     """Mask ``[M]`` of the anchors of ``first`` that move; None where everything changes, as at a cut.
 
-    An anchor moves if the change gate of an online frame finds it between the renderings of ``before`` and ``first``,
+    An anchor moves if the selection of an online frame finds it between the renderings of ``before`` and ``first``,
     or if it changed from ``earlier`` to ``before`` or from ``first`` to ``second``: what moves slowly, and the plain
     inside of what moves fast, changes the pictures by less than the two fits differ.
 

@@ -89,7 +89,7 @@ class Tracker:
 
     Args:
         config: sizes and cameras.
-        motion: thresholds of the change gate, for pictures of the stream.
+        motion: thresholds of the selection, for pictures of the stream.
         lift: of the fit of displacements.
         rig: of the stream, in the units of the scene.
         backend: the compute back-end.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Global light: what all cameras see fade or brighten together, slower than the change gate notices.
+"""Global light: what all cameras see fade or brighten together, slower than the selection notices.
 
 Lamps warm up, the sun goes, and every pixel follows by a fraction of a level per frame. No pixel changes, so nothing is
 trained, and what stands still keeps frame 0's colours. Here the change since frame 0 is measured in the training
