@@ -175,7 +175,7 @@ class _Rounds:
         return DynamicSplit.of(current, replace(found, anchors=found.anchors | away, free=torch.ones_like(found.free)))
 
     def _recalled(self, split: DynamicSplit, views: list[View]) -> tuple[DynamicSplit, int]:
-        """``split`` with its stragglers where their neighbours are; how many they are."""
+        """``split`` with its lost anchors where their neighbours are; how many they are."""
         fit, config = self.fit, self.fit.config
         dynamic, count = relocate_lost_anchors(
             split.dynamic,

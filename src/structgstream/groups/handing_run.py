@@ -25,7 +25,7 @@ from structgstream.kernels.backend import BackendName, select_backend
 from structgstream.whole_files import write_whole
 
 MOST_GROUPS = 8
-"""Of a run: a process takes two seconds to start, and what it has done is told when it ends."""
+"""Of a run: a process takes two seconds to start, and its result is reported when it ends."""
 
 
 @dataclass(frozen=True)

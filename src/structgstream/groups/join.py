@@ -186,7 +186,7 @@ def _check(segments: Sequence[tuple[Path, Segment]]) -> None:
 
 
 def check_births(path: Path, firsts: Sequence[int]) -> None:
-    """Decode a stream of groups, and check that free Gaussians were born in their own group.
+    """Decode a stream of groups, and check that free Gaussians were spawned in their own group.
 
     A birth's identity is its frame times 2^32 and a number, so births of different groups are different.
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stragglers: anchors that tracking lost on the way to a group's first frame, and that look wrong where they are.
+"""Anchors that tracking lost on the way to a group's first frame and that look wrong where they are.
 
 What covers few pixels at the rim of a body may get no vote for a while, stays behind as a speck on the background, and
 then nothing there changes any more. Iterations do not find the way back, which is far. But what was beside it in frame
-0 and looks alike has arrived: a straggler gets the displacement of these neighbours, and iterations do the rest.
+0 and looks alike has arrived: a lost anchor gets the displacement of these neighbours, and iterations do the rest.
 """
 
 from collections.abc import Mapping, Sequence
@@ -53,7 +53,7 @@ def relocate_lost_anchors(
     config: LostAnchorConfig,
     backend: Backend,
 ) -> tuple[Scene, int]:
-    """``dynamic`` with its stragglers where neighbours are, and how many they are.
+    """``dynamic`` with its lost anchors where neighbours are, and how many they are.
 
     Args:
         dynamic: the dynamic part of a scene.

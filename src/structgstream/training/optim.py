@@ -286,7 +286,7 @@ def gradients_of(
 class MeanOfSteps:
     """Sums of trained leaves over the iterations after ``after``.
 
-    A leaf whose number of rows changes, because free Gaussians are pruned or born, starts again.
+    A leaf whose number of rows changes, because free Gaussians are pruned or spawned, starts again.
     """
 
     after: int

@@ -241,7 +241,7 @@ class RateTerm:
         return cls(weight, {name: parameters.values[name].detach().clone() for name in paid}, paid)
 
     def after_pruning(self, keep: Tensor) -> "RateTerm":
-        """The price after free Gaussians outside the mask ``keep`` were pruned; ones born since are not priced."""
+        """The term after free Gaussians outside the mask ``keep`` were pruned; ones spawned since have none."""
         before = {
             name: value[keep[: len(value)]] if name in FREE_ROWS else value for name, value in self.before.items()
         }

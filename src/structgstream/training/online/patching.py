@@ -175,5 +175,5 @@ class FreeSet:
     def _next_birth(self) -> int:
         first = self.frame_index * IDS_PER_FRAME
         births = self.parameters.births
-        # Some may have been born in this frame already.
+        # Some may have been spawned in this frame already.
         return max(first, int(births.max()) + 1) if len(births) else first

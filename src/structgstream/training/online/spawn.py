@@ -225,7 +225,7 @@ def _merge_points(
         if config.crowded == "small-clusters":
             enough[enough.clone()] = _in_small_clusters(means[enough, :3], CLUSTER_VOXELS * voxel, most=config.most)
             break
-        voxel *= 2.0**0.5  # Too many: what is missing is large, and is born coarser.
+        voxel *= 2.0**0.5  # Too many: what is missing is large, and coarser Gaussians fill it.
     order = hits.argsort(descending=True, stable=True)
     chosen = order[enough[order]][: config.most].sort().values
     count = len(chosen)
@@ -433,15 +433,15 @@ def _reduced(camera: Camera) -> Camera:
 
 @dataclass(frozen=True)
 class SpawnResult:
-    """Result of the renewal of a dynamic part's free Gaussians.
+    """Which free Gaussians of a dynamic part stay, and the new ones.
 
     Args:
-        kept: mask ``[F]`` of those that are kept.
-        new_free: those that are born.
+        kept: mask ``[F]`` of those that stay.
+        new_free: the spawned ones.
         thin_count: how many of them are thin content's.
-        thin_refused_count: how many thin ones were not born because they would have been too many.
-        merged_count: how many more would have been born, had they not been made coarser because they were too many.
-        refused: whether too much is missing for births.
+        thin_refused_count: how many thin ones were not spawned because they would have been too many.
+        merged_count: how many more there would be, had they not been made coarser because they were too many.
+        refused: whether too much is missing to spawn anything.
     """
 
     kept: Tensor
@@ -476,7 +476,7 @@ def prune_and_spawn(
     config: SpawnConfig,
     backend: Backend,
 ) -> SpawnResult:
-    """Removal and births of free Gaussians before the first iteration.
+    """Prune outlier free Gaussians and spawn new ones before the first iteration.
 
     Args:
         split: with its dynamic part after the scene flow.
