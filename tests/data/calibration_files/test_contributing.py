@@ -4,6 +4,7 @@
 import csv
 import re
 import textwrap
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ def converter() -> dict[str, Any]:
     section = (ROOT / "CONTRIBUTING.md").read_text().split("### A capture format")[1].split("\n##")[0]
     (code,) = re.findall(r" *```python\n(.*?)```", section, re.DOTALL)
     known: dict[str, Any] = {
-        "csv": csv, "Path": Path, "readable": readable, "calibration_of": calibration_of, "EXPECTED": "a row a camera",
+        "csv": csv, "Iterator": Iterator, "Path": Path, "readable": readable, "calibration_of": calibration_of, "EXPECTED": "a row a camera",
         "Calibration": Calibration, "PosedCamera": PosedCamera, "intrinsics": intrinsics, "rigid": rigid,
         "from_integer_centers": from_integer_centers, "read_text": read_text, "number": number,
         "pixels": picture_pixels,
