@@ -28,10 +28,10 @@ void step(float* param, const float* grad, float* first, float* second, int64_t 
 
 }  // namespace
 
-// rows: null, or the `count` rows of `width` floats to move; without it the tensors hold count * width floats.
+// All tensors hold `count` floats.
 void adam_step(
-    float* param, const float* grad, float* first, float* second, const int64_t* rows, int64_t count, int64_t width,
-    double lr, int64_t steps, double beta1, double beta2, double eps, int threads) {
+    float* param, const float* grad, float* first, float* second, int64_t count, double lr, int64_t steps, double beta1,
+    double beta2, double eps, int threads) {
     const Rates rates{
         static_cast<float>(beta1),
         static_cast<float>(beta2),
@@ -42,19 +42,11 @@ void adam_step(
         static_cast<float>(eps)};
     constexpr int64_t kSpan = 1 << 14;
     constexpr int64_t kWorthThreads = 1 << 22;  // Waking a thread costs more than it saves below.
-    if (rows == nullptr) {
-        const int64_t total = count * width, chunks = (total + kSpan - 1) / kSpan;
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1 && total >= kWorthThreads)
-        for (int64_t n = 0; n < chunks; ++n) {
-            const int64_t at = n * kSpan;
-            step(param + at, grad + at, first + at, second + at, std::min(kSpan, total - at), rates);
-        }
-        return;
-    }
-#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1 && count * width >= kWorthThreads)
-    for (int64_t n = 0; n < count; ++n) {
-        const int64_t at = rows[n] * width;
-        step(param + at, grad + at, first + at, second + at, width, rates);
+    const int64_t chunks = (count + kSpan - 1) / kSpan;
+#pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1 && count >= kWorthThreads)
+    for (int64_t n = 0; n < chunks; ++n) {
+        const int64_t at = n * kSpan;
+        step(param + at, grad + at, first + at, second + at, std::min(kSpan, count - at), rates);
     }
 }
 

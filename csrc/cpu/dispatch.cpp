@@ -32,8 +32,7 @@
         const sgs_anchors&, const sgs_selection&, const sgs_gaussians&, const sgs_gaussian_gradients&,                \
         const sgs_anchor_gradients&, int);                                                                            \
     void adam_step(                                                                                                   \
-        float*, const float*, float*, float*, const int64_t*, int64_t, int64_t, double, int64_t, double, double,      \
-        double, int);                                                                                                 \
+        float*, const float*, float*, float*, int64_t, double, int64_t, double, double, double, int);                 \
     void lift_flow(const FlowLift&, int);                                                                             \
     void plane_scores(const PlaneSweep&);                                                                             \
     double change_bits(const float*, const float*, int64_t, float, float*);                                           \
@@ -335,9 +334,9 @@ double sgs_change_bits(const float* values, const float* before, int64_t count, 
 }
 
 void sgs_adam_step(
-    float* param, const float* grad, float* first, float* second, const int64_t* rows, int64_t count, int64_t width,
-    double lr, int64_t step, double beta1, double beta2, double eps, int threads) {
-    SGS_DISPATCH(adam_step(param, grad, first, second, rows, count, width, lr, step, beta1, beta2, eps, threads))
+    float* param, const float* grad, float* first, float* second, int64_t count, double lr, int64_t step, double beta1,
+    double beta2, double eps, int threads) {
+    SGS_DISPATCH(adam_step(param, grad, first, second, count, lr, step, beta1, beta2, eps, threads))
 }
 
 }  // extern "C"

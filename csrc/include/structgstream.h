@@ -13,7 +13,7 @@ extern "C" {
 
 /* Which version of this interface the library has. It rises with every change of what stands in this file or in
  * cpu/anchors.h; kernels/native.py expects the same number, so that a library of another version is refused. */
-#define SGS_ABI_VERSION 7
+#define SGS_ABI_VERSION 8
 int sgs_abi_version(void);
 
 /* Instruction sets: 0 baseline (SSE2, NEON or plain C++), 1 AVX2 with FMA, 2 AVX-512. */
@@ -150,10 +150,10 @@ double sgs_neighbour_difference(
 /* Sum of log2(1 + |values - before| / step) over `count` numbers, returned, and its gradient by the values. */
 double sgs_change_bits(const float* values, const float* before, int64_t count, float step, float* gradient);
 
-/* Adam, in place. rows: null, or `count` row numbers (int64) of `width` numbers each. */
+/* Adam, in place, on tensors of `count` numbers. */
 void sgs_adam_step(
-    float* param, const float* grad, float* first, float* second, const int64_t* rows, int64_t count, int64_t width,
-    double lr, int64_t step, double beta1, double beta2, double eps, int threads);
+    float* param, const float* grad, float* first, float* second, int64_t count, double lr, int64_t step, double beta1,
+    double beta2, double eps, int threads);
 
 /* Interleaved rANS (docs/entropy.md). symbols [count], contexts [count] rows of frequencies [context_count, alphabet];
  * lanes is 1, 4 or 32; states [lanes]; words has room for `count` (encode). Return 0; 1 where memory does not suffice;

@@ -23,6 +23,14 @@ def test_a_moved_square_is_found_with_its_rim() -> None:
     assert mask[10:20, 12:22].all()
 
 
+def test_the_rim_is_as_wide_in_the_scene_in_a_larger_picture() -> None:
+    first = np.full((360, 960, 3), 50, np.uint8)
+    truth = first.copy()
+    truth[100:200, 120:220] = 250
+    columns = np.flatnonzero(changed_pixels(truth, first).any(0))
+    assert (columns[0], columns[-1]) == (114, 225)  # one pixel of the mean and 3 x 960 / 640, rounded up
+
+
 @pytest.mark.parametrize(("change", "found"), [(25, False), (26, True)])
 def test_the_threshold_is_a_tenth_of_full_scale(change: int, found: bool) -> None:
     first = np.full((16, 16, 3), 100, np.uint8)

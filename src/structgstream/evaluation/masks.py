@@ -5,11 +5,16 @@ In typical captures nine of ten pixels are static, so a mean over all pixels hid
 masks are computed from the camera's pictures, never from renderings.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.cameras import enlargement
+
 THRESHOLD = 0.1  # of full scale
-SMOOTHED, GROWN = 1, 3  # half widths in pixels: a 3x3 mean against noise, a 7x7 dilation to include edges
+SMOOTHED = 1  # half width in pixels of a 3x3 mean against noise, which is of pixels at any size
+REACH_PIXELS = 3  # of the dilation, which includes edges; multiplied by the picture's enlargement
 
 
 def blackened(picture: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
@@ -30,11 +35,14 @@ def changed_pixels(
     """Dilated mask ``[H, W]`` of the pixels that changed since the camera's first picture.
 
     The absolute difference of the two pictures ``[H, W, 3]``, averaged over channels and 3x3 pixels, is thresholded at
-    0.1 of full scale, and the mask dilated by 3 pixels. Pixels outside of ``mask`` have not changed.
+    0.1 of full scale, and the mask dilated by 3 pixels of a picture of the reference size
+    (:func:`structgstream.cameras.enlargement`). Pixels outside of ``mask`` have not changed.
     """
     if mask is not None:
         return changed_pixels(blackened(truth, mask), blackened(first, mask)) & mask
-    return dilate(differing(truth, first, THRESHOLD * 255), GROWN)
+    height, width = truth.shape[:2]
+    reach = math.floor(REACH_PIXELS * enlargement(width, height) + 0.5)
+    return dilate(differing(truth, first, THRESHOLD * 255), reach)
 
 
 def differing(one: NDArray[np.uint8], other: NDArray[np.uint8], levels: float) -> NDArray[np.bool_]:

@@ -188,7 +188,6 @@ def generate_structured(
     *,
     distance_input: bool,
     tiles: TileSelection | None = None,
-    seen_from: Tensor | None = None,
     sampling_intervals: Tensor | None = None,
 ) -> StructuredGaussians:
     """See ``reference_anchors.generate_structured``.
@@ -200,5 +199,4 @@ def generate_structured(
         OutOfMemoryError: there is no memory for one byte per anchor.
     """
     visible = visible_anchors(anchors, viewport, tiles, sampling_intervals)
-    center = viewport.center if seen_from is None else seen_from
-    return activate_anchors(anchors, mlps, center, visible, distance_input=distance_input)
+    return activate_anchors(anchors, mlps, viewport.center, visible, distance_input=distance_input)

@@ -227,5 +227,5 @@ def adam_step(
                 f"got {tensor.dtype} {tuple(tensor.shape)}; take the reference back-end for others."
             )
     grad = grad.to(torch.float32).contiguous()
-    sizes, numbers = (param.numel(), 1), (float(lr), int(step), *betas, eps)
-    native_library().sgs_adam_step(param, grad, exp_avg, exp_avg_sq, None, *sizes, *numbers, torch.get_num_threads())
+    numbers = (param.numel(), float(lr), int(step), *betas, eps)
+    native_library().sgs_adam_step(param, grad, exp_avg, exp_avg_sq, *numbers, torch.get_num_threads())

@@ -33,7 +33,6 @@ def generate_all_in_torch(
     *,
     distance_input: bool,
     tiles: TileSelection | None = None,
-    seen_from: Tensor | None = None,
     sampling_intervals: Tensor | None = None,
 ) -> StructuredGaussians:
     """See ``reference_anchors.generate_structured``: ``N = M * K`` Gaussians of all anchors.
@@ -44,7 +43,7 @@ def generate_all_in_torch(
     positions, log_offset_scales, log_base_scales, offsets, features = anchors
     count, k = offsets.shape[:2]
     seen = visible_anchor_mask(anchors, viewport, tiles, sampling_intervals)
-    to_anchor = positions - (viewport.center if seen_from is None else seen_from)
+    to_anchor = positions - viewport.center
     distance = to_anchor.norm(dim=1, keepdim=True).clamp_min(1e-12)
     parts = [features, to_anchor / distance]
     inputs = torch.cat([*parts, distance] if distance_input else parts, dim=1)
@@ -172,7 +171,6 @@ def generate_structured(
     *,
     distance_input: bool,
     tiles: TileSelection | None = None,
-    seen_from: Tensor | None = None,
     sampling_intervals: Tensor | None = None,
     every: bool = False,
 ) -> StructuredGaussians:
@@ -183,7 +181,7 @@ def generate_structured(
     Raises:
         BackendError: a precision or device that the kernels do not support.
     """
-    center = (viewport.center if seen_from is None else seen_from).detach().contiguous()
+    center = viewport.center.detach().contiguous()
     mask = None if tiles is None else tiles.mask.contiguous()
     given = (*anchors, viewport.viewmat, viewport.K, center, sampling_intervals)
     library.check_devices(*given, mask)

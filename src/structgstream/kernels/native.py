@@ -16,7 +16,7 @@ from torch import Tensor
 
 from structgstream.errors import BackendError
 
-ABI_VERSION = 7
+ABI_VERSION = 8
 """As in csrc/include/structgstream.h, which states when it is incremented."""
 ISA_NAMES = ("baseline", "avx2", "avx512")
 TYPES: Mapping[str, Any] = {
@@ -56,7 +56,7 @@ PROTOTYPES: Mapping[str, tuple[str, str]] = {
     "sgs_excess_backward": ("v", "ppllffpp"),
     "sgs_neighbour_difference": ("d", "pppllfp"),
     "sgs_change_bits": ("d", "pplfp"),
-    "sgs_adam_step": ("v", "ppppplldldddi"),
+    "sgs_adam_step": ("v", "ppppldldddi"),
     "sgs_rans_encode": ("i", "pplpliippp"),
     "sgs_rans_decode": ("i", "plpiplplip"),
     "sgs_code_activity": ("i", "pppilppp"),

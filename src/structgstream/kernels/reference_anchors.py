@@ -87,7 +87,6 @@ def generate_structured(
     *,
     distance_input: bool,
     tiles: TileSelection | None = None,
-    seen_from: Tensor | None = None,
     sampling_intervals: Tensor | None = None,
 ) -> StructuredGaussians:
     """The Gaussians of the anchors in a camera's view (paper, equations for mu' and Sigma').
@@ -101,12 +100,10 @@ def generate_structured(
         viewport: the camera.
         distance_input: whether the distance is an input of the heads.
         tiles: if given, only anchors that reach one of these tiles.
-        seen_from: ``[3]`` origin of direction and distance; the viewport's centre when None.
         sampling_intervals: ``[M]`` of the anchors, by which their balls grow for the rasteriser's low-pass.
     """
     visible = visible_anchors(anchors, viewport, tiles, sampling_intervals)
-    center = viewport.center if seen_from is None else seen_from
-    return activate_anchors(anchors, mlps, center, visible, distance_input=distance_input)
+    return activate_anchors(anchors, mlps, viewport.center, visible, distance_input=distance_input)
 
 
 def activate_anchors(

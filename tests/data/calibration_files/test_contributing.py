@@ -28,9 +28,9 @@ def converter() -> dict[str, Any]:
     section = (ROOT / "CONTRIBUTING.md").read_text().split("### A capture format")[1].split("\n##")[0]
     (code,) = re.findall(r" *```python\n(.*?)```", section, re.DOTALL)
     known: dict[str, Any] = {
-        "csv": csv, "Iterator": Iterator, "Path": Path, "readable": readable, "calibration_of": calibration_of, "EXPECTED": "a row a camera",
-        "Calibration": Calibration, "PosedCamera": PosedCamera, "intrinsics": intrinsics, "rigid": rigid,
-        "from_integer_centers": from_integer_centers, "read_text": read_text, "number": number,
+        "csv": csv, "Iterator": Iterator, "Path": Path, "readable": readable, "calibration_of": calibration_of,
+        "EXPECTED": "a row a camera", "Calibration": Calibration, "PosedCamera": PosedCamera, "intrinsics": intrinsics,
+        "rigid": rigid, "from_integer_centers": from_integer_centers, "read_text": read_text, "number": number,
         "pixels": picture_pixels,
     }  # fmt: skip
     exec(compile(textwrap.dedent(code), "CONTRIBUTING.md", "exec"), known)
