@@ -39,19 +39,6 @@ def chosen_method(footage: Footage, options: PrepareOptions) -> str | Calibratio
     return find_calibration(footage.where) or "sfm"
 
 
-def check_tone(method: str | Calibration, options: PrepareOptions) -> None:
-    """
-    Raises:
-        ConfigError: tone curves without points in the pictures of the take, whose colours they are estimated from.
-    """
-    if options.tone and method != "sfm" and not options.refine:
-        name = "a board" if isinstance(method, str) else str(method.where)
-        raise ConfigError(
-            f"Tone curves are estimated from points that structure from motion or --refine find in the pictures, and a "
-            f"calibration by {name} has none; add --refine, or leave out --tone."
-        )
-
-
 def check_used(method: str | Calibration, footage: Footage, options: PrepareOptions) -> None:
     """
     Raises:

@@ -7,7 +7,6 @@ from dataclasses import asdict
 from structgstream.data.calibration import listed
 from structgstream.data.posed import Calibration
 from structgstream.data.timeline import Clock
-from structgstream.data.tone import ToneCurve
 from structgstream.errors import ConfigError
 from structgstream.frames import LEAST_CAMERAS
 from structgstream.preparation.calibrating import (
@@ -29,11 +28,9 @@ from structgstream.preparation.solvers import (
     TIMESTAMPS,
     Clocks,
     first_clocks,
-    matched_pictures,
     refined,
     solved_by,
     synchronized,
-    tone_curves,
 )
 from structgstream.preparation.stated import focals_told, stated_focals, turns_told
 from structgstream.preparation.steps import Stored, fingerprint
@@ -189,26 +186,6 @@ class CameraSteps:
             after=(after,),
         )
         return found[0]
-
-    def tones(
-        self, footage: Footage, clocks: Clocks, solved: SolvedCalibration, held_out: frozenset[str]
-    ) -> dict[str, ToneCurve]:
-        """Tone curves; ``clocks`` are those of the calibration, whose pictures its observations are of."""
-        curves, _ = self.steps.run(
-            "tone",
-            {"held_out": sorted(held_out)},
-            lambda: tone_curves(solved, matched_pictures(footage, clocks, self.options), held_out=sorted(held_out)),
-            pack=lambda found: Stored(
-                {"curves": {name: curve.controls for name, curve in found[0].items()}, "told": found[1]}
-            ),
-            unpack=lambda stored: (
-                {name: ToneCurve(curve) for name, curve in stored.values["curves"].items()},
-                str(stored.values["told"]),
-            ),
-            summary=lambda found: found[1],
-            after=("scale",),
-        )
-        return curves
 
 
 def _first(

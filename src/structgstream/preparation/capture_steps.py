@@ -25,7 +25,6 @@ from structgstream.data.prepared import (
 from structgstream.data.rectilinear import rectilinear
 from structgstream.data.source import FrameSource
 from structgstream.data.timeline import Clock
-from structgstream.data.tone import ToneCurve
 from structgstream.data.video import measured_fps
 from structgstream.data.wrappers import WithRig
 from structgstream.preparation.calibration.solved import SolvedCalibration
@@ -189,7 +188,7 @@ def assembled(
     solved: SolvedCalibration,
     options: PrepareOptions,
 ) -> PreparedCapture:
-    """The content of ``capture.json`` with the usual near plane, without points and tone curves.
+    """The content of ``capture.json`` with the usual near plane, without points.
 
     Raises:
         ConfigError: a field of view or size that cannot be.
@@ -206,9 +205,3 @@ def assembled(
     near = options.near or NEAR_IN_RIG_RADII * rig_radius(rig.with_held_out(held_out))
     fps = measured_fps(footage.tracks, clocks) if footage.tracks else None
     return PreparedCapture(cameras, fps or footage.fps, near, "metres" if solved.metres else "arbitrary", held_out)
-
-
-def with_tones(content: PreparedCapture, curves: Mapping[str, ToneCurve]) -> PreparedCapture:
-    """The content with a curve for each camera that has one."""
-    cameras = {name: replace(camera, tone=curves.get(name)) for name, camera in content.cameras.items()}
-    return replace(content, cameras=cameras)

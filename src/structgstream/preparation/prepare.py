@@ -7,9 +7,9 @@ from pathlib import Path
 
 from structgstream.data.folder_files import REPORT
 from structgstream.data.posed import Calibration
-from structgstream.preparation.calibrating import check_board, check_tone, check_used, chosen_method
+from structgstream.preparation.calibrating import check_board, check_used, chosen_method
 from structgstream.preparation.camera_steps import CameraSteps
-from structgstream.preparation.capture_steps import CaptureSteps, assembled, with_tones
+from structgstream.preparation.capture_steps import CaptureSteps, assembled
 from structgstream.preparation.checking.findings import Finding
 from structgstream.preparation.claiming import alone
 from structgstream.preparation.footage import Footage
@@ -60,7 +60,6 @@ def prepare_capture(
     footage = find.find()
     method = chosen_method(footage, options)
     check_used(method, footage, options)
-    check_tone(method, options)
     check_board(method, options)
     with alone(capture):
         return _made(job, find, footage, method)
@@ -73,8 +72,6 @@ def _made(job: Job, find: CameraSteps, footage: Footage, method: str | Calibrati
     solved = find.calibrate(footage, first, method)
     clocks = find.synchronize_again(footage, first, method, solved)
     content = assembled(footage, clocks.clocks, solved, options)
-    if options.tone:
-        content = with_tones(content, find.tones(footage, first, solved, content.held_out))
     make = CaptureSteps(job)
     make.bring(footage, content)
     content = make.points(make.near(content))
