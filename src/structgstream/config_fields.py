@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -13,7 +13,7 @@ SIGNED = frozenset({"quality", "tiles_around"})
 """Fields that may be negative."""
 SHARES = frozenset({"mean_of_last", "motion_prior", "picture_scale", "dropped_share", "until_share", "carried_share"})
 """Fields that are at most 1."""
-POSITIVE = frozenset({"picture_scale", "normalised_radius", "key_interval_seconds"})
+POSITIVE = frozenset({"picture_scale", "key_interval_seconds"})
 """Fields that must not be 0."""
 _KINDS: Mapping[Any, tuple[type, ...]] = {int: (int,), float: (int, float), bool: (bool,)}
 
@@ -37,6 +37,47 @@ def unknown_fields(kind: Any, values: Any, path: str = "") -> Iterator[str]:
             yield f"{path}{name}"
         else:
             yield from unknown_fields(hints[name], item, f"{path}{name}.")
+
+
+def plain_value(value: Any) -> Any:
+    """``value``, of a configuration, as plain JSON values."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return plain_value(asdict(value))
+    if isinstance(value, dict):
+        return {key: plain_value(item) for key, item in value.items()}
+    if isinstance(value, frozenset | set):
+        return sorted(value)
+    return [plain_value(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def constants_of(kind: Any) -> dict[str, Any]:
+    """The upper-case ``ClassVar`` of a configuration class, in lower case: fields of earlier versions."""
+    if not isinstance(kind, type) or not is_dataclass(kind):
+        return {}
+    return {name.lower(): getattr(kind, name) for name in get_type_hints(kind) if name.isupper()}
+
+
+def without_constants(kind: Any, values: Any, path: str = "", *, off: bool = False) -> Any:
+    """``values`` of an earlier version without the fields that are constants of the dataclass ``kind`` now.
+
+    In a group that is off (``enabled`` is False, or ``weight`` 0) they have no effect, and are not compared.
+
+    Raises:
+        ConfigError: a field has another value than the constant.
+    """
+    if not isinstance(values, Mapping) or not isinstance(kind, type) or not is_dataclass(kind):
+        return values
+    hints, constants, left = get_type_hints(kind), constants_of(kind), {}
+    off = off or values.get("enabled") is False or values.get("weight") == 0.0
+    for name, item in values.items():
+        if name not in constants:
+            left[name] = without_constants(hints.get(name), item, f"{path}{name}.", off=off)
+        elif not off and not holds(constant := plain_value(constants[name]), item):
+            raise ConfigError(
+                f"The header's configuration has {path}{name} = {item}, which is always {constant} in this version of "
+                "structgstream; continue the stream with the version that began it."
+            )
+    return left
 
 
 def without_fields(values: Mapping[str, Any], paths: Collection[str], path: str = "") -> dict[str, Any]:

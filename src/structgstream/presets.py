@@ -4,10 +4,18 @@
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from structgstream.cameras import CameraRig
-from structgstream.config_fields import check_numbers, holds, read_value, unknown_fields, without_fields
+from structgstream.config_fields import (
+    check_numbers,
+    holds,
+    plain_value,
+    read_value,
+    unknown_fields,
+    without_constants,
+    without_fields,
+)
 from structgstream.data.denoising import DenoisingConfig
 from structgstream.data.points import PointsConfig
 from structgstream.errors import ConfigError
@@ -47,9 +55,6 @@ class StreamConfig:
     """Means over frames of what stands still in frame 0."""
     environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
     """Background of unobserved directions."""
-    normalised_radius: float = 1.0
-    """Largest distance of a training camera to their mean in normalised units, to which learning rates and voxel sizes
-    refer (paper: not stated)."""
     key_interval_seconds: float = 1.0
     """Interval of key packets, at which a viewer can start, in seconds of media time."""
     codec: Literal["raw", "compact"] = "raw"
@@ -61,6 +66,10 @@ class StreamConfig:
     seed: int = 0
     """Random seed, from 0 on."""
 
+    NORMALISED_RADIUS: ClassVar[float] = 1.0
+    """Largest distance of a training camera to their mean in normalised units, to which learning rates and voxel sizes
+    refer (paper: not stated)."""
+
     def __post_init__(self) -> None:
         check_numbers(self)
 
@@ -68,16 +77,7 @@ class StreamConfig:
 def to_json(config: StreamConfig) -> dict[str, Any]:
     """The resolved configuration as plain JSON values: what a stream's header stores."""
 
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: plain(item) for key, item in value.items()}
-        if isinstance(value, frozenset | set):
-            return sorted(value)
-        if isinstance(value, list | tuple):
-            return [plain(item) for item in value]
-        return value
-
-    found = plain(asdict(config))
+    found = plain_value(config)
     if found.get("period") == asdict(PeriodConfig()):
         del found["period"]
     return found
@@ -102,13 +102,14 @@ WITHDRAWN = frozenset(
 def from_json(values: Mapping[str, Any]) -> StreamConfig:
     """The configuration that :func:`to_json` turned into ``values``, such as a stream's header has.
 
-    Fields that ``values`` lacks, as those of an older version do, have their defaults; :data:`WITHDRAWN` ones are
-    ignored.
+    Fields that ``values`` lacks, as those of an older version do, have their defaults. :data:`WITHDRAWN` ones are
+    ignored, and so are constants of the classes that were fields and have the constant's value.
 
     Raises:
-        ConfigError: there is a field that this version does not have, or a value that no field can have.
+        ConfigError: there is a field that this version does not have, another value than that of a constant, or a value
+            that no field can have.
     """
-    values = without_fields(values, WITHDRAWN)
+    values = without_constants(StreamConfig, without_fields(values, WITHDRAWN))
     if unknown := [*unknown_fields(StreamConfig, values)]:
         raise ConfigError(
             f"The header's configuration has the field {unknown[0]}, which this version of structgstream does not "
