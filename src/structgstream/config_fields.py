@@ -20,6 +20,10 @@ _KINDS: Mapping[Any, tuple[type, ...]] = {int: (int,), float: (int, float), bool
 
 def holds(found: Any, given: Any) -> bool:
     """Whether ``found`` has all that is ``given``."""
+    if isinstance(found, list) and isinstance(given, dict):
+        given = [*given.values()]
+    if isinstance(given, list) and isinstance(found, list):
+        return len(found) == len(given) and all(map(holds, found, given))
     if isinstance(given, dict) and isinstance(found, dict):
         return all((key == "period" and key not in found) or holds(found.get(key), item) for key, item in given.items())
     return (type(found) is type(given) and found == given) or (_is_number(found, given) and found == given)
@@ -100,16 +104,22 @@ def check_numbers(config: Any, path: str = "") -> None:
         value, where = getattr(config, item.name), f"{path}{item.name}"
         if is_dataclass(value):
             check_numbers(value, f"{where}.")
+        elif isinstance(value, tuple):
+            for number in value:
+                _check_number(number, item.name, where)
         elif hints[item.name] in _KINDS and type(value) not in _KINDS[hints[item.name]]:
             expected = {int: "a whole number", float: "a number", bool: "true or false"}[hints[item.name]]
             raise ConfigError(f"{where} is {value!r}; expected {expected}.")
         elif isinstance(value, int | float) and not isinstance(value, bool):
-            shares = item.name in SHARES
-            least, most = (-math.inf if item.name in SIGNED else 0.0), (1.0 if shares else math.inf)
-            positive = item.name in POSITIVE
-            if not math.isfinite(value) or not least <= value <= most or (positive and value == 0):
-                start = "more than 0" if positive else "a finite number" if item.name in SIGNED else "0 or more"
-                raise ConfigError(f"{where} is {value!r}; expected {start}{', and at most 1' if shares else ''}.")
+            _check_number(value, item.name, where)
+
+
+def _check_number(value: float, name: str, where: str) -> None:
+    shares, positive = name in SHARES, name in POSITIVE
+    least, most = (-math.inf if name in SIGNED else 0.0), (1.0 if shares else math.inf)
+    if not math.isfinite(value) or not least <= value <= most or (positive and value == 0):
+        start = "more than 0" if positive else "a finite number" if name in SIGNED else "0 or more"
+        raise ConfigError(f"{where} is {value!r}; expected {start}{', and at most 1' if shares else ''}.")
 
 
 def read_value(kind: Any, value: Any) -> Any:
@@ -122,5 +132,6 @@ def read_value(kind: Any, value: Any) -> Any:
         (kind,) = (of for of in arguments if of is not type(None))
         return None if value is None else read_value(kind, value)
     if origin is tuple:
-        return tuple(read_value(arguments[0], item) for item in value)
+        items = value.values() if isinstance(value, Mapping) else value  # The ends of a schedule had names once.
+        return tuple(read_value(arguments[0], item) for item in items)
     return origin(value) if origin in (frozenset, dict) else value

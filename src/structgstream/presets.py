@@ -25,7 +25,6 @@ from structgstream.training.frame0.densify import GrowthConfig
 from structgstream.training.frame0.fit import InitialConfig, InitialRates
 from structgstream.training.frame0.regularizers import DepthDistortionConfig, FreeSpaceConfig, PerturbationConfig
 from structgstream.training.frame0.seeding import EnvironmentConfig
-from structgstream.training.losses import LossWeights
 from structgstream.training.online.config import (
     ExposureConfig,
     FlowConfig,
@@ -37,7 +36,6 @@ from structgstream.training.online.config import (
     SpawnConfig,
     ThinSpawnConfig,
 )
-from structgstream.training.optim import LearningRate
 from structgstream.training.parameters import RoundingConfig
 
 MOST_QUALITY = 6.0  # steps 64 times as small, or as large
@@ -89,7 +87,11 @@ WITHDRAWN = frozenset(
         "initial.disturbance.view_noise_left",
         "initial.growth.contribution_at",
         "initial.growth.least_contribution",
+        "initial.rates.positions",
         "online.least_gain",
+        "online.losses.offset_distance",
+        "online.losses.offset_distance_reading",
+        "online.losses.offset_distance_reduction",
         "online.motion.full_every_frames",
         "online.motion.least_views_share",
         "online.motion.tiles",
@@ -181,9 +183,7 @@ def with_budget(config: StreamConfig, *, name: str | None, quality: float | None
 
 def with_decay(rates: InitialRates, share: float) -> InitialRates:
     """The same initial learning rates, each decaying to ``share`` of itself over the schedule."""
-    return InitialRates(
-        **{name: LearningRate(rate.initial, rate.initial * share) for name, rate in vars(rates).items()}
-    )
+    return InitialRates(**{name: (first, first * share) for name, (first, _) in vars(rates).items()})
 
 
 PAPER = StreamConfig()
@@ -254,7 +254,6 @@ RIG = StreamConfig(
         coarse_iterations=2500,
         rates=with_decay(InitialRates(), 0.05),
         growth=GrowthConfig(collect_from=500, start=800, stop=3400, max_anchors=120_000),
-        losses=LossWeights(offset_distance=0.005),
     ),
     online=OnlineConfig(patching=PatchingConfig(max_free=100_000)),
 )
@@ -280,10 +279,10 @@ COMPACT = replace(
         all_drawn=True,
         rates=replace(
             MOTION.initial.rates,
-            offsets=LearningRate(0.02, 0.001),
-            features=LearningRate(0.02, 0.001),
-            scales=LearningRate(0.021, 0.001),
-            opacity_mlp=LearningRate(0.004, 2e-4),
+            offsets=(0.02, 0.001),
+            features=(0.02, 0.001),
+            scales=(0.021, 0.001),
+            opacity_mlp=(0.004, 2e-4),
         ),
         growth=GrowthConfig(
             collect_from=110,
@@ -298,7 +297,7 @@ COMPACT = replace(
         ),
         losses=replace(MOTION.initial.losses, l1=0.6, ssim=0.45),
         disturbance=PerturbationConfig(dropped_share=0.2, noise_scales=0.5, until_share=0.7),
-        solidity=DepthDistortionConfig(weight=0.05, every=4),
+        solidity=DepthDistortionConfig(weight=0.05),
         free_space=FreeSpaceConfig(enabled=True),
         random_background=True,
         sampling_filter=True,
