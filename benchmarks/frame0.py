@@ -23,7 +23,7 @@ def contestants(*, iterations: int, scale: float, points: int) -> list[Contestan
     """Torch for all but the raster first, then the C++ with one and with two threads; ``points`` are made before."""
     source = resized(bundled_clip(), scale)
     frame = next(iter(source.frames()))
-    similarity = normalizing_similarity(source.rig, radius=TINY.normalised_radius)
+    similarity = normalizing_similarity(source.rig, radius=TINY.NORMALISED_RADIUS)
     made = initial_points(frame, source.rig, config=replace(FAST.points, max_points=points), seed=0).positions
     # The tiny schedule stretched: a fixed share of the iterations on small pictures and before each growth.
     stretch = iterations / TINY.initial.iterations

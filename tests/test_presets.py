@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from structgstream.data.plane_sweep import DEFAULT_LEVELS
 from structgstream.errors import ConfigError
 from structgstream.presets import (
     DEFAULT_PRESET,
@@ -89,6 +90,25 @@ def test_fields_of_mechanisms_that_are_gone_are_ignored() -> None:
     assert from_json(values) == PRESETS["compact"]
 
 
+def test_a_former_field_is_ignored_if_it_has_the_value_of_its_constant_or_its_group_is_off() -> None:
+    values = json.loads(json.dumps(to_json(PRESETS["compact"])))
+    values["denoising"] |= {"threshold": 0.024, "reach_pixels": 3}
+    values["rate"]["window_seconds"] = 1
+    values["points"]["sweep_levels"] = [
+        {**vars(level), "agreement": [1.0, 0.01], "planes": [48, 128]} for level in DEFAULT_LEVELS
+    ]
+    assert from_json(values) == PRESETS["compact"]
+    values["initial"]["rates"]["offsets"] = {"initial": 0.02, "final": 0.001}
+    values["initial"]["rates"]["positions"] = {"initial": 0.0, "final": 0.0}
+    values["initial"]["solidity"]["every"] = 4
+    assert from_json(values) == PRESETS["compact"]
+    values["environment"]["degree"] = 1
+    with pytest.raises(ConfigError, match=r"environment.degree = 1, which is always 2 in this version"):
+        from_json(values)
+    values["environment"]["enabled"] = False
+    assert not from_json(values).environment.enabled
+
+
 @pytest.mark.parametrize(
     ("edit", "said"),
     [
@@ -112,14 +132,13 @@ def test_what_no_field_can_have_is_refused_by_its_reason(edit: dict[str, Any], s
         ("online.mean_of_last", 2.0),
         ("online.motion_prior", math.nan),
         ("online.motion.picture_scale", 0.0),
-        ("initial.rates.offsets.initial", -1e-3),
+        ("initial.rates.offsets", (-1e-3, 0.0)),
         ("key_interval_seconds", math.inf),
-        ("normalised_radius", 0.0),
         ("rate.target_mbits", -1.0),
         ("seed", -1),
     ],
 )
-def test_values_out_of_range_are_refused_by_the_path_of_the_field(path: str, value: float) -> None:
+def test_values_out_of_range_are_refused_by_the_path_of_the_field(path: str, value: object) -> None:
     def edited(config: Any, names: list[str]) -> Any:
         first, *others = names
         return replace(config, **{first: edited(getattr(config, first), others) if others else value})

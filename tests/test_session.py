@@ -253,7 +253,6 @@ def test_nothing_of_the_machine_or_the_moment_is_in_a_stream(quick_fits: list[in
         "initial",
         "online",
         "points",
-        "normalised_radius",
         "key_interval_seconds",
         "rate",
         "codec",

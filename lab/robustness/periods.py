@@ -137,7 +137,7 @@ def _turned_pictures(stream: Path, index: int, backend: Backend) -> dict[str, np
 
 def first_fit(source: FrameSource, backend: Backend) -> FitResult[Scene]:
     """The fit of frame 0, which is the same in all cases, without its environment."""
-    config, similarity = config_of("none"), normalizing_similarity(source.rig, radius=FAST.normalised_radius)
+    config, similarity = config_of("none"), normalizing_similarity(source.rig, radius=FAST.NORMALISED_RADIUS)
     frame = next(source.frames())
     points = initial_points_of(source, frame, config=config.points, seed=0, similarity=similarity)
     rig = similarity.rig(source.rig)

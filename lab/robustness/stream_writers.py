@@ -124,15 +124,18 @@ def real_writer(frames: int) -> Writer:
         from structgstream.data.clip import bundled_clip_path
         from structgstream.data.open import open_capture
         from structgstream.data.plane_sweep import SweepConfig
+        from structgstream.data.points import PointsConfig
         from structgstream.kernels.backend import select_backend
         from structgstream.presets import TINY
         from structgstream.recorder import record, segments_at, segments_folder
         from structgstream.struct_gstream import stream_pipeline
 
-        sweeps = (SweepConfig(width=60, planes=(8, 12)),)
+        class FewPoints(PointsConfig):
+            SWEEP_LEVELS = (SweepConfig(width=60, planes=(8, 12)),)
+
         config = replace(
             TINY,
-            points=replace(TINY.points, max_points=1500, sweep_levels=sweeps),
+            points=FewPoints(max_points=1500),
             initial=replace(TINY.initial, iterations=3),
             online=replace(TINY.online, iterations=2, patching=replace(TINY.online.patching, iteration=1)),
             key_interval_seconds=0.1,

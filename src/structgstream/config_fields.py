@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass
 from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -13,13 +13,17 @@ SIGNED = frozenset({"quality", "tiles_around"})
 """Fields that may be negative."""
 SHARES = frozenset({"mean_of_last", "motion_prior", "picture_scale", "dropped_share", "until_share", "carried_share"})
 """Fields that are at most 1."""
-POSITIVE = frozenset({"picture_scale", "normalised_radius", "key_interval_seconds"})
+POSITIVE = frozenset({"picture_scale", "key_interval_seconds"})
 """Fields that must not be 0."""
 _KINDS: Mapping[Any, tuple[type, ...]] = {int: (int,), float: (int, float), bool: (bool,)}
 
 
 def holds(found: Any, given: Any) -> bool:
     """Whether ``found`` has all that is ``given``."""
+    if isinstance(found, list) and isinstance(given, dict):
+        given = [*given.values()]
+    if isinstance(given, list) and isinstance(found, list):
+        return len(found) == len(given) and all(map(holds, found, given))
     if isinstance(given, dict) and isinstance(found, dict):
         return all((key == "period" and key not in found) or holds(found.get(key), item) for key, item in given.items())
     return (type(found) is type(given) and found == given) or (_is_number(found, given) and found == given)
@@ -37,6 +41,47 @@ def unknown_fields(kind: Any, values: Any, path: str = "") -> Iterator[str]:
             yield f"{path}{name}"
         else:
             yield from unknown_fields(hints[name], item, f"{path}{name}.")
+
+
+def plain_value(value: Any) -> Any:
+    """``value``, of a configuration, as plain JSON values."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return plain_value(asdict(value))
+    if isinstance(value, dict):
+        return {key: plain_value(item) for key, item in value.items()}
+    if isinstance(value, frozenset | set):
+        return sorted(value)
+    return [plain_value(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def constants_of(kind: Any) -> dict[str, Any]:
+    """The upper-case ``ClassVar`` of a configuration class, in lower case: fields of earlier versions."""
+    if not isinstance(kind, type) or not is_dataclass(kind):
+        return {}
+    return {name.lower(): getattr(kind, name) for name in get_type_hints(kind) if name.isupper()}
+
+
+def without_constants(kind: Any, values: Any, path: str = "", *, off: bool = False) -> Any:
+    """``values`` of an earlier version without the fields that are constants of the dataclass ``kind`` now.
+
+    In a group that is off (``enabled`` is False, or ``weight`` 0) they have no effect, and are not compared.
+
+    Raises:
+        ConfigError: a field has another value than the constant.
+    """
+    if not isinstance(values, Mapping) or not isinstance(kind, type) or not is_dataclass(kind):
+        return values
+    hints, constants, left = get_type_hints(kind), constants_of(kind), {}
+    off = off or values.get("enabled") is False or values.get("weight") == 0.0
+    for name, item in values.items():
+        if name not in constants:
+            left[name] = without_constants(hints.get(name), item, f"{path}{name}.", off=off)
+        elif not off and not holds(constant := plain_value(constants[name]), item):
+            raise ConfigError(
+                f"The header's configuration has {path}{name} = {item}, which is always {constant} in this version of "
+                "structgstream; continue the stream with the version that began it."
+            )
+    return left
 
 
 def without_fields(values: Mapping[str, Any], paths: Collection[str], path: str = "") -> dict[str, Any]:
@@ -59,16 +104,22 @@ def check_numbers(config: Any, path: str = "") -> None:
         value, where = getattr(config, item.name), f"{path}{item.name}"
         if is_dataclass(value):
             check_numbers(value, f"{where}.")
+        elif isinstance(value, tuple):
+            for number in value:
+                _check_number(number, item.name, where)
         elif hints[item.name] in _KINDS and type(value) not in _KINDS[hints[item.name]]:
             expected = {int: "a whole number", float: "a number", bool: "true or false"}[hints[item.name]]
             raise ConfigError(f"{where} is {value!r}; expected {expected}.")
         elif isinstance(value, int | float) and not isinstance(value, bool):
-            shares = item.name in SHARES
-            least, most = (-math.inf if item.name in SIGNED else 0.0), (1.0 if shares else math.inf)
-            positive = item.name in POSITIVE
-            if not math.isfinite(value) or not least <= value <= most or (positive and value == 0):
-                start = "more than 0" if positive else "a finite number" if item.name in SIGNED else "0 or more"
-                raise ConfigError(f"{where} is {value!r}; expected {start}{', and at most 1' if shares else ''}.")
+            _check_number(value, item.name, where)
+
+
+def _check_number(value: float, name: str, where: str) -> None:
+    shares, positive = name in SHARES, name in POSITIVE
+    least, most = (-math.inf if name in SIGNED else 0.0), (1.0 if shares else math.inf)
+    if not math.isfinite(value) or not least <= value <= most or (positive and value == 0):
+        start = "more than 0" if positive else "a finite number" if name in SIGNED else "0 or more"
+        raise ConfigError(f"{where} is {value!r}; expected {start}{', and at most 1' if shares else ''}.")
 
 
 def read_value(kind: Any, value: Any) -> Any:
@@ -81,5 +132,6 @@ def read_value(kind: Any, value: Any) -> Any:
         (kind,) = (of for of in arguments if of is not type(None))
         return None if value is None else read_value(kind, value)
     if origin is tuple:
-        return tuple(read_value(arguments[0], item) for item in value)
+        items = value.values() if isinstance(value, Mapping) else value  # The ends of a schedule had names once.
+        return tuple(read_value(arguments[0], item) for item in items)
     return origin(value) if origin in (frozenset, dict) else value

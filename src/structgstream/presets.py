@@ -4,10 +4,18 @@
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from structgstream.cameras import CameraRig
-from structgstream.config_fields import check_numbers, holds, read_value, unknown_fields, without_fields
+from structgstream.config_fields import (
+    check_numbers,
+    holds,
+    plain_value,
+    read_value,
+    unknown_fields,
+    without_constants,
+    without_fields,
+)
 from structgstream.data.denoising import DenoisingConfig
 from structgstream.data.points import PointsConfig
 from structgstream.errors import ConfigError
@@ -17,7 +25,6 @@ from structgstream.training.frame0.densify import GrowthConfig
 from structgstream.training.frame0.fit import InitialConfig, InitialRates
 from structgstream.training.frame0.regularizers import DepthDistortionConfig, FreeSpaceConfig, PerturbationConfig
 from structgstream.training.frame0.seeding import EnvironmentConfig
-from structgstream.training.losses import LossWeights
 from structgstream.training.online.config import (
     ExposureConfig,
     FlowConfig,
@@ -29,7 +36,6 @@ from structgstream.training.online.config import (
     SpawnConfig,
     ThinSpawnConfig,
 )
-from structgstream.training.optim import LearningRate
 from structgstream.training.parameters import RoundingConfig
 
 MOST_QUALITY = 6.0  # steps 64 times as small, or as large
@@ -47,9 +53,6 @@ class StreamConfig:
     """Means over frames of what stands still in frame 0."""
     environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
     """Background of unobserved directions."""
-    normalised_radius: float = 1.0
-    """Largest distance of a training camera to their mean in normalised units, to which learning rates and voxel sizes
-    refer (paper: not stated)."""
     key_interval_seconds: float = 1.0
     """Interval of key packets, at which a viewer can start, in seconds of media time."""
     codec: Literal["raw", "compact"] = "raw"
@@ -61,6 +64,10 @@ class StreamConfig:
     seed: int = 0
     """Random seed, from 0 on."""
 
+    NORMALISED_RADIUS: ClassVar[float] = 1.0
+    """Largest distance of a training camera to their mean in normalised units, to which learning rates and voxel sizes
+    refer (paper: not stated)."""
+
     def __post_init__(self) -> None:
         check_numbers(self)
 
@@ -68,16 +75,7 @@ class StreamConfig:
 def to_json(config: StreamConfig) -> dict[str, Any]:
     """The resolved configuration as plain JSON values: what a stream's header stores."""
 
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: plain(item) for key, item in value.items()}
-        if isinstance(value, frozenset | set):
-            return sorted(value)
-        if isinstance(value, list | tuple):
-            return [plain(item) for item in value]
-        return value
-
-    found = plain(asdict(config))
+    found = plain_value(config)
     if found.get("period") == asdict(PeriodConfig()):
         del found["period"]
     return found
@@ -89,7 +87,11 @@ WITHDRAWN = frozenset(
         "initial.disturbance.view_noise_left",
         "initial.growth.contribution_at",
         "initial.growth.least_contribution",
+        "initial.rates.positions",
         "online.least_gain",
+        "online.losses.offset_distance",
+        "online.losses.offset_distance_reading",
+        "online.losses.offset_distance_reduction",
         "online.motion.full_every_frames",
         "online.motion.least_views_share",
         "online.motion.tiles",
@@ -102,13 +104,14 @@ WITHDRAWN = frozenset(
 def from_json(values: Mapping[str, Any]) -> StreamConfig:
     """The configuration that :func:`to_json` turned into ``values``, such as a stream's header has.
 
-    Fields that ``values`` lacks, as those of an older version do, have their defaults; :data:`WITHDRAWN` ones are
-    ignored.
+    Fields that ``values`` lacks, as those of an older version do, have their defaults. :data:`WITHDRAWN` ones are
+    ignored, and so are constants of the classes that were fields and have the constant's value.
 
     Raises:
-        ConfigError: there is a field that this version does not have, or a value that no field can have.
+        ConfigError: there is a field that this version does not have, another value than that of a constant, or a value
+            that no field can have.
     """
-    values = without_fields(values, WITHDRAWN)
+    values = without_constants(StreamConfig, without_fields(values, WITHDRAWN))
     if unknown := [*unknown_fields(StreamConfig, values)]:
         raise ConfigError(
             f"The header's configuration has the field {unknown[0]}, which this version of structgstream does not "
@@ -180,9 +183,7 @@ def with_budget(config: StreamConfig, *, name: str | None, quality: float | None
 
 def with_decay(rates: InitialRates, share: float) -> InitialRates:
     """The same initial learning rates, each decaying to ``share`` of itself over the schedule."""
-    return InitialRates(
-        **{name: LearningRate(rate.initial, rate.initial * share) for name, rate in vars(rates).items()}
-    )
+    return InitialRates(**{name: (first, first * share) for name, (first, _) in vars(rates).items()})
 
 
 PAPER = StreamConfig()
@@ -253,7 +254,6 @@ RIG = StreamConfig(
         coarse_iterations=2500,
         rates=with_decay(InitialRates(), 0.05),
         growth=GrowthConfig(collect_from=500, start=800, stop=3400, max_anchors=120_000),
-        losses=LossWeights(offset_distance=0.005),
     ),
     online=OnlineConfig(patching=PatchingConfig(max_free=100_000)),
 )
@@ -279,10 +279,10 @@ COMPACT = replace(
         all_drawn=True,
         rates=replace(
             MOTION.initial.rates,
-            offsets=LearningRate(0.02, 0.001),
-            features=LearningRate(0.02, 0.001),
-            scales=LearningRate(0.021, 0.001),
-            opacity_mlp=LearningRate(0.004, 2e-4),
+            offsets=(0.02, 0.001),
+            features=(0.02, 0.001),
+            scales=(0.021, 0.001),
+            opacity_mlp=(0.004, 2e-4),
         ),
         growth=GrowthConfig(
             collect_from=110,
@@ -297,7 +297,7 @@ COMPACT = replace(
         ),
         losses=replace(MOTION.initial.losses, l1=0.6, ssim=0.45),
         disturbance=PerturbationConfig(dropped_share=0.2, noise_scales=0.5, until_share=0.7),
-        solidity=DepthDistortionConfig(weight=0.05, every=4),
+        solidity=DepthDistortionConfig(weight=0.05),
         free_space=FreeSpaceConfig(enabled=True),
         random_background=True,
         sampling_filter=True,

@@ -132,7 +132,7 @@ class CompactCodec(SceneCodec):
             scene, sensitivity, config=rounding, voxel_size=voxel_size, steps=steps
         )
         if scene.environment is not None:
-            init_steps["environment"] = float32(self.config.environment.step)
+            init_steps["environment"] = float32(self.config.environment.STEP)
         rounded = round_to_bins(state_of(in_morton_order(scene, step=init_steps["anchor_positions"])), init_steps)
         return scene_of(rounded, distance_input=scene.distance_input, sampling=scene.sampling), QuantizationSteps(
             steps, init_steps

@@ -172,7 +172,7 @@ def stream_pipeline(
         scene_codec(config),
         config=to_json(config),
         seed=config.seed,
-        normalised_radius=config.normalised_radius,
+        normalised_radius=config.NORMALISED_RADIUS,
         points=config.points,
         rate=config.rate,
         period=config.period,

@@ -45,7 +45,7 @@ def test_quality_and_rate_reach_the_stream(tmp_path: Path) -> None:
     rounding = header.config["online"]["rounding"]
     assert rounding["quality"] == 1.5
     assert header.steps["free_log_scales"] == pytest.approx(rounding["free_log_scale_step"] / 2**1.5)
-    assert header.config["rate"] == {"target_mbits": 0.5, "window_seconds": 1.0}
+    assert header.config["rate"] == {"target_mbits": 0.5}
 
 
 def test_an_existing_stream_is_not_replaced_by_accident(stream: Path, capsys: pytest.CaptureFixture[str]) -> None:

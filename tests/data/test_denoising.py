@@ -16,6 +16,7 @@ from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import section
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MultiViewFrame
+from tests.varied import varied
 
 HEIGHT, WIDTH, FRAMES = 48, 64, 12
 EIGHT = DenoisingConfig(frames=8)
@@ -222,13 +223,10 @@ def test_the_largest_sums_fit() -> None:
     assert (found.images["cam01"] == 255).all()
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [{"frames": 0}, {"frames": MOST_FRAMES + 1}, {"threshold": 0.0}, {"threshold": float("nan")}, {"reach_pixels": -1}],
-)
-def test_what_cannot_be_is_refused(wrong: dict[str, float]) -> None:
+@pytest.mark.parametrize("frames", [0, MOST_FRAMES + 1])
+def test_what_cannot_be_is_refused(frames: int) -> None:
     with pytest.raises(ConfigError, match="Denoising takes"):
-        DenoisingConfig(**wrong)  # type: ignore[arg-type]
+        DenoisingConfig(frames=frames)
 
 
 def test_the_surroundings_that_have_to_stand_still_are_as_wide_in_larger_pictures(
@@ -240,7 +238,7 @@ def test_the_surroundings_that_have_to_stand_still_are_as_wide_in_larger_picture
         frames = [picture.repeat(times, 0).repeat(times, 1) for picture in (flat(10), flat(18))]
         first, later = (MultiViewFrame(number, 0.0, {"cam01": picture}) for number, picture in enumerate(frames))
         monkeypatch.setattr(cameras, "REFERENCE_PIXELS", WIDTH)
-        found = mean_of_still(first, [later], names=["cam01"], config=DenoisingConfig(frames=2, reach_pixels=6))
+        found = mean_of_still(first, [later], names=["cam01"], config=varied(DenoisingConfig(frames=2), REACH_PIXELS=6))
         return found.images["cam01"][::times, ::times, 0] != frames[0][::times, ::times, 0]
 
     def flat(column: int) -> np.ndarray:

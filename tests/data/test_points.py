@@ -16,6 +16,7 @@ from structgstream.data.plane_sweep import DEFAULT_LEVELS, SweepConfig
 from structgstream.data.points import InitialPoints, PointsConfig, _has_neighbors, initial_points
 from structgstream.data.wrappers import resized
 from structgstream.frames import MultiViewFrame
+from tests.varied import varied
 
 
 class Guarded(Mapping[str, np.ndarray]):
@@ -79,7 +80,7 @@ def test_points_have_the_colour_that_the_held_out_camera_sees(
 
 def test_pictures_without_texture_give_random_points_and_say_so(caplog: pytest.LogCaptureFixture) -> None:
     blank = MultiViewFrame(0, 0.0, {name: np.full((120, 160, 3), 128, dtype=np.uint8) for name in CLIP.rig})
-    config = PointsConfig(random_points=500, sweep_levels=COARSE)
+    config = varied(PointsConfig(), RANDOM_POINTS=500, SWEEP_LEVELS=COARSE)
     with caplog.at_level(logging.WARNING):
         points = initial_points(blank, CLIP.rig, config=config, seed=3)
     assert points.random
@@ -97,7 +98,8 @@ def room_points(
     rig = room_rig()
     frame = room_frame(rig)
     guarded = MultiViewFrame(0, 0.0, Guarded(frame.images, rig.held_out))
-    return initial_points(guarded, rig, config=PointsConfig(max_points=max_points, sweep_levels=levels), seed=seed)
+    config = varied(PointsConfig(max_points=max_points), SWEEP_LEVELS=levels)
+    return initial_points(guarded, rig, config=config, seed=seed)
 
 
 def test_points_lie_on_the_surfaces_of_a_room_of_planes() -> None:
@@ -124,7 +126,7 @@ def test_a_point_without_company_is_left_out() -> None:
     kept = _has_neighbors(np.concatenate([together, few, alone, beside]), cell=1.0)
     assert kept.tolist() == [True] * 4 + [False] * 4 + [True]
     rig = room_rig()
-    config = PointsConfig(sweep_levels=(), isolation_share=1e-6, random_points=400)
+    config = varied(PointsConfig(), SWEEP_LEVELS=(), ISOLATION_SHARE=1e-6, RANDOM_POINTS=400)
     assert initial_points(room_frame(rig), rig, config=config).random
 
 
@@ -147,7 +149,7 @@ def test_absent_cameras_and_masked_pixels_give_no_points() -> None:
         mask[:, len(mask[0]) // 2 :] = False
     absent = CLIP.rig.training[2]
     images = {name: image for name, image in frame.images.items() if name != absent}
-    config = PointsConfig(max_points=20_000, sweep_levels=COARSE)
+    config = varied(PointsConfig(max_points=20_000), SWEEP_LEVELS=COARSE)
     found = initial_points(MultiViewFrame(0, 0.0, images, masks), CLIP.rig, config=config)
     assert not found.random
     assert len(found.positions) > 300
@@ -174,7 +176,7 @@ def test_random_points_lie_behind_pixels_that_count() -> None:
     frame = next(iter(CLIP.frames()))
     masks = {name: np.ones(image.shape[:2], bool) for name, image in frame.images.items()}
     masks[CLIP.rig.training[0]][:, 3:] = False
-    config = PointsConfig(min_points=10**6, random_points=900, sweep_levels=())
+    config = varied(PointsConfig(), MIN_POINTS=10**6, RANDOM_POINTS=900, SWEEP_LEVELS=())
     found = initial_points(MultiViewFrame(0, 0.0, frame.images, masks), CLIP.rig, config=config)
     assert found.random
     assert 750 < len(found.positions) < 850  # one of nine cameras gives nearly none
@@ -184,13 +186,13 @@ def test_cameras_that_look_away_from_each_other_give_random_points() -> None:
     """As inverted poses do, of which the check tells afterwards."""
     frame = next(iter(CLIP.frames()))
     inverted = {name: replace(camera, viewmat=camera.viewmat.inverse()) for name, camera in CLIP.rig.cameras.items()}
-    config = PointsConfig(random_points=900, sweep_levels=())
+    config = varied(PointsConfig(), RANDOM_POINTS=900, SWEEP_LEVELS=())
     assert initial_points(frame, CLIP.rig.mapped(inverted), config=config).random
 
 
 def test_keypoints_are_those_of_pictures_of_the_reference_size(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures of twice the size give the points that they give when they are reduced."""
-    clip, config = CLIP, PointsConfig(max_points=20_000, sweep_levels=(), min_points=1)
+    clip, config = CLIP, varied(PointsConfig(max_points=20_000), SWEEP_LEVELS=(), MIN_POINTS=1)
     frame, rig = next(iter(clip.frames())), clip.rig
     width, height = rig[rig.training[0]].width, rig[rig.training[0]].height
     large = replace(rig, cameras={name: rig[name].resized(2 * width, 2 * height) for name in rig})

@@ -15,8 +15,9 @@ from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.training.frame0.regularizers import FreeSpaceConfig, in_free_space
+from tests.varied import varied
 
-CONFIG = FreeSpaceConfig(least_views=4, scale=1.0)
+CONFIG = varied(FreeSpaceConfig(), LEAST_VIEWS=4, SCALE=1.0)
 RIG = arc_rig(9, width=64, height=48)
 CAMERAS = [RIG[name] for name in RIG.training]
 WIDTH = 8
@@ -86,7 +87,7 @@ def test_what_all_cameras_draw_stays() -> None:
 def test_what_one_camera_draws_goes() -> None:
     scene = wall_and(FLOATING[:1], opacity=0.4, view_dependent=True)
     drawn = [
-        int((scene.structured(camera, quickest_backend()).raw_opacities[-1] > CONFIG.drawn_opacity).sum())
+        int((scene.structured(camera, quickest_backend()).raw_opacities[-1] > CONFIG.DRAWN_OPACITY).sum())
         for camera in CAMERAS
     ]
     assert drawn == [1] + [0] * (len(CAMERAS) - 1)
@@ -100,7 +101,7 @@ def test_what_lies_on_or_behind_a_surface_stays() -> None:
 def test_too_few_cameras_judge_nothing() -> None:
     scene = wall_and(FLOATING, opacity=-0.5)
     assert found(scene, cameras=CAMERAS[:3]) == [False, False]
-    assert found(scene, config=replace(CONFIG, least_views=len(CAMERAS) + 1)) == [False, False]
+    assert found(scene, config=varied(CONFIG, LEAST_VIEWS=len(CAMERAS) + 1)) == [False, False]
     assert found(scene, cameras=[]) == [False, False]
 
 
@@ -120,7 +121,7 @@ def test_where_nothing_is_drawn_nothing_is_in_front_of_it() -> None:
 
 
 def test_smaller_pictures_tell_the_same() -> None:
-    assert found(wall_and(FLOATING, opacity=-0.5), config=replace(CONFIG, scale=0.5)) == [True, True]
+    assert found(wall_and(FLOATING, opacity=-0.5), config=varied(CONFIG, SCALE=0.5)) == [True, True]
 
 
 def test_back_ends_agree() -> None:

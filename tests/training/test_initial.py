@@ -20,6 +20,7 @@ from structgstream.training.frame0.regularizers import (
     in_free_space,
 )
 from structgstream.training.frame0.seeding import voxel_centers
+from tests.varied import varied
 from worlds import moving_world, psnr, rendered
 
 QUICK = InitialConfig(
@@ -75,7 +76,7 @@ def test_exposures_are_learned_with_their_gauge() -> None:
     dark = world.rig.training[0]
     images = dict(world.frames[0].images)
     images[dark] = (images[dark] * 0.7).astype(np.uint8)
-    rates = replace(InitialRates(), camera_color=replace(InitialRates().camera_color, initial=0.02))
+    rates = replace(InitialRates(), camera_color=(0.02, InitialRates().camera_color[1]))
     config = replace(QUICK, camera_color=True, rates=rates)
     color = fit(world, frame=MultiViewFrame(0, 0.0, images), config=config).scene.camera_color
     assert color.gains[0].mean() < color.gains[1:].mean() - 0.05
@@ -114,7 +115,7 @@ def test_what_floats_before_surfaces_is_removed_in_the_end_and_nothing_else_chan
     centers = torch.stack([world.rig[name].center for name in world.rig.training]).float()
     between = 0.6 * centers.mean(0) + 0.4 * surface.mean(0) + 0.02 * torch.randn(20, 3, generator=torch.manual_seed(1))
     points = torch.cat([surface, between])
-    removing = replace(QUICK, free_space=FreeSpaceConfig(enabled=True, least_views=2, drawn_opacity=2.0))
+    removing = replace(QUICK, free_space=varied(FreeSpaceConfig(enabled=True), LEAST_VIEWS=2, DRAWN_OPACITY=2.0))
     kept, found = fit(world, points=points), fit(world, points=points, config=removing)
     cameras = [world.rig[name] for name in world.rig.training]
     floating = in_free_space(kept.scene, cameras, config=removing.free_space, backend=quickest_backend())

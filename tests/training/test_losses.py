@@ -9,7 +9,7 @@ import torch
 
 from rigs import random_scene
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.losses import LossWeights, offset_distance, volume
+from structgstream.training.losses import InitialLossWeights, offset_distance, volume
 
 
 def test_volume_is_the_product_of_scales() -> None:
@@ -44,7 +44,7 @@ def test_offset_distance_counts_what_is_beyond_two_voxels(reading: Literal["scal
     length = {"raw": np.abs(offsets), "scaled": np.abs(scaled), "norm": np.linalg.norm(scaled, axis=-1)}[reading]
     eps = 0.03
     expected = np.where(length - 2 * eps > 0, np.abs(length - 2 * eps), 0.0).sum()  # theta(O - 2 eps) ||O - 2 eps||
-    weights = LossWeights(offset_distance=1.0, offset_distance_reading=reading, offset_distance_reduction="sum")
+    weights = InitialLossWeights(offset_distance=1.0, offset_distance_reading=reading, offset_distance_reduction="sum")
     assert offset_distance(
         anchors, voxel_size=eps, weights=weights, backend=reference_backend()
     ).item() == pytest.approx(expected, rel=1e-5)
@@ -52,5 +52,5 @@ def test_offset_distance_counts_what_is_beyond_two_voxels(reading: Literal["scal
 
 def test_offsets_within_two_voxels_cost_nothing() -> None:
     anchors = random_scene().anchors
-    weights = LossWeights(offset_distance=1.0)
+    weights = InitialLossWeights(offset_distance=1.0)
     assert offset_distance(anchors, voxel_size=10.0, weights=weights, backend=reference_backend()).item() == 0.0

@@ -28,7 +28,6 @@ def loss_of(parameters, scene, **weights):
         view,
         backend=reference_backend(),
         weights=LossWeights(**weights),
-        voxel_size=0.01,
         track_screen=True,
         watch=Stopwatch(),
     )

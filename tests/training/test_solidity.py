@@ -65,7 +65,7 @@ def test_nothing_drawn_is_no_spread_and_no_nan() -> None:
 
 
 def test_when_it_counts() -> None:
-    config = DepthDistortionConfig(weight=0.05, from_share=0.3, every=4)
+    config = DepthDistortionConfig(weight=0.05)
     counts = [config.weight_at(iteration, 100) for iteration in range(1, 101)]
     assert not any(counts[:30])
     assert counts[31] == pytest.approx(0.2)

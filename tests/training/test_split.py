@@ -93,7 +93,6 @@ def test_active_tiles_draw_and_learn_what_the_whole_picture_would(build: Callabl
                 view,
                 backend=backend,
                 weights=LossWeights(volume=0.0),
-                voxel_size=0.0,
                 track_screen=False,
                 watch=Stopwatch(),
                 active=place,

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from itertools import chain, islice
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,19 +36,17 @@ class DenoisingConfig:
 
     frames: int = 1
     """The training pictures of frame 0 are means over as many frames, itself and those after it (paper: 1)."""
-    threshold: float = 0.024
-    """A pixel stands still while the smoothed difference to frame 0, in 0 ... 1, in the channel that differs most, is
+
+    THRESHOLD: ClassVar[float] = 0.024
+    """A pixel is static while the smoothed difference to frame 0, in 0 ... 1, in the channel that differs most, is
     below this everywhere around it."""
-    reach_pixels: int = 3
-    """Distance up to which the surroundings of a pixel have to stand still, too, in pixels of a picture of the
-    reference size (``cameras.enlargement``)."""
+    REACH_PIXELS: ClassVar[int] = 3
+    """Distance up to which the surroundings of a pixel have to be static, too, in pixels of a picture of the reference
+    size (``cameras.enlargement``)."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.frames <= MOST_FRAMES or self.reach_pixels < 0 or not self.threshold > 0:
-            raise ConfigError(
-                f"Denoising takes 1 to {MOST_FRAMES} frames, a threshold above 0 and a reach from 0 on; got "
-                f"{self.frames}, {self.threshold:g} and {self.reach_pixels}."
-            )
+        if not 1 <= self.frames <= MOST_FRAMES:
+            raise ConfigError(f"Denoising takes 1 to {MOST_FRAMES} frames; got {self.frames}.")
 
 
 @dataclass(frozen=True)
@@ -145,9 +143,9 @@ def _unchanged(first: NDArray[np.uint8], other: NDArray[np.uint8], config: Denoi
     difference = cv2.absdiff(_box_sums(first), _box_sums(other))
     around = _box_sums(cv2.max(cv2.max(difference[..., 0], difference[..., 1]), difference[..., 2]))
     height, width = first.shape[:2]
-    reach = 2 * round(config.reach_pixels * enlargement(width, height)) + 1
+    reach = 2 * round(config.REACH_PIXELS * enlargement(width, height)) + 1
     most = cv2.dilate(around, np.ones((reach, reach), np.uint8))
-    return most < config.threshold * 255.0 * SMOOTHING_PIXELS**4
+    return most < config.THRESHOLD * 255.0 * SMOOTHING_PIXELS**4
 
 
 def _box_sums(values: Any) -> Any:

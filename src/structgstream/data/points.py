@@ -10,6 +10,7 @@ import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,40 +41,38 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PointsConfig:
-    """Configuration of the initial points. Keypoints are matched in pictures of at most the reference size
-    (``cameras.enlargement``), the plane sweep reduces pictures by itself: pixels are of these.
+    """Initial points, for captures without points.
 
-    Args:
-        max_points: most points returned.
-        min_points: if fewer points are found, random ones replace them.
-        random_points: number of random points.
-        features: SIFT keypoints per picture.
-        neighbours: cameras that each camera is matched with.
-        line_pixels: largest distance of a match to its epipolar line.
-        ratio: largest ratio of the best to the second-best descriptor distance along the line.
-        confirm_pixels: largest reprojection error in a third view.
-        near_share: near limit of matching and sweep, as a share of the viewing distance.
-        far_share: far limit of matching, as a multiple of the viewing distance.
-        cell_share: side of the cells that keep one point each, as a share of the viewing distance (enlarged if more
-            than ``max_points`` remain).
-        isolation_share: side of the cells of the isolation test, as a share of the viewing distance; points with too
-            few neighbours are removed.
-        sweep_levels: the plane sweeps, fine to coarse; empty for none.
+    Keypoints are matched in pictures of at most the reference size (``cameras.enlargement``), the plane sweep reduces
+    pictures by itself: pixels are of these. Shares are of the viewing distance (``data.matching.viewing_distance``).
     """
 
     max_points: int = 60_000
-    min_points: int = 300
-    random_points: int = 20_000
-    features: int = 3000
-    neighbours: int = 4
-    line_pixels: float = 1.5
-    ratio: float = 0.85
-    confirm_pixels: float = 2.0
-    near_share: float = 0.1
-    far_share: float = 8.0
-    cell_share: float = 0.004
-    isolation_share: float = 0.02
-    sweep_levels: tuple[SweepConfig, ...] = DEFAULT_LEVELS
+    """Largest number of initial points."""
+
+    MIN_POINTS: ClassVar[int] = 300
+    """If fewer points are found, random ones replace them."""
+    RANDOM_POINTS: ClassVar[int] = 20_000
+    FEATURES: ClassVar[int] = 3000
+    """SIFT keypoints per picture."""
+    NEIGHBOURS: ClassVar[int] = 4
+    """Number of cameras that each camera is matched with."""
+    LINE_PIXELS: ClassVar[float] = 1.5
+    """Largest distance of a match to its epipolar line."""
+    RATIO: ClassVar[float] = 0.85
+    """Largest ratio of the best to the second-best descriptor distance along the line."""
+    CONFIRM_PIXELS: ClassVar[float] = 2.0
+    """Largest reprojection error in a third view."""
+    NEAR_SHARE: ClassVar[float] = 0.1
+    """Near limit of matching and sweep."""
+    FAR_SHARE: ClassVar[float] = 8.0
+    """Far limit of matching."""
+    CELL_SHARE: ClassVar[float] = 0.004
+    """Side of the cells that keep one point each; enlarged if more than ``max_points`` remain."""
+    ISOLATION_SHARE: ClassVar[float] = 0.02
+    """Side of the cells of the isolation test: points with too few neighbours are removed."""
+    SWEEP_LEVELS: ClassVar[tuple[SweepConfig, ...]] = DEFAULT_LEVELS
+    """The plane sweeps, fine to coarse; empty for none."""
 
 
 @dataclass(frozen=True)
@@ -111,13 +110,13 @@ def initial_points(
     cameras = {name: rig[name] for name in frame.showing(rig.training)}
     images, masks = {name: frame.images[name] for name in cameras}, frame.masks
     distance = viewing_distance(cameras)
-    neighbours = neighbor_views(cameras, count=config.neighbours, distance=distance)
+    neighbours = neighbor_views(cameras, count=config.NEIGHBOURS, distance=distance)
     workers = max(1, min(len(cameras), os.cpu_count() or 1))
     positions, colors = _sift_points(
         *_at_reference(cameras, images, masks), neighbours, distance=distance, workers=workers, config=config
     )
     sources = np.zeros(len(positions), np.uint8)
-    if config.sweep_levels:
+    if config.SWEEP_LEVELS:
         bounds = _sweep_bounds(cameras, positions, distance=distance, config=config)
         swept, swept_colors = sweep_points(
             cameras,
@@ -125,20 +124,20 @@ def initial_points(
             neighbours=neighbours,
             bounds=bounds,
             workers=workers,
-            levels=config.sweep_levels,
+            levels=config.SWEEP_LEVELS,
             masks=masks,
         )
         positions, colors = np.concatenate([positions, swept]), np.concatenate([colors, swept_colors])
         sources = np.concatenate([sources, np.ones(len(swept), np.uint8)])
-    kept = np.flatnonzero(_has_neighbors(positions, cell=config.isolation_share * distance))
-    kept = kept[_thin_out(positions[kept], cell=config.cell_share * distance, count=config.max_points)]
-    if len(kept) < config.min_points:
+    kept = np.flatnonzero(_has_neighbors(positions, cell=config.ISOLATION_SHARE * distance))
+    kept = kept[_thin_out(positions[kept], cell=config.CELL_SHARE * distance, count=config.max_points)]
+    if len(kept) < config.MIN_POINTS:
         _log.warning(
             "Only %d initial points could be triangulated from frame %d (too little texture or overlap); "
             "starting from %d random points in the volume that the cameras see: expect a worse result.",
             len(kept),
             frame.index,
-            config.random_points,
+            config.RANDOM_POINTS,
         )
         positions, colors = _random_points(
             cameras, images, masks=masks, distance=distance, rng=np.random.default_rng(seed), config=config
@@ -179,7 +178,7 @@ def _sift_points(
     """Triangulated keypoints that a third view confirms."""
     pairs = unique_pairs(neighbours)
     with ThreadPoolExecutor(workers) as pool:
-        found = pool.map(lambda name: sift_features(images[name], count=config.features, mask=masks.get(name)), cameras)
+        found = pool.map(lambda name: sift_features(images[name], count=config.FEATURES, mask=masks.get(name)), cameras)
         features = dict(zip(cameras, found, strict=True))
 
         def match(pair: Pair) -> NDArray[np.intp]:
@@ -188,13 +187,13 @@ def _sift_points(
                 features[first],
                 features[second],
                 (cameras[first], cameras[second]),
-                line_pixels=config.line_pixels,
-                depth_range=(config.near_share * distance, config.far_share * distance),
-                ratio=config.ratio,
+                line_pixels=config.LINE_PIXELS,
+                depth_range=(config.NEAR_SHARE * distance, config.FAR_SHARE * distance),
+                ratio=config.RATIO,
             )
 
         matches = dict(zip(pairs, pool.map(match, pairs), strict=True))
-    positions, names, pixels = _confirm_points(cameras, features, matches, tolerance=config.confirm_pixels)
+    positions, names, pixels = _confirm_points(cameras, features, matches, tolerance=config.CONFIRM_PIXELS)
     colors = np.empty((len(positions), 3), np.uint8)
     for index, name in enumerate(cameras):
         own = names == index
@@ -263,7 +262,7 @@ def _sweep_bounds(
 
 def _depth_range(camera: Camera, points: Floats, distance: float, config: PointsConfig) -> tuple[float, float]:
     """Nearest and farthest depth to sweep: the range of the points in the picture, with a margin."""
-    near = max(config.near_share * distance, camera.near)
+    near = max(config.NEAR_SHARE * distance, camera.near)
     pixels, depths = project(camera, points)
     depths = depths[inside(camera, pixels, depths, near=near)]
     if len(depths) < 30:
@@ -320,9 +319,9 @@ def _random_points(
     """Random points in the cameras' views, uniform in inverse depth, with the colours of their pixels."""
     positions: list[Floats] = []
     colors: list[NDArray[np.uint8]] = []
-    each = -(-config.random_points // len(cameras))
+    each = -(-config.RANDOM_POINTS // len(cameras))
     for name, camera in cameras.items():
-        near = max(config.near_share * distance, camera.near)
+        near = max(config.NEAR_SHARE * distance, camera.near)
         pixels = rng.random((each, 2)) * (camera.width, camera.height)
         inverse = rng.uniform(1 / max(3 * distance, 2 * near), 1 / near, each)
         if name in masks:

@@ -149,7 +149,7 @@ STATE_TABLE: tuple[StateField, ...] = (
     StateField(
         "anchor_positions", 1, "x_v", "anchor", ("M", 3), "anchors.positions", dynamic=True,
         init_coding="positions", init_step="own",
-        step="position_pixels", online_rate="anchor_positions", first_rate="positions",
+        step="position_pixels", online_rate="anchor_positions",
     ),
     StateField(
         "offset_scales", 2, "l_v", "anchor", ("M", 3), "anchors.log_offset_scales", dynamic=True,

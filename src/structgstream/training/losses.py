@@ -40,8 +40,14 @@ class LossWeights:
     """On the product of each drawn Gaussian's scales, the paper's lambda_vol (0.01)."""
     volume_reduction: Literal["mean", "sum"] = "mean"
     """The paper's equation is a sum, Scaffold-GS takes the mean (docs/method.md has both measured)."""
-    offset_distance: float = 0.0
-    """On L_dist, the paper's lambda_dist (0.005 in frame 0, 0 afterwards)."""
+
+
+@dataclass(frozen=True)
+class InitialLossWeights(LossWeights):
+    """Weights in frame 0, which alone has L_dist."""
+
+    offset_distance: float = 0.005
+    """On L_dist, the paper's lambda_dist (0.005)."""
     offset_distance_reduction: Literal["mean", "sum"] = "mean"
     """The paper's equation is a sum over anchors and offsets."""
     offset_distance_reading: Literal["scaled", "raw", "norm"] = "scaled"
@@ -57,7 +63,9 @@ def volume(scales: Tensor, opacities: Tensor, *, reduction: Literal["mean", "sum
     return total / drawn.clamp(min=1) if reduction == "mean" else total
 
 
-def offset_distance(anchors: AnchorCloud, *, voxel_size: float, weights: LossWeights, backend: Backend) -> Tensor:
+def offset_distance(
+    anchors: AnchorCloud, *, voxel_size: float, weights: InitialLossWeights, backend: Backend
+) -> Tensor:
     """L_dist: penalty on offsets of Gaussians from their anchors beyond two voxels.
 
     theta(x) x is a hinge: only the part above ``2 * voxel_size`` (the paper's 2 eps) counts.
@@ -209,14 +217,13 @@ def view_loss(
     *,
     backend: Backend,
     weights: LossWeights,
-    voxel_size: float,
     track_screen: bool,
     watch: Stopwatch,
     active: ActiveTiles | None = None,
     perturbation: Callable[[Gaussians], Gaussians] | None = None,
     background: Tensor | None = None,
 ) -> SceneLoss:
-    """Render ``view`` and compare it with its picture, or the tiles of ``active`` (paper, equations for L and L_init).
+    """Render ``view`` and compare it with its picture, or the tiles of ``active`` (paper, equation for L).
 
     Optionally the Gaussians are perturbed by ``perturbation``, and ``background`` ``[3]`` replaces the scene's
     environment.
@@ -242,9 +249,6 @@ def view_loss(
             scales, opacities = gaussians.scales, gaussians.opacities
             value = volume(scales, opacities, reduction=weights.volume_reduction, backend=backend)
             loss = with_term(loss, "volume", value, weight=weights.volume)
-        if weights.offset_distance:
-            value = offset_distance(scene.anchors, voxel_size=voxel_size, weights=weights, backend=backend)
-            loss = with_term(loss, "offset_distance", value, weight=weights.offset_distance)
     return SceneLoss(**vars(loss), structured=structured, unperturbed=unperturbed)
 
 

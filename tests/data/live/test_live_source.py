@@ -29,6 +29,7 @@ from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_p
 from structgstream.data.source import frame_count, may_read_ahead
 from structgstream.data.video_pictures import srgb
 from structgstream.errors import CaptureError, ConfigError, StorageError
+from tests.varied import varied
 
 NAMES = ("a", "b", "c")
 FPS = 30.0
@@ -238,7 +239,7 @@ def test_a_file_that_ends_first_is_not_waited_for(tmp_path: Path, caplog: pytest
 @pytest.mark.parametrize("policy", ["every", "latest"])
 def test_frame_0_is_averaged_and_no_set_that_waits_is_lost(tmp_path: Path, policy: Policy) -> None:
     """The film moves everywhere but at its rims; with ``every`` the averaged sets are frames of their own, too."""
-    denoising = DenoisingConfig(frames=3, threshold=0.1, reach_pixels=0)
+    denoising = varied(DenoisingConfig(frames=3), THRESHOLD=0.1, REACH_PIXELS=0)
     path = files(tmp_path)
     source = LiveSource(path, tmp_path / "x.sgs", LiveOptions(policy=policy, denoising=denoising))
     frames = list(source.frames())

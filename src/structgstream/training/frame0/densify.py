@@ -9,6 +9,7 @@ Applies growing and pruning of anchors to parameters, optimiser moments and stat
 """
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -41,14 +42,10 @@ class GrowthConfig:
     grad_threshold: float = 2e-4
     """Mean view-space gradient (NDC) above which a Gaussian proposes an anchor at the coarsest level; doubles with each
     finer level (Scaffold-GS: 2e-4)."""
-    levels: int = 3
-    """Number of cell sizes, 16, 4 and 1 voxels (Scaffold-GS: 3)."""
     eligible_count: int = 40
     """A Gaussian proposes anchors only if it was drawn more often than this since the last growing."""
     prune_visits: int = 80
     """An anchor can be pruned by opacity once it was in view more often than this."""
-    prune_opacity: float = 0.005
-    """An anchor is pruned if the sum of its Gaussians' opacities is below this on average over the views."""
     max_anchors: int = 1_000_000
     """Largest number of anchors for pictures of the reference size (:meth:`for_pictures`); proposals with the largest
     gradients are taken first (paper: no bound)."""
@@ -56,6 +53,11 @@ class GrowthConfig:
     """At least this share of the number of seeds may be added, even beyond ``max_anchors``."""
     room_until: int = 0
     """The allowed number of anchors rises linearly from ``start`` to this iteration; 0: all are allowed at once."""
+
+    LEVELS: ClassVar[int] = 3
+    """Number of cell sizes, 16, 4 and 1 voxels (Scaffold-GS: 3)."""
+    PRUNE_OPACITY: ClassVar[float] = 0.005
+    """An anchor is pruned if the sum of its Gaussians' opacities is below this on average over the views."""
 
     def for_pictures(self, enlarged: float) -> "GrowthConfig":
         """The same for pictures whose sides are ``enlarged`` times those of the reference size (``View.enlargement``).
@@ -159,7 +161,7 @@ def grow(
     means = (anchors.positions[:, None] + anchors.offsets * anchors.log_offset_scales.exp()[:, None]).reshape(-1, 3)
     added: list[NewAnchors] = []
     occupied = anchors.positions
-    for level in range(config.levels):
+    for level in range(config.LEVELS):
         if level > 0 and not added:
             break
         sampled = torch.rand(means.shape[0], generator=generator).to(means.device) > 0.5 ** (level + 1)
@@ -211,7 +213,7 @@ def _new_cells(means: Tensor, features: Tensor, strengths: Tensor, *, occupied: 
 def prunable_mask(statistics: OpacityStatistics, config: GrowthConfig) -> Tensor:
     """Mask ``[M]`` of the anchors that were in view often enough and are nearly transparent."""
     judged = statistics.visits > config.prune_visits
-    return judged & (statistics.opacity < config.prune_opacity * statistics.visits)
+    return judged & (statistics.opacity < config.PRUNE_OPACITY * statistics.visits)
 
 
 @dataclass

@@ -3,6 +3,7 @@
 
 from dataclasses import dataclass, field, replace
 from statistics import median
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -24,8 +25,8 @@ from structgstream.training.frame0.regularizers import (
     perturbation_at,
 )
 from structgstream.training.frame0.seeding import seeded_scene, warm_start
-from structgstream.training.losses import LossWeights, SceneLoss, view_loss, with_term
-from structgstream.training.optim import Adam, Hooks, LastPass, LearningRate, Schedule, constant, minimize
+from structgstream.training.losses import InitialLossWeights, SceneLoss, offset_distance, view_loss, with_term
+from structgstream.training.optim import Adam, Hooks, LastPass, LearningRate, Schedule, minimize
 from structgstream.training.parameters import CAMERA_ROWS, Parameters, detached
 from structgstream.training.result import FitResult, StepListener, Stopwatch
 from structgstream.training.views import View, coarse_to_fine, training_views
@@ -33,19 +34,20 @@ from structgstream.training.views import View, coarse_to_fine, training_views
 
 @dataclass(frozen=True)
 class InitialRates:
-    """Learning rates of frame 0 (Scaffold-GS), scheduled over ``schedule_iterations``."""
+    """Learning rates of frame 0, first and last ones of schedules over ``schedule_iterations`` (Scaffold-GS).
 
-    positions: LearningRate = constant(0.0)
-    """Of x_v: positions are fixed in frame 0."""
-    offsets: LearningRate = LearningRate(0.01, 1e-4)
+    Positions of anchors are fixed.
+    """
+
+    offsets: tuple[float, float] = (0.01, 1e-4)
     """Of O_v, times 1.1 rig radii, as in Scaffold-GS."""
-    features: LearningRate = constant(0.0075)
-    scales: LearningRate = constant(0.007)
+    features: tuple[float, float] = (0.0075, 0.0075)
+    scales: tuple[float, float] = (0.007, 0.007)
     """Of both scales of an anchor, in log space."""
-    opacity_mlp: LearningRate = LearningRate(0.002, 2e-5)
-    covariance_mlp: LearningRate = constant(0.004)
-    color_mlp: LearningRate = LearningRate(0.008, 5e-5)
-    camera_color: LearningRate = LearningRate(0.002, 1e-4)
+    opacity_mlp: tuple[float, float] = (0.002, 2e-5)
+    covariance_mlp: tuple[float, float] = (0.004, 0.004)
+    color_mlp: tuple[float, float] = (0.008, 5e-5)
+    camera_color: tuple[float, float] = (0.002, 1e-4)
     """Of gains and biases; unused without ``camera_color``."""
 
 
@@ -62,23 +64,15 @@ class InitialConfig:
     anchors between them."""
     offsets_per_anchor: int = 5
     """The paper's k (5): structured Gaussians per anchor."""
-    feature_width: int = 32
-    """Length of f_v (Scaffold-GS: 32)."""
-    hidden_width: int = 32
-    """Width of the MLPs' hidden layer (Scaffold-GS: 32)."""
     distance_input: bool = True
     """Whether the distance to the camera is an input of the MLPs (paper: yes; Scaffold-GS: no)."""
     camera_color: bool = False
     """Train a gain and a bias per training camera and channel (Note [Colour gauge]), for rigs with unequal exposures
     (paper: no)."""
     coarse_iterations: int = 0
-    """Number of first iterations on pictures reduced by ``coarse_scale``, which cost less (paper: 0)."""
-    coarse_scale: float = 0.5
-    """Scale of width and height of the pictures in these iterations."""
+    """Number of first iterations on pictures reduced by ``COARSE_SCALE``, which cost less (paper: 0)."""
     medium_iterations: int = 0
-    """Number of iterations after these on pictures reduced by ``medium_scale`` (paper: 0)."""
-    medium_scale: float = 0.7
-    """Scale of width and height of the pictures in these iterations."""
+    """Number of iterations after these on pictures reduced by ``MEDIUM_SCALE`` (paper: 0)."""
     schedule_iterations: int = 30_000
     """Length of the learning-rate schedules (Scaffold-GS: 30,000, of which the paper runs 4,000)."""
     random_background: bool = False
@@ -93,15 +87,24 @@ class InitialConfig:
     disturbance: PerturbationConfig = field(default_factory=PerturbationConfig)
     solidity: DepthDistortionConfig = field(default_factory=DepthDistortionConfig)
     free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
-    losses: LossWeights = LossWeights(offset_distance=0.005)
+    losses: InitialLossWeights = InitialLossWeights()
     rates: InitialRates = field(default_factory=InitialRates)
     growth: GrowthConfig = field(default_factory=GrowthConfig)
+
+    FEATURE_WIDTH: ClassVar[int] = 32
+    """Length of f_v (Scaffold-GS: 32)."""
+    HIDDEN_WIDTH: ClassVar[int] = 32
+    """Width of the MLPs' hidden layer (Scaffold-GS: 32)."""
+    COARSE_SCALE: ClassVar[float] = 0.5
+    """Scale of width and height of the pictures in these iterations."""
+    MEDIUM_SCALE: ClassVar[float] = 0.7
+    """Scale of width and height of the pictures in these iterations."""
 
     def stages(self, *, done: int = 0) -> list[tuple[int, float]]:
         """Number and scale of the iterations on reduced pictures that are left after the first ``done``."""
         coarse = max(self.coarse_iterations - done, 0)
         medium = max(self.coarse_iterations + self.medium_iterations - max(done, self.coarse_iterations), 0)
-        return [(coarse, self.coarse_scale), (medium, self.medium_scale)]
+        return [(coarse, self.COARSE_SCALE), (medium, self.MEDIUM_SCALE)]
 
 
 def rates_at(iteration: int, config: InitialConfig, *, extent: float) -> dict[ParameterName, float]:
@@ -109,7 +112,8 @@ def rates_at(iteration: int, config: InitialConfig, *, extent: float) -> dict[Pa
     share = iteration / config.schedule_iterations
     units = {"offsets": extent}
     return {
-        parameter.name: getattr(config.rates, parameter.first_rate).at(share) * units.get(parameter.first_rate, 1.0)
+        parameter.name: LearningRate(*getattr(config.rates, parameter.first_rate)).at(share)
+        * units.get(parameter.first_rate, 1.0)
         for parameter in PARAMETERS
         if parameter.first_rate
     }
@@ -152,16 +156,21 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
             sample,
             backend=self.backend,
             weights=config.losses,
-            voxel_size=config.voxel_size,
             track_screen=self.densifier.collects(iteration),
             watch=self.watch,
             perturbation=perturbation_at(iteration, config.iterations, config.disturbance, self.numbers),
             background=torch.rand(3, generator=generator).to(self.backend.device) if config.random_background else None,
         )
+        if config.losses.offset_distance:
+            with self.watch.stage("loss"):
+                distance = offset_distance(
+                    scene.anchors, voxel_size=config.voxel_size, weights=config.losses, backend=self.backend
+                )
+                loss = with_term(loss, "offset_distance", distance, weight=config.losses.offset_distance)
         if weight := config.solidity.weight_at(iteration, config.iterations):
             with self.watch.stage("rasterise"):
                 spread = depth_distortion(
-                    loss.unperturbed, sample.camera, scale=config.solidity.scale, backend=self.backend
+                    loss.unperturbed, sample.camera, scale=config.solidity.SCALE, backend=self.backend
                 )
                 loss = with_term(loss, "depth_distortion", spread, weight=weight)
         self.last_pass.add(iteration, loss, sample)
@@ -293,8 +302,8 @@ def _seeded(
         cameras=cameras,
         voxel_size=config.voxel_size * config.seed_voxels,
         offsets_per_anchor=config.offsets_per_anchor,
-        feature_width=config.feature_width,
-        hidden_width=config.hidden_width,
+        feature_width=config.FEATURE_WIDTH,
+        hidden_width=config.HIDDEN_WIDTH,
         distance_input=config.distance_input,
         device=device,
         generator=generator,

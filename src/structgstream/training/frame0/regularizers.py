@@ -24,6 +24,7 @@ something behind it, and hardly any of them draws it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -129,18 +130,19 @@ class DepthDistortionConfig:
 
     weight: float = 0.0
     """Mean weight of the depth spread in the loss per iteration (paper: 0)."""
-    from_share: float = 0.3
+
+    FROM_SHARE: ClassVar[float] = 0.3
     """Share of the iterations before it starts, in which surfaces form."""
-    every: int = 2
-    """It is computed in every ``every``-th iteration, with ``every`` times the weight."""
-    scale: float = 0.5
+    EVERY: ClassVar[int] = 4
+    """It is computed in every ``EVERY``-th iteration, with ``EVERY`` times the weight."""
+    SCALE: ClassVar[float] = 0.5
     """Scale of width and height of the pictures in which depth is drawn."""
 
     def weight_at(self, iteration: int, iterations: int) -> float:
         """Weight of the depth spread in ``iteration`` of ``iterations``; 0: it is not computed."""
-        if iteration <= self.from_share * iterations or iteration % self.every:
+        if iteration <= self.FROM_SHARE * iterations or iteration % self.EVERY:
             return 0.0
-        return self.weight * self.every
+        return self.weight * self.EVERY
 
 
 def depth_distortion(gaussians: Gaussians, camera: Camera, *, scale: float, backend: Backend) -> Tensor:
@@ -173,15 +175,16 @@ class FreeSpaceConfig:
 
     enabled: bool = False
     """Remove them after the last iteration (paper: no)."""
-    depth_share: float = 0.9
+
+    DEPTH_SHARE: ClassVar[float] = 0.9
     """An anchor is in front of what a camera draws if its depth is below this share of the drawn depth."""
-    least_views: int = 6
+    LEAST_VIEWS: ClassVar[int] = 6
     """An anchor is judged only if as many cameras see it in front of what they draw."""
-    drawn_share: float = 0.34
+    DRAWN_SHARE: ClassVar[float] = 0.34
     """It is removed if at most this share of them, or a single one, draws one of its Gaussians."""
-    drawn_opacity: float = 0.05
+    DRAWN_OPACITY: ClassVar[float] = 0.05
     """Opacity above which a Gaussian counts as drawn."""
-    scale: float = 0.5
+    SCALE: ClassVar[float] = 0.5
     """Scale of width and height of the pictures in which depth is drawn."""
 
 
@@ -191,14 +194,14 @@ def in_free_space(scene: Scene, cameras: Sequence[Camera], *, config: FreeSpaceC
     drawn = torch.zeros_like(in_front)
     with torch.no_grad():
         for camera in cameras:
-            small = camera.resized(*(max(1, round(side * config.scale)) for side in (camera.width, camera.height)))
+            small = camera.resized(*(max(1, round(side * config.SCALE)) for side in (camera.width, camera.height)))
             structured = scene.structured(small, backend)
             rows = structured.anchors
-            before = _before_surfaces(scene.anchors.positions[rows], scene, small, config.depth_share, backend)
-            opaque = structured.raw_opacities.amax(1) > config.drawn_opacity
+            before = _before_surfaces(scene.anchors.positions[rows], scene, small, config.DEPTH_SHARE, backend)
+            opaque = structured.raw_opacities.amax(1) > config.DRAWN_OPACITY
             in_front[rows] += before.to(in_front)
             drawn[rows] += (before & opaque).to(drawn)
-    return (in_front >= config.least_views) & (drawn <= (config.drawn_share * in_front).clamp(min=1.0))
+    return (in_front >= config.LEAST_VIEWS) & (drawn <= (config.DRAWN_SHARE * in_front).clamp(min=1.0))
 
 
 def _before_surfaces(points: Tensor, scene: Scene, camera: Camera, share: float, backend: Backend) -> Tensor:

@@ -19,6 +19,7 @@ stays transparent is unobserved.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -127,13 +128,14 @@ class EnvironmentConfig:
 
     enabled: bool = False
     """Whether an environment is fitted (paper: no, black)."""
-    degree: int = 2
+
+    DEGREE: ClassVar[int] = 2
     """Degree of the spherical harmonics, 0 to 2."""
-    smoothness: float = 1e-3
+    SMOOTHNESS: ClassVar[float] = 1e-3
     """Ridge penalty: for a coefficient of degree l, l (l + 1) times this times the mean weight of the pixels."""
-    least_weight: float = 1e-2
+    LEAST_WEIGHT: ClassVar[float] = 1e-2
     """Added to a pixel's transparency (1 - coverage) to give its weight, so that covered pixels count a little."""
-    step: float = 1 / 256
+    STEP: ClassVar[float] = 1 / 256
     """Quantization step of the coefficients with the codec ``compact``, full scale 1."""
 
 
@@ -146,7 +148,7 @@ def fit_environment(scene: Scene, views: Sequence[View], *, config: EnvironmentC
         config: of the fit.
         backend: the compute back-end.
     """
-    count = (config.degree + 1) ** 2
+    count = (config.DEGREE + 1) ** 2
     products = torch.zeros(count, count, dtype=torch.float64)
     targets = torch.zeros(count, 3, dtype=torch.float64)
     total, color = 0.0, scene.camera_color
@@ -157,15 +159,15 @@ def fit_environment(scene: Scene, views: Sequence[View], *, config: EnvironmentC
         pixels = (rows[:, None] * alpha.shape[1] + columns).reshape(-1)
         gains, biases = (value[view.index].cpu().double() for value in (color.gains, color.biases))
         colors = (view.image.reshape(-1, 3)[pixels].cpu().double() / 255.0 - biases) / gains.clamp(min=_LEAST_GAIN)
-        weights = (1.0 - alpha.reshape(-1)[pixels]).cpu().double() + config.least_weight
+        weights = (1.0 - alpha.reshape(-1)[pixels]).cpu().double() + config.LEAST_WEIGHT
         if view.mask is not None:
             weights = weights * view.mask.reshape(-1)[pixels].cpu()
-        basis = sh_basis(pixel_directions(view.camera, pixels).cpu().double(), config.degree)
+        basis = sh_basis(pixel_directions(view.camera, pixels).cpu().double(), config.DEGREE)
         products += (basis * weights[:, None]).T @ basis
         targets += (basis * weights[:, None]).T @ (colors - 0.5)
         total += float(weights.sum())
-    degrees = torch.tensor([degree for degree in range(config.degree + 1) for _ in range(2 * degree + 1)])
-    ridge = config.smoothness * total / (4.0 * torch.pi) * (degrees * (degrees + 1)).double()
+    degrees = torch.tensor([degree for degree in range(config.DEGREE + 1) for _ in range(2 * degree + 1)])
+    ridge = config.SMOOTHNESS * total / (4.0 * torch.pi) * (degrees * (degrees + 1)).double()
     found = torch.linalg.solve(products + ridge.diag(), targets)
     return found.to(scene.anchors.positions)
 

@@ -277,7 +277,6 @@ class OnlineHooks(Hooks[View, SceneLoss]):
             sample,
             backend=self.backend,
             weights=self.losses,
-            voxel_size=0.0,
             track_screen=self._tracks_screen(iteration),
             watch=self.watch,
             active=replace(active, tiles=active.changed) if active is not None and self._rests(sample) else active,

@@ -16,11 +16,13 @@ from structgstream.presets import RIG
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import STATE_TABLE, FieldName, on_device, scene_of, state_of
 from structgstream.training.frame0.fit import InitialConfig, fit_first_frame
-from structgstream.training.losses import LossWeights
+from structgstream.training.losses import InitialLossWeights
 from structgstream.training.result import FitResult
 from structgstream_studies.peers.method import Arrays, IndependentFrames, stored
 
-SCAFFOLD = replace(RIG.initial, distance_input=False, losses=LossWeights(l1=0.8, ssim=0.2, volume=0.01))
+SCAFFOLD = replace(
+    RIG.initial, distance_input=False, losses=InitialLossWeights(l1=0.8, ssim=0.2, volume=0.01, offset_distance=0.0)
+)
 """The preset ``rig`` with Scaffold-GS's inputs and loss: no distance, no term that keeps offsets short."""
 
 
