@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Groups of the bundled clip in pictures of 80x60 pixels, made once for all tests."""
+"""Groups of the small clip in pictures of 80x60 pixels, made once in a test run."""
 
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from tempfile import mkdtemp
 
 from backends import quickest_backend
+from shared_folder import made_once
+from small_clip import small_clip_path
 from small_presets import QUICK
 from structgstream.api import reconstruct
-from structgstream.data.clip import bundled_clip_path
 from structgstream.groups.base import GroupBase
 from structgstream.groups.first_frame import GroupStartConfig
 from structgstream.groups.pictures import open_for
@@ -20,8 +20,8 @@ from structgstream.groups.unit import SegmentTask, fit_segment
 
 FRAMES, LENGTH = 6, 2
 START = GroupStartConfig(iterations=6, rounds=2, births=50)
-OPTIONS = TrackOptions(LENGTH, tracking=TrackConfig(scale=1.0, cameras=9, picture_scale=1.0))
-CAPTURE = bundled_clip_path()
+OPTIONS = TrackOptions(LENGTH, tracking=TrackConfig(scale=1.0, cameras=5, picture_scale=1.0))
+CAPTURE = small_clip_path()
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,18 @@ def fit(path: Path, group: SegmentTask, *, stop_after: int = FRAMES, overwrite: 
 
 @cache
 def made() -> Made:
-    """All of it, in a folder of its own; not to be changed."""
-    folder = Path(mkdtemp(prefix="structgstream-groups-"))
-    header, path = folder / "header.sgs", folder / "track"
-    reconstruct(CAPTURE, header, preset=QUICK, scale=0.25, frames=1, backend=quickest_backend())
-    track(path, header)
-    found = Made(header, path, [folder / f"g{first}.sgs" for first in range(0, FRAMES, LENGTH)])
+    """All of it, not to be changed."""
+    return _made_in(made_once("groups", _make))
+
+
+def _made_in(folder: Path) -> Made:
+    segments = [folder / f"g{first}.sgs" for first in range(0, FRAMES, LENGTH)]
+    return Made(folder / "header.sgs", folder / "track", segments)
+
+
+def _make(folder: Path) -> None:
+    found = _made_in(folder)
+    reconstruct(CAPTURE, found.header, preset=QUICK, scale=0.25, frames=1, backend=quickest_backend())
+    track(found.track, found.header)
     for number, segment in enumerate(found.segments):
         fit(segment, task(found, number * LENGTH))
-    return found

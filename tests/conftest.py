@@ -10,17 +10,28 @@ loaded, which is why nothing above the functions imports torch.
 """
 
 import os
+import shutil
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from properties import use_for_all
+from shared_folder import open_shared_folder
+
+SHARED = pytest.StashKey[Path | None]()
 
 
-def pytest_configure() -> None:
+def pytest_configure(config: pytest.Config) -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     use_for_all()
+    config.stash[SHARED] = open_shared_folder()
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if folder := config.stash.get(SHARED, None):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture(autouse=True)

@@ -30,7 +30,7 @@ def test_a_track_has_a_start_for_each_group() -> None:
 
 def test_interrupted_it_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
     path = tmp_path / "track"
-    for stop, left in ((1, 5), (2, 3), (3, 3), (4, 1)):
+    for stop, left in ((2, 3), (3, 3)):
         assert track(path, made().header, stop_after=stop) == stop
         assert not path.exists()
         assert track(path, made().header) == left

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a rendering lacks in each view, and the depth in front of which it is looked for."""
+"""What a rendering lacks in each view, and the sweep for its depth in front of what is drawn."""
 
 from dataclasses import replace
 from typing import Any

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What pictures say of movers: sums by blending weight, and where a mover is seen."""
+"""What the pictures say of dynamic primitives: sums by blending weight, and where a primitive is visible."""
 
 from dataclasses import replace
 

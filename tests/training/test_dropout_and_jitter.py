@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Disturbances of frame 0."""
+"""Dropout and jitter of Gaussians in frame 0."""
 
 import pytest
 import torch

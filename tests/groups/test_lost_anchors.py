@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An anchor that was left behind and looks wrong goes where its neighbours went."""
+"""An anchor that was left behind and looks wrong is moved with its neighbours."""
 
 from dataclasses import replace
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What two pictures of one camera tell, with no scene at hand."""
+"""Changes between two pictures of a camera, without a scene."""
 
 from dataclasses import replace
 from typing import Any

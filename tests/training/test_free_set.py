@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Free Gaussians that die and are born in the middle of a frame, in the tensors that are being fitted."""
+"""The set of free Gaussians, pruned and spawned in the middle of a frame while it is optimized."""
 
 from dataclasses import replace
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hidden anchors that go along with what hides them."""
+"""Motion is propagated to anchors that the dynamic ones occlude."""
 
 import pytest
 import torch

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures that do not tell of the scene are found by what the others say."""
+"""Views whose pictures disagree with what the others say are left out."""
 
 from dataclasses import replace
 

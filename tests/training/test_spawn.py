@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who is to blame, what is missing, and how points of many rays become Gaussians."""
+"""Error shares, missing pixels, and how points of many rays become Gaussians."""
 
 from dataclasses import replace
 

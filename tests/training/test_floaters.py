@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Anchors that float in front of surfaces and that hardly any camera draws."""
+"""Anchors that float in front of surfaces, and that hardly any camera draws."""
 
 from dataclasses import replace
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frame 0 as whole numbers of steps."""
+"""Frame 0 as quantization indices."""
 
 from dataclasses import replace
 from functools import cache

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The price of moving unlike the neighbours."""
+"""The penalty on motion that differs from that of the neighbours."""
 
 from dataclasses import replace
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Before the first iteration: what emerged is born where it is, and what is to blame dies."""
+"""Before the first iteration: Gaussians are spawned where something emerged, and those with the error are pruned."""
 
 from dataclasses import replace
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What bits cost in the loss."""
+"""The rate term of the loss."""
 
 import pytest
 import torch

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Flow in the training pictures, lifted to motion: who shares it, and what counts as none."""
+"""2D flow of the training views, lifted to 3D displacements: who shares it, and what counts as none."""
 
 from dataclasses import replace
 
