@@ -265,6 +265,11 @@ def test_a_scene_that_no_picture_shows_is_held_and_found_again(world: World, tmp
     scenes = decoded(whole)
     assert torch.equal(scenes[2].anchors.positions, scenes[1].anchors.positions)
     assert not torch.equal(scenes[3].anchors.positions, scenes[2].anchors.positions)
+    without = replace(config, online=replace(config.online, motion_prior=0.0))
+    run(source, tmp_path / "without.sgs", config=without)
+    after = decoded(tmp_path / "without.sgs")
+    assert torch.equal(after[1].anchors.positions, scenes[1].anchors.positions)
+    assert not torch.equal(after[3].anchors.positions, scenes[3].anchors.positions), "frames 0 and 1 predict motion"
     for done in (2, 3):
         begun = tmp_path / f"begun{done}.sgs"
         run(section(source, frames=done), begun, config=config)

@@ -23,9 +23,9 @@ from structgstream.data.open import open_capture
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import SourceWrapper, WithRig, every_nth_frame, section
 from structgstream.frames import MultiViewFrame
+from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.verdicts import judge
 from structgstream.preparation.checking.check import Examination, check_capture, examine_capture
-from structgstream.preparation.checking.findings import Finding
-from structgstream.preparation.checking.verdicts import judge
 
 Cameras = dict[str, Camera]
 TRUE_OF_ALL = ("Exposure differs", "White balance differs", "have no matches with", "other camera only", "lacks ",

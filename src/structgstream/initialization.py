@@ -43,7 +43,7 @@ def initial_points_of(
 
     A capture's points are those of its beginning: where another period begins they are estimated.
     """
-    from structgstream.data.pose_check import check_poses
+    from structgstream.pose_check.check import check_poses
 
     check_poses(frame, source.rig)
     given = source.points if frame.index == 0 else None

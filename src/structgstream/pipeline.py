@@ -100,7 +100,8 @@ class Past(Generic[State, Memory]):
     Args:
         state: the previous decoded frame (``codec.encoder``, Note [Closed loop]).
         memory: see :meth:`Method.prepare`.
-        older: the decoded frame before that, if the method needs it and it is of the same period.
+        older: the decoded frame before that, if the method needs it and it is of the same period. Frames that show
+            nothing, whose scene is that of the frame before them, do not count for either.
         seconds: presentation times of ``older`` and ``state``; None where one of them is unknown.
     """
 

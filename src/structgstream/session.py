@@ -6,7 +6,7 @@ hands out its newest frame is asked only when the frame before is stored.
 """
 
 from collections import deque
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import partial
 from typing import Generic
@@ -86,7 +86,8 @@ class Session(Generic[State, Memory]):
         self._controller = RateController(pipeline.rate, source.fps, keys=self._keys)
         self._coder: FrameCoder[State] | None = None
         self._steps: Mapping[str, float] = {}
-        self._times: deque[float] = deque(maxlen=2)
+        self._first = 0  # frame of the period
+        self._shown: deque[tuple[int, float]] = deque(maxlen=2)  # its last two frames that show something
         if resumed is not None:
             check_resumable(resumed.header, self._facts)
 
@@ -192,7 +193,6 @@ class Session(Generic[State, Memory]):
     def _note(self, packet: Packet | PacketInfo, size: int, *, begins: bool) -> None:
         """A packet has been written: what follows depends on it."""
         index, pts_seconds = packet.index, packet.pts_seconds
-        self._times.append(pts_seconds)
         if packet.kind is PacketKind.KEY:
             self._keys.begin(index, pts_seconds)
         self._controller.add(size, packet.kind, index=index, pts_seconds=pts_seconds, begins=begins)
@@ -210,18 +210,34 @@ class Session(Generic[State, Memory]):
     def _advance(self, past: Past[State, Memory] | None, state: State, task: FrameTask) -> Past[State, Memory]:
         """The state from which the next frame is fitted."""
         method = self._pipeline.method
+        index, shows = task.frame.index, shows_enough(task.frame, self._rig)
         if past is not None and task.begins is None:
             self._measure(state, task)
-            return Past(state, past.memory, past.state if method.needs_older else None, self._last_two)
-        self._plan.begin(task.frame.index, task.frame.pts_seconds)
-        keep_frames(self._source, task.frame.index, last=self._plan.remembered)
+            if shows:
+                self._shown.append((index, task.frame.pts_seconds))
+            self._keep(index)
+            older = past.state if shows else past.older  # the scene of a held frame is the one before it
+            return Past(state, past.memory, older if method.needs_older else None, self._seconds_shown)
+        self._begin(index, [(index, task.frame.pts_seconds)])
+        self._plan.begin(index, task.frame.pts_seconds)
+        self._keep(index)
         self._measure(state, task)
         return Past(state, method.prepare(state, lambda: task))
 
+    def _begin(self, first: int, shown: Iterable[tuple[int, float]]) -> None:
+        """A period has begun with frame ``first``; ``shown`` are its last frames that show something."""
+        self._first = first
+        self._shown.clear()
+        self._shown.extend(shown)
+
+    def _keep(self, index: int) -> None:
+        """Ask for the pictures that a run reads again which is resumed after this frame."""
+        keep_frames(self._source, self._first, last=max(self._plan.remembered, index + 1 - self._shown[0][0]))
+
     @property
-    def _last_two(self) -> tuple[float, float] | None:
-        """Presentation times of the last two frames; None before the second."""
-        return (self._times[0], self._times[1]) if len(self._times) == 2 else None
+    def _seconds_shown(self) -> tuple[float, float] | None:
+        """Presentation times of the last two frames that show something; None before the second."""
+        return (self._shown[0][1], self._shown[1][1]) if len(self._shown) == 2 else None
 
     def _measure(self, state: State, task: FrameTask) -> None:
         """How well a decoded frame shows its pictures, for the plan of periods, if that asks for it."""
@@ -245,13 +261,24 @@ class Session(Generic[State, Memory]):
         state = deque(map(self._coder.replay, resumed.group(count - 1)), maxlen=1).pop()
         period = resumed.period(count - 1)
         first = period.first_frame
-        older = resumed.scene(count - 2) if method.needs_older and count - 1 > first else None
-        keep_frames(self._source, first, last=self._plan.remembered)
+        shown = self._last_shown(count, first) if method.needs_older else [*range(max(count - 2, first), count)]
+        self._begin(first, ((index, resumed.packets[index].pts_seconds) for index in shown))
+        older = resumed.scene(shown[0]) if method.needs_older and len(shown) == 2 else None
+        self._keep(count - 1)
         if self._pipeline.period.enabled:
             self._restore_plan(resumed, period)
-        return Past(
-            state, method.prepare(resumed.scene(first), partial(self._task_again, first)), older, self._last_two
-        )
+        memory = method.prepare(resumed.scene(first), partial(self._task_again, first))
+        return Past(state, memory, older, self._seconds_shown)
+
+    def _last_shown(self, count: int, first: int) -> list[int]:
+        """The last two frames, of those from ``first`` to ``count``, whose pictures show something; the first does."""
+        found: list[int] = []
+        for index in range(count - 1, first, -1):
+            if shows_enough(next(self._source.frames(index)), self._rig):
+                found.append(index)
+            if len(found) == 2:
+                break
+        return [first, *reversed(found)][-2:]
 
     def _restore_plan(self, resumed: StoredStream[State], period: Period) -> None:
         """What the plan of periods knew: when the last period began, and residuals measured again."""

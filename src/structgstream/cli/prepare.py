@@ -16,7 +16,7 @@ from structgstream.cli.plain_text import say
 from structgstream.cli.step_display import step_display
 
 if TYPE_CHECKING:
-    from structgstream.preparation.checking.findings import Finding
+    from structgstream.pose_check.findings import Finding
     from structgstream.preparation.options import PrepareOptions
 
 HIDDEN = tyro.conf.arg(help_behavior_hint="")

@@ -24,21 +24,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.cameras import Camera, CameraRig
+from structgstream.cameras import CameraRig
 from structgstream.data.aligned_points import aligned_points
-from structgstream.data.calibration import calibrated_camera, calibrated_rig
 from structgstream.data.calibration_files.reading import read_array, readable
 from structgstream.data.camera_files import pictures_in, roots_of, videos_in
 from structgstream.data.colmap import find_model, read_model
-from structgstream.data.pair_matches import PairMatcher
-from structgstream.data.pose_check import PoseCheckConfig, confirmed_share
+from structgstream.data.pair_matches import PairMatcher, confirmed_share
 from structgstream.data.posed import Calibration, PosedCamera, intrinsics, rigid
-from structgstream.data.posed_capture import of_pictures
+from structgstream.data.posed_capture import of_pictures, of_videos
 from structgstream.data.source import FrameSource
-from structgstream.data.text_files import BROKEN, pixels, reason
+from structgstream.data.text_files import pixels
 from structgstream.data.timeline import natural
-from structgstream.data.video import synchronised
-from structgstream.data.video_index import VideoTrack, scan_videos
 from structgstream.data.wrappers import resized
 from structgstream.errors import CalibrationError
 
@@ -73,17 +69,15 @@ def open_n3dv(path: Path) -> FrameSource:
             f"{path / POSES} has {len(poses)} poses, {path} has {len(names)} {'videos' if videos else 'cameras'}; "
             "expected one pose per camera, in sorted order."
         )
-    tracks = scan_videos({name: videos[name] for name in names}) if videos else {}
 
     def opened(names: Sequence[str]) -> FrameSource:
         posed = {name: _camera(name, pose, path / POSES) for name, pose in zip(names, poses, strict=True)}
         posed = {name: posed[name] for name in sorted(posed, key=natural)}
         held_out = [name for name in HELD_OUT if name in posed]
-        if not tracks:
-            calibration = Calibration(path / POSES, tuple(posed.values()), held_out=held_out)
-            return of_pictures(path, pictures, posed, root=path, calibration=calibration)[0]
-        cameras = {name: _sized(posed[name], tracks[name], path / POSES) for name in posed}
-        return synchronised(tracks, calibrated_rig(cameras, held_out, where=path), where=path)
+        calibration = Calibration(path / POSES, tuple(posed.values()), held_out=held_out)
+        if videos:
+            return of_videos(path, videos, root=path, calibration=calibration)[0]
+        return of_pictures(path, pictures, posed, root=path, calibration=calibration)[0]
 
     source = opened(names)
     if names != sorted(names) and _as_text(source, opened(sorted(names)).rig):
@@ -105,7 +99,7 @@ def _as_text(by_number: FrameSource, as_text: CameraRig) -> bool:
     shares = []
     for rig in (by_number.rig, as_text):
         cameras = {name: rig[name].resized(small.rig[name].width, small.rig[name].height) for name in names}
-        shares.append(confirmed_share(cameras, matcher, PoseCheckConfig()))
+        shares.append(confirmed_share(cameras, matcher))
     if max(shares) < LEAST_CONFIRMED or shares[0] == shares[1]:
         log.warning(
             "%s: the pictures do not say whether the rows of %s follow the names by number or as text; by "
@@ -124,10 +118,8 @@ def _points(path: Path, rig: CameraRig) -> NDArray[np.float64] | None:
 
 def _read_poses(file: Path) -> NDArray[np.float64]:
     """``[V, 3, 5]`` matrices of the file."""
-    try:
+    with readable(file, "3x5 poses and two bounds of each camera"):
         rows = read_array(file)
-    except BROKEN as error:
-        raise CalibrationError(f"{file} cannot be read ({reason(error)}); copy or export it again.") from None
     if rows.ndim != 2 or rows.shape[1] != 17:
         raise CalibrationError(f"{file} has shape {rows.shape}; expected (cameras, 17): 3x5 poses and two bounds.")
     return rows[:, :15].reshape(-1, 3, 5)
@@ -141,15 +133,3 @@ def _camera(name: str, pose: NDArray[np.float64], where: Path) -> PosedCamera:
     with readable(where, "3x5 poses with height, width and focal length"):
         size = pixels((width, height))
     return PosedCamera(name, rigid(rotation, -rotation @ center), intrinsics(focal, focal, width / 2, height / 2), size)
-
-
-def _sized(posed: PosedCamera, track: VideoTrack, where: Path) -> Camera:
-    assert posed.size is not None
-    width, height = posed.size
-    camera = calibrated_camera(posed.name, viewmat=posed.viewmat, K=posed.K, width=width, height=height, where=where)
-    if abs(track.height - height * track.width / width) > 1:
-        raise CalibrationError(
-            f"The video {track.path} has {track.width}x{track.height} pixels, {where} is for "
-            f"{width:g}x{height:g}; expected the same proportions."
-        )
-    return camera.resized(track.width, track.height)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keypoint matches between pictures, found without the poses, so that they can judge the poses."""
+"""Keypoint matches between pictures, found without the poses, so that they can judge the poses, and their errors."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -9,10 +9,28 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.cameras import enlargement
+from structgstream.cameras import Camera, enlargement
 from structgstream.data.arrays import Floats
 from structgstream.data.descriptor_matches import mutual_matches
-from structgstream.data.matching import Features, Pair, load_cv2, sift_features
+from structgstream.data.matching import (
+    Features,
+    Pair,
+    angles,
+    epipolar_errors,
+    fundamental_matrix,
+    load_cv2,
+    neighbor_views,
+    rays,
+    sift_features,
+    triangulate,
+    unique_pairs,
+    viewing_distance,
+)
+
+MIN_PARALLAX_DEGREES = 0.3  # between the rays of a match, from which a point behind a camera counts
+VIOLATION_SHARE = 0.01  # of the picture's width
+PAIR_SHARE = 0.3  # of a pair's matches that violate the poses: of right poses mostly 0 to 0.14, of wrong ones most
+MAX_PAIRS = 200  # of neighbours: all of rigs up to 150 cameras, since a camera of which no pair is tested is unchecked
 
 
 @dataclass(frozen=True)
@@ -106,3 +124,52 @@ class PairMatcher:
         if agree.sum() < config.min_inliers or agree.mean() < config.min_inlier_share:
             return empty
         return np.stack([rows[agree], columns[agree]], 1)
+
+
+@dataclass(frozen=True)
+class PairError:
+    """How badly the poses explain the matches of a pair: a median in pixels, and the share of violating matches."""
+
+    pixels: float
+    share: float
+    matches: int
+
+
+def pair_error(first: Camera, second: Camera, pixels1: Floats, pixels2: Floats) -> PairError:
+    """Matches ``[M, 2]`` of one pair against the poses.
+
+    A match violates them when it lies off its epipolar line, or is triangulated behind a camera: cameras that only
+    differ in position keep their epipolar lines when they are inverted.
+    """
+    errors = epipolar_errors(fundamental_matrix(first, second), pixels1, pixels2)
+    _, depths = triangulate(first, second, pixels1, pixels2)
+    parallax = np.degrees(angles(rays(first, pixels1), rays(second, pixels2)))
+    behind = (depths < 0).any(1) & (parallax > MIN_PARALLAX_DEGREES)
+    violating = (errors > VIOLATION_SHARE * first.width) | behind
+    return PairError(float(np.median(errors)), float(violating.mean()), len(errors))
+
+
+def neighbor_pairs(cameras: Mapping[str, Camera], *, count: int = 2) -> list[Pair]:
+    """Each camera with its ``count`` best neighbours; at most ``MAX_PAIRS``, spread over the rig."""
+    pairs = unique_pairs(neighbor_views(cameras, count=count, distance=viewing_distance(cameras)))
+    chosen = np.linspace(0, len(pairs) - 1, min(len(pairs), MAX_PAIRS)).round().astype(int)
+    return [pairs[index] for index in chosen]
+
+
+def neighbor_errors(cameras: Mapping[str, Camera], matcher: PairMatcher) -> dict[Pair, PairError | None]:
+    """The error of each pair of neighbours; None where their pictures do not match.
+
+    Raises:
+        MissingExtraError: cv2 is not installed.
+    """
+    matches = matcher.matches(neighbor_pairs(cameras))
+    return {
+        pair: pair_error(cameras[pair[0]], cameras[pair[1]], *pixels) if len(pixels[0]) else None
+        for pair, pixels in matches.items()
+    }
+
+
+def confirmed_share(cameras: Mapping[str, Camera], matcher: PairMatcher) -> float:
+    """The share of the pairs of neighbours whose pictures match and agree with the poses, to compare readings."""
+    errors = neighbor_errors(cameras, matcher).values()
+    return sum(error is not None and error.share <= PAIR_SHARE for error in errors) / max(1, len(errors))

@@ -27,9 +27,9 @@ from structgstream.data.source import FrameSource
 from structgstream.data.timeline import Clock
 from structgstream.data.video import measured_fps
 from structgstream.data.wrappers import WithRig
+from structgstream.pose_check.findings import Finding
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.checking.check import Examination, check_capture, examine_capture
-from structgstream.preparation.checking.findings import Finding
 from structgstream.preparation.checking.scales import nearest_depth, observed_depths
 from structgstream.preparation.footage import Footage
 from structgstream.preparation.job import Job

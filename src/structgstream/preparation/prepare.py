@@ -7,10 +7,10 @@ from pathlib import Path
 
 from structgstream.data.folder_files import REPORT
 from structgstream.data.posed import Calibration
+from structgstream.pose_check.findings import Finding
 from structgstream.preparation.calibrating import check_board, check_used, chosen_method
 from structgstream.preparation.camera_steps import CameraSteps
 from structgstream.preparation.capture_steps import CaptureSteps, assembled
-from structgstream.preparation.checking.findings import Finding
 from structgstream.preparation.claiming import alone
 from structgstream.preparation.footage import Footage
 from structgstream.preparation.job import Job, new_job

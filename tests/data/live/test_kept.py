@@ -2,6 +2,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from structgstream.data.live.kept import LAST, KeptFrames, kept_folder
@@ -44,6 +45,16 @@ def test_what_a_period_needs_is_kept_instead(tmp_path: Path) -> None:
             frames.need(11, last=4)
     found = sorted(int(file.name[6:14]) for file in (tmp_path / "x.live").glob("frame-*"))
     assert found == [11, *range(14, 20)]
+
+
+def test_of_a_frame_that_shows_nothing_the_noise_is_not_kept(tmp_path: Path) -> None:
+    frames, sizes = kept(tmp_path / "x.live"), []
+    noise = np.random.default_rng(0).integers(7, 10, (480, 640, 3), dtype=np.uint8)
+    for index, image in enumerate((noise, noise, 20 * noise)):
+        frames.keep(MultiViewFrame(index, index / 4, {"a": image}), origin_seconds=0.0)
+        sizes.append((tmp_path / "x.live" / f"frame-{index:08d}.pictures").stat().st_size)
+    assert 50 * sizes[1] < sizes[2]
+    assert not next(kept(tmp_path / "x.live", resume=True).following(1)).showing(["a"])
 
 
 def test_several_periods_keep_a_first_frame_each(tmp_path: Path) -> None:

@@ -13,10 +13,10 @@ from memory_captures import MemoryCapture
 from planes import room_frame, room_rig
 from structgstream.cameras import Camera, CameraRig
 from structgstream.frames import MultiViewFrame
+from structgstream.pose_check.evidence import gather
+from structgstream.pose_check.explanations import explain
+from structgstream.pose_check.verdicts import judge
 from structgstream.preparation.checking.check import Checked, check_capture
-from structgstream.preparation.checking.evidence import gather
-from structgstream.preparation.checking.explanations import explain
-from structgstream.preparation.checking.verdicts import judge
 
 Cameras = dict[str, Camera]
 TURNED = ("cam02", 1.0)

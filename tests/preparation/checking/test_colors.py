@@ -6,8 +6,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from structgstream.pose_check.evidence import Evidence
 from structgstream.preparation.checking.colors import Color, color_findings, compare_colors
-from structgstream.preparation.checking.evidence import Evidence
 
 SIDE, ACROSS = 9, 12
 PATCHES = ACROSS * ACROSS

@@ -6,8 +6,8 @@ import pytest
 
 from evidence_made import Cameras, evidence_of, scattered, turned, wide_ring
 from structgstream.data.matching import project
+from structgstream.pose_check.tracks import build_tracks
 from structgstream.preparation.checking.scales import nearest_depth, observed_depths, scale_findings
-from structgstream.preparation.checking.tracks import build_tracks
 
 WORLD = scattered(200)
 

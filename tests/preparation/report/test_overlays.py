@@ -11,8 +11,8 @@ import pytest
 from evidence_made import turned
 from memory_captures import MemoryCapture
 from planes import HEIGHT, WIDTH, room_frame, room_rig
+from structgstream.pose_check.evidence import pair_errors
 from structgstream.preparation.checking.check import Checked, check_capture, examine
-from structgstream.preparation.checking.evidence import pair_errors
 from structgstream.preparation.report import overlays
 
 OFF = "cam03"

@@ -3,7 +3,8 @@
 
 They lie in ``OUT.live`` beside the stream: a frame's file is complete before the frame is handed out, so whenever the
 run ends, those of the frame before the first one that the stream lacks are there. What is older than :data:`LAST`
-frames is removed, so the folder does not grow.
+frames is removed, so the folder does not grow; while no picture shows anything, the last two frames that did stay, and
+those after them are stored as black.
 """
 
 import re
@@ -11,9 +12,11 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from structgstream.data.live.picture_file import read_pictures, write_pictures
 from structgstream.errors import CaptureError, StorageError
-from structgstream.frames import MultiViewFrame
+from structgstream.frames import LEAST_CAMERAS, MultiViewFrame
 from structgstream.owned_folders import check_owned, own_folder
 
 LAST = 3
@@ -60,6 +63,8 @@ class KeptFrames:
             StorageError: they cannot be written.
         """
         images = {name: image for name, image in frame.images.items() if name in self._cameras}
+        if len(frame.showing(self._cameras)) < min(LEAST_CAMERAS, len(self._cameras)):  # a held frame, of any length
+            images = {name: np.zeros_like(image) for name, image in images.items()}
         masks = {name: mask for name, mask in frame.masks.items() if name in self._cameras}
         own_folder(self._folder, PURPOSE)
         if not self._resume:

@@ -16,10 +16,10 @@ from structgstream.data.arrays import Floats
 from structgstream.data.calibration import listed
 from structgstream.data.matching import epipolar_errors, fundamental_matrix
 from structgstream.frames import MultiViewFrame
-from structgstream.preparation.checking.evidence import Evidence, gather
-from structgstream.preparation.checking.findings import Finding
+from structgstream.pose_check.evidence import Evidence, gather
+from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.tracks import AGREE_PIXELS
 from structgstream.preparation.checking.stillness import Movement, picture_movement
-from structgstream.preparation.checking.tracks import AGREE_PIXELS
 
 CLEAR = 0.5  # largest ratio of the errors of two explanations at which a match speaks for the better one
 LEAST_VOTES = 15

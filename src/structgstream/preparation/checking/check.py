@@ -10,16 +10,19 @@ from structgstream.cameras import Camera
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import select_cameras
 from structgstream.frames import MultiViewFrame
+from structgstream.pose_check.check import examine_poses
+from structgstream.pose_check.evidence import Evidence, pair_errors
+from structgstream.pose_check.explanations import explain
+from structgstream.pose_check.findings import worst_first
+from structgstream.pose_check.suspects import Suspects
+from structgstream.pose_check.tracks import LEAST_VIEWS, Tracks
+from structgstream.pose_check.verdicts import Verdict
 from structgstream.preparation.checking.bumps import bump_findings
 from structgstream.preparation.checking.colors import Color, color_findings, compare_colors
-from structgstream.preparation.checking.evidence import Evidence, gather, pair_errors
-from structgstream.preparation.checking.explanations import explain
 from structgstream.preparation.checking.findings import (
     CameraCheck,
     CheckReport,
-    Finding,
     PairCheck,
-    worst_first,
 )
 from structgstream.preparation.checking.overlap import coverage, overlap_findings, overlaps
 from structgstream.preparation.checking.presence import (
@@ -31,10 +34,7 @@ from structgstream.preparation.checking.presence import (
     whole_frame,
 )
 from structgstream.preparation.checking.scales import nearest_depth, observed_depths, scale_findings
-from structgstream.preparation.checking.suspects import Suspects
 from structgstream.preparation.checking.times import measure_times, time_findings
-from structgstream.preparation.checking.tracks import LEAST_VIEWS, Tracks
-from structgstream.preparation.checking.verdicts import Verdict, judge
 from structgstream.preparation.steps import Listener, Silent
 from structgstream.preparation.synchronization import SynchronizationCheck
 
@@ -83,8 +83,8 @@ def examine(frame: MultiViewFrame, cameras: Mapping[str, Camera]) -> Examination
         MissingExtraError: cv2 or scipy is not installed.
     """
     seen = {name: camera for name, camera in cameras.items() if name in frame.images}
-    evidence = gather(frame, seen)
-    return Examination(frame, seen, evidence, judge(evidence, seen), compare_colors(evidence))
+    evidence, verdict = examine_poses(frame, seen)
+    return Examination(frame, seen, evidence, verdict, compare_colors(evidence))
 
 
 def examine_capture(source: FrameSource) -> Examination:
@@ -154,11 +154,6 @@ def check_capture(
         unit=unit,
     )
     return Checked(report, first)
-
-
-def with_findings(checked: Checked, findings: list[Finding]) -> Checked:
-    """The check with further findings."""
-    return replace(checked, report=replace(checked.report, findings=worst_first([*checked.report.findings, *findings])))
 
 
 def _measured_times(source: FrameSource, suspects: Suspects) -> SynchronizationCheck | None:

@@ -12,7 +12,7 @@ from structgstream.data.source import FrameSource
 from structgstream.data.video import VideoSource
 from structgstream.data.wrappers import unwrapped
 from structgstream.frames import MultiViewFrame
-from structgstream.preparation.checking.findings import Finding
+from structgstream.pose_check.findings import Finding
 
 Presence = dict[str, NDArray[np.bool_]]
 MOST_TRIED = 4  # frames, where pictures that should be there cannot be decoded

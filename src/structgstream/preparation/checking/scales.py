@@ -8,9 +8,9 @@ import numpy as np
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.matching import project
-from structgstream.preparation.checking.findings import Finding
+from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.tracks import LEAST_VIEWS, Tracks
 from structgstream.preparation.checking.overlap import cameras_per_point
-from structgstream.preparation.checking.tracks import LEAST_VIEWS, Tracks
 
 NEAR_PERCENTILE = 0.5
 LEAST_POINTS = 30

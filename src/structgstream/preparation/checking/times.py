@@ -2,7 +2,7 @@
 """Whether pictures of one frame are of one moment, from what moves in them."""
 
 from structgstream.data.source import FrameSource
-from structgstream.preparation.checking.findings import Finding
+from structgstream.pose_check.findings import Finding
 from structgstream.preparation.synchronization import SynchronizationCheck, check_synchronization
 
 FRAMES = 90

@@ -10,8 +10,8 @@ import numpy as np
 
 from structgstream.data.matching import Pair, epipolar_errors, fundamental_matrix
 from structgstream.figure import COLORS, INK, figure_of, save_figure
+from structgstream.pose_check.evidence import pair_errors
 from structgstream.preparation.checking.check import Examination
-from structgstream.preparation.checking.evidence import pair_errors
 from structgstream.preparation.checking.findings import CheckReport
 
 if TYPE_CHECKING:

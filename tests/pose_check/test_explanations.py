@@ -9,9 +9,9 @@ import torch
 
 from evidence_made import Cameras, evidence_of, scattered, turned, wide_ring
 from structgstream.cameras import Camera
-from structgstream.preparation.checking.explanations import explain
-from structgstream.preparation.checking.findings import Finding
-from structgstream.preparation.checking.verdicts import judge
+from structgstream.pose_check.explanations import explain
+from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.verdicts import judge
 
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 

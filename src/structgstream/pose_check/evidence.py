@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Matches between all pictures of one instant, found without the poses."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -10,24 +10,12 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
-from structgstream.data.matching import (
-    Pair,
-    angles,
-    epipolar_errors,
-    fundamental_matrix,
-    neighbor_views,
-    rays,
-    triangulate,
-    unique_pairs,
-    viewing_distance,
-)
-from structgstream.data.pair_matches import MatchConfig, PairMatcher
+from structgstream.data.matching import Pair
+from structgstream.data.pair_matches import PairError, PairMatcher, neighbor_pairs, pair_error
 from structgstream.frames import MultiViewFrame
 
 ALL_PAIRS = 32  # cameras; with more, only neighbours by the given poses are matched
 NEIGHBOURS = 8
-MIN_PARALLAX_DEGREES = 0.3
-VIOLATION_SHARE = 0.01  # of the picture's width
 
 
 @dataclass(frozen=True)
@@ -54,17 +42,21 @@ class Evidence:
         return [pair for pair, rows in self.matches.items() if len(rows)]
 
 
-@dataclass(frozen=True)
-class PairError:
-    """How badly the poses explain the matches of a pair: a median in pixels, and the share of violating matches."""
+def gather(
+    frame: MultiViewFrame,
+    cameras: Mapping[str, Camera],
+    *,
+    matcher: PairMatcher | None = None,
+    readings: Collection[Mapping[str, Camera]] = (),
+) -> Evidence:
+    """Matches of all pairs of a frame's pictures; of large rigs those of neighbours, by the cameras and by ``readings``
+    of their poses.
 
-    pixels: float
-    share: float
-    matches: int
-
-
-def gather(frame: MultiViewFrame, cameras: Mapping[str, Camera], *, config: MatchConfig | None = None) -> Evidence:
-    """Matches of all pairs of a frame's pictures, of neighbours only in large rigs.
+    Args:
+        frame: the pictures.
+        cameras: as given.
+        matcher: of the same pictures, where some pairs were matched before.
+        readings: other poses of the same cameras.
 
     Raises:
         MissingExtraError: cv2 is not installed.
@@ -73,25 +65,11 @@ def gather(frame: MultiViewFrame, cameras: Mapping[str, Camera], *, config: Matc
     if len(names) <= ALL_PAIRS:
         pairs = list(combinations(names, 2))
     else:
-        seen = {name: cameras[name] for name in names}
-        pairs = unique_pairs(neighbor_views(seen, count=NEIGHBOURS, distance=viewing_distance(seen)))
-    matcher = PairMatcher(frame.images, config or MatchConfig(), masks=frame.masks)
+        rigs = [{name: rig[name] for name in names} for rig in (cameras, *readings)]
+        pairs = list(dict.fromkeys(pair for rig in rigs for pair in neighbor_pairs(rig, count=NEIGHBOURS)))
+    matcher = matcher or PairMatcher(frame.images, masks=frame.masks)
     matches = matcher.indices(pairs)
     return Evidence(frame.images, {name: matcher.keypoints(name) for name in names if pairs}, matches)
-
-
-def pair_error(first: Camera, second: Camera, pixels1: Floats, pixels2: Floats) -> PairError:
-    """Matches ``[M, 2]`` of one pair against the poses.
-
-    A match violates them when it lies off its epipolar line, or is triangulated behind a camera: cameras that only
-    differ in position keep their epipolar lines when they are inverted.
-    """
-    errors = epipolar_errors(fundamental_matrix(first, second), pixels1, pixels2)
-    _, depths = triangulate(first, second, pixels1, pixels2)
-    parallax = np.degrees(angles(rays(first, pixels1), rays(second, pixels2)))
-    behind = (depths < 0).any(1) & (parallax > MIN_PARALLAX_DEGREES)
-    violating = (errors > VIOLATION_SHARE * first.width) | behind
-    return PairError(float(np.median(errors)), float(violating.mean()), len(errors))
 
 
 def pair_errors(evidence: Evidence, cameras: Mapping[str, Camera]) -> dict[Pair, PairError]:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,10 +10,11 @@ import torch
 from planes import room_frame, room_rig
 from structgstream.cameras import CameraRig
 from structgstream.data.clip import bundled_clip
-from structgstream.data.pose_check import check_poses
+from structgstream.data.open import open_capture
 from structgstream.data.wrappers import resized
 from structgstream.errors import CalibrationError
 from structgstream.frames import MultiViewFrame
+from structgstream.pose_check.check import check_poses
 
 CLIP = resized(bundled_clip(), 0.6)
 
@@ -26,7 +28,7 @@ def test_right_poses_pass_with_room_to_spare(clip_frame: MultiViewFrame) -> None
     check = check_poses(clip_frame, CLIP.rig)
     assert check.conclusive
     assert check.share_violating < 0.1
-    assert check.median_epipolar_error_pixels < 0.7
+    assert not check.findings
 
 
 def changed(rig: CameraRig, change: Callable[[torch.Tensor], torch.Tensor]) -> CameraRig:
@@ -38,7 +40,7 @@ def inverted(rig: CameraRig) -> CameraRig:
 
 
 def test_camera_to_world_given_as_world_to_camera_is_named(clip_frame: MultiViewFrame) -> None:
-    with pytest.raises(CalibrationError, match="camera-to-world matrices given as world-to-camera"):
+    with pytest.raises(CalibrationError, match="look inverted \\(camera to world in place of world to camera\\)"):
         check_poses(clip_frame, inverted(CLIP.rig))
 
 
@@ -46,12 +48,12 @@ FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 
 
 def test_opengl_axes_are_named(clip_frame: MultiViewFrame) -> None:
-    with pytest.raises(CalibrationError, match="look like OpenGL axes"):
+    with pytest.raises(CalibrationError, match="look in OpenGL axes in place of OpenCV"):
         check_poses(clip_frame, changed(CLIP.rig, lambda viewmat: FLIP @ viewmat))
 
 
 def test_camera_to_world_with_opengl_axes_is_named(clip_frame: MultiViewFrame) -> None:
-    with pytest.raises(CalibrationError, match="camera-to-world matrices with OpenGL axes"):
+    with pytest.raises(CalibrationError, match="look inverted and in OpenGL axes"):
         check_poses(clip_frame, changed(CLIP.rig, lambda viewmat: torch.linalg.inv(viewmat) @ FLIP))
 
 
@@ -59,7 +61,7 @@ def test_pictures_of_the_wrong_cameras_are_refused_without_a_wrong_guess(clip_fr
     rig = CLIP.rig
     names = list(rig)
     mixed = {name: clip_frame.images[names[(i * 3 + 1) % len(names)]] for i, name in enumerate(names)}
-    with pytest.raises(CalibrationError, match="each camera's own pictures"):
+    with pytest.raises(CalibrationError, match="Poses and pictures do not belong together"):
         check_poses(MultiViewFrame(0, 0.0, mixed), rig)
 
 
@@ -75,7 +77,7 @@ def test_inverted_poses_of_a_flat_array_look_backwards() -> None:
     rig = CameraRig(moved)
     frame = room_frame(rig)
     assert check_poses(frame, rig).share_violating < 0.1
-    with pytest.raises(CalibrationError, match="camera-to-world matrices given as world-to-camera"):
+    with pytest.raises(CalibrationError, match="look inverted \\(camera to world in place of world to camera\\)"):
         check_poses(frame, inverted(rig))
 
 
@@ -104,10 +106,22 @@ def test_exchanged_cameras_are_named(
     clip_frame: MultiViewFrame, wrong: list[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     check = check_poses(clip_frame, permuted(CLIP.rig, wrong))
-    assert set(wrong) <= set(check.suspects)
-    assert len(check.suspects) <= len(wrong) + 1
-    assert f"The poses or names of cameras {', '.join(map(repr, check.suspects))} of 9 look wrong" in caplog.text
+    assert sorted(check.off) == wrong
+    assert f"Names of cameras are exchanged: the pictures of {wrong[0]!r}" in caplog.text or (
+        f"The names of cameras {wrong[0]!r} and {wrong[1]!r} are exchanged" in caplog.text
+    )
     caplog.clear()
+
+
+def test_wrong_matches_of_cameras_far_apart_accuse_nobody(caplog: pytest.LogCaptureFixture) -> None:
+    """Of examples/throw without every third camera: 43 % of the matches of cam06 and cam08 fit another geometry."""
+    throw = open_capture(Path(__file__).parents[2] / "examples" / "throw")
+    rig = CameraRig({name: throw.rig[name] for name in ("cam01", "cam02", "cam03", "cam06", "cam08")})
+    frame = next(iter(throw.frames()))
+    check = check_poses(replace(frame, images={name: frame.images[name] for name in rig}), rig)
+    assert check.conclusive
+    assert not check.off
+    assert not caplog.text
 
 
 def test_a_third_of_a_rig_is_never_permuted_silently(
@@ -116,5 +130,5 @@ def test_a_third_of_a_rig_is_never_permuted_silently(
     training = list(CLIP.rig.training)
     for seed in range(8):
         wrong = [training[place] for place in np.random.default_rng(seed).permutation(len(training))[:3]]
-        assert check_poses(clip_frame, permuted(CLIP.rig, wrong)).suspects
+        assert check_poses(clip_frame, permuted(CLIP.rig, wrong)).off
     caplog.clear()

@@ -8,9 +8,9 @@ import numpy as np
 
 from evidence_made import wide_ring
 from structgstream.data.matching import Pair
-from structgstream.preparation.checking.evidence import PairError
-from structgstream.preparation.checking.suspects import Suspects, accused, find_suspects
-from structgstream.preparation.checking.tracks import Tracks
+from structgstream.data.pair_matches import PairError
+from structgstream.pose_check.suspects import Suspects, accused, find_suspects
+from structgstream.pose_check.tracks import Tracks
 
 GOOD, WRONG = PairError(0.3, 0.02, 80), PairError(6.0, 0.3, 80)
 

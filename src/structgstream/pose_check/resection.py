@@ -14,7 +14,7 @@ import numpy as np
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.matching import load_cv2, project
-from structgstream.preparation.checking.tracks import AGREE_PIXELS, Tracks
+from structgstream.pose_check.tracks import AGREE_PIXELS, Tracks
 
 LEAST_SEEN = 8
 LEAST_POINTS = 12

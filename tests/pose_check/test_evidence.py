@@ -8,8 +8,9 @@ import torch
 from evidence_made import evidence_of, scattered, wide_ring
 from planes import room_frame, room_rig
 from structgstream.cameras import Camera
-from structgstream.preparation.checking import evidence
-from structgstream.preparation.checking.evidence import gather, pair_error, pair_errors
+from structgstream.data.pair_matches import pair_error
+from structgstream.pose_check import evidence
+from structgstream.pose_check.evidence import gather, pair_errors
 
 WIDTH, FOCAL = 1000, 800.0
 PIXELS = np.random.default_rng(0).uniform(200, 700, (40, 2))

@@ -8,8 +8,8 @@ import numpy as np
 
 from structgstream.cameras import Camera
 from structgstream.data.matching import Pair
-from structgstream.preparation.checking.evidence import PairError
-from structgstream.preparation.checking.tracks import LEAST_VIEWS, Tracks
+from structgstream.data.pair_matches import PairError
+from structgstream.pose_check.tracks import LEAST_VIEWS, Tracks
 
 TIMES_TYPICAL = 4.0
 FLOOR_PIXELS = 0.75  # of pictures up to 1000 pixels wide, in proportion above

@@ -9,11 +9,12 @@ import torch
 
 from structgstream.cameras import Camera
 from structgstream.data.matching import Pair
-from structgstream.data.pose_check import MISTAKES, reinterpreted
-from structgstream.preparation.checking.evidence import Evidence, pair_error
-from structgstream.preparation.checking.findings import Finding
-from structgstream.preparation.checking.resection import explained
-from structgstream.preparation.checking.verdicts import Verdict
+from structgstream.data.pair_matches import pair_error
+from structgstream.data.timeline import natural
+from structgstream.pose_check.evidence import Evidence
+from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.resection import explained
+from structgstream.pose_check.verdicts import Verdict
 
 EXPLAINED, UNEXPLAINED = 0.25, 0.5  # largest share of violating matches after, and least before
 SLIGHT_PIXELS = 1.5  # of pictures up to 1000 pixels wide: blurs, but does not spoil
@@ -24,13 +25,32 @@ LENGTHS = {
     0.01: "metres among centimetres",
 }
 SIZES = (0.5, 2.0, 0.25, 4.0, 2 / 3, 1.5, 0.75, 4 / 3)
-HOW = {
-    0: "inverted (camera to world in place of world to camera)",
-    1: "in OpenGL axes in place of OpenCV's (y and z flipped)",
-    2: "inverted and in OpenGL axes (camera to world in place of world to camera)",
-}
 
+
+def _inverted(viewmat: torch.Tensor) -> torch.Tensor:
+    return torch.linalg.inv(viewmat)
+
+
+def _flipped(viewmat: torch.Tensor) -> torch.Tensor:
+    return torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=viewmat.dtype)) @ viewmat
+
+
+MISTAKES: Mapping[str, Callable[[torch.Tensor], torch.Tensor]] = {
+    "inverted (camera to world in place of world to camera)": _inverted,
+    "in OpenGL axes in place of OpenCV's (y and z flipped)": _flipped,
+    "inverted and in OpenGL axes (camera to world in place of world to camera)": lambda viewmat: _flipped(
+        _inverted(viewmat)
+    ),
+}  # what undoes each
 Change = Callable[[Camera], Camera]
+
+
+def readings_of(cameras: Mapping[str, Camera]) -> dict[str, dict[str, Camera]]:
+    """The cameras after undoing each common mistake in all poses, by what the mistake is."""
+    return {
+        how: {name: replace(camera, viewmat=change(camera.viewmat)) for name, camera in cameras.items()}
+        for how, change in MISTAKES.items()
+    }
 
 
 def explain(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Verdict) -> list[Finding]:
@@ -52,13 +72,13 @@ def _explain_all(evidence: Evidence, cameras: Mapping[str, Camera]) -> Finding:
     """Most pairs disagree: a convention that all poses share, else nothing single."""
     pairs = evidence.overlapping()
     before = _shares(evidence, cameras, pairs)
-    readings = [_shares(evidence, reinterpreted(cameras, change), pairs) for change in MISTAKES.values()]
-    best = int(np.argmin(readings))
+    readings = {how: _shares(evidence, reading, pairs) for how, reading in readings_of(cameras).items()}
+    best = min(readings, key=lambda how: readings[how])
     names = tuple(cameras)
     if readings[best] < min(0.5, before / 2):
         return Finding(
             "error",
-            f"The poses of all cameras look {HOW[best]}: {before:.0%} of the matches between pictures violate them as "
+            f"The poses of all cameras look {best}: {before:.0%} of the matches between pictures violate them as "
             f"they are, {readings[best]:.0%} once that is undone; write world-to-camera matrices with OpenCV axes.",
             names,
         )
@@ -74,7 +94,10 @@ def _explain_all(evidence: Evidence, cameras: Mapping[str, Camera]) -> Finding:
 def _exchanged(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Verdict) -> tuple[list[Finding], list[str]]:
     """Cameras that are off and agree with the others under each other's calibration, and those that are left."""
     off = verdict.suspects.off
-    same = [name for name in off if (cameras[name].width, cameras[name].height) == _size(cameras, off)]
+    if len(off) < 2:
+        return [], list(off)
+    size = _size(cameras, off)
+    same = sorted((name for name in off if (cameras[name].width, cameras[name].height) == size), key=natural)
     if len(same) < 2:
         return [], list(off)
     from scipy.optimize import linear_sum_assignment
@@ -115,8 +138,8 @@ def _single(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdic
     if not before > UNEXPLAINED:
         return None
     changes: dict[str, Change] = {
-        f"has its pose {HOW[number]}; write it as world to camera with OpenCV axes": _by_viewmat(change)
-        for number, change in enumerate(MISTAKES.values())
+        f"has its pose {how}; write it as world to camera with OpenCV axes": _by_viewmat(change)
+        for how, change in MISTAKES.items()
     }
     changes |= {
         f"stands {factor:g} times as far from the origin as its pictures say: its position looks like {unit}; write it "

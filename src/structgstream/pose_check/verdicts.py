@@ -6,10 +6,11 @@ from dataclasses import dataclass, field, replace
 
 from structgstream.cameras import Camera
 from structgstream.data.matching import Pair
-from structgstream.preparation.checking.evidence import Evidence, PairError, pair_errors
-from structgstream.preparation.checking.resection import Resection, resected
-from structgstream.preparation.checking.suspects import Suspects, accused, find_suspects
-from structgstream.preparation.checking.tracks import Tracks, build_tracks
+from structgstream.data.pair_matches import PairError
+from structgstream.pose_check.evidence import Evidence, pair_errors
+from structgstream.pose_check.resection import Resection, resected
+from structgstream.pose_check.suspects import Suspects, accused, find_suspects
+from structgstream.pose_check.tracks import Tracks, build_tracks
 
 LEAST_MATCHES = 60  # of a camera's pairs, from which on they tell something without points; chance makes 20 to 25
 

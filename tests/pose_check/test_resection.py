@@ -11,8 +11,8 @@ from rigs import look_at
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.matching import project
-from structgstream.preparation.checking.resection import Resection, explained, resected
-from structgstream.preparation.checking.tracks import Tracks
+from structgstream.pose_check.resection import Resection, explained, resected
+from structgstream.pose_check.tracks import Tracks
 
 NOISE = 0.3  # pixels
 

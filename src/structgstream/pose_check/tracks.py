@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.matching import epipolar_errors, fundamental_matrix, project, rays
-from structgstream.preparation.checking.evidence import Evidence
+from structgstream.pose_check.evidence import Evidence
 
 AGREE_PIXELS = 3.0  # of pictures up to 1000 pixels wide, in proportion above
 LEAST_VIEWS = 3

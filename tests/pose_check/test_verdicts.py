@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from evidence_made import Cameras, evidence_of, scattered, shifted, turned, wide_ring
-from structgstream.preparation.checking.verdicts import LEAST_MATCHES, Verdict, judge
+from structgstream.pose_check.verdicts import LEAST_MATCHES, Verdict, judge
 
 RIG = wide_ring(7)
 

@@ -6,8 +6,8 @@ import pytest
 
 from evidence_made import evidence_of, scattered, turned, wide_ring
 from structgstream.data.matching import project
-from structgstream.preparation.checking.evidence import Evidence
-from structgstream.preparation.checking.tracks import Tracks, build_tracks
+from structgstream.pose_check.evidence import Evidence
+from structgstream.pose_check.tracks import Tracks, build_tracks
 
 
 def truth_of(tracks: Tracks, evidence: Evidence, name: str) -> np.ndarray:
