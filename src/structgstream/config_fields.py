@@ -63,6 +63,14 @@ def constants_of(kind: Any) -> dict[str, Any]:
     return found | vars(found.pop("rules", SimpleNamespace()))
 
 
+def constant_at(kind: Any, path: str) -> Any:
+    """The constant that the field at ``path``, as ``online.motion.reach_pixels``, has become; None if there is none."""
+    name, _, rest = path.partition(".")
+    if not isinstance(kind, type) or not is_dataclass(kind):
+        return None
+    return constant_at(get_type_hints(kind).get(name), rest) if rest else constants_of(kind).get(name)
+
+
 def without_constants(kind: Any, values: Any, path: str = "", *, off: bool = False) -> Any:
     """``values`` of an earlier version without the fields that are constants of the dataclass ``kind`` now.
 

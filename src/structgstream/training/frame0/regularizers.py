@@ -175,7 +175,7 @@ class FreeSpaceConfig:
     """Removal of anchors in free space (Note [Free space]); not in the paper."""
 
     enabled: bool = False
-    """Remove them after the last iteration (paper: no)."""
+    """Remove anchors in free space after the last iteration (paper: no)."""
 
     DEPTH_SHARE: ClassVar[float] = 0.9
     """An anchor is in front of what a camera draws if its depth is below this share of the drawn depth."""

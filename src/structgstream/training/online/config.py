@@ -174,7 +174,7 @@ class ThinSpawnConfig:
     """
 
     enabled: bool = False
-    """Whether there is a second sweep."""
+    """Spawn thin content by a second sweep."""
     crowded: Literal["coarser", "none", "small-clusters"] = "none"
     """Where there would be more than 150 (``SpawnRules.crowded``). Thin content needs few Gaussians. More candidates
     mean that dynamic anchors are misplaced, as in a throw: new Gaussians in their place follow worse and cost more. A
@@ -204,7 +204,7 @@ class SpawnConfig:
     """Spawning of free Gaussians from geometry, and pruning by residuals; not in the paper."""
 
     enabled: bool = False
-    """Paper: False, free Gaussians are spawned by gradients only."""
+    """Spawn free Gaussians where content is missing (paper: False, by gradients only)."""
     most: int = 5000
     """Largest number of Gaussians that are spawned in a frame."""
     thin: ThinSpawnConfig = field(default_factory=ThinSpawnConfig)
@@ -244,7 +244,8 @@ class ExposureConfig:
     """Following the global light; not in the paper."""
 
     enabled: bool = False
-    """Follow it (paper: False); needs ``color_mlp`` in the dynamic set, of which only the output biases then change."""
+    """Follow the global light (paper: False); needs ``color_mlp`` in the dynamic set, of which only the output biases
+    then change."""
 
     PICTURE_SCALE: ClassVar[float] = 0.25
     """Scale of width and height, relative to the reference size, of the pictures that are compared."""
