@@ -17,7 +17,7 @@ from benchmarks.contest import Contestant, Quantity, Results
 from benchmarks.world import World, held_out_psnr, wall_world
 from structgstream.kernels.backend import Backend, cpu_backend
 from structgstream.presets import MOTION, PAPER
-from structgstream.training.online.config import OnlineConfig
+from structgstream.training.online.config import MotionConfig, OnlineConfig
 from structgstream.training.online.fit import fit_next_frame
 from structgstream.training.online.preprocess import preprocess
 from structgstream.training.result import FitResult
@@ -98,7 +98,11 @@ def contestants(
             _fitting("a part moves, everything fitted", here, native, everything, compared=False),
         ]
     if contest == "pictures":
-        whole = replace(motion, motion=replace(motion.motion, margin_pixels=max(width, height)))  # reaches all tiles
+
+        class WholePictures(MotionConfig):
+            MARGIN_PIXELS = max(width, height)  # reaches all tiles
+
+        whole = replace(motion, motion=WholePictures(**vars(motion.motion)))
         return [
             _fitting("following motion, whole pictures", here, native, whole),
             _fitting("following motion", here, native, motion),

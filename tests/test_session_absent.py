@@ -33,6 +33,8 @@ from structgstream.presets import PRESETS, StreamConfig
 from structgstream.scene.scene import Scene
 from structgstream.session import Session
 from structgstream.struct_gstream import stream_pipeline
+from structgstream.training.online.config import SpawnRules
+from tests.varied import varied
 from worlds import World, moving_world
 
 COMPACT = PRESETS["compact"]
@@ -51,7 +53,7 @@ CONFIG = replace(
         iterations=8,
         patching=replace(COMPACT.online.patching, iteration=4),
         motion=replace(COMPACT.online.motion, picture_scale=0.5),
-        births=replace(COMPACT.online.births, most_missing_share=1.0),
+        births=varied(COMPACT.online.births, RULES=SpawnRules(most_missing_share=1.0)),
     ),
 )
 """Everything that the preset compact does with pictures, in seconds."""

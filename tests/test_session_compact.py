@@ -28,6 +28,7 @@ from structgstream.struct_gstream import stream_pipeline
 from structgstream.training.frame0.seeding import EnvironmentConfig
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.parameters import RoundingConfig, pixel_size
+from tests.varied import varied
 from worlds import moving_world
 
 FRAMES = 4
@@ -44,10 +45,10 @@ CONFIG = replace(
         TINY_RIG.online,
         iterations=8,
         patching=replace(TINY_RIG.online.patching, iteration=4),
-        motion=MotionConfig(enabled=True, reach_pixels=1, picture_scale=1.0),
+        motion=varied(MotionConfig(enabled=True, picture_scale=1.0), REACH_PIXELS=1),
         motion_prior=0.5,
         # Eight iterations in pictures of 48 pixels do not carry an anchor further than half a common step.
-        rounding=RoundingConfig(position_pixels=0.02),
+        rounding=varied(RoundingConfig(), POSITION_PIXELS=0.02),
     ),
 )
 
@@ -162,7 +163,10 @@ def test_interrupted_at_every_frame_and_resumed_it_is_the_same_file(tmp_path: Pa
 def test_a_target_rate_is_kept_to_and_resumes_as_it_was(tmp_path: Path) -> None:
     """The target is half of what frame 2 takes without one; the pressure after it is a matter of record."""
     free = whole()[1]
-    config = replace(CONFIG, rate=RateConfig(free[2].bytes * 8 * MemoryCapture.fps / 2e6, 2 / MemoryCapture.fps))
+    config = replace(
+        CONFIG,
+        rate=varied(RateConfig(free[2].bytes * 8 * MemoryCapture.fps / 2e6), WINDOW_SECONDS=2 / MemoryCapture.fps),
+    )
     sink = MemorySink()
     reports = run(sink, config=config)
     assert [r.bytes for r in reports[:2]] == [r.bytes for r in free[:2]]
@@ -202,7 +206,9 @@ def test_a_higher_price_makes_fewer_bytes() -> None:
 
 
 def test_without_a_look_at_motion_everything_moves_f_sigma_too() -> None:
-    online = replace(CONFIG.online, motion=MotionConfig(), rounding=RoundingConfig(0.02, weight_step=1e-4))
+    online = replace(
+        CONFIG.online, motion=MotionConfig(), rounding=varied(RoundingConfig(), POSITION_PIXELS=0.02, WEIGHT_STEP=1e-4)
+    )
     run(sink := MemorySink(), config=replace(CONFIG, online=online), frames=3)
     reader = StreamReader(sink.data)
     assert "covariance_mlp" in reader.header.reference

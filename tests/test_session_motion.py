@@ -14,6 +14,7 @@ from structgstream.kernels.backend import reference_backend
 from structgstream.session import FrameReport, Session
 from structgstream.struct_gstream import stream_pipeline
 from structgstream.training.online.config import MotionConfig
+from tests.varied import varied
 from worlds import moving_world
 
 WORLD = moving_world(4, speed=0.06, movers=20)
@@ -24,7 +25,7 @@ CONFIG = replace(
         TINY_RIG.online,
         iterations=8,
         patching=replace(TINY_RIG.online.patching, iteration=4),
-        motion=MotionConfig(enabled=True, reach_pixels=1, picture_scale=1.0),
+        motion=varied(MotionConfig(enabled=True, picture_scale=1.0), REACH_PIXELS=1),
     ),
 )
 

@@ -18,6 +18,8 @@ from structgstream.frames import MultiViewFrame
 from structgstream.presets import COMPACT
 from structgstream.session import FrameReport, Session
 from structgstream.struct_gstream import stream_pipeline
+from structgstream.training.online.config import SpawnRules
+from tests.varied import varied
 from worlds import moving_world
 
 FRAMES = 4
@@ -29,8 +31,8 @@ CONFIG = replace(
     online=replace(
         COMPACT.online,
         iterations=6,
-        motion=replace(COMPACT.online.motion, reach_pixels=1),
-        births=replace(COMPACT.online.births, least_hits=2, residual_threshold=0.2),
+        motion=varied(COMPACT.online.motion, REACH_PIXELS=1),
+        births=varied(COMPACT.online.births, RULES=SpawnRules(least_hits=2, residual_threshold=0.2)),
     ),
 )
 

@@ -4,14 +4,14 @@
 import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, fields, is_dataclass
-from types import UnionType
+from types import SimpleNamespace, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from structgstream.errors import ConfigError
 
 SIGNED = frozenset({"quality", "tiles_around"})
 """Fields that may be negative."""
-SHARES = frozenset({"mean_of_last", "motion_prior", "picture_scale", "dropped_share", "until_share", "carried_share"})
+SHARES = frozenset({"mean_of_last", "motion_prior", "picture_scale", "dropped_share", "carried_share"})
 """Fields that are at most 1."""
 POSITIVE = frozenset({"picture_scale", "key_interval_seconds"})
 """Fields that must not be 0."""
@@ -55,16 +55,26 @@ def plain_value(value: Any) -> Any:
 
 
 def constants_of(kind: Any) -> dict[str, Any]:
-    """The upper-case ``ClassVar`` of a configuration class, in lower case: fields of earlier versions."""
+    """The upper-case ``ClassVar`` of a configuration class, in lower case: fields of earlier versions.
+
+    Those of a family that is one value, ``RULES``, were fields of the class too.
+    """
+    found = {name.lower(): getattr(kind, name) for name in get_type_hints(kind) if name.isupper()}
+    return found | vars(found.pop("rules", SimpleNamespace()))
+
+
+def constant_at(kind: Any, path: str) -> Any:
+    """The constant that the field at ``path``, as ``online.motion.reach_pixels``, has become; None if there is none."""
+    name, _, rest = path.partition(".")
     if not isinstance(kind, type) or not is_dataclass(kind):
-        return {}
-    return {name.lower(): getattr(kind, name) for name in get_type_hints(kind) if name.isupper()}
+        return None
+    return constant_at(get_type_hints(kind).get(name), rest) if rest else constants_of(kind).get(name)
 
 
 def without_constants(kind: Any, values: Any, path: str = "", *, off: bool = False) -> Any:
     """``values`` of an earlier version without the fields that are constants of the dataclass ``kind`` now.
 
-    In a group that is off (``enabled`` is False, or ``weight`` 0) they have no effect, and are not compared.
+    In a group that is off (``enabled`` is False, or all its numbers are 0) they have no effect, and are not compared.
 
     Raises:
         ConfigError: a field has another value than the constant.
@@ -72,10 +82,12 @@ def without_constants(kind: Any, values: Any, path: str = "", *, off: bool = Fal
     if not isinstance(values, Mapping) or not isinstance(kind, type) or not is_dataclass(kind):
         return values
     hints, constants, left = get_type_hints(kind), constants_of(kind), {}
-    off = off or values.get("enabled") is False or values.get("weight") == 0.0
+    off = off or values.get("enabled") is False or not any(values.get(item.name) for item in fields(kind))
     for name, item in values.items():
-        if name not in constants:
-            left[name] = without_constants(hints.get(name), item, f"{path}{name}.", off=off)
+        if name in hints:
+            left[name] = without_constants(hints[name], item, f"{path}{name}.", off=off)
+        elif name not in constants:
+            left[name] = item
         elif not off and not holds(constant := plain_value(constants[name]), item):
             raise ConfigError(
                 f"The header's configuration has {path}{name} = {item}, which is always {constant} in this version of "

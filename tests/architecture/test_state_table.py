@@ -9,6 +9,7 @@ import sys
 from dataclasses import fields
 from pathlib import Path
 
+from structgstream.config_fields import constants_of
 from structgstream.scene.state import PARAMETERS, STATE_TABLE
 from structgstream.training.frame0.fit import InitialRates
 from structgstream.training.online.config import OnlineRates
@@ -57,8 +58,9 @@ def test_rows_name_settings_that_there_are() -> None:
         ({p.online_rate for p in PARAMETERS}, OnlineRates),
         ({p.first_rate for p in PARAMETERS}, InitialRates),
     ):
-        assert keys - {None} <= {field.name for field in fields(config)}, config.__name__
-    assert {field.name for field in fields(OnlineRates)} - {p.online_rate for p in PARAMETERS} == {"final_share"}
+        named = {field.name for field in fields(config)} | constants_of(config).keys()
+        assert keys - {None} <= named, config.__name__
+    assert constants_of(OnlineRates).keys() == {p.online_rate for p in PARAMETERS} - {None}
     assert {field.name for field in fields(InitialRates)} == {p.first_rate for p in PARAMETERS} - {None}
 
 

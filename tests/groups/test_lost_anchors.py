@@ -8,7 +8,7 @@ import torch
 from structgstream.groups.lost_anchors import LostAnchorConfig, relocate_lost_anchors
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.scene import Scene
-from structgstream.training.online.config import MotionConfig, SpawnConfig
+from structgstream.training.online.config import MotionConfig, SpawnRules
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.views import training_views
 from worlds import moved_since, moving_world
@@ -39,8 +39,8 @@ def recalled(scene: Scene, *, config: LostAnchorConfig = CONFIG) -> tuple[torch.
         views,
         find_active_tiles(split, views, config=motion, backend=BACKEND),
         floor=None,
-        least_pixels=motion.least_pixels,
-        births=SpawnConfig(enabled=True, picture_width=96),
+        least_pixels=motion.LEAST_PIXELS,
+        births=SpawnRules(picture_width=96),
         config=config,
         backend=BACKEND,
     )

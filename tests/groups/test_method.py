@@ -163,7 +163,7 @@ def test_lower_is_half_of_the_views_and_a_quarter_of_the_births() -> None:
 
 def test_a_group_catches_up_by_thin_births_in_small_clusters_and_is_else_as_any_stream() -> None:
     found, births = catching_up(TINY), TINY.online.births
-    assert (births.thin.crowded, found.online.births.for_thin.crowded) == ("none", "small-clusters")
-    assert found.online.births.crowded == births.crowded == "coarser"
+    assert (births.thin.crowded, found.online.births.thin.rules.crowded) == ("none", "small-clusters")
+    assert found.online.births.rules.crowded == births.rules.crowded == "coarser"
     thin = replace(found.online.births.thin, crowded="none")
     assert replace(found, online=replace(found.online, births=replace(births, thin=thin))) == TINY

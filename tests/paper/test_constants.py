@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every constant of the paper's section Implementations, and the ablations as edits of one preset."""
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import pytest
 
@@ -40,13 +40,13 @@ def test_online(name: str) -> None:
     assert online.iterations == 100
     assert online.dynamic == PAPER_DYNAMIC
     rates = online.rates
-    assert (rates.anchor_positions, rates.offset_scales, rates.covariance_mlp) == (4e-4, 5e-3, 4e-3)
+    assert (rates.ANCHOR_POSITIONS, rates.OFFSET_SCALES, rates.COVARIANCE_MLP) == (4e-4, 5e-3, 4e-3)
     free = (
-        rates.free_means,
-        rates.free_log_scales,
-        rates.free_quats,
-        rates.free_logit_opacities,
-        rates.free_colors,
+        rates.FREE_MEANS,
+        rates.FREE_LOG_SCALES,
+        rates.FREE_QUATS,
+        rates.FREE_LOGIT_OPACITIES,
+        rates.FREE_COLORS,
     )
     assert free == (2e-4, 5e-3, 1e-3, 5e-2, 2.5e-3)
     assert rates.final_share == 1.0
@@ -54,14 +54,14 @@ def test_online(name: str) -> None:
 
 @pytest.mark.parametrize("name", PAPERS)
 def test_patching(name: str) -> None:
-    patching = asdict(PRESETS[name].online.patching)
-    assert patching["iteration"] == 50
-    assert patching["grad_threshold"] == 1e-3
-    assert patching["covariance_factor"] == 2.0
-    assert patching["opacity"] == 0.1
-    assert patching["prune_opacity"] == 0.005
-    assert patching["lifetime"] == "stream"
-    assert patching["spawn"] == "gradient"
+    patching = PRESETS[name].online.patching
+    assert patching.iteration == 50
+    assert patching.grad_threshold == 1e-3
+    assert patching.COVARIANCE_FACTOR == 2.0
+    assert patching.OPACITY == 0.1
+    assert patching.prune_opacity == 0.005
+    assert patching.lifetime == "stream"
+    assert patching.spawn == "gradient"
 
 
 def test_one_set_of_constants_is_printed_for_all_data_sets() -> None:

@@ -13,6 +13,7 @@ from structgstream.kernels.backend import reference_backend
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.preprocess import detect_changes
 from structgstream.training.views import View, blackened, training_views
+from tests.varied import varied
 
 RIG = arc_rig(3)
 
@@ -32,7 +33,7 @@ def changes(
     return detect_changes(
         now,
         before,
-        config=MotionConfig(change_threshold=0.1, reach_pixels=reach_pixels, picture_scale=0.5),
+        config=varied(MotionConfig(change_threshold=0.1, picture_scale=0.5), REACH_PIXELS=reach_pixels),
         backend=reference_backend(),
         flow_from=flow_from,
     )

@@ -11,6 +11,7 @@ from structgstream.training.frame0.regularizers import (
     RandomNumbers,
     perturbation_at,
 )
+from tests.varied import varied
 
 COUNT = 20_000
 
@@ -90,7 +91,7 @@ def test_the_seed_decides() -> None:
 
 
 def test_it_fades_and_ends() -> None:
-    config = PerturbationConfig(dropped_share=0.4, until_share=0.5)
+    config = varied(PerturbationConfig(dropped_share=0.4), UNTIL_SHARE=0.5)
     shares = []
     for iteration in (1, 25, 49):
         found = perturbation_at(iteration, 100, config, numbers())

@@ -24,6 +24,7 @@ from structgstream.training.frame0.quantization import (
     regauge,
 )
 from structgstream.training.parameters import RoundingConfig
+from tests.varied import varied
 
 BACKEND = reference_backend()
 RIG = arc_rig(7, width=40, height=32)
@@ -111,7 +112,7 @@ def test_the_worth_of_another_gauge_is_that_of_the_numbers_there() -> None:
 
 
 def quantized(levels: float, *, quality: float = 0.0) -> tuple[Scene, dict[FieldName, float]]:
-    config = RoundingConfig(first_noise_levels=levels, quality=quality)
+    config = varied(RoundingConfig(quality=quality), FIRST_NOISE_LEVELS=levels)
     scene, sensitivity = after()
     return quantize_first_frame(with_appearance(scene, 2), sensitivity, config=config, voxel_size=VOXEL, steps=STEPS)
 
@@ -148,7 +149,7 @@ def test_what_is_not_used_is_zero() -> None:
 def test_offsets_take_what_positions_lose() -> None:
     """On a grid of a tenth of the scene, Gaussians stay where they were."""
     scene, sensitivity = after()
-    config = RoundingConfig(first_noise_levels=0.01)
+    config = varied(RoundingConfig(), FIRST_NOISE_LEVELS=0.01)
     moved, steps = quantize_first_frame(scene, sensitivity, config=config, voxel_size=0.1, steps=STEPS)
     assert steps["anchor_positions"] == pytest.approx(0.1)
     lost = (moved.anchors.positions - scene.anchors.positions).abs()

@@ -16,21 +16,23 @@ from structgstream.training.online.config import (
     SceneFlowConfig,
     SmoothnessConfig,
     SpawnConfig,
+    SpawnRules,
 )
 from structgstream.training.online.patching import IDS_PER_FRAME
 from structgstream.training.online.preprocess import detect_changes
 from structgstream.training.parameters import RoundingConfig
 from structgstream.training.residuals import residual_floor
 from structgstream.training.views import training_views
+from tests.varied import varied
 from worlds import World, moving_world, psnr, rendered
 
 SPEED, FRAME = 0.06, 4
 MOTION = MotionConfig(enabled=True, picture_scale=0.5, residual_threshold=0.05)
 CONFIG = OnlineConfig(
-    rates=OnlineRates(anchor_positions=1e-3),
+    rates=varied(OnlineRates(), ANCHOR_POSITIONS=1e-3),
     motion=MOTION,
     start=SceneFlowConfig(enabled=True),
-    births=SpawnConfig(enabled=True, picture_width=128),
+    births=varied(SpawnConfig(enabled=True), RULES=SpawnRules(picture_width=128)),
     patching=PatchingConfig(spawn="off", iteration=4),
 )
 START = GroupStartConfig(iterations=16, rounds=2, births=40)
@@ -122,7 +124,7 @@ def test_births_of_several_rounds_have_identities_of_their_own() -> None:
     world = moving_world(FRAME + 1, cameras=6, emerges_at=1, movers=0, width=96, height=64)
     none = torch.zeros(len(world.scene.anchors) + len(world.scene.free), 3)
     motion = MotionConfig(enabled=True, picture_scale=1.0)
-    config = replace(CONFIG, motion=motion, births=SpawnConfig(enabled=True, least_hits=2))
+    config = replace(CONFIG, motion=motion, births=varied(SpawnConfig(enabled=True), RULES=SpawnRules(least_hits=2)))
     found = fit(world, none, start=replace(START, flow_rounds=0), config=config)
     births = found.scene.free.births
     assert len(births) > 0

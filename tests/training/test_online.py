@@ -22,11 +22,12 @@ from structgstream.training.online.fit import fit_next_frame
 from structgstream.training.online.patching import IDS_PER_FRAME
 from structgstream.training.online.preprocess import preprocess
 from structgstream.training.result import Step
+from tests.varied import varied
 from worlds import moving_world, psnr, rendered
 
 QUICK = OnlineConfig(
     iterations=24,
-    rates=OnlineRates(anchor_positions=2e-3),
+    rates=varied(OnlineRates(), ANCHOR_POSITIONS=2e-3),
     patching=PatchingConfig(iteration=12, grad_threshold=1e-3),
 )
 
@@ -145,7 +146,7 @@ def test_progress_is_told_after_every_iteration() -> None:
 
 FOLLOWING = replace(
     QUICK,
-    motion=MotionConfig(enabled=True, reach_pixels=1, picture_scale=1.0),
+    motion=varied(MotionConfig(enabled=True, picture_scale=1.0), REACH_PIXELS=1),
 )
 
 

@@ -13,10 +13,10 @@ from structgstream.training.online.config import ExposureConfig, OnlineConfig, O
 def test_rates_of_anchors_and_mlps_fall_within_a_frame_and_those_of_free_gaussians_stay() -> None:
     config = OnlineConfig(rates=replace(OnlineRates(), final_share=0.25))
     first, half, last = (online_rates(config, share) for share in (0.0, 0.5, 1.0))
-    assert first["anchor_positions"] == OnlineRates().anchor_positions
+    assert first["anchor_positions"] == OnlineRates.ANCHOR_POSITIONS
     assert half["anchor_positions"] == pytest.approx(0.5 * first["anchor_positions"])
     assert last["anchor_positions"] == pytest.approx(0.25 * first["anchor_positions"])
-    assert last["free_means"] == first["free_means"] == OnlineRates().free_means
+    assert last["free_means"] == first["free_means"] == OnlineRates.FREE_MEANS
     assert first.keys() == {parameter.name for row in STATE_TABLE for parameter in row.parameters}
 
 

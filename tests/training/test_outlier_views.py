@@ -10,11 +10,12 @@ from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.measure import ViewChange
 from structgstream.training.online.select import inlier_views, is_scene_cut, outlier_candidates, unrecognized_faults
 from structgstream.training.views import training_views
+from tests.varied import varied
 from worlds import moved_since, moving_world
 
 USUAL = ViewChange(changed_share=0.05, wrong_share=0.02, repeated=False)
 WORLD = moving_world(2, speed=0.06, movers=10, cameras=7)
-CONFIG = MotionConfig(enabled=True, reach_pixels=1, picture_scale=1.0)
+CONFIG = varied(MotionConfig(enabled=True, picture_scale=1.0), REACH_PIXELS=1)
 
 
 def test_usual_pictures_are_believed() -> None:

@@ -10,17 +10,18 @@ from structgstream.kernels.backend import Backend, cpu_backend, reference_backen
 from structgstream.kernels.native import native_reason
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
-from structgstream.training.online.config import MotionConfig, SpawnConfig, ThinSpawnConfig
+from structgstream.training.online.config import MotionConfig, SpawnConfig, SpawnRules, ThinSpawnConfig
 from structgstream.training.online.patching import IDS_PER_FRAME
 from structgstream.training.online.spawn import SpawnResult, prune_and_spawn
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.residuals import ResidualFloor, residual_floor
 from structgstream.training.views import training_views
+from tests.varied import varied
 from worlds import emerging_ball, moved_since, moving_world
 
 CPU = torch.device("cpu")
 WORLD = moving_world(2, cameras=6, emerges_at=1, movers=0, width=96, height=64)
-CONFIG = SpawnConfig(enabled=True, least_hits=2)
+CONFIG = varied(SpawnConfig(enabled=True), RULES=SpawnRules(least_hits=2))
 BACKENDS = [
     pytest.param(reference_backend, id="reference"),
     pytest.param(cpu_backend, id="cpu", marks=pytest.mark.skipif(native_reason() is not None, reason="no native")),
@@ -45,7 +46,7 @@ def renewed(
         first_birth=1 << 32,
         floor=residual_floor(WORLD.scene, first, scale=1.0, backend=backend) if floor is None else floor,
         room=room,
-        least_pixels=motion.least_pixels,
+        least_pixels=motion.LEAST_PIXELS,
         config=config,
         backend=backend,
     )
@@ -72,7 +73,7 @@ def test_what_emerges_before_something_that_frame_0_drew_badly_is_born_if_the_fl
     for of_view in bad.maps.values():
         of_view[16:48, 24:72] = 0.9  # Frame 0 was drawn badly in the middle, where the ball is now.
     born = [
-        len(renewed(backend, floor=bad, config=replace(CONFIG, changed_floor_medians=medians)).new_free)
+        len(renewed(backend, floor=bad, config=varied(CONFIG, CHANGED_FLOOR_MEDIANS=medians)).new_free)
         for medians in (None, 1.0)
     ]
     assert born[0] == 0
@@ -87,7 +88,11 @@ def test_where_no_picture_lacks_anything_nothing_is_drawn(monkeypatch: pytest.Mo
         return draw(*arguments, **options)
 
     monkeypatch.setattr("structgstream.training.online.spawn.draw", counting)
-    assert not len(renewed(reference_backend(), config=replace(CONFIG, missing_threshold=10.0)).new_free)
+    assert not len(
+        renewed(
+            reference_backend(), config=varied(CONFIG, RULES=replace(CONFIG.RULES, missing_threshold=10.0))
+        ).new_free
+    )
     assert not drawn
     assert len(renewed(reference_backend()).new_free)
     assert drawn, "where something is missing it is"
@@ -110,7 +115,7 @@ def test_off_nothing_is_born() -> None:
 
 
 def test_when_everything_is_missing_nothing_is_born_and_that_is_told() -> None:
-    found = renewed(reference_backend(), config=replace(CONFIG, most_missing_share=1e-4))
+    found = renewed(reference_backend(), config=varied(CONFIG, RULES=replace(CONFIG.RULES, most_missing_share=1e-4)))
     assert found.refused
     assert len(found.new_free) == 0
 
@@ -155,15 +160,18 @@ def test_a_ghost_dies() -> None:
     assert found.kept.tolist() == [False]
 
 
-BLIND = replace(CONFIG, missing_threshold=0.9)
+BLIND = varied(CONFIG, RULES=SpawnRules(least_hits=2, missing_threshold=0.9))
 """By these rules nothing is missing."""
-THIN = ThinSpawnConfig(
-    enabled=True,
-    picture_width=96,
-    missing_threshold=0.10,
-    most_contradictions=0.34,
-    most_cost=0.12,
-    least_hits=2,
+THIN = varied(
+    ThinSpawnConfig(enabled=True),
+    RULES=replace(
+        ThinSpawnConfig.RULES,
+        picture_width=96,
+        missing_threshold=0.10,
+        most_contradictions=0.34,
+        most_cost=0.12,
+        least_hits=2,
+    ),
 )
 
 
@@ -186,7 +194,9 @@ def test_the_second_sweep_bears_nothing_where_it_would_bear_more_than_thin_conte
     """In a throw everything that lags would be born, and stand where anchors belong."""
     number = len(renewed(reference_backend(), config=replace(BLIND, thin=THIN)).new_free)
     for most, born in ((number, number), (number - 1, 0)):
-        found = renewed(reference_backend(), config=replace(BLIND, thin=replace(THIN, most=most)))
+        found = renewed(
+            reference_backend(), config=replace(BLIND, thin=varied(THIN, RULES=replace(THIN.RULES, most=most)))
+        )
         assert len(found.new_free) == found.thin_count == born
         assert found.counts["thin births refused"] == number - born, "told in the log"
 
@@ -199,5 +209,5 @@ def test_a_cap_that_makes_births_coarser_is_told_in_the_log() -> None:
 
 
 def test_the_second_sweep_bears_nothing_where_much_is_missing() -> None:
-    few = replace(THIN, most_missing_share=1e-4)
+    few = varied(THIN, RULES=replace(THIN.RULES, most_missing_share=1e-4))
     assert not len(renewed(reference_backend(), config=replace(BLIND, thin=few)).new_free)

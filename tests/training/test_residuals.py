@@ -11,6 +11,7 @@ from structgstream.kernels.backend import reference_backend
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.residuals import ResidualFloor, apply_camera_color, box_mean, residual, residual_floor
 from structgstream.training.views import blackened, training_views
+from tests.varied import varied
 from worlds import moved_since, moving_world
 
 CPU = torch.device("cpu")
@@ -75,7 +76,7 @@ def test_the_floor_is_at_most_the_usual_one_where_pictures_have_changed() -> Non
 def test_slow_change_is_seen_by_the_residual_alone() -> None:
     """Between two equal pictures nothing changed, but the scene was left behind a frame ago."""
     floor = residual_floor(WORLD.scene, views(0), scale=1.0, backend=BACKEND)
-    config = MotionConfig(enabled=True, reach_pixels=1, picture_scale=1.0, residual_threshold=0.05)
+    config = varied(MotionConfig(enabled=True, picture_scale=1.0, residual_threshold=0.05), REACH_PIXELS=1)
 
     def found(threshold: float):
         wanted = replace(config, residual_threshold=threshold)
@@ -92,7 +93,7 @@ def test_what_frame_0_already_missed_does_not_count() -> None:
     wrong = replace(WORLD.scene, anchors=replace(WORLD.scene.anchors, positions=WORLD.scene.anchors.positions + 0.05))
     seen = training_views(other.frames[0], other.rig, CPU)
     floor = residual_floor(wrong, seen, scale=1.0, backend=BACKEND)
-    config = MotionConfig(enabled=True, reach_pixels=1, picture_scale=1.0, residual_threshold=0.05)
+    config = varied(MotionConfig(enabled=True, picture_scale=1.0, residual_threshold=0.05), REACH_PIXELS=1)
     assert not moved_since(wrong, seen, seen, config=config, backend=BACKEND, floor=floor).anchors.any()
     free_of_it = replace(floor, maps={index: torch.zeros_like(values) for index, values in floor.maps.items()})
     assert moved_since(wrong, seen, seen, config=config, backend=BACKEND, floor=free_of_it).anchors.any()

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
 import math
-from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ from structgstream.training.parameters import (
     pixel_size,
     round_straight_through,
 )
+from tests.varied import varied
 
 
 def test_rounding_is_drawn_and_not_felt() -> None:
@@ -56,7 +56,7 @@ def test_what_the_trainer_draws_is_what_the_codec_sends() -> None:
 
 
 def test_there_is_a_step_for_everything_that_can_change() -> None:
-    steps = RoundingConfig(position_pixels=0.5).steps(0.01)
+    steps = varied(RoundingConfig(), POSITION_PIXELS=0.5).steps(0.01)
     assert steps.keys() == {p.name for p in parameters_of(CODABLE) if p.step}
     assert steps["anchor_positions"] == steps["free_means"] == 0.005
     assert all(step > 0 for step in steps.values())
@@ -70,24 +70,14 @@ def test_one_more_of_quality_is_twice_as_fine_and_a_quarter_as_dear(quality: flo
     mlps = ("opacity_mlp", "color_mlp", "covariance_mlp")
     wanted |= dict.fromkeys(mlps, 2.0 ** (-quality / 2))
     assert ratios == pytest.approx(wanted)
-    assert {other.steps(0.01)[name] for name in mlps} == {other.resolved().first_weight_step}, "frame 0's, for its bits"
-    assert other.resolved().rate_weight == pytest.approx(3e-4 * 4.0**-quality)
+    assert {other.steps(0.01)[name] for name in mlps} == {other.at_quality("first_weight_step")}, "frame 0's"
+    assert other.resolved_rate_weight == pytest.approx(3e-4 * 4.0**-quality)
 
 
-def test_without_quality_everything_is_as_its_field_says() -> None:
-    config = RoundingConfig(log_scale_step=0.3, rate_weight=0.7)
+def test_without_quality_every_step_is_its_constant() -> None:
+    config = varied(RoundingConfig(rate_weight=0.7), LOG_SCALE_STEP=0.3)
     assert config.steps(1.0)["offset_scales"] == 0.3
-    assert config.resolved() == config
-
-
-def test_every_field_follows_the_quality() -> None:
-    plain, resolved = RoundingConfig(quality=1.0), RoundingConfig(quality=1.0).resolved()
-    assert resolved.quality == 0.0
-    assert resolved.resolved() == resolved
-    others = {field.name for field in fields(plain)} - {"quality", "rate_weight", "free_priced"}
-    first = {"first_noise_levels", "first_weight_step", "weight_step"}
-    assert all(getattr(resolved, name) == getattr(plain, name) / 2 for name in others - first)
-    assert all(getattr(resolved, name) == pytest.approx(getattr(plain, name) / 2**0.5) for name in first)
+    assert config.resolved_rate_weight == 0.7
 
 
 def test_a_pixel_is_as_large_as_it_is_seen() -> None:

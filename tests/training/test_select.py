@@ -17,10 +17,11 @@ from structgstream.training.online.select import changed_primitives
 from structgstream.training.online.split import DynamicSplit
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.views import training_views
+from tests.varied import varied
 from worlds import moved_since, moving_world
 
 CPU = torch.device("cpu")
-CONFIG = MotionConfig(enabled=True, reach_pixels=1, picture_scale=1.0)
+CONFIG = varied(MotionConfig(enabled=True, picture_scale=1.0), REACH_PIXELS=1)
 WORLD = moving_world(2, speed=0.06, movers=20)
 
 
@@ -56,9 +57,9 @@ def test_nothing_moves_between_equal_pictures() -> None:
 
 
 def test_one_view_is_not_enough() -> None:
-    config = replace(CONFIG, least_views=len(WORLD.rig.training) + 1)
+    config = varied(CONFIG, LEAST_VIEWS=len(WORLD.rig.training) + 1)
     assert not moving(config=config).anchors.any()
-    assert moving(config=replace(CONFIG, least_views=1)).anchors.sum() >= moving().anchors.sum()
+    assert moving(config=varied(CONFIG, LEAST_VIEWS=1)).anchors.sum() >= moving().anchors.sum()
 
 
 def test_each_view_tells_which_gaussians_it_shows() -> None:
@@ -74,7 +75,7 @@ def test_each_view_tells_which_gaussians_it_shows() -> None:
 
 
 def test_what_moved_before_moves_more_easily() -> None:
-    strict = replace(CONFIG, least_share=0.9, moved_ease=0.2)
+    strict = varied(replace(CONFIG, moved_ease=0.2), LEAST_SHARE=0.9)
     views, earlier = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (1, 0))
 
     def found(older: Scene | None) -> torch.Tensor:

@@ -9,7 +9,7 @@ import torch
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.color import CameraColor
 from structgstream.scene.render import draw
-from structgstream.training.online.config import SpawnConfig
+from structgstream.training.online.config import SpawnRules
 from structgstream.training.online.spawn import (
     ViewResidual,
     _merge_points,
@@ -21,7 +21,7 @@ from structgstream.training.residuals import ResidualFloor
 from structgstream.training.views import View, training_views
 from worlds import moving_world
 
-CONFIG = SpawnConfig(enabled=True)
+RULES = SpawnRules()
 WORLD = moving_world(1, width=96, height=64)
 VIEWS = training_views(WORLD.frames[0], WORLD.rig, torch.device("cpu"))
 
@@ -29,12 +29,10 @@ VIEWS = training_views(WORLD.frames[0], WORLD.rig, torch.device("cpu"))
 def test_blame_takes_two_views_and_half_of_those_that_see() -> None:
     coverage = torch.tensor([[10.0, 10, 10, 10], [10, 10, 10, 0.1], [10, 10, 10, 0.1], [10, 0, 10, 0.1]])
     wrong = torch.tensor([[6.0, 6, 6, 6], [6, 0, 6, 0.1], [0, 0, 6, 0.1], [0, 0, 0, 0.1]])
-    found = outlier_mask(coverage, wrong, least_pixels=0.3, config=CONFIG)
+    found = outlier_mask(coverage, wrong, least_pixels=0.3, rules=RULES)
     # Two of four; one of three; three of four; one, since the others do not see it.
     assert found.tolist() == [True, False, True, False]
-    assert not outlier_mask(coverage, 0.5 * coverage, least_pixels=0.3, config=CONFIG).any(), (
-        "half is not more than half"
-    )
+    assert not outlier_mask(coverage, 0.5 * coverage, least_pixels=0.3, rules=RULES).any(), "half is not more than half"
 
 
 def spoiled(view: View) -> torch.Tensor:
@@ -44,26 +42,26 @@ def spoiled(view: View) -> torch.Tensor:
     return picture
 
 
-def compared(picture: torch.Tensor, view: View, *, config: SpawnConfig, floor: ResidualFloor | None) -> ViewResidual:
+def compared(picture: torch.Tensor, view: View, *, rules: SpawnRules, floor: ResidualFloor | None) -> ViewResidual:
     color = CameraColor.identity(view.index + 1)
-    return view_residual(picture, view, color, floor=floor, config=config, backend=reference_backend())
+    return view_residual(picture, view, color, floor=floor, rules=rules, backend=reference_backend())
 
 
 def test_what_is_missing_is_what_differs_by_more_than_frame_0_did() -> None:
     view = VIEWS[1]
-    none = compared(view.colors, view, floor=None, config=CONFIG)
+    none = compared(view.colors, view, floor=None, rules=RULES)
     assert not none.wrong.any()
     assert not none.missing_share.any()
-    found = compared(spoiled(view), view, floor=None, config=CONFIG)
+    found = compared(spoiled(view), view, floor=None, rules=RULES)
     inner = (view.colors[20:32, 30:42] - 0.5).abs().mean(-1) > 0.2  # grey has no opposite
     assert found.wrong[20:32, 30:42][inner].all()
     assert not found.missing_share[:15].any()
     floor = ResidualFloor(1.0, {view.index: torch.full((64, 96), 1.0)})
-    assert not compared(spoiled(view), view, floor=floor, config=CONFIG).missing_share.any()
+    assert not compared(spoiled(view), view, floor=floor, rules=RULES).missing_share.any()
 
 
 def test_pictures_are_looked_at_in_the_width_that_is_asked_for() -> None:
-    found = compared(VIEWS[0].colors, VIEWS[0], floor=None, config=replace(CONFIG, picture_width=48))
+    found = compared(VIEWS[0].colors, VIEWS[0], floor=None, rules=replace(RULES, picture_width=48))
     assert (found.view.camera.width, found.view.camera.height) == (48, 32)
     assert found.missing_share.shape == (32, 48)
 
@@ -72,7 +70,7 @@ def test_without_anything_missing_nothing_is_born() -> None:
     views = [ViewResidual(v, torch.zeros(64, 96, dtype=torch.bool), torch.zeros(64, 96)) for v in VIEWS]
     depths = {v.index: torch.full((64, 96), 5.0) for v in VIEWS}
     color = CameraColor.identity(len(VIEWS))
-    found = spawn_by_sweep(views, depths, color, first_birth=7, config=CONFIG, backend=reference_backend())
+    found = spawn_by_sweep(views, depths, color, first_birth=7, rules=RULES, backend=reference_backend())
     assert (len(found.free), found.refused_count) == (0, 0)
 
 
@@ -84,19 +82,19 @@ def test_a_view_of_which_nothing_counts_neither_supports_nor_contradicts() -> No
     backend, color = reference_backend(), CameraColor.identity(len(views))
     without = {v.index: draw(world.scene.gaussians(v.camera, backend), v.camera, backend).image for v in views}
     depths = {v.index: torch.full((64, 96), torch.inf) for v in views}
-    config = replace(CONFIG, residual_threshold=0.05, most_contradictions=0.2, least_hits=1)
+    rules = replace(RULES, residual_threshold=0.05, most_contradictions=0.2, least_hits=1)
     floor = ResidualFloor(1.0, {v.index: torch.zeros(64, 96) for v in views})
 
     def born(last: ViewResidual) -> int:
-        found = [compared(without[v.index].clamp(0, 1), v, floor=floor, config=config) for v in views[:-1]]
-        return len(spawn_by_sweep([*found, last], depths, color, first_birth=0, config=config, backend=backend).free)
+        found = [compared(without[v.index].clamp(0, 1), v, floor=floor, rules=rules) for v in views[:-1]]
+        return len(spawn_by_sweep([*found, last], depths, color, first_birth=0, rules=rules, backend=backend).free)
 
     last = views[-1]
     silent = ViewResidual(last, torch.zeros(64, 96, dtype=torch.bool), torch.zeros(64, 96))
     masked = replace(last, mask=torch.zeros(64, 96, dtype=torch.bool), image=torch.zeros_like(last.image))
     unknown = replace(floor, maps={index: m for index, m in floor.maps.items() if index != last.index})
-    absent = compared(without[last.index].clamp(0, 1), last, floor=unknown, config=config)
-    seen = compared(without[last.index].clamp(0, 1), masked, floor=floor, config=config)
+    absent = compared(without[last.index].clamp(0, 1), last, floor=unknown, rules=rules)
+    seen = compared(without[last.index].clamp(0, 1), masked, floor=floor, rules=rules)
     assert not absent.missing_share.any()
     assert not seen.missing_share.any()
     assert born(absent) == born(seen) > born(silent)
@@ -122,8 +120,8 @@ def test_where_there_are_too_many_whole_clusters_are_born_or_none(
     crowded: str, most: int, rows: list[int], refused: int
 ) -> None:
     points = lines(4, 8, 3)
-    config = replace(CONFIG, crowded=crowded, most=most, least_hits=1)
-    found = _merge_points(points, torch.rand(15, 3), torch.ones(15), first_birth=7, config=config)
+    rules = replace(RULES, crowded=crowded, most=most, least_hits=1)
+    found = _merge_points(points, torch.rand(15, 3), torch.ones(15), first_birth=7, rules=rules)
     assert found.refused_count == refused
     assert sorted({round(float(y) / 50) for y in found.free.means[:, 1]}) == rows
     assert len(found.free) == sum((4, 8, 3)[row] for row in rows)
@@ -131,13 +129,12 @@ def test_where_there_are_too_many_whole_clusters_are_born_or_none(
 
 
 def test_where_there_are_too_many_births_are_coarser() -> None:
-    config = replace(CONFIG, crowded="coarser", most=9, least_hits=1)
-    found = _merge_points(lines(4, 8, 3), torch.rand(15, 3), torch.ones(15), first_birth=0, config=config)
+    rules = replace(RULES, crowded="coarser", most=9, least_hits=1)
+    found = _merge_points(lines(4, 8, 3), torch.rand(15, 3), torch.ones(15), first_birth=0, rules=rules)
     assert (0 < len(found.free) <= 9, found.refused_count) == (True, 0)
     assert found.merged_count == 15 - len(found.free), "a cap that binds is told"
-    assert float(found.free.log_scales.mean()) > float(torch.tensor(CONFIG.size).log())
-    unbound = replace(config, most=15)
+    assert float(found.free.log_scales.mean()) > float(torch.tensor(RULES.size).log())
+    unbound = replace(rules, most=15)
     assert (
-        _merge_points(lines(4, 8, 3), torch.rand(15, 3), torch.ones(15), first_birth=0, config=unbound).merged_count
-        == 0
+        _merge_points(lines(4, 8, 3), torch.rand(15, 3), torch.ones(15), first_birth=0, rules=unbound).merged_count == 0
     )

@@ -8,7 +8,7 @@ import torch
 
 from structgstream.kernels.backend import reference_backend
 from structgstream.kernels.values import RasterOutput
-from structgstream.training.online.config import MotionConfig, SpawnConfig
+from structgstream.training.online.config import MotionConfig, SpawnRules
 from structgstream.training.online.spawn import Sweep, missing_share
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.residuals import residual_floor
@@ -17,17 +17,17 @@ from worlds import emerging_ball, moved_since, moving_world
 
 CPU = torch.device("cpu")
 WORLD = moving_world(2, cameras=6, emerges_at=1, movers=0, width=96, height=64)
-CONFIG = SpawnConfig(enabled=True, least_hits=2)
+RULES = SpawnRules(least_hits=2)
 
 
-def sweep(config: SpawnConfig = CONFIG) -> Sweep:
+def sweep(rules: SpawnRules = RULES) -> Sweep:
     """Over the frame in which a ball emerges."""
     backend, motion = reference_backend(), MotionConfig(enabled=True, picture_scale=1.0)
     first, views = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (0, 1))
     split = DynamicSplit.of(WORLD.scene, moved_since(WORLD.scene, views, first, config=motion, backend=backend))
     active_tiles = find_active_tiles(split, views, config=motion, backend=backend)
     floor = residual_floor(WORLD.scene, first, scale=1.0, backend=backend)
-    return Sweep(split.dynamic, split.static, views, active_tiles, floor, config, backend)
+    return Sweep(split.dynamic, split.static, views, active_tiles, floor, rules, backend)
 
 
 def test_missing_is_the_ball_in_the_views_that_show_it() -> None:
@@ -80,7 +80,7 @@ def test_without_room_nothing_is_born_and_with_room_as_much_as_there_is() -> Non
     missing = swept.missing()
     assert not len(swept.births(missing, first_birth=0, room=0).free)
     assert len(swept.births(missing, first_birth=0, room=2).free) == 2
-    unsupported = sweep(replace(CONFIG, least_supports=6)).births(missing, first_birth=0, room=9)
+    unsupported = sweep(replace(RULES, least_supports=6)).births(missing, first_birth=0, room=9)
     assert not len(unsupported.free), "six others of six"
     assert not unsupported.refused_count
 

@@ -23,6 +23,7 @@ from structgstream.training.optim import gradients_of
 from structgstream.training.parameters import Parameters, parameters_of_fields
 from structgstream.training.result import Stopwatch
 from structgstream.training.views import training_views
+from tests.varied import varied
 from worlds import moving_world
 
 CPU = torch.device("cpu")
@@ -72,7 +73,7 @@ def test_what_moved_moves_and_births_stay_in_order() -> None:
 def test_active_tiles_draw_and_learn_what_the_whole_picture_would(build: Callable[[], Backend]) -> None:
     """The gradient of a step with them is that of the same step over the whole picture: to float32 rounding."""
     backend = build()
-    config = MotionConfig(enabled=True, margin_pixels=24)
+    config = varied(MotionConfig(enabled=True), MARGIN_PIXELS=24)
     split = some()
     active_tiles = find_active_tiles(split, VIEWS, config=config, backend=backend)
     trained = parameters_of_fields(PAPER_DYNAMIC.difference(SHARED_FIELDS))

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """``structgstream reconstruct``."""
 
+import shutil
+import sys
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -12,6 +14,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError, usage_errors
+from structgstream.cli.config_help import config_lines
 from structgstream.cli.live_run import LiveChoice, ending_of, open_live, run_metrics, watched
 from structgstream.cli.options import (
     CaptureOptions,
@@ -100,6 +103,7 @@ def main(arguments: list[str]) -> None:
         raise UsageError("reconstruct has no --init: a group of frames is fitted by structgstream fit-group.")
     if "--help-config" in arguments:
         _print_config(arguments)
+        return
     options, rest = parse_known_options(Reconstruct, "reconstruct", arguments=arguments)
     check_ending(options.output, ".sgs", command="reconstruct", folder=True)
     if options.resume and options.overwrite:
@@ -287,4 +291,7 @@ def _print_config(arguments: list[str]) -> None:
             preset = following
         elif argument.startswith("--preset="):
             preset = argument.removeprefix("--preset=")
-    resolve_config(preset, ["--help"], command="reconstruct SCENE -o OUT.sgs", seed=None)
+    config, name = resolve_config(preset, [], command="reconstruct", seed=None)
+    print(f"Each field of the configuration is an option of reconstruct; values are those of the preset {name!r}.\n")
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+    print("\n".join(config_lines(config, width=width)))

@@ -141,7 +141,7 @@ class _Rounds:
                 first_birth=self._first_birth(current.free),
                 floor=self.floor,
                 room=config.patching.max_free - len(split.static.free),
-                least_pixels=config.motion.least_pixels,
+                least_pixels=config.motion.LEAST_PIXELS,
                 config=config.births,
                 backend=backend,
             )
@@ -183,8 +183,8 @@ class _Rounds:
             views,
             find_active_tiles(split, views, config=config.motion, backend=fit.backend),
             floor=self.floor,
-            least_pixels=config.motion.least_pixels,
-            births=config.births,
+            least_pixels=config.motion.LEAST_PIXELS,
+            births=config.births.rules,
             config=self.start.stragglers,
             backend=fit.backend,
         )

@@ -17,7 +17,7 @@ from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.scene import Scene
 from structgstream.training.neighbours import nearest
-from structgstream.training.online.config import SpawnConfig
+from structgstream.training.online.config import SpawnRules
 from structgstream.training.online.measure import accumulate, primitive_of, sum_by_primitive
 from structgstream.training.online.spawn import outlier_mask, view_residual
 from structgstream.training.parameters import pixel_size
@@ -49,7 +49,7 @@ def relocate_lost_anchors(
     *,
     floor: ResidualFloor | None,
     least_pixels: float,
-    births: SpawnConfig,
+    births: SpawnRules,
     config: LostAnchorConfig,
     backend: Backend,
 ) -> tuple[Scene, int]:
@@ -92,7 +92,7 @@ def _wrong_anchors(
     active_tiles: Mapping[int, ActiveTiles],
     floor: ResidualFloor | None,
     least_pixels: float,
-    births: SpawnConfig,
+    births: SpawnRules,
     backend: Backend,
 ) -> Tensor:
     """Mask ``[M]`` of the anchors that are outliers in several views (``births.outlier_mask``)."""
@@ -101,7 +101,7 @@ def _wrong_anchors(
         active = active_tiles.get(view.index)
         if active is None:
             continue
-        found = view_residual(active.picture, view, dynamic.camera_color, floor=floor, config=births, backend=backend)
+        found = view_residual(active.picture, view, dynamic.camera_color, floor=floor, rules=births, backend=backend)
         small = found.view
         pixels = found.wrong.to(active.picture)
         counting = torch.ones_like(pixels) if small.mask is None else small.mask.to(pixels)
@@ -113,7 +113,7 @@ def _wrong_anchors(
         wrong.append(sums[: len(dynamic.anchors), 1])
     if not coverage:
         return torch.zeros(len(dynamic.anchors), dtype=torch.bool, device=dynamic.anchors.positions.device)
-    return outlier_mask(torch.stack(coverage), torch.stack(wrong), least_pixels=least_pixels, config=births)
+    return outlier_mask(torch.stack(coverage), torch.stack(wrong), least_pixels=least_pixels, rules=births)
 
 
 def _displacements_of_neighbours(

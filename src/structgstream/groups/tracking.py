@@ -118,7 +118,7 @@ class Tracker:
         taken = [views[n] for n in chosen]
         motion = replace(
             self.motion,
-            reach_pixels=max(1, round(self.motion.reach_pixels * self.config.scale)),
+            reach_pixels=max(1, round(self.motion.REACH_PIXELS * self.config.scale)),
             picture_scale=self.config.picture_scale,
         )
         indices = [view.index for view in taken]
@@ -171,7 +171,7 @@ def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tra
             votes = torch.stack([entry.votes for entry in seen]).sum(0)
             # What moved goes on as long as one camera sees it: not all that see it are used in every frame.
             goes_on = (past.velocities != 0).any(1) & (votes > 0)
-            moving = (votes >= tracker.motion.least_views) | goes_on
+            moving = (votes >= tracker.motion.LEAST_VIEWS) | goes_on
             moving[: len(scene.anchors)] |= _occluded(tracker.motion, scene, seen, moving[: len(scene.anchors)])
             primitives = moving.nonzero()[:, 0]
         with watch.stage("flow between pictures"):
@@ -230,7 +230,7 @@ def _seen(tracker: Tracker, scene: Scene, view: View, change: PictureChange) -> 
     sums *= _enlarged(tracker, view, size)
     moved = sum_by_primitive(sums, primitives, scene)
     total, changed = moved[:, 3], moved[:, 7]
-    votes = (changed > motion.least_pixels) & (changed > motion.least_share * total)
+    votes = (changed > motion.LEAST_PIXELS) & (changed > motion.LEAST_SHARE * total)
     of_view = ViewChange(float(change.changed.float().mean()), 0.0, repeated=change.repeated)
     return _Seen(view, tiles, gaussians, primitives, votes, sums[:, 3], moved[:, :7], of_view)
 
@@ -252,10 +252,10 @@ def _occluded(motion: MotionConfig, scene: Scene, seen: Sequence[_Seen], moving:
         of_view = torch.zeros(len(entry.votes), dtype=torch.bool, device=moving.device)
         of_view[entry.primitives] = True
         drawn += of_view[:anchors]
-        shown += entry.flows[:anchors, 3] > motion.least_pixels
-    among = ((drawn >= motion.least_views) | (shown >= motion.least_views)).nonzero()[:, 0]
+        shown += entry.flows[:anchors, 3] > motion.LEAST_PIXELS
+    among = ((drawn >= motion.LEAST_VIEWS) | (shown >= motion.LEAST_VIEWS)).nonzero()[:, 0]
     occluded[among] = occluded_dynamic(
-        scene.anchors.positions[among], moving[among], shown[among] >= motion.least_views, share=motion.carried_share
+        scene.anchors.positions[among], moving[among], shown[among] >= motion.LEAST_VIEWS, share=motion.carried_share
     )
     return occluded
 

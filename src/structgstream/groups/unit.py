@@ -148,7 +148,7 @@ def _run(
 def _entry(start: TrackStart, base: GroupBase, source: FrameSource) -> GroupEntry:
     displacements, velocities = dense(base.scene(), start, step=base.position_step)
     # Tracking is not as exact as that: what it moved by less has probably not moved, and keeps frame 0's bits.
-    least = LEAST_PIXELS / base.config.online.rounding.resolved().position_pixels * base.position_step
+    least = LEAST_PIXELS / base.config.online.rounding.at_quality("position_pixels") * base.position_step
     displacements[(displacements.abs() <= least).all(1)] = 0.0
 
     @cache

@@ -39,7 +39,7 @@ class LossWeights:
     volume: float = 0.01
     """On the product of each drawn Gaussian's scales, the paper's lambda_vol (0.01)."""
     volume_reduction: Literal["mean", "sum"] = "mean"
-    """The paper's equation is a sum, Scaffold-GS takes the mean (docs/method.md has both measured)."""
+    """Reduction of L_vol: the paper's equation is a sum, Scaffold-GS takes the mean (docs/method.md)."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,10 @@ class InitialLossWeights(LossWeights):
     offset_distance: float = 0.005
     """On L_dist, the paper's lambda_dist (0.005)."""
     offset_distance_reduction: Literal["mean", "sum"] = "mean"
-    """The paper's equation is a sum over anchors and offsets."""
+    """Reduction of L_dist: the paper's equation is a sum over anchors and offsets."""
     offset_distance_reading: Literal["scaled", "raw", "norm"] = "scaled"
-    """Compared with 2 eps: ``scaled`` each component of |O * l_v|, ``raw`` of |O|, ``norm`` the norm of O * l_v."""
+    """What L_dist compares with 2 eps: ``scaled`` each component of |O * l_v|, ``raw`` of |O|, ``norm`` the norm of
+    O * l_v."""
 
 
 def volume(scales: Tensor, opacities: Tensor, *, reduction: Literal["mean", "sum"], backend: Backend) -> Tensor:

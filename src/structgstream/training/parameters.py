@@ -9,8 +9,8 @@ integers and errors do not accumulate. The rate term is what changes of bins sin
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, Final
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Final
 
 import torch
 from torch import Tensor
@@ -62,57 +62,57 @@ def round_all_straight_through(values: Sequence[Tensor], steps: Sequence[float])
     return _RoundStraightThrough.apply([*steps], *values) if values else ()  # type: ignore[return-value]
 
 
-# The quality multiplies a field of RoundingConfig by 2^(-quality * share); the share is 1 unless stated. For frame 0 it
-# is 0.5, because its errors affect every later frame and its bytes are sent once. Fields that are no steps have 0.
-_HALF_SHARE = {"quality_share": 0.5}
-_NO_STEP = {"quality_share": 0.0}
-
-
 @dataclass(frozen=True)
 class RoundingConfig:
-    """Quantization steps and price of bits for the codec ``compact``; not in the paper."""
+    """Quantization steps and weight of the rate term for the codec ``compact``; not in the paper."""
 
-    position_pixels: float = 0.25
-    """Step of positions of anchors and free Gaussians, in pixels of a median camera at a median distance
-    (:func:`pixel_size`)."""
-    log_scale_step: float = 0.02
-    """Step of the logarithms of anchors' scales."""
-    appearance_step: float = 1 / 16
-    """Step of appearance, in standard deviations of the features along a row of the basis."""
-    weight_step: float = field(default=1 / 1024, metadata=_HALF_SHARE)
-    """Step of the MLPs' weights after frame 0: that of frame 0, so that its weights stay as they are."""
-    free_log_scale_step: float = 0.05
-    """Step of the logarithms of free Gaussians' scales."""
-    free_quat_step: float = 1 / 64
-    """Step of the components of free Gaussians' quaternions."""
-    free_logit_opacity_step: float = 0.125
-    """Step of the logits of free Gaussians' opacities."""
-    free_color_step: float = 1 / 128
-    """Step of free Gaussians' colours, full scale 1."""
-    first_noise_levels: float = field(default=0.5, metadata=_HALF_SHARE)
-    """Root mean square error that quantizing frame 0 may add to the pictures, in 8-bit levels."""
-    first_weight_step: float = field(default=1 / 1024, metadata=_HALF_SHARE)
-    """Step of the MLPs' weights in frame 0."""
-    rate_weight: float = field(default=7.5e-5, metadata=_NO_STEP)
+    rate_weight: float = 7.5e-5
     """What a kilobyte of changes adds to the loss."""
-    free_priced: bool = field(default=False, metadata=_NO_STEP)
+    free_priced: bool = False
     """Whether bits of free Gaussians that existed in the last frame are priced too."""
-    quality: float = field(default=0.0, metadata=_NO_STEP)
+    quality: float = 0.0
     """Steps are multiplied by 2^-quality and ``rate_weight`` by 4^-quality; frame 0's steps and those of MLPs by
     2^(-quality / 2)."""
 
-    def resolved(self) -> "RoundingConfig":
-        """The configuration with the quality applied to the other fields and set to 0."""
-        shares = {f.name: f.metadata.get("quality_share", 1.0) for f in fields(self)}
-        finer = {name: getattr(self, name) * 2.0 ** (-self.quality * share) for name, share in shares.items() if share}
-        # Errors grow with the square of a step.
-        return replace(self, **finer, rate_weight=self.rate_weight * 4.0**-self.quality, quality=0.0)
+    POSITION_PIXELS: ClassVar[float] = 0.25
+    """Step of positions of anchors and free Gaussians, in pixels of a median camera at a median distance
+    (:func:`pixel_size`)."""
+    LOG_SCALE_STEP: ClassVar[float] = 0.02
+    """Step of the logarithms of anchors' scales."""
+    APPEARANCE_STEP: ClassVar[float] = 1 / 16
+    """Step of appearance, in standard deviations of the features along a row of the basis."""
+    WEIGHT_STEP: ClassVar[float] = 1 / 1024
+    """Step of the MLPs' weights after frame 0: that of frame 0, so that its weights stay as they are."""
+    FREE_LOG_SCALE_STEP: ClassVar[float] = 0.05
+    """Step of the logarithms of free Gaussians' scales."""
+    FREE_QUAT_STEP: ClassVar[float] = 1 / 64
+    """Step of the components of free Gaussians' quaternions."""
+    FREE_LOGIT_OPACITY_STEP: ClassVar[float] = 0.125
+    """Step of the logits of free Gaussians' opacities."""
+    FREE_COLOR_STEP: ClassVar[float] = 1 / 128
+    """Step of free Gaussians' colours, full scale 1."""
+    FIRST_NOISE_LEVELS: ClassVar[float] = 0.5
+    """Root mean square error that quantizing frame 0 may add to the pictures, in 8-bit levels."""
+    FIRST_WEIGHT_STEP: ClassVar[float] = 1 / 1024
+    """Step of the MLPs' weights in frame 0."""
+    HALF_QUALITY: ClassVar[frozenset[str]] = frozenset({"first_noise_levels", "first_weight_step", "weight_step"})
+    """These follow half of the quality, because errors of frame 0 affect every later frame and its bytes are sent
+    once."""
+
+    def at_quality(self, name: str) -> float:
+        """The constant of this name, in lower case, multiplied by 2^-quality, or 2^(-quality / 2)."""
+        share = 0.5 if name in self.HALF_QUALITY else 1.0
+        return getattr(self, name.upper()) * 2.0 ** (-self.quality * share)
+
+    @property
+    def resolved_rate_weight(self) -> float:
+        """``rate_weight`` at the quality: errors grow with the square of a step."""
+        return self.rate_weight * 4.0**-self.quality
 
     def steps(self, pixel: float) -> dict[ParameterName, float]:
         """The step of every dynamic parameter; ``pixel`` is the size of a pixel in scene units (:func:`pixel_size`)."""
-        plain = self.resolved()
         units = {"position_pixels": pixel}
-        return {p.name: getattr(plain, p.step) * units.get(p.step, 1.0) for p in PARAMETERS if p.step}
+        return {p.name: self.at_quality(p.step) * units.get(p.step, 1.0) for p in PARAMETERS if p.step}
 
 
 def pixel_size(positions: Tensor, cameras: Iterable[Camera]) -> float | None:

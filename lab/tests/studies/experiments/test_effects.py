@@ -57,7 +57,6 @@ def test_what_the_switches_are() -> None:
     assert whole.start.enabled
     assert not online["compact-without-start"].start.enabled
     assert (whole.start.rounds, online["compact-one-round"].start.rounds) == (2, 1)
-    assert online["compact-colors-alike"].start.lift.color_bandwidth == 0.0 < whole.start.lift.color_bandwidth
     assert online["compact-without-residuals"].motion.residual_threshold == 0.0 < whole.motion.residual_threshold
     assert whole.rounding.free_priced
     assert not online["compact-free-unpriced"].rounding.free_priced

@@ -42,11 +42,15 @@ class InitialRates:
     offsets: tuple[float, float] = (0.01, 1e-4)
     """Of O_v, times 1.1 rig radii, as in Scaffold-GS."""
     features: tuple[float, float] = (0.0075, 0.0075)
+    """Of f_v."""
     scales: tuple[float, float] = (0.007, 0.007)
     """Of both scales of an anchor, in log space."""
     opacity_mlp: tuple[float, float] = (0.002, 2e-5)
+    """Of F_alpha."""
     covariance_mlp: tuple[float, float] = (0.004, 0.004)
+    """Of F_Sigma."""
     color_mlp: tuple[float, float] = (0.008, 5e-5)
+    """Of F_c."""
     camera_color: tuple[float, float] = (0.002, 1e-4)
     """Of gains and biases; unused without ``camera_color``."""
 

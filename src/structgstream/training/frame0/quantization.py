@@ -152,7 +152,7 @@ def quantize_first_frame(
         voxel_size: the grid of the anchors.
         steps: quantization steps of the later frames, for dynamic fields.
     """
-    plain, state = config.resolved(), state_of(scene)
+    state = state_of(scene)
     used = sensitivity.used[..., None].expand_as(state["anchor_offsets"])
     counted = {"anchor_offsets": used}
     numbers = sum(
@@ -160,7 +160,7 @@ def quantize_first_frame(
         for name, sensitivities in sensitivity.fields.items()
     )
     # A quantization error has the variance step^2 / 12; all values contribute equally.
-    most = plain.first_noise_levels / 255.0 * (12.0 / max(numbers, 1)) ** 0.5
+    most = config.at_quality("first_noise_levels") / 255.0 * (12.0 / max(numbers, 1)) ** 0.5
     found: dict[FieldName, float] = {"anchor_positions": float32(voxel_size)}
     state["anchor_positions"] = round_straight_through(state["anchor_positions"], found["anchor_positions"])
     shown = state["anchor_positions"]
@@ -177,7 +177,7 @@ def quantize_first_frame(
     for name in state.keys() - found.keys():
         row = FIELDS[name]
         if row.init_coding != "uncoded" and (key := row.init_step or row.step) not in (None, "own"):
-            step = getattr(plain, key) if row.init_step else steps.get(name, getattr(plain, key))
+            step = config.at_quality(key) if row.init_step else steps.get(name, config.at_quality(key))
             found[name] = float32(step)
             state[name] = round_straight_through(state[name], found[name])
     return scene_of(state, distance_input=scene.distance_input, sampling=scene.sampling), found

@@ -46,7 +46,8 @@ class PerturbationConfig:
     """Share of the Gaussians dropped in an iteration; the others' opacities are scaled up accordingly (paper: 0)."""
     noise_scales: float = 0.0
     """Standard deviation of normal noise on the means, in units of each Gaussian's own scale (paper: 0)."""
-    until_share: float = 1.0
+
+    UNTIL_SHARE: ClassVar[float] = 0.7
     """Both decrease linearly to 0 at this share of the iterations."""
 
 
@@ -114,7 +115,7 @@ def perturbation_at(
     iteration: int, iterations: int, config: PerturbationConfig, numbers: RandomNumbers
 ) -> Perturbation | None:
     """The perturbation of ``iteration`` of ``iterations``; None for none."""
-    strength = 1.0 - iteration / max(1.0, iterations * config.until_share)
+    strength = 1.0 - iteration / max(1.0, iterations * config.UNTIL_SHARE)
     if strength <= 0.0 or not (config.dropped_share or config.noise_scales):
         return None
     return Perturbation(config, numbers, strength=strength)
@@ -174,7 +175,7 @@ class FreeSpaceConfig:
     """Removal of anchors in free space (Note [Free space]); not in the paper."""
 
     enabled: bool = False
-    """Remove them after the last iteration (paper: no)."""
+    """Remove anchors in free space after the last iteration (paper: no)."""
 
     DEPTH_SHARE: ClassVar[float] = 0.9
     """An anchor is in front of what a camera draws if its depth is below this share of the drawn depth."""

@@ -2,7 +2,7 @@
 """Configuration of the frames after the first: the paper's method, and what goes beyond it."""
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 from structgstream.errors import ConfigError
 from structgstream.scene.state import (
@@ -33,7 +33,7 @@ class FlowConfig:
     def __post_init__(self) -> None:
         if self.finest_level < 0 or self.least_width < 0:
             raise ConfigError(
-                f"online.start.flow has finest level {self.finest_level} and least width {self.least_width}; "
+                f"The flow search has finest level {self.finest_level} and least width {self.least_width}; "
                 "expected neither below 0."
             )
 
@@ -62,29 +62,30 @@ class MotionConfig:
     (full scale 1) exceeds this; above the sensors' noise."""
     residual_threshold: float = 0.0
     """A pixel has also changed if its residual exceeds frame 0's by this (full scale 1). 0: residuals are not used."""
-    reach_pixels: int = 3
-    """Changed pixels are dilated by this many pixels."""
-    least_pixels: float = 0.3
-    """Least number of changed pixels, summed by blending weight, that a primitive covers in a view to get its vote."""
-    least_share: float = 0.3
-    """Least share of changed pixels among all that a primitive covers in a view to get its vote."""
-    least_views: int = 2
-    """Least number of votes of a primitive that is trained: two, because one view may have changed by noise."""
     moved_ease: float = 1.0
     """Factor (hysteresis) on the thresholds of pixels and shares for primitives that the last frame changed. 1:
     none."""
     carried_share: float = 0.0
-    """An anchor that fewer than ``least_views`` views show is trained if at least this share of its nearest shown ones
+    """An anchor that fewer than ``LEAST_VIEWS`` views show is trained if at least this share of its nearest shown ones
     is: it lies in or behind what moves. 0: none."""
     picture_scale: float = 0.25
     """Scale of width and height, relative to the reference size, of the pictures on which coverage is computed."""
-    margin_pixels: int = 8
-    """Tiles within this many pixels of dynamic Gaussians are drawn too, so that these get gradients where they move."""
     rest_every: int = 1
     """Unchanged tiles are rendered only in every n-th iteration of a view. 1: always."""
     tiles_around: int = -1
     """Tiles (16 pixels) farther than this many tiles from one in which something has changed are not drawn, though
     dynamic Gaussians reach them. -1: all are."""
+
+    REACH_PIXELS: ClassVar[int] = 3
+    """Changed pixels are dilated by this many pixels."""
+    LEAST_PIXELS: ClassVar[float] = 0.3
+    """Least number of changed pixels, summed by blending weight, that a primitive covers in a view to get its vote."""
+    LEAST_SHARE: ClassVar[float] = 0.3
+    """Least share of changed pixels among all that a primitive covers in a view to get its vote."""
+    LEAST_VIEWS: ClassVar[int] = 2
+    """Least number of votes of a primitive that is trained: two, because one view may have changed by noise."""
+    MARGIN_PIXELS: ClassVar[int] = 8
+    """Tiles within this many pixels of dynamic Gaussians are drawn too, so that these get gradients where they move."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.carried_share <= 1.0:
@@ -119,63 +120,37 @@ class SceneFlowConfig:
     views: int = 12
     """Approximate upper bound of the views in which flow is estimated and what is missing is looked for; of more views
     every second or third, in turn."""
-    flow: FlowConfig = FlowConfig()
+
+    FLOW: ClassVar[FlowConfig] = FlowConfig(apart=True, far=True)
     """How flow is searched."""
-    lift: LiftConfig = field(default_factory=LiftConfig)
+    LIFT: ClassVar[LiftConfig] = LiftConfig()
+    """How displacements are fitted to it."""
 
 
 @dataclass(frozen=True)
-class ThinSpawnConfig:
-    """A second sweep for thin, faint content such as a stream of water, in frames in which the first spawns nothing.
+class SpawnRules:
+    """Thresholds of one sweep for missing content, by which free Gaussians are spawned and pruned."""
 
-    Its fields replace those of the same names of :class:`SpawnConfig`: finer pictures, every ray, lower thresholds. By
-    these rules something large would become many small Gaussians, which follow it worse than few large ones and cost
-    more.
-    """
-
-    enabled: bool = False
-    picture_width: int = 480
-    missing_threshold: float = 0.04
-    pixel_step: int = 1
-    most_contradictions: float = 0.5
-    most_cost: float = 0.2
-    least_hits: int = 3
-    most: int = 150
-    crowded: Literal["coarser", "none", "small-clusters"] = "none"
-    """Thin content needs few Gaussians. More candidates mean that dynamic anchors are misplaced, as in a throw: new
-    Gaussians in their place follow worse and cost more. A group of frames that is fitted separately lacks what earlier
-    frames would have spawned: its first frames spawn what lies in small clusters."""
-    most_missing_share: float = 0.02
-    """Of the pictures 0.0005 lack something where a pitcher pours. More is light that changed."""
-
-
-@dataclass(frozen=True)
-class SpawnConfig:
-    """Spawning of free Gaussians from geometry, and pruning by residuals; not in the paper."""
-
-    enabled: bool = False
-    """Paper: False, free Gaussians are spawned by gradients only."""
     picture_width: int = 320
     """Pictures are reduced to at most this width, pixels."""
     residual_threshold: float = 0.10
     """Residual, 0 to 1, above which a pixel counts as wrong."""
     missing_threshold: float = 0.10
     """Excess of the residual over frame 0's, 0 to 1, above which a pixel counts as missing."""
-    changed_floor_medians: float | None = None
-    """Where a picture has changed, frame 0's residual, which was of other content, counts as at most this many medians
-    of its view's. None: all of it counts, as it does in the sweep for thin content."""
     pixel_step: int = 2
     """Distance in pixels, across and down, between missing pixels whose rays are swept."""
     planes: int = 48
+    """Number of depths of a ray."""
     least_supports: int = 2
     """Least number of other views that support a point: there a missing pixel lies at its projection."""
     most_contradictions: float = 0.34
     """Largest share of contradicting views, which would see the point but miss nothing, among those that can judge."""
     most_cost: float = 0.12
+    """Largest mean colour difference of the supporting views, 0 to 1."""
     least_hits: int = 4
-    """Least number of ray points within 1.8 voxels for a birth."""
+    """Least number of ray points within 1.8 voxels of a new Gaussian."""
     most: int = 5000
-    """Largest number of births per frame: more than who walks in needs, since below that number all of it is haze."""
+    """Largest number of new Gaussians: more than who walks in needs, since below that number all of it is haze."""
     crowded: Literal["coarser", "none", "small-clusters"] = "coarser"
     """Where there would be more than ``most``: Gaussians in larger voxels, none, or those in the smallest clusters."""
     most_missing_share: float = 0.25
@@ -183,16 +158,67 @@ class SpawnConfig:
     size: float = 0.7
     """Standard deviation of a new Gaussian, in units of the distance between neighbouring swept rays."""
     opacity: float = 0.7
+    """Of a new Gaussian."""
     blame_share: float = 0.5
     """A free Gaussian is an outlier in a view if more than this share of its pixels is wrong."""
     blame_views: int = 2
     """A free Gaussian is removed if it is an outlier in at least this many views and in half of those that show it."""
-    thin: ThinSpawnConfig = field(default_factory=ThinSpawnConfig)
+
+
+@dataclass(frozen=True)
+class ThinSpawnConfig:
+    """A second sweep for thin, faint content such as a stream of water, in frames in which the first spawns nothing.
+
+    Its rules are finer pictures, every ray, lower thresholds. By them something large would become many small
+    Gaussians, which follow it worse than few large ones and cost more.
+    """
+
+    enabled: bool = False
+    """Spawn thin content by a second sweep."""
+    crowded: Literal["coarser", "none", "small-clusters"] = "none"
+    """Where there would be more than 150 (``SpawnRules.crowded``). Thin content needs few Gaussians. More candidates
+    mean that dynamic anchors are misplaced, as in a throw: new Gaussians in their place follow worse and cost more. A
+    group of frames that is fitted separately lacks what earlier frames would have spawned: its first frames spawn what
+    lies in small clusters."""
+
+    RULES: ClassVar[SpawnRules] = SpawnRules(
+        picture_width=480,
+        missing_threshold=0.04,
+        pixel_step=1,
+        most_contradictions=0.5,
+        most_cost=0.2,
+        least_hits=3,
+        most=150,
+        most_missing_share=0.02,
+    )
+    """Of the pictures 0.0005 lack something where a pitcher pours; more than 0.02 is light that changed."""
 
     @property
-    def for_thin(self) -> "SpawnConfig":
+    def rules(self) -> SpawnRules:
         """The rules of the second sweep."""
-        return replace(self, **vars(self.thin))
+        return replace(self.RULES, crowded=self.crowded)
+
+
+@dataclass(frozen=True)
+class SpawnConfig:
+    """Spawning of free Gaussians from geometry, and pruning by residuals; not in the paper."""
+
+    enabled: bool = False
+    """Spawn free Gaussians where content is missing (paper: False, by gradients only)."""
+    most: int = 5000
+    """Largest number of Gaussians that are spawned in a frame."""
+    thin: ThinSpawnConfig = field(default_factory=ThinSpawnConfig)
+
+    RULES: ClassVar[SpawnRules] = SpawnRules()
+    """Of the first sweep."""
+    CHANGED_FLOOR_MEDIANS: ClassVar[float | None] = 1.0
+    """Where a picture has changed, frame 0's residual, which was of other content, counts as at most this many medians
+    of its view's. None: all of it counts, as it does in the sweep for thin content."""
+
+    @property
+    def rules(self) -> SpawnRules:
+        """The rules of the first sweep."""
+        return replace(self.RULES, most=self.most)
 
 
 @dataclass(frozen=True)
@@ -201,24 +227,16 @@ class SmoothnessConfig:
 
     weight: float = 0.0
     """Weight in the loss of the mean difference of displacement from the neighbours, pixels (paper: 0, none)."""
-    neighbours: int = 8
+
+    NEIGHBOURS: ClassVar[int] = 8
     """Number of nearest moving anchors that an anchor is compared with."""
-    bandwidth: float = 0.7
+    BANDWIDTH: ClassVar[float] = 0.7
     """Standard deviation of the Gaussian weight of a neighbour by distance, relative to the farthest neighbour's."""
-    feature_bandwidth: float = 1.0
+    FEATURE_BANDWIDTH: ClassVar[float] = 1.0
     """Standard deviation of the Gaussian weight of a neighbour by the root mean square difference of features, in their
     standard deviations. 0: no weight by features."""
-    slack_pixels: float = 0.25
+    SLACK_PIXELS: ClassVar[float] = 0.25
     """Differences far below this cost in proportion to their square, those far above it to their length."""
-
-    def __post_init__(self) -> None:
-        least_of_two = min(self.weight, self.feature_bandwidth)
-        if least_of_two < 0.0 or self.neighbours < 1 or self.bandwidth <= 0.0 or self.slack_pixels <= 0.0:
-            raise ConfigError(
-                f"online.coherence has weight {self.weight:g}, {self.neighbours} neighbours, bandwidth "
-                f"{self.bandwidth:g}, feature bandwidth {self.feature_bandwidth:g} and slack {self.slack_pixels:g}; "
-                "expected a weight and a feature bandwidth of at least 0, at least one neighbour, the others above 0."
-            )
 
 
 @dataclass(frozen=True)
@@ -226,18 +244,20 @@ class ExposureConfig:
     """Following the global light; not in the paper."""
 
     enabled: bool = False
-    """Follow it (paper: False); needs ``color_mlp`` in the dynamic set, of which only the output biases then change."""
-    picture_scale: float = 0.25
+    """Follow the global light (paper: False); needs ``color_mlp`` in the dynamic set, of which only the output biases
+    then change."""
+
+    PICTURE_SCALE: ClassVar[float] = 0.25
     """Scale of width and height, relative to the reference size, of the pictures that are compared."""
-    same_threshold: float = 0.03
+    SAME_THRESHOLD: ClassVar[float] = 0.03
     """Largest mean difference over the channels (full scale 1), beyond the light followed so far, of a pixel that shows
     the same as in frame 0."""
-    least_share: float = 0.2
+    LEAST_SHARE: ClassVar[float] = 0.2
     """Least share of such pixels, weighted by what they tell (black and white ones little), in a view that counts."""
-    least_change: float = 1 / 256
+    LEAST_CHANGE: ClassVar[float] = 1 / 256
     """Smallest change of a bias that is followed at first, at most a quarter of an 8-bit level: flicker below it costs
     no bits."""
-    least_further_change: float = 1 / 1024
+    LEAST_FURTHER_CHANGE: ClassVar[float] = 1 / 1024
     """Smallest change of a bias that is made once the light differs from that of frame 0."""
 
 
@@ -253,10 +273,6 @@ class PatchingConfig:
     """The paper's tau_grad (0.001), on the mean view-space gradient in NDC (Note [View-space units])."""
     collect_from: int = 0
     """Iteration of the frame after which gradients are averaged (paper: not stated)."""
-    covariance_factor: float = 2.0
-    """Factor on the covariance from which a child's mean is drawn, N(mu, factor * Sigma) (paper: 2)."""
-    opacity: float = 0.1
-    """Opacity at birth (paper: 0.1)."""
     prune_opacity: float | None = 0.005
     """Free Gaussians of less opacity are removed before spawning (paper: 0.005); None: no pruning, the paper's "w/o
     quantity control"."""
@@ -265,28 +281,34 @@ class PatchingConfig:
     max_free: int = 1_000_000
     """Largest number of free Gaussians; parents with the largest gradients are taken first (paper: no bound)."""
 
+    COVARIANCE_FACTOR: ClassVar[float] = 2.0
+    """Factor on the covariance from which a child's mean is drawn, N(mu, factor * Sigma) (paper: 2)."""
+    OPACITY: ClassVar[float] = 0.1
+    """Opacity at birth (paper: 0.1)."""
+
 
 @dataclass(frozen=True)
 class OnlineRates:
     """Learning rates of online frames (values of the paper, section Implementations), in normalised units."""
 
-    anchor_positions: float = 4e-4
-    offset_scales: float = 5e-3
-    covariance_mlp: float = 4e-3
-    free_means: float = 2e-4
-    free_log_scales: float = 5e-3
-    free_quats: float = 1e-3
-    free_logit_opacities: float = 5e-2
-    free_colors: float = 2.5e-3
-    base_scales: float = 5e-3
-    """This and the following are used only if the field is in the dynamic set (not in the paper)."""
-    anchor_offsets: float = 1e-3
-    anchor_features: float = 2.5e-3
-    appearance: float = 2e-2
-    opacity_mlp: float = 2e-3
-    color_mlp: float = 4e-3
     final_share: float = 1.0
     """Learning rates of anchors and MLPs decay log-linearly to this share within a frame (paper: 1, constant)."""
+
+    ANCHOR_POSITIONS: ClassVar[float] = 4e-4
+    OFFSET_SCALES: ClassVar[float] = 5e-3
+    COVARIANCE_MLP: ClassVar[float] = 4e-3
+    FREE_MEANS: ClassVar[float] = 2e-4
+    FREE_LOG_SCALES: ClassVar[float] = 5e-3
+    FREE_QUATS: ClassVar[float] = 1e-3
+    FREE_LOGIT_OPACITIES: ClassVar[float] = 5e-2
+    FREE_COLORS: ClassVar[float] = 2.5e-3
+    BASE_SCALES: ClassVar[float] = 5e-3
+    """This and the following are used only if the field is in the dynamic set (not in the paper)."""
+    ANCHOR_OFFSETS: ClassVar[float] = 1e-3
+    ANCHOR_FEATURES: ClassVar[float] = 2.5e-3
+    APPEARANCE: ClassVar[float] = 2e-2
+    OPACITY_MLP: ClassVar[float] = 2e-3
+    COLOR_MLP: ClassVar[float] = 4e-3
 
 
 @dataclass(frozen=True)
@@ -336,6 +358,6 @@ def online_rates(config: OnlineConfig, share: float) -> dict[ParameterName, floa
     rates: dict[ParameterName, float] = {}
     for row in STATE_TABLE:
         for parameter in row.parameters:
-            rate = getattr(config.rates, parameter.online_rate) if parameter.online_rate else 0.0
+            rate = getattr(config.rates, parameter.online_rate.upper()) if parameter.online_rate else 0.0
             rates[parameter.name] = rate if row.granularity == "free" else rate * falling
     return rates

@@ -13,7 +13,7 @@ F_c's colours are c = sigmoid(x), so a change d of the biases changes a picture 
 leaves out cameras that correct their own exposure. The fit is against the pictures of frame 0, not against renderings
 or the last frame, so errors do not accumulate and renderings' own errors do not enter.
 
-Where the light is steady, the estimate still wavers by up to half of ``least_change``, and what would follow that
+Where the light is steady, the estimate still wavers by up to half of ``LEAST_CHANGE``, and what would follow that
 flickers. Where it fades, coarse steps show and lag behind. So the first step takes a large change, and later ones small
 changes.
 """
@@ -52,7 +52,7 @@ class ExposureReference:
 
 def exposure_reference(scene: Scene, views: Sequence[View], *, config: ExposureConfig) -> ExposureReference:
     """The reference of a stream whose decoded frame 0 is ``scene`` and has the pictures ``views``."""
-    small = {view.index: view.evidence(config.picture_scale) for view in views}
+    small = {view.index: view.evidence(config.PICTURE_SCALE) for view in views}
     return ExposureReference(small, scene.mlps.color.b2.detach().clone())
 
 
@@ -71,7 +71,7 @@ def with_exposure_of(
     head = scene.mlps.color
     so_far = (head.b2 - reference.biases).reshape(-1, 3)[0]
     found = _light_change(scene, views, reference, so_far, config)
-    least = config.least_further_change if bool(so_far.any()) else config.least_change
+    least = config.LEAST_FURTHER_CHANGE if bool(so_far.any()) else config.LEAST_CHANGE
     wanted = torch.where((found - so_far).abs() < least, so_far, found)
     biases = reference.biases + wanted.repeat(len(head.b2) // 3)
     if step is not None:
@@ -90,7 +90,7 @@ def _light_change(
         for view in views:
             if view.index in reference.views:
                 gains, biases = scene.camera_color.gains[view.index], scene.camera_color.biases[view.index]
-                now, then = view.evidence(config.picture_scale), reference.views[view.index]
+                now, then = view.evidence(config.PICTURE_SCALE), reference.views[view.index]
                 change = _view_change(now, then, gains, biases, so_far, config)
                 found += [] if change is None else [change]
     return torch.stack(found).quantile(0.5, dim=0) if len(found) >= LEAST_VIEWS else so_far
@@ -103,13 +103,13 @@ def _view_change(
     colors = ((then.colors - biases) / gains).clamp(0.0, 1.0)
     sensitivity = gains * colors * (1.0 - colors)
     difference = now.colors - then.colors
-    other = (difference - sensitivity * so_far).abs().mean(-1) > config.same_threshold
+    other = (difference - sensitivity * so_far).abs().mean(-1) > config.SAME_THRESHOLD
     for mask in (now.mask, then.mask):
         other = other if mask is None else other | ~mask
     width = 2 * REACH_PIXELS + 1
     same = max_pool2d(other[None].float(), width, stride=1, padding=REACH_PIXELS)[0] < 0.5
     squares = sensitivity.square()
     weight = (squares * same[..., None]).sum((0, 1))
-    if not bool((weight > config.least_share * squares.sum((0, 1))).all()):
+    if not bool((weight > config.LEAST_SHARE * squares.sum((0, 1))).all()):
         return None
     return (difference * sensitivity * same[..., None]).sum((0, 1)) / weight

@@ -105,7 +105,7 @@ def fit_next_frame(
             first_birth=frame.index * IDS_PER_FRAME,
             floor=floor,
             room=config.patching.max_free - len(split.static.free),
-            least_pixels=config.motion.least_pixels,
+            least_pixels=config.motion.LEAST_PIXELS,
             config=config.births,
             backend=backend,
         )

@@ -200,11 +200,11 @@ class FrameOptimizer:
         trained = parameters_of_fields(dynamic)
         steps: dict[ParameterName, float] = {name: self.steps[name] for name in trained if name in self.steps}
         parameters = Parameters.of(start.scene, trained=trained, steps=steps)
-        rounding = config.rounding.resolved()
+        rounding = config.rounding
         known, free = parameters, rounding.free_priced
         if start.reference is not None:
             known, free = Parameters.of(start.reference, trained=trained, steps=steps), False
-        return parameters, RateTerm.of(known, steps, weight=rounding.rate_weight, free=free)
+        return parameters, RateTerm.of(known, steps, weight=rounding.resolved_rate_weight, free=free)
 
 
 def rest_every(most: int, *, views: int, iterations: int) -> int:

@@ -87,14 +87,14 @@ def spawn_children(
     """One free Gaussian per parent, with its mean drawn from N(mu, factor * Sigma).
 
     With Sigma = R S S^T R^T a sample is mu + sqrt(factor) R S z with z standard normal. Colour and scale are the
-    parent's, the rotation is the identity, the opacity ``config.opacity``. Identities count from ``first_birth``.
+    parent's, the rotation is the identity, the opacity ``config.OPACITY``. Identities count from ``first_birth``.
     """
     count = len(parents)
     z = torch.randn(count, 3, generator=generator).to(parents.means)
-    local = (config.covariance_factor**0.5) * parents.scales * z
+    local = (config.COVARIANCE_FACTOR**0.5) * parents.scales * z
     rotations = quaternion_matrices(parents.quats)
     unit = parents.means.new_tensor([1.0, 0.0, 0.0, 0.0])
-    opacity = torch.tensor(config.opacity)
+    opacity = torch.tensor(config.OPACITY)
     return FreeGaussians(
         means=parents.means + (rotations @ local[:, :, None])[:, :, 0],
         log_scales=parents.scales.clamp(min=1e-9).log(),

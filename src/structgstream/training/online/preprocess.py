@@ -101,10 +101,10 @@ def preprocess(
     earlier = training_views(before, rig, backend.device)
     known = {view.index for view in earlier}
     compared = [view for view in views if view.index in known]
-    if len(compared) < min(motion.least_views, len(rig.training)):
+    if len(compared) < min(motion.LEAST_VIEWS, len(rig.training)):
         return FramePictures(views, None)
     flow_from = flow_views(compared, frame.index, start)
-    changes = detect_changes(views, earlier, config=motion, backend=backend, flow_from=flow_from, flow=start.flow)
+    changes = detect_changes(views, earlier, config=motion, backend=backend, flow_from=flow_from, flow=start.FLOW)
     return FramePictures(views, changes)
 
 
@@ -148,7 +148,7 @@ def detect_changes(
                 continue
             both = _both(view.mask, last.mask)
             then, now = blackened(last.image, both), blackened(view.image, both)
-            reach = round(config.reach_pixels * view.enlargement)
+            reach = round(config.REACH_PIXELS * view.enlargement)
             changed = backend.changed_pixels(then, now, threshold=config.change_threshold, reach_pixels=reach)
             changed = changed if both is None else changed & both
             small, found, far_boxes = view.evidence(config.picture_scale).camera, None, 0

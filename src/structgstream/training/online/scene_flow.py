@@ -173,7 +173,7 @@ def apply_scene_flow(
     dynamic = selection.primitives
     evidence, centers = selection.evidence.select(dynamic), selection.centers[dynamic]
     views_with_flow = [view for view in views if view.index in selection.views_with_flow]
-    first = lift_flow(evidence, centers, priors, views_with_flow, config=config.lift, backend=backend)
+    first = lift_flow(evidence, centers, priors, views_with_flow, config=config.LIFT, backend=backend)
     fast = _is_fast(evidence, views_with_flow)
 
     moved = split.displaced(first.displacements)
@@ -238,7 +238,7 @@ def residual_flow(
         inside, camera = active_tiles[view.index].tiles.pixels(), view.evidence(scale).camera
         inside = inside if view.mask is None else inside & view.mask
         size = (camera.height, camera.width)
-        return flow_map(picture, view.image, inside, size, mask=view.mask, config=config.flow, backend=backend).maps
+        return flow_map(picture, view.image, inside, size, mask=view.mask, config=config.FLOW, backend=backend).maps
 
     threads = torch.get_num_threads()
     with torch.no_grad(), ThreadPoolExecutor(threads) as pool:
@@ -256,4 +256,4 @@ def residual_flow(
     if not seen:
         return LiftedFlow(nothing, torch.zeros(len(nothing), dtype=torch.bool, device=nothing.device))
     evidence = flow_evidence(sums)
-    return lift_flow(evidence, primitive_centers(dynamic, coverage), nothing, seen, config=config.lift, backend=backend)
+    return lift_flow(evidence, primitive_centers(dynamic, coverage), nothing, seen, config=config.LIFT, backend=backend)

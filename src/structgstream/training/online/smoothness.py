@@ -59,16 +59,16 @@ class MotionSmoothness:
         pixel = pixel_size(positions, cameras)
         if pixel is None:
             return None
-        rows, distances = nearest_others(positions, config.neighbours)
-        spread = config.bandwidth * distances[:, -1:].clamp(min=1e-9)
+        rows, distances = nearest_others(positions, config.NEIGHBOURS)
+        spread = config.BANDWIDTH * distances[:, -1:].clamp(min=1e-9)
         affinities = torch.exp(-0.5 * (distances / spread).square())
-        if config.feature_bandwidth > 0.0:
+        if config.FEATURE_BANDWIDTH > 0.0:
             features = scene.features.detach()
             features = features / features.std(0).clamp(min=1e-6)
             apart = (features[rows] - features[:, None]).square().mean(-1)
-            affinities = affinities * torch.exp(-0.5 * apart / config.feature_bandwidth**2)
+            affinities = affinities * torch.exp(-0.5 * apart / config.FEATURE_BANDWIDTH**2)
         shares = affinities / affinities.sum(1, keepdim=True).clamp(min=1e-6)
-        return cls(config.weight, positions.detach(), rows, shares, pixel, config.slack_pixels)
+        return cls(config.weight, positions.detach(), rows, shares, pixel, config.SLACK_PIXELS)
 
     def difference(self, positions: Tensor, backend: Backend) -> Tensor:
         """Mean difference ``[]`` of the displacements at ``positions`` ``[M, 3]`` from the neighbours', pixels."""

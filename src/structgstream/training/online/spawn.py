@@ -26,7 +26,7 @@ from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
-from structgstream.training.online.config import SpawnConfig
+from structgstream.training.online.config import SpawnConfig, SpawnRules
 from structgstream.training.online.measure import accumulate
 from structgstream.training.online.split import DynamicSplit, changed_tiles
 from structgstream.training.residuals import ResidualFloor, box_mean
@@ -61,7 +61,7 @@ def view_residual(
     color: CameraColor,
     *,
     floor: ResidualFloor | None,
-    config: SpawnConfig,
+    rules: SpawnRules,
     backend: Backend,
     tiles: TileSelection | None = None,
 ) -> ViewResidual:
@@ -72,11 +72,11 @@ def view_residual(
         view: in full size.
         color: the colour correction of the cameras.
         floor: residuals of frame 0; None for none.
-        config: the rules.
+        rules: the rules.
         backend: the compute back-end.
         tiles: the tiles that were drawn; elsewhere it is the picture. None for all.
     """
-    scale = min(1.0, config.picture_width / view.camera.width)
+    scale = min(1.0, rules.picture_width / view.camera.width)
     small = view.reduced(scale)
     if drawn is None or (floor is not None and view.index not in floor.maps):
         # Of a camera that was absent from frame 0 nothing is known to be new.
@@ -93,25 +93,25 @@ def view_residual(
         outside=None if tiles is None else view.image,
         mask=small.mask,
     )
-    limit = off.new_full((), config.missing_threshold)
+    limit = off.new_full((), rules.missing_threshold)
     if floor is not None:
         limit = limit + interpolate(floor.maps[view.index][None, None], size=off.shape, mode="bilinear")[0, 0]
     missing = box_mean((off > limit).float(), MASK_PIXELS)
-    return ViewResidual(small, off > config.residual_threshold, missing if small.mask is None else missing * small.mask)
+    return ViewResidual(small, off > rules.residual_threshold, missing if small.mask is None else missing * small.mask)
 
 
-def outlier_mask(coverage: Tensor, wrong: Tensor, *, least_pixels: float, config: SpawnConfig) -> Tensor:
+def outlier_mask(coverage: Tensor, wrong: Tensor, *, least_pixels: float, rules: SpawnRules) -> Tensor:
     """Mask ``[F]`` of the free Gaussians to remove, as outliers in several views.
 
     Args:
         coverage: ``[V, F]`` pixels that each covers, by blending weight.
         wrong: ``[V, F]`` wrong pixels among them.
         least_pixels: views where a Gaussian covers fewer pixels do not count.
-        config: the rule.
+        rules: the rule.
     """
     seen = coverage > least_pixels
-    bad = (seen & (wrong > config.blame_share * coverage)).sum(0)
-    return (bad >= config.blame_views) & (2 * bad >= seen.sum(0))
+    bad = (seen & (wrong > rules.blame_share * coverage)).sum(0)
+    return (bad >= rules.blame_views) & (2 * bad >= seen.sum(0))
 
 
 @dataclass(frozen=True)
@@ -120,8 +120,8 @@ class Spawned:
 
     Args:
         free: the new free Gaussians.
-        refused_count: how many more there were, if these are more than ``SpawnConfig.most``; always 0
-            where Gaussians are coarser then (``SpawnConfig.crowded``).
+        refused_count: how many more there were, if these are more than ``SpawnRules.most``; always 0
+            where Gaussians are coarser then (``SpawnRules.crowded``).
         merged_count: how many more there would be, had they not been made coarser for that reason.
     """
 
@@ -136,7 +136,7 @@ def spawn_by_sweep(
     color: CameraColor,
     *,
     first_birth: int,
-    config: SpawnConfig,
+    rules: SpawnRules,
     backend: Backend,
 ) -> Spawned:
     """New free Gaussians at points whose colour is missing in several views.
@@ -146,7 +146,7 @@ def spawn_by_sweep(
         depths: by view index, rendered depth ``[h, w]``, infinite where nothing is rendered.
         color: colour corrections of the cameras.
         first_birth: identity of the first.
-        config: the rule.
+        rules: the rule.
         backend: the compute back-end.
 
     Raises:
@@ -156,7 +156,7 @@ def spawn_by_sweep(
     points, colors, spacings = [], [], []
     for index, (entry, view) in enumerate(zip(missing, views)):
         lacking = entry.missing_share > 0.5
-        rows, columns = (lacking & _strided_mask(config.pixel_step, lacking)).nonzero().unbind(1)
+        rows, columns = (lacking & _strided_mask(rules.pixel_step, lacking)).nonzero().unbind(1)
         if not len(rows):
             continue
         reachable = view.depths[view.depths.isfinite()]
@@ -167,21 +167,21 @@ def spawn_by_sweep(
             index,
             torch.stack([columns, rows], -1),
             farthest,
-            planes=config.planes,
-            least_supports=config.least_supports,
-            most_contradictions=config.most_contradictions,
+            planes=rules.planes,
+            least_supports=rules.least_supports,
+            most_contradictions=rules.most_contradictions,
         )
-        good = swept.costs < config.most_cost
+        good = swept.costs < rules.most_cost
         z, x, y = swept.depths[good], columns[good] + 0.5, rows[good] + 0.5
         K, viewmat = view.K, view.viewmat
         local = torch.stack([(x - K[0, 2]) / K[0, 0] * z, (y - K[1, 2]) / K[1, 1] * z, z], -1)
         points.append((local - viewmat[:3, 3]) @ viewmat[:3, :3])
         colors.append(view.colors[rows[good], columns[good]])
-        spacings.append(config.pixel_step * z / K[0, 0])
+        spacings.append(rules.pixel_step * z / K[0, 0])
     if not points or not sum(len(group) for group in points):
         return Spawned(FreeGaussians.empty(views[0].colors))
     return _merge_points(
-        torch.cat(points), torch.cat(colors), torch.cat(spacings), first_birth=first_birth, config=config
+        torch.cat(points), torch.cat(colors), torch.cat(spacings), first_birth=first_birth, rules=rules
     )
 
 
@@ -202,9 +202,7 @@ def _strided_mask(step: int, like: Tensor) -> Tensor:
     return mask
 
 
-def _merge_points(
-    points: Tensor, colors: Tensor, spacings: Tensor, *, first_birth: int, config: SpawnConfig
-) -> Spawned:
+def _merge_points(points: Tensor, colors: Tensor, spacings: Tensor, *, first_birth: int, rules: SpawnRules) -> Spawned:
     """One free Gaussian per voxel of the points, if at least ``least_hits`` points lie around it."""
     try:
         from scipy.spatial import KDTree
@@ -215,35 +213,35 @@ def _merge_points(
     finest = None
     while True:
         means, hits = _cells(values, tree, voxel)
-        enough = hits >= config.least_hits
+        enough = hits >= rules.least_hits
         wanted = int(enough.sum())
         finest = wanted if finest is None else finest
-        if wanted <= config.most or voxel > COARSEST * float(spacings.median()):
+        if wanted <= rules.most or voxel > COARSEST * float(spacings.median()):
             break
-        if config.crowded == "none":
+        if rules.crowded == "none":
             return Spawned(FreeGaussians.empty(points), wanted)
-        if config.crowded == "small-clusters":
-            enough[enough.clone()] = _in_small_clusters(means[enough, :3], CLUSTER_VOXELS * voxel, most=config.most)
+        if rules.crowded == "small-clusters":
+            enough[enough.clone()] = _in_small_clusters(means[enough, :3], CLUSTER_VOXELS * voxel, most=rules.most)
             break
         voxel *= 2.0**0.5  # Too many: what is missing is large, and coarser Gaussians fill it.
     order = hits.argsort(descending=True, stable=True)
-    chosen = order[enough[order]][: config.most].sort().values
+    chosen = order[enough[order]][: rules.most].sort().values
     count = len(chosen)
     centers, looks, sizes = means[chosen].split([3, 3, 1], dim=1)
     sizes = sizes * (voxel / float(spacings.median()))
     unit = points.new_tensor([1.0, 0.0, 0.0, 0.0])
-    opacity = torch.logit(torch.tensor(config.opacity)).to(points)
+    opacity = torch.logit(torch.tensor(rules.opacity)).to(points)
     return Spawned(
         FreeGaussians(
             means=centers.contiguous(),
-            log_scales=(config.size * sizes).log().expand(count, 3).contiguous(),
+            log_scales=(rules.size * sizes).log().expand(count, 3).contiguous(),
             quats=unit.expand(count, 4).clone(),
             logit_opacities=opacity.expand(count).clone(),
             colors=looks.contiguous(),
             births=first_birth + torch.arange(count, device=points.device),
         ),
-        refused_count=wanted - count if config.crowded == "small-clusters" else 0,
-        merged_count=max(0, finest - count) if config.crowded == "coarser" else 0,
+        refused_count=wanted - count if rules.crowded == "small-clusters" else 0,
+        merged_count=max(0, finest - count) if rules.crowded == "coarser" else 0,
     )
 
 
@@ -319,7 +317,7 @@ class Sweep:
         views: of the frame.
         active_tiles: by view index, the tiles that the dynamic part reaches.
         floor: residuals of frame 0; None for none.
-        config: the rules.
+        rules: the rules.
         backend: the compute back-end.
         known: by view index, what a sweep of the same Gaussians by other rules has drawn.
     """
@@ -329,7 +327,7 @@ class Sweep:
     views: Sequence[View]
     active_tiles: Mapping[int, ActiveTiles]
     floor: ResidualFloor | None
-    config: SpawnConfig
+    rules: SpawnRules
     backend: Backend
     known: Mapping[int, Missing] = field(default_factory=dict)
 
@@ -360,13 +358,13 @@ class Sweep:
             {entry.view.index: self.depth_map(entry.view) for entry in residuals},
             self.dynamic.camera_color,
             first_birth=first_birth,
-            config=replace(self.config, most=min(self.config.most, room)),
+            rules=replace(self.rules, most=min(self.rules.most, room)),
             backend=self.backend,
         )
 
     def _enough(self, missing: Sequence[Missing]) -> bool:
         """Whether enough views have missing pixels for a birth."""
-        return sum(entry.any for entry in missing) > self.config.least_supports
+        return sum(entry.any for entry in missing) > self.rules.least_supports
 
     def _before(self, view: View, *, wrong: bool) -> Missing:
         """By the picture that is drawn already; ``wrong`` pixels make their tiles suspect, too."""
@@ -404,7 +402,7 @@ class Sweep:
             view,
             self.dynamic.camera_color,
             floor=self.floor,
-            config=self.config,
+            rules=self.rules,
             backend=self.backend,
             tiles=None if active is None else active.tiles,
         )
@@ -495,17 +493,17 @@ def prune_and_spawn(
     if not config.enabled or not active_tiles:
         return none
     with torch.no_grad():
-        eased = floor
-        if floor is not None and config.changed_floor_medians is not None:
-            eased = floor.eased(split.selection.changed, medians=config.changed_floor_medians)
-        sweep = Sweep(dynamic, static, views, active_tiles, eased, config, backend)
+        rules, eased = config.rules, floor
+        if floor is not None and config.CHANGED_FLOOR_MEDIANS is not None:
+            eased = floor.eased(split.selection.changed, medians=config.CHANGED_FLOOR_MEDIANS)
+        sweep = Sweep(dynamic, static, views, active_tiles, eased, rules, backend)
         missing = sweep.missing()
-        if missing_share(missing) > config.most_missing_share:
+        if missing_share(missing) > rules.most_missing_share:
             return replace(none, refused=True)
         kept = everything
         if len(dynamic.free):
             kept = ~_outlier_mask(
-                dynamic, missing, active_tiles, least_pixels=least_pixels, config=config, backend=backend
+                dynamic, missing, active_tiles, least_pixels=least_pixels, rules=rules, backend=backend
             )
         if not kept.all():
             sweep = replace(sweep, dynamic=replace(dynamic, free=dynamic.free.select(kept)))
@@ -516,7 +514,7 @@ def prune_and_spawn(
             return SpawnResult(kept, large.free, merged_count=large.merged_count)
         known = {entry.view.index: entry for entry in missing}
         # With all of frame 0's floor: by these low thresholds an eased one would take all that moves for thin content.
-        thin_sweep = replace(sweep, floor=floor, config=config.for_thin, known=known)
+        thin_sweep = replace(sweep, floor=floor, rules=config.thin.rules, known=known)
         thin = _thin_births(thin_sweep, first_birth=first_birth, room=room)
     return SpawnResult(kept, thin.free, len(thin.free), thin.refused_count)
 
@@ -524,7 +522,7 @@ def prune_and_spawn(
 def _thin_births(sweep: Sweep, *, first_birth: int, room: int) -> Spawned:
     """Spawn thin content, where nothing large is spawned."""
     missing = sweep.missing(blames=False)
-    if missing_share(missing) > sweep.config.most_missing_share:
+    if missing_share(missing) > sweep.rules.most_missing_share:
         return Spawned(FreeGaussians.empty(sweep.dynamic.free.means))
     return sweep.births(missing, first_birth=first_birth, room=room)
 
@@ -535,7 +533,7 @@ def _outlier_mask(
     active_tiles: Mapping[int, ActiveTiles],
     *,
     least_pixels: float,
-    config: SpawnConfig,
+    rules: SpawnRules,
     backend: Backend,
 ) -> Tensor:
     coverage, wrong = [], []
@@ -554,4 +552,4 @@ def _outlier_mask(
         of_free = sums[len(sums) - len(dynamic.free) :]  # Free Gaussians are the last, and all there.
         coverage.append(of_free[:, 0])
         wrong.append(of_free[:, 1])
-    return outlier_mask(torch.stack(coverage), torch.stack(wrong), least_pixels=least_pixels, config=config)
+    return outlier_mask(torch.stack(coverage), torch.stack(wrong), least_pixels=least_pixels, rules=rules)

@@ -120,7 +120,7 @@ def _focus(
     reach = draw(in_motion, small, backend)
     reach = replace(reach, radii=reach.radii * (camera.width / small.width))
     enlarged = enlargement(camera.width, camera.height)
-    tiles = reached_tiles(reach, visible[in_motion.ids], camera, round(config.margin_pixels * enlarged))
+    tiles = reached_tiles(reach, visible[in_motion.ids], camera, round(config.MARGIN_PIXELS * enlarged))
     if not tiles.mask.any():
         return None
     tiles_of_change = changed_tiles(tiles, changed)

@@ -21,7 +21,7 @@ WHOLE = "compact"
 """Key of the compact stream with everything, as ``structgstream compare`` calls it."""
 BETTER_FIRST = "paper-better-first"
 """Key of paper mode with the compact stream's frame 0."""
-DISTURBANCE_FIELDS = tuple(f"initial.disturbance.{name}" for name in ("dropped_share", "noise_scales", "until_share"))
+DISTURBANCE_FIELDS = tuple(f"initial.disturbance.{name}" for name in ("dropped_share", "noise_scales"))
 LOSS_FIELDS = ("initial.losses.l1", "initial.losses.ssim")
 OFFSET_FIELDS, PAPER_OFFSETS = ("initial.offsets_per_anchor", "initial.all_drawn"), 5
 CARRIED_SHARE, EASED, OTHER_RANK = 0.4, 0.5, 8
@@ -158,8 +158,6 @@ def _of_the_start(rows: _Rows) -> None:
     off, single = replace(start, enabled=False), replace(start, rounds=1)
     rows.online("without-start", "w/o motion start", replace(whole, start=off), "start.enabled")
     rows.online("one-round", "motion start in one round", replace(whole, start=single), "start.rounds")
-    alike = replace(whole, start=replace(start, lift=replace(start.lift, color_bandwidth=0.0)))
-    rows.online("colors-alike", "displacements w/o weights by colour", alike, "start.lift.color_bandwidth")
     motion = replace(whole.motion, residual_threshold=0.0)
     rows.gated("without-residuals", "gate w/o residuals", motion, "residual_threshold")
 
