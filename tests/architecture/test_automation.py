@@ -38,7 +38,6 @@ def test_what_is_called_exists(path: Path) -> None:
 
 
 def test_each_workflow_calls_something_of_the_repository() -> None:
-    assert [path.name for path in WORKFLOWS] == ["docs.yml", "test.yml", "wheels.yml"]
     for path in WORKFLOWS:
         runs = re.findall(r"^\s*- run: (.*)$", path.read_text(), re.MULTILINE)
         assert runs, path.name

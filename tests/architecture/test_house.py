@@ -1,46 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The architecture is a test: layers, size caps, exports, docstrings, and what an import may pull in."""
+"""Exports, docstrings, licences, and what an import may pull in. Layers are checked by ``scripts/check``."""
 
 import ast
 import importlib
 import pkgutil
-import re
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import structgstream
 
 ROOT = Path(__file__).parents[2]
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
-
-
-def test_layers() -> None:
-    """The contracts of pyproject.toml (import-linter)."""
-    program = Path(sys.executable).with_name("lint-imports")
-    result = subprocess.run([program, "--no-cache"], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stdout
-
-
-def drawn_and_stated() -> list[tuple[list[set[str]], list[set[str]]]]:
-    """Rows of each picture of ARCHITECTURE's section Layers beside those of each contract on layers, in their order."""
-    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
-    layers = [contract["layers"] for contract in contracts if contract["type"] == "layers"]
-    stated = [[{name.removeprefix("structgstream.") for name in row.split(" | ")} for row in rows] for rows in layers]
-    section = (ROOT / "ARCHITECTURE.md").read_text().split("\n## Layers")[1].split("\n## ")[0]
-    pictures = [picture.splitlines() for picture in section.split("```")[1::2]]
-    drawn = [[set(re.findall(r"`(\w+)`", line)) for line in lines if line.strip()] for lines in pictures]
-    return list(zip(drawn, stated, strict=True))
-
-
-def test_the_pictures_of_layers_are_those_of_the_contracts() -> None:
-    """Row by row; and every module of the package has a place in the first."""
-    for drawn, stated in drawn_and_stated():
-        assert drawn == stated
-    whole, _ = drawn_and_stated()[0]
-    modules = {module.name for module in pkgutil.iter_modules(structgstream.__path__)}
-    assert set().union(*whole) == modules - {"__main__"}
 
 
 def test_public_names_are_sorted_and_importable() -> None:
@@ -65,12 +36,6 @@ def test_everything_public_says_what_it_is() -> None:
 def test_every_source_states_its_licence() -> None:
     texts = {path: path.read_text() for path in SOURCES}
     assert not [path.name for path, text in texts.items() if text and "SPDX-License-Identifier: Apache-2.0" not in text]
-
-
-def test_architecture_names_every_package() -> None:
-    text = (ROOT / "ARCHITECTURE.md").read_text()
-    packages = [m.name for m in pkgutil.iter_modules(structgstream.__path__) if not m.name.startswith("_")]
-    assert not [name for name in packages if f"`{name}" not in text]
 
 
 def loaded_by(imports: str, among: tuple[str, ...]) -> list[str]:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from properties import thinned
 from streams import compact_header, small_scene
 from structgstream.codec.container.blocks import BLOCK, iterate_blocks, unpack_blocks
 from structgstream.codec.container.init_record import LENGTH
@@ -81,9 +82,11 @@ def counts_of(fields: Fields, decode: Callable[[Fields], object]) -> list[Count]
 
 
 def enlarged(fields: Fields, counts: list[Count]) -> Iterator[tuple[Count, int, Fields]]:
+    all_values = {*thinned(counts)}
     for count in counts:
         data = fields[count.field]
-        for value in (*HUGE, 2**35 - 1):
+        # The least of them is the one for which most memory would be there.
+        for value in (*HUGE, 2**35 - 1) if count in all_values else HUGE[:1]:
             yield count, value, {**fields, count.field: data[: count.start] + varint(value) + data[count.end :]}
 
 
