@@ -142,9 +142,9 @@ def test_exports(stream: Path, tmp_path: Path) -> None:
     folder = structgstream.export(stream, tmp_path / "all", format="spz", sh_degree=0, backend=QUICKEST)
     assert [entry.name for entry in sorted(folder.iterdir())] == ["frame_000000.spz", "frame_000001.spz"]
     assert frame.read_bytes() == (folder / "frame_000001.spz").read_bytes()
-    with pytest.raises(ConfigError, match="holds one frame"):
+    with pytest.raises(ConfigError, match="contains one frame"):
         structgstream.export(stream, tmp_path / "two.ply", backend=QUICKEST)
-    with pytest.raises(ConfigError, match="a page holds the whole stream"):
+    with pytest.raises(ConfigError, match="a page contains the whole stream"):
         structgstream.export(stream, tmp_path / "x.html", frame=0)
     with pytest.raises(ConfigError, match="give one of them"):
         structgstream.export(stream, tmp_path / "x", frame=0, frames=(0, 1))

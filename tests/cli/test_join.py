@@ -56,7 +56,7 @@ def test_what_is_refused_is_one_sentence_and_leaves_nothing(
     for given, status, said in (
         ([], 2, "join needs the segments of a stream."),
         (segments[1:], 1, "Frames 0 to 2 are missing"),
-        ([*segments, segments[1]], 1, "Frames 3 to 6 are there twice"),
+        ([*segments, segments[1]], 1, "Frames 3 to 6 are duplicated"),
         ([segments[0], str(cut)], 1, "cut.sgs is not finished or damaged"),
         ([str(tmp_path / "absent.sgs")], 1, "Cannot read"),
     ):

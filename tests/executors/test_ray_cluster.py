@@ -151,7 +151,7 @@ def test_a_cluster_that_refuses_is_told(ray: FakeRay, monkeypatch: pytest.Monkey
     monkeypatch.setattr(ray, "init", refused)
     with pytest.raises(ConfigError, match=r"head:6379 cannot be joined \(Failed to connect\)"):
         RayEngine(RayOptions("head:6379"))
-    with pytest.raises(ConfigError, match=r"cannot be begun here \(Failed to connect\)"):
+    with pytest.raises(ConfigError, match=r"cannot be started here \(Failed to connect\)"):
         RayEngine(RayOptions())
 
 

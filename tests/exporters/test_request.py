@@ -82,5 +82,5 @@ def test_a_low_pass_is_a_share_of_a_training_pixel() -> None:
 def test_a_page_has_no_wishes() -> None:
     check_page(frame=None, frames=None, sh_degree=None, low_pass=0.0)
     for wish in ({"frame": 0}, {"frames": (0, 0)}, {"sh_degree": 0}, {"low_pass": 0.2}):
-        with pytest.raises(ConfigError, match="a page holds the whole stream"):
+        with pytest.raises(ConfigError, match="a page contains the whole stream"):
             check_page(**{"frame": None, "frames": None, "sh_degree": None, "low_pass": 0.0, **wish})

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from streams import STEPS, small_scene
 from structgstream.codec.scene.bins import dequantize, quantize
-from structgstream.groups.hand_over import FADE_FRAMES, NEIGHBOURS, HandOver
+from structgstream.groups.seam_blend import FADE_FRAMES, NEIGHBOURS, SeamBlend
 from structgstream.kernels.values import HeadWeights
 from structgstream.scene.scene import Scene
 from structgstream.training.online.patching import IDS_PER_FRAME
@@ -56,7 +56,7 @@ def bins_from(shown: Scene, own: Scene) -> Tensor:
 def test_what_stands_still_has_the_bits_of_the_frame_before() -> None:
     own = two_heaps()
     before = shifted(own, ~NONE, 5)
-    shown = HandOver(before, own, NONE, steps=STEPS).scene(own)
+    shown = SeamBlend(before, own, NONE, steps=STEPS).scene(own)
     assert torch.equal(shown.anchors.positions, before.anchors.positions)
     assert torch.equal(shown.anchors.log_offset_scales, before.anchors.log_offset_scales)
 
@@ -65,13 +65,13 @@ def test_what_stands_still_has_the_bits_of_the_frame_before() -> None:
 def test_differences_fade_in_equal_steps(bins: int) -> None:
     """Of differences of one bin a like number goes in each frame."""
     own = two_heaps()
-    hand_over = HandOver(shifted(own, ~NONE, bins), own, NONE, steps=STEPS)
+    seam_blend = SeamBlend(shifted(own, ~NONE, bins), own, NONE, steps=STEPS)
     for left in range(FADE_FRAMES + 1, -1, -1):
-        differences = bins_from(hand_over.scene(own), own)
+        differences = bins_from(seam_blend.scene(own), own)
         expected = bins * left / (FADE_FRAMES + 1)
         assert torch.all((differences - expected).abs() < 1.0)
         assert abs(float(differences.mean()) - expected) < 0.05 * abs(bins)
-    assert torch.equal(hand_over.scene(own).anchors.positions, own.anchors.positions)
+    assert torch.equal(seam_blend.scene(own).anchors.positions, own.anchors.positions)
 
 
 def in_light(scene: Scene, bins: int) -> Scene:
@@ -85,10 +85,10 @@ def in_light(scene: Scene, bins: int) -> Scene:
 def test_light_goes_over_in_equal_steps_where_things_move_too(bins: int) -> None:
     own = in_light(two_heaps(), 0)
     before = in_light(two_heaps(), bins)
-    hand_over = HandOver(before, own, ~NONE, steps=STEPS)
+    seam_blend = SeamBlend(before, own, ~NONE, steps=STEPS)
     brighter = []
     for _ in range(FADE_FRAMES + 2):
-        shown = hand_over.scene(own)
+        shown = seam_blend.scene(own)
         brighter.append(((shown.mlps.color.b2 - own.mlps.color.b2) / LIGHT_STEP).round().unique().tolist())
         assert torch.equal(shown.mlps.color.w2, own.mlps.color.w2)
         assert torch.equal(shown.anchors.positions, own.anchors.positions)
@@ -101,7 +101,7 @@ def test_light_goes_over_in_equal_steps_where_things_move_too(bins: int) -> None
 def test_what_moves_at_the_border_is_the_groups_own() -> None:
     own = two_heaps()
     before = shifted(own, ~NONE, 5)
-    shown = HandOver(before, own, LEFT, steps=STEPS).scene(own)
+    shown = SeamBlend(before, own, LEFT, steps=STEPS).scene(own)
     assert torch.equal(shown.anchors.positions[LEFT], own.anchors.positions[LEFT])
     assert torch.equal(shown.anchors.positions[~LEFT], before.anchors.positions[~LEFT])
 
@@ -109,34 +109,34 @@ def test_what_moves_at_the_border_is_the_groups_own() -> None:
 def test_what_is_withdrawn_is_the_groups_own() -> None:
     own = two_heaps()
     before = shifted(own, ~NONE, 5)
-    hand_over = HandOver(before, own, NONE, steps=STEPS)
+    seam_blend = SeamBlend(before, own, NONE, steps=STEPS)
     one = torch.arange(2 * SIDE) == 2 * SIDE - 1
-    assert (hand_over.handed, hand_over.withdraw(LEFT), hand_over.withdraw(LEFT), hand_over.withdraw(one)) == (
+    assert (seam_blend.blended, seam_blend.withdraw(LEFT), seam_blend.withdraw(LEFT), seam_blend.withdraw(one)) == (
         2 * SIDE,
         SIDE,
         0,
         1,
     )
     expected = torch.where((LEFT | one)[:, None], own.anchors.positions, before.anchors.positions)
-    assert torch.equal(hand_over.first.anchors.positions, expected)
-    assert torch.equal(hand_over.scene(own).anchors.positions, expected)
-    assert hand_over.handed == SIDE - 1
+    assert torch.equal(seam_blend.first.anchors.positions, expected)
+    assert torch.equal(seam_blend.scene(own).anchors.positions, expected)
+    assert seam_blend.blended == SIDE - 1
 
 
 def test_an_anchor_between_those_withdrawn_is_withdrawn() -> None:
     own = two_heaps()
-    hand_over = HandOver(shifted(own, ~NONE, 5), own, NONE, steps=STEPS)
+    seam_blend = SeamBlend(shifted(own, ~NONE, 5), own, NONE, steps=STEPS)
     some = LEFT & (torch.arange(2 * SIDE) % 2 == 0)
-    assert SIDE // 2 < hand_over.withdraw(some) <= SIDE
+    assert SIDE // 2 < seam_blend.withdraw(some) <= SIDE
 
 
 def test_differences_halve_besides_where_the_group_moves() -> None:
     own = two_heaps()
-    hand_over = HandOver(shifted(own, ~NONE, -48), own, NONE, steps=STEPS)
-    hand_over.scene(own)
+    seam_blend = SeamBlend(shifted(own, ~NONE, -48), own, NONE, steps=STEPS)
+    seam_blend.scene(own)
     for halved, left in ((24, 5), (12, 4), (6, 3)):
         own = shifted(own, LEFT, 1)
-        differences = bins_from(hand_over.scene(own), own)
+        differences = bins_from(seam_blend.scene(own), own)
         share = left / (FADE_FRAMES + 1)
         assert ((differences[LEFT] + halved * share).abs() < 1.0).all()
         assert torch.equal(differences[~LEFT], torch.full_like(differences[~LEFT], -48 * share))
@@ -144,11 +144,11 @@ def test_differences_halve_besides_where_the_group_moves() -> None:
 
 def test_a_few_movers_keep_their_neighbourhood_and_fade_themselves() -> None:
     own = two_heaps()
-    hand_over = HandOver(shifted(own, ~NONE, 24), own, NONE, steps=STEPS)
-    hand_over.scene(own)
+    seam_blend = SeamBlend(shifted(own, ~NONE, 24), own, NONE, steps=STEPS)
+    seam_blend.scene(own)
     one = torch.arange(2 * SIDE) == 3
     moved = shifted(own, one, 1)
-    differences = bins_from(hand_over.scene(moved), moved)
+    differences = bins_from(seam_blend.scene(moved), moved)
     share = FADE_FRAMES / (FADE_FRAMES + 1)
     assert (differences[one] == 12 * share).all()
     assert (differences[~one] == 24 * share).all()
@@ -157,6 +157,6 @@ def test_a_few_movers_keep_their_neighbourhood_and_fade_themselves() -> None:
 @pytest.mark.parametrize("moving", [NONE, ~NONE], ids=["still", "moving"])
 def test_free_gaussians_are_the_groups_own_at_once(moving: Tensor) -> None:
     before, own = born_in(two_heaps(free=4), 2), born_in(two_heaps(free=6), 8)
-    shown = HandOver(before, own, moving, steps=STEPS).scene(own)
+    shown = SeamBlend(before, own, moving, steps=STEPS).scene(own)
     assert torch.equal(shown.free.births, own.free.births)
     assert torch.equal(shown.free.means, own.free.means)

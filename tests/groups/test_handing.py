@@ -9,7 +9,7 @@ from backends import quickest_backend
 from clip_groups import FRAMES, LENGTH, made
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import open_stream
-from structgstream.groups.handing import Border
+from structgstream.groups.blending import Border
 from structgstream.groups.join import join_segments
 from structgstream.scene.scene import Scene
 
@@ -30,7 +30,7 @@ def test_more_anchors_keep_their_bits_across_borders(tmp_path: Path) -> None:
     backend = quickest_backend()
     assert join_segments(made().segments, handed, check=True, backend=backend, on_border=borders.append) == FRAMES
     assert [border.frame for border in borders] == list(range(LENGTH, FRAMES, LENGTH))
-    assert all(border.handed > 0 <= border.withdrawn for border in borders)
+    assert all(border.blended > 0 <= border.withdrawn for border in borders)
     before, after = scenes_of(plain), scenes_of(handed)
     for index in range(LENGTH):
         assert torch.equal(before[index].anchors.positions, after[index].anchors.positions)

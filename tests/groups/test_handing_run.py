@@ -16,11 +16,11 @@ from structgstream.errors import ConfigError, TaskError
 from structgstream.executors.task import PYTHON, Task
 from structgstream.groups import join
 from structgstream.groups.base import GroupBase
-from structgstream.groups.hand_over import OWN_FRAMES
-from structgstream.groups.handing import Border
-from structgstream.groups.handing_run import MOST_GROUPS, HandedRun, main, runs_of
+from structgstream.groups.blending import Border
+from structgstream.groups.blending_run import MOST_GROUPS, BlendedRun, main, runs_of
 from structgstream.groups.join import PURPOSE, join_segments
 from structgstream.groups.pictures import open_for
+from structgstream.groups.seam_blend import OWN_FRAMES
 from structgstream.groups.track_pass import track_capture
 from structgstream.owned_folders import own_folder
 
@@ -60,7 +60,7 @@ def test_workers_give_the_bytes_of_one(tmp_path: Path) -> None:
         )
         assert count == FRAMES
         assert [border.frame for border in borders] == [*BORDERS]
-        assert borders[0].handed > 0
+        assert borders[0].blended > 0
         found.append((path.read_bytes(), borders))
     assert found[1] == found[0]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1.sgs", "2.sgs"]
@@ -69,7 +69,7 @@ def test_workers_give_the_bytes_of_one(tmp_path: Path) -> None:
 def test_a_run_tells_its_borders_and_records(tmp_path: Path) -> None:
     paths, output = made().segments, tmp_path / "run"
     main([quickest_backend().name, str(output), *map(str, paths)])
-    run = HandedRun.read(output)
+    run = BlendedRun.read(output)
     assert [border.frame for border in run.borders] == [2, 4]
     whole = tmp_path / "whole.sgs"
     join_segments(paths, whole, backend=quickest_backend())

@@ -46,7 +46,7 @@ def test_gaps_overlaps_and_damage_are_refused_and_nothing_is_written(tmp_path: P
         join_segments([first, third], path)
     with pytest.raises(StreamError, match="Frames 0 to 1 are missing"):
         join_segments([second, third], path)
-    with pytest.raises(StreamError, match="Frames 2 to 3 are there twice"):
+    with pytest.raises(StreamError, match="Frames 2 to 3 are duplicated"):
         join_segments([first, second, second, third], path)
     with pytest.raises(ConfigError, match="nothing to join"):
         join_segments([], path)
@@ -68,7 +68,7 @@ def test_births_of_another_group_are_found(tmp_path: Path) -> None:
     scenes = [moved(small_scene(), number) for number in range(4)]  # Frame 3 has three births of frame 0.
     write_stream(FileSink(path), scenes)
     check_births(path, [0])
-    with pytest.raises(StreamError, match="Frame 2 .* born in frames 0 to 0; its group begins at frame 2"):
+    with pytest.raises(StreamError, match="Frame 2 .* spawned in frames 0 to 0; its group begins at frame 2"):
         check_births(path, [0, 2])
 
 

@@ -27,7 +27,7 @@ def test_another_capture_is_refused_by_its_cameras() -> None:
     moved = header.rig.mapped({**header.rig.cameras, "cam00": replace(first, K=longer)})
     with pytest.raises(CaptureError, match="not the one of the header: cam00 differs"):
         open_for(replace(header, rig=moved), CAPTURE, frames=3)
-    with pytest.raises(CaptureError, match="has 12 frames; frames up to 99"):
+    with pytest.raises(CaptureError, match="has 12 frames, but 99 are needed"):
         open_for(header, CAPTURE, frames=99)
 
 

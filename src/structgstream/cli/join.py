@@ -14,7 +14,7 @@ from structgstream.cli.plain_text import say
 from structgstream.cli.progress import human_bytes
 
 if TYPE_CHECKING:
-    from structgstream.groups.handing import Border
+    from structgstream.groups.blending import Border
     from structgstream.kernels.backend import Backend
 
 
@@ -83,6 +83,6 @@ def _workers(asked: int | None, backend: "Backend | None") -> int:
 def _tell(border: "Border", console: Console) -> None:
     say(
         console,
-        f"Border at frame {border.frame}: {border.handed:,} anchors keep their values of the frame before; "
+        f"Border at frame {border.frame}: {border.blended:,} anchors keep their values of the frame before; "
         f"{border.withdrawn:,} do not, as two fits side by side would show there.",
     )

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """PSNR after a colour correction of the rendering.
 
-A held-out camera's exposure and white balance are unknown to training, so a part of its error is unrelated to the
+A held-out camera's exposure and white balance are unknown in training, so a part of its error is unrelated to the
 scene. The best affine colour transform, fitted to the scored picture itself, bounds that part. It uses the ground
-truth, so it is never the headline: reports label it ``psnr_affine``.
+truth, so it is never the main result; reports label it ``psnr_affine``.
 
 Note [Colour of a camera]
 ~~~~~~~~~~~~~~~~~~~~~~~~~
 A camera's colour response is constant over time. So ``psnr_camera_color`` fits a gain and a bias per channel to the
-camera's first frame, as training does for its cameras (``scene/color.py``), and keeps them: later frames are scored as
-if the camera had been colour-calibrated once. Changing light and local colour errors still count, which a fit per frame
-or one that mixes channels would hide.
+camera's first frame, as training does for its cameras (``scene/color.py``), and uses them for all later frames, as if
+the camera had been colour-calibrated once. Changing light and local colour errors still count; a fit per frame, or one
+that mixes channels, would hide them.
 """
 
 from dataclasses import dataclass
@@ -38,8 +38,8 @@ class ChannelFit:
     """A camera's colour response, ``gain * rendering + bias`` per channel (Note [Colour of a camera]).
 
     Args:
-        gains: red, green, blue.
-        biases: the same, full scale is 1.
+        gains: gain of red, green and blue.
+        biases: bias of red, green and blue, full scale 1.
     """
 
     gains: tuple[float, float, float]
@@ -47,7 +47,7 @@ class ChannelFit:
 
 
 def channel_fit(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> ChannelFit:
-    """The gain and bias of each channel with the least squared error of ``picture`` against ``truth``.
+    """The gain and bias of each channel that minimize the squared error of ``picture`` against ``truth``.
 
     Both are ``[H, W, 3]`` uint8. A constant channel gets gain 1, because it does not determine one.
     """
@@ -66,7 +66,7 @@ def _fit_line(values: NDArray[np.uint8], targets: NDArray[np.uint8]) -> tuple[fl
 
 
 def psnr_camera_color(picture: NDArray[np.uint8], truth: NDArray[np.uint8], fit: ChannelFit) -> float:
-    """PSNR of ``picture`` corrected by ``fit``, clamped and not rounded, dB."""
+    """PSNR, dB, of ``picture`` corrected by ``fit`` and clamped, not rounded."""
     levels = np.arange(256, dtype=np.float64)
     total = 0.0
     for channel, (gain, bias) in enumerate(zip(fit.gains, fit.biases, strict=True)):
@@ -91,7 +91,7 @@ def _planes(*pictures: NDArray[np.uint8]) -> Tensor:
 
 
 def _fit_matrix(planes: Tensor) -> NDArray[np.float64]:
-    # The normal equations are 4x4, so the fit costs a pass over the pixels.
+    # The normal equations are 4x4, so the fit costs one pass over the pixels.
     products = (planes.transpose(0, 1) @ planes.permute(1, 2, 0)).sum(0, dtype=torch.float64)  # [7, 7]
     scale = torch.tensor([1.0] + 6 * [255.0], dtype=torch.float64)
     products = (products / (scale[:, None] * scale)).numpy()

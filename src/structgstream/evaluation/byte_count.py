@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Accounting of a stream's bytes by packet, field and kind of packet, and in the header."""
+"""Accounting of a stream's bytes by packet, field, kind of packet and header."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,18 +8,18 @@ from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import StreamReader
 
 REST = "the rest"
-"""Bytes of no field: heads of records, checksums, and the header's JSON."""
+"""Bytes that belong to no field: heads of records, checksums, and the header's JSON."""
 FIRST = "first packet"
-NOTHING = 0.01  # of the header: a first packet smaller than this share is left out of the parts
+NOTHING = 0.01  # share of the header's size; a smaller first packet is left out of the parts
 Parts = dict[str, dict[str, float]]
-"""Bytes by field, and :data:`REST`, of named parts of a stream."""
+"""Bytes by field, including :data:`REST`, of named parts of a stream."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One packet: ``kind`` is ``key`` or ``delta``; ``sizes`` are bytes by field and add up, with the rest, to all.
+    """One packet: ``kind`` is ``key`` or ``delta``; ``sizes`` are bytes by field and sum, with the rest, to its size.
 
-    ``first``: it begins a period.
+    ``first`` is True if it begins a period.
     """
 
     index: int
@@ -75,7 +75,8 @@ def occurring_fields(sizes: Iterable[Mapping[str, float]]) -> list[str]:
 def groups_of(rows: Sequence[Row]) -> dict[str, Group]:
     """The first packet of each period, and the means of each kind of the others.
 
-    First packets are listed apart: with the codec ``compact`` they are nearly empty, because headers hold their frames.
+    First packets are a group of their own: with the codec ``compact`` they are nearly empty, because headers contain
+    their frames.
     """
     chosen = {
         FIRST: [row for row in rows if row.first],

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a stream's bytes go, as a picture: each packet by field, and what header, key and delta packets consist of."""
+"""A plot of a stream's bytes: each packet by field, and the composition of header, key and delta packets."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
-SMALL = 0.01  # of every part: fields that take less are put together
-TOWERING = 3.0  # times the largest delta packet: a key packet above that is drawn cut, with its size over it
-GAPS = 150  # with more packets than this, bars touch
-NUMBERS = 25  # with more cut packets than this, their sizes are left out
-TOLD = 0.06  # of a part: smaller shares are not labelled
+SMALL = 0.01  # fields below this share of every part are combined
+TALLEST_KEY = 3.0  # times the largest delta packet; a larger key packet is drawn cut, with its size above it
+MAX_GAPS = 150  # bars of more packets than this touch
+MAX_SIZE_LABELS = 25  # sizes are not written for more cut packets than this
+LABELLED_SHARE = 0.06  # smaller shares of a part are not labelled
 
 
 def write_byte_plot(path: Path, rows: Sequence[Row], parts: Parts, *, title: str) -> None:
@@ -28,7 +28,7 @@ def write_byte_plot(path: Path, rows: Sequence[Row], parts: Parts, *, title: str
     Args:
         path: the picture; its suffix is a format that matplotlib writes.
         rows: all packets of the stream, at least one.
-        parts: bytes by field of parts of it; the last ones choose the order of the fields.
+        parts: bytes by field of its parts; the last ones determine the order of the fields.
         title: a line above.
 
     Raises:
@@ -47,7 +47,7 @@ def write_byte_plot(path: Path, rows: Sequence[Row], parts: Parts, *, title: str
 
 
 def field_colors(parts: Parts) -> dict[str, str]:
-    """A colour for each field above :data:`SMALL`: by parts from the last on, in a part by size."""
+    """A colour for each field above :data:`SMALL`, assigned from the last part to the first, by size in each part."""
     colours: dict[str, str] = {}
     for sizes in reversed(parts.values()):
         whole = sum(sizes.values())
@@ -63,13 +63,13 @@ def _packets(axis: "Axes", rows: Sequence[Row], colours: Mapping[str, str]) -> "
     total = np.array([row.bytes for row in rows]) / 1000
     key = np.array([row.kind == "key" for row in rows])
     top = float(total.max())
-    if key.any() and not key.all() and top > TOWERING * total[~key].max():
+    if key.any() and not key.all() and top > TALLEST_KEY * total[~key].max():
         top = 1.3 * float(total[~key].max())
     cut = total > top
     shown = np.minimum(total, top)
     base: NDArray[np.float64] = np.zeros(len(rows))
-    # Bars that touch have an edge of their own colour, or white hairs would show between them.
-    width, edge = (0.85, 0.0) if len(rows) <= GAPS else (1.0, 0.3)
+    # Bars that touch have an edge of their own colour, because otherwise white lines are visible between them.
+    width, edge = (0.85, 0.0) if len(rows) <= MAX_GAPS else (1.0, 0.3)
     for field, colour in colours.items():
         share = np.array([row.sizes.get(field, 0) / row.bytes for row in rows])
         height = shown - base if field == REST else shown * share
@@ -77,7 +77,7 @@ def _packets(axis: "Axes", rows: Sequence[Row], colours: Mapping[str, str]) -> "
         base = base + height
     axis.hlines([0.93 * top] * int(cut.sum()), index[cut] - 0.6, index[cut] + 0.6, color="white", linewidth=2.5)
     for number, size in zip(index[cut], total[cut]):
-        if cut.sum() <= NUMBERS:
+        if cut.sum() <= MAX_SIZE_LABELS:
             axis.annotate(
                 f"{size:,.0f}", (number, 1.04 * top), xytext=(6, 0), textcoords="offset points",
                 fontsize=8, color=INK, va="center",
@@ -96,13 +96,13 @@ def _packets(axis: "Axes", rows: Sequence[Row], colours: Mapping[str, str]) -> "
 
 
 def _shares(axis: "Axes", parts: Parts, colours: Mapping[str, str]) -> None:
-    """A bar across for each part, all of one length."""
+    """A horizontal bar for each part, all of equal length."""
     for row, sizes in enumerate(parts.values()):
         whole, base = sum(sizes.values()), 0.0
         for field, colour in colours.items():
             share = 1.0 - base if field == REST else sizes.get(field, 0.0) / whole
             axis.barh(row, share, left=base, height=0.72, color=colour)
-            if share >= TOLD:
+            if share >= LABELLED_SHARE:
                 ink = INK if _bright(colour) else "white"
                 axis.text(base + share / 2, row, f"{share:.0%}", fontsize=8, color=ink, ha="center", va="center")
             base += share

@@ -10,11 +10,11 @@ from torch import Tensor
 from structgstream.cameras import Camera, CameraRig
 from structgstream.errors import ConfigError
 
-ORBIT_SHARE = 0.5  # of the distance to the nearest cameras: further out, surfaces were seen from one side only
+ORBIT_SHARE = 0.5  # of the distance to the nearest cameras; farther out, surfaces were seen from one side only
 NEIGHBOURS = 3
 ARC_HALF_ANGLE = math.radians(50.0)
 LEAST_NEAR_SHARE = 0.01
-"""A free camera's near plane is at least this share of its nearest camera's: what is nearer is a blur."""
+"""A free camera's near plane is at least this share of its nearest camera's, because nearer content is blurred."""
 
 
 def focus_point(rig: CameraRig) -> Tensor:
@@ -38,7 +38,7 @@ def focus_point(rig: CameraRig) -> Tensor:
 
 
 def orbit(rig: CameraRig, frames: int, *, around: str | None = None) -> list[Camera]:
-    """A flat ellipse around a camera of the rig, always looking at the point in the centre of that camera's picture.
+    """A flat ellipse around a camera of the rig, directed at the point in the centre of that camera's picture.
 
     Args:
         rig: the cameras.
@@ -64,12 +64,12 @@ def orbit(rig: CameraRig, frames: int, *, around: str | None = None) -> list[Cam
 
 
 def arc(rig: CameraRig, frames: int, *, between: tuple[str, str] | None = None) -> list[Camera]:
-    """From one camera of the rig to another, at interpolated distances from the focus point.
+    """A path from one camera of the rig to another, at interpolated distances from the focus point.
 
     Args:
         rig: the cameras.
         frames: number of cameras on the path.
-        between: the ends; None for the two furthest apart of those within 50 degrees of the middle camera.
+        between: the ends; None for the two most distant cameras within 50 degrees of the middle camera.
 
     Raises:
         ConfigError: an unknown camera.
@@ -88,7 +88,7 @@ def arc(rig: CameraRig, frames: int, *, between: tuple[str, str] | None = None) 
 
 
 def looking(camera: Camera, eye: Tensor, target: Tensor, down: Tensor, rig: CameraRig) -> Camera:
-    """``camera`` moved to ``eye`` and turned to ``target``, upright as ``down`` says (all ``[3]``, world)."""
+    """``camera`` moved to ``eye`` and directed at ``target``; ``down`` is its vertical axis (``[3]`` each, world)."""
     forward = torch.nn.functional.normalize(target - eye, dim=0)
     right = torch.nn.functional.normalize(torch.linalg.cross(down, forward), dim=0)
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
@@ -98,10 +98,10 @@ def looking(camera: Camera, eye: Tensor, target: Tensor, down: Tensor, rig: Came
 
 
 def free_near(rig: CameraRig, eye: Tensor) -> float:
-    """The near plane of a free camera at ``eye`` ``[3]``: nothing that the rig's cameras show is behind it.
+    """The near plane of a free camera at ``eye`` ``[3]``, which cuts nothing that the rig's cameras show.
 
-    The rig's cameras show nothing nearer to them than their own near plane, so around each there is a ball of that
-    radius that need not be drawn; what is left of it shrinks as the free camera leaves its nearest camera.
+    The rig's cameras show nothing nearer than their own near plane, so a ball of that radius around each need not be
+    drawn. The near plane decreases with the distance of the free camera from its nearest camera.
     """
     distances = (rig.centers - eye).norm(dim=1)
     near = list(rig.cameras.values())[int(distances.argmin())].near

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pictures that a stream was made from."""
+"""Opens the capture that a stream was made from."""
 
 from pathlib import Path
 
@@ -10,12 +10,12 @@ from structgstream.data.wrappers import resized, section
 
 
 def part_metadata(*, start: int, scale: float, every: int) -> dict[str, object]:
-    """What a header says of the part of a capture that a stream is made from, which :func:`capture_of` reads.
+    """Metadata of a header on the part of a capture that a stream is made from; :func:`capture_of` reads it.
 
     Args:
         start: first frame.
         scale: size of the pictures relative to the stored ones.
-        every: step between frames; 1 is left out, as streams from before there were steps have none.
+        every: step between frames; 1 is left out, because older streams have no step.
     """
     part: dict[str, object] = {"start": start, "scale": scale}
     return part if every == 1 else part | {"every": every}
@@ -25,19 +25,19 @@ def capture_of(header: StreamHeader, folder: Path | str, *, frames: int | None) 
     """The part of the capture in ``folder`` that a stream was made from, at the stream's sizes.
 
     Args:
-        header: the stream's.
-        folder: the capture's.
-        frames: how many the stream has; None for all that the capture has from its first on.
+        header: header of the stream.
+        folder: folder of the capture.
+        frames: number of frames of the stream; None for all from the stream's first frame on.
 
     Raises:
-        CaptureError: the folder holds no capture, or less than the stream begins with.
+        CaptureError: the folder contains no capture, or the capture ends before the stream's first frame.
     """
     whole = open_capture(folder)
     return _part(resized(whole, _scale(header, whole)), header, frames)
 
 
 def stored_capture(header: StreamHeader, folder: Path | str, *, frames: int | None) -> FrameSource | None:
-    """As :func:`capture_of`, at the size of the stored pictures; None where these are not larger than the stream's.
+    """As :func:`capture_of`, at the size of the stored pictures; None if these are not larger than the stream's.
 
     Raises:
         CaptureError: see :func:`capture_of`.

@@ -32,7 +32,7 @@ def environment() -> dict[str, Any]:
 
 
 def usable_cores() -> int:
-    """Cores that this process may run on, which containers make fewer than the machine has."""
+    """Number of cores that this process may use, which a container may limit."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -50,7 +50,7 @@ def source_commit() -> str | None:
     """The commit of the working copy that this package runs from; ``-dirty`` when it has changes."""
     folder = Path(__file__).parents[1]
     git = shutil.which("git")
-    # Sources must be tracked: an environment inside some other repository would give that one's commit.
+    # Check that the sources are tracked: an environment may lie inside another repository.
     if git is None or _output(git, "ls-files", "--error-unmatch", "__init__.py", folder=folder) is None:
         return None
     return _output(git, "describe", "--always", "--dirty", "--exclude=*", folder=folder)

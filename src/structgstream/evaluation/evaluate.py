@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluates a stream from its file alone: decodes, renders held-out views, and compares."""
+"""Evaluates a stream from its file: decodes it, renders held-out views, and compares them with the capture."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -54,12 +54,12 @@ class Compared:
 
     Args:
         camera: its name.
-        truth: ``[H, W, 3]``; this and the next are black where a mask leaves pixels out.
-        picture: the rendering.
-        scores: of it.
+        truth: ``[H, W, 3]`` picture of the camera, black in masked pixels.
+        picture: ``[H, W, 3]`` rendering, black in masked pixels.
+        scores: scores of the rendering.
         first: the camera's first picture.
         counting: ``[H, W]``, the pixels that count in both; None for all.
-        ghosts: where something was (``ghosts.py``); None if the camera's background is not known.
+        ghosts: ghosts of the rendering (``ghosts.py``); None if the camera's background is not known.
     """
 
     camera: str
@@ -72,7 +72,7 @@ class Compared:
 
 
 EVALUATION = "evaluation"
-"""Name of the stage of memory that scoring is."""
+"""Name of the scoring stage in measurements of memory."""
 
 Observer = Callable[[int, Compared], None]
 
@@ -98,11 +98,12 @@ def evaluate(
         backend: the compute back-end.
         cameras: names of the cameras to score; None for the held-out ones.
         log: the trainer's log by frame number (``run_log.read_log``).
-        observer: called with frame number and comparison for every picture, for pictures and progress.
+        observer: called with frame number and comparison for every picture.
         metrics: "basic" leaves out the metrics that take longer than rendering: MS-SSIM, FLIP, LPIPS, temporal ones.
         flow: exact flow to the frame before, if the capture has it; None estimates it.
         lpips_weights: folder or file with the weights of LPIPS (``lpips.py``, Note [Weights]).
-        stored: the same frames at the capture's own, larger size (``capture.stored_capture``); None for no such scores.
+        stored: the same frames at the capture's own, larger size (``capture.stored_capture``); None to leave out these
+            scores.
 
     Raises:
         CaptureError: the capture is not the stream's: a camera is missing, has another calibration or picture size, or
@@ -157,13 +158,13 @@ def evaluate(
 
 @dataclass
 class _Comparison:
-    """Renderings against pictures, frame by frame, with what scores need of each camera's earlier frames.
+    """Compares renderings with pictures frame by frame, and stores what scores need of each camera's earlier frames.
 
     Args:
         views: cameras by name, scene units.
         backend: the compute back-end.
         optional_metrics: the metrics that take longer; None for none.
-        ghosts: finds what is still drawn where something was.
+        ghosts: finds ghosts.
         large: scores at the size of the stored pictures; None for none.
         first: each camera's first picture, and its mask.
         colors: each camera's colour response, fitted to frame 0.
@@ -187,7 +188,7 @@ class _Comparison:
     ) -> Compared:
         """The rendering of frame ``index`` by ``camera``, and its scores over the pixels of ``mask``.
 
-        Both pictures are black in the other pixels, so that these do not reach into the scores of their neighbours.
+        Both pictures are black in the other pixels, so that these do not affect the scores of their neighbours.
         """
         truth = blackened(truth, mask)
         first, first_mask = self.first.setdefault(camera, (truth, mask))
@@ -242,7 +243,7 @@ class _Comparison:
 
 
 def _not_available(metrics: OptionalMetrics | None, masked_share: Mapping[str, float]) -> dict[str, str]:
-    """Reasons for missing scores; those of what is missing altogether come before those of masks."""
+    """Reasons for missing scores; a metric that is not available at all takes precedence over masks."""
     if metrics is None:
         return {}
     reason = f"masks leave out pixels of {', '.join(masked_share)}, and this score compares whole pictures"

@@ -21,7 +21,7 @@ def scored_cameras(header: StreamHeader, cameras: tuple[str, ...] | None) -> tup
     """The cameras to score: the named ones, or all that were held out.
 
     Raises:
-        ConfigError: an unknown name, or nothing was held out and nothing named.
+        ConfigError: a name is unknown, or no camera was held out and none is named.
     """
     if cameras is None:
         if not header.rig.testing:
@@ -36,7 +36,7 @@ def scored_cameras(header: StreamHeader, cameras: tuple[str, ...] | None) -> tup
 
 
 def check_same_rig(header: StreamHeader, source: FrameSource, names: tuple[str, ...]) -> None:
-    """Check that the capture's cameras of these names are those of the stream.
+    """Check that the capture's cameras of these names are equal to those of the stream.
 
     Raises:
         CaptureError: one is missing, or has another calibration or picture size.
@@ -153,14 +153,14 @@ def _largest_by_stage(logs: list[Mapping[str, Any]]) -> dict[str, int]:
 def comparison_facts(
     frames: Sequence[FrameScores], names: Sequence[str], left_out: Mapping[str, Sequence[float]]
 ) -> dict[str, Any]:
-    """What was not compared: frames that cameras are absent from, and mean shares of masked pixels; both by camera.
+    """Data that was not compared: frames without a picture and mean shares of masked pixels, both by camera.
 
-    Cameras of which everything was compared are left out.
+    Cameras without such data are left out.
 
     Args:
         frames: the evaluated frames.
-        names: of the scored cameras.
-        left_out: camera name to the share of masked pixels in each of its pictures.
+        names: names of the scored cameras.
+        left_out: share of masked pixels in each of a camera's pictures, by camera name.
     """
     absent = {name: sum(name not in frame.cameras for frame in frames) for name in names}
     masked = {name: float(np.mean(shares)) for name, shares in left_out.items()}

@@ -2,10 +2,10 @@
 """LDR-FLIP (Andersson et al., 2020): visibility of the difference when a display alternates between two pictures.
 
 Implemented from the paper and tested against its authors' package, ``flip-evaluator`` 1.7, which takes 0.24 s of a core
-for a pair of 640x360. Temporal FLIP compares three pairs per picture: with its truth, with the rendering before, and
-the truth with the one before. So features are computed once per picture (:func:`features_of`, 6 ms of a core) and
-compared per pair (:func:`flip_of`, 1 ms). Operations are in place where possible, because allocating memory can cost
-more than the arithmetic.
+for a pair of 640x360. Temporal FLIP compares three pairs per frame: rendering with truth, rendering with the previous
+rendering, and truth with the previous truth. So features are computed once per picture (:func:`features_of`, 6 ms of a
+core) and compared per pair (:func:`flip_of`, 1 ms). Operations are in place where possible, because allocating memory
+can cost more than the arithmetic.
 """
 
 from dataclasses import dataclass
@@ -25,13 +25,13 @@ COLOR_EXPONENT, KNEE, KNEE_ERROR = 0.7, 0.4, 0.95  # q_c, p_c, p_t of the paper
 FEATURE_DEGREES = 0.082  # width of the detected edges and points
 FEATURE_EXPONENT = 0.5
 
-# Linear sRGB to XYZ in parts of white's, and from there to (Y, X - Y, Y - Z): YCxCz without the scales and offsets of
-# its axes, which filters that sum to one leave as they are.
+# Linear sRGB to XYZ relative to white, and from there to (Y, X - Y, Y - Z): YCxCz without the scales and offsets of its
+# axes, which do not change the result of filters that sum to one.
 XYZ = np.array([[0.412391, 0.357584, 0.180481], [0.212639, 0.715169, 0.072192], [0.019331, 0.119195, 0.950532]])
 TO_XYZ = XYZ / XYZ.sum(1, keepdims=True)
 TO_OPPONENT = np.array([[0.0, 1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, -1.0]]) @ TO_XYZ
 TO_LAB = np.array([[0.0, 116.0, 0.0, -16.0], [500.0, -500.0, 0.0, 0.0], [0.0, 200.0, -200.0, 0.0]])
-DELTA = 6 / 29  # below its cube, L*a*b* continues the cube root by its tangent
+DELTA = 6 / 29  # below its cube, L*a*b* replaces the cube root by its tangent
 
 Plane = NDArray[np.float32]
 
@@ -52,7 +52,7 @@ class FlipFeatures:
 
 
 def opencv() -> ModuleType:
-    """OpenCV, which filters.
+    """The module OpenCV, which filters pictures.
 
     Raises:
         MissingExtraError: it is not installed.
@@ -86,7 +86,7 @@ def flip_map(one: FlipFeatures, other: FlipFeatures) -> Plane:
     color = cv2.pow(light, COLOR_EXPONENT, dst=light)
     largest = _largest_color_difference()
     knee = KNEE * largest
-    # Both lines pass the knee, and the second is less steep.
+    # Both lines pass through the knee, and the second is less steep.
     above = (1 - KNEE_ERROR) / (largest - knee)
     second = color * np.float32(above)
     second += np.float32(1 - above * largest)
@@ -119,10 +119,10 @@ def _bell(deviation: float, radius: int) -> tuple[NDArray[np.float64], NDArray[n
 
 def _seen_color(cv2: ModuleType, opponent: tuple[Plane, ...]) -> tuple[Plane, Plane, Plane]:
     deviations = [[PIXELS_PER_DEGREE * (b / 2) ** 0.5 / np.pi for _, b in terms] for terms in SENSITIVITY]
-    radius = int(np.ceil(3 * max(max(of_one) for of_one in deviations)))  # of all three, as the paper has it
+    radius = int(np.ceil(3 * max(max(of_one) for of_one in deviations)))  # one for all three filters
     blurred = []
     for plane, terms, widths in zip(opponent, SENSITIVITY, deviations, strict=True):
-        # What lies further out than five deviations is less than the rounding of float32.
+        # The Gaussian beyond five deviations is below the rounding of float32.
         bells = [_bell(deviation, min(radius, int(np.ceil(5 * deviation))))[1] for deviation in widths]
         weights = [a * (np.pi / b) ** 0.5 * bell.sum() ** 2 for (a, b), bell in zip(terms, bells, strict=True)]
         total = np.zeros_like(plane)
@@ -139,9 +139,9 @@ def _seen_color(cv2: ModuleType, opponent: tuple[Plane, ...]) -> tuple[Plane, Pl
 
 
 def _lab(cv2: ModuleType, linear: NDArray[np.float32]) -> NDArray[np.float32]:
-    """L*a*b* of linear sRGB in [0, 1], both ``[..., 3]``; writes over what it is given."""
+    """L*a*b* of linear sRGB in [0, 1], both ``[..., 3]``; overwrites its argument."""
     xyz = cv2.transform(linear, TO_XYZ.astype(np.float32))
-    # The root's argument stays away from 0, and the tangent adds what is missing below: nothing is lost near black.
+    # The root's argument is bounded from below, and the tangent adds the difference: no precision is lost near black.
     knee = np.float32(DELTA**3)
     root = np.maximum(xyz, knee, out=linear)
     cv2.pow(root, 1 / 3, dst=root)
@@ -157,7 +157,7 @@ def _edges_and_points(cv2: ModuleType, luminance: Plane) -> tuple[Plane, Plane]:
     x, bell = _bell(deviation, int(np.ceil(3 * deviation)))
     found = []
     for kernel in (-x * bell, ((x / deviation) ** 2 - 1) * bell):
-        # Positive weights sum to 1 and negative ones to -1; across, the Gaussian sums to 1.
+        # Positive weights sum to 1 and negative ones to -1; in the other direction the Gaussian sums to 1.
         along = np.where(kernel > 0, kernel / kernel[kernel > 0].sum(), kernel / -kernel[kernel < 0].sum())
         pair = along.astype(np.float32), (bell / bell.sum()).astype(np.float32)
         x_and_y = (pair, pair[::-1])
@@ -167,7 +167,7 @@ def _edges_and_points(cv2: ModuleType, luminance: Plane) -> tuple[Plane, Plane]:
 
 
 def _length(x: Plane, y: Plane) -> Plane:
-    """Of the vectors ``(x, y)``; writes over both. OpenCV's own rounds differently with where the memory lies."""
+    """Length of the vectors ``(x, y)``; overwrites both. OpenCV's own function rounds depending on memory alignment."""
     x *= x
     y *= y
     x += y
@@ -175,7 +175,7 @@ def _length(x: Plane, y: Plane) -> Plane:
 
 
 def _largest_color_difference() -> float:
-    """Of pure green and pure blue, the furthest apart that a display has, to the exponent."""
+    """Colour difference of pure green and pure blue, the largest on a display, raised to :data:`COLOR_EXPONENT`."""
     green, blue = (_hunt_adjusted(color) for color in (np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])))
     return float((abs(green[0] - blue[0]) + np.hypot(*(green - blue)[1:])) ** COLOR_EXPONENT)
 

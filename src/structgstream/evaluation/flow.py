@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Backward optical flow between consecutive pictures of one camera.
 
-Synthetic captures give exact flow instead of estimated flow: any :data:`Flow`.
+Synthetic captures may provide exact flow instead: any :data:`Flow`.
 """
 
 from collections.abc import Callable
@@ -27,7 +27,7 @@ class FlowField:
 
 
 Flow = Callable[[NDArray[np.uint8], NDArray[np.uint8], str, int], FlowField]
-"""Truth of the frame before, truth of this frame, camera name, number of this frame; gives the field of this frame."""
+"""From truth of the previous frame, truth of this frame, camera name and frame number to this frame's flow field."""
 
 
 def dis_flow() -> Flow:

@@ -1,21 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ghosts: what is still drawn where something has been and is no more.
+"""Ghosts: content that is still drawn at a place that it has left.
 
 Note [Ghosts]
 ~~~~~~~~~~~~~
-The truth alone says where a ghost may be. Its *background* is the median, pixel by pixel, of at most 15 pictures that
-are spread over ten seconds: what is there most of the time. A pixel is *occupied* while the truth is off the background
-by more than 20 levels, and *disoccluded* if
+The truth alone determines where a ghost may be. Its *background* is the median, pixel by pixel, of at most 15 pictures
+that are spread over ten seconds. A pixel is *occupied* while the truth differs from the background by more than 20
+levels, and *disoccluded* if
 
-- something was there, or within 1.9 % of the picture's longer side of it, in an earlier frame of the last two seconds
-  (12 frames at least),
-- nothing is within 0.9 % of that side now, and
-- the truth is within 8 levels of the background: as it was before it came.
+- a pixel within 1.9 % of the picture's longer side was occupied in an earlier frame of the last two seconds (at least
+  12 frames),
+- no pixel within 0.9 % of that side is occupied now, and
+- the truth is within 8 levels of the background.
 
-A disoccluded pixel is a *ghost* if the rendering is off the truth by more than 8 levels, and not wrong all along: where
-it was seen before something came, it is off what was drawn then by more than 8 levels, too; elsewhere, as behind what
-stood there in the first frame, its error holds a quarter or more of the colour of what was there. Ghosts that no square
-of 0.8 % of the side fits into are left out: outlines that are a little off are no ghosts. It counts while it stays.
+A disoccluded pixel is a *ghost* if the rendering differs from the truth by more than 8 levels and was not wrong before.
+If the pixel was visible before it was occupied, the rendering must also differ from the rendering of that time by more
+than 8 levels. Otherwise, for example behind an object of the first frame, the error must contain at least a quarter of
+the colour of the object that was there. Ghosts into which no square of 0.8 % of the side fits are left out, because
+they are slightly displaced outlines. A ghost counts in every frame in which it is visible.
 
 Differences of pictures are means over the channels and 3x3 pixels. Pictures whose longer side has 1280 pixels or more
 are reduced first, by a whole factor and by area mean, to 640 to 1279, so that size does not change the score.
@@ -37,8 +38,8 @@ Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
 OCCUPIED, RESTORED, WRONG = 20, 8, 8  # levels of 255; noise of cameras and compression is 2 to 4 after the 3x3 mean
-REACH, MARGIN = 12 / 640, 6 / 640  # shares of the longer side: soft edges, and shadows beside what moves
-SPECK = 2 / 640  # half the width of the smallest ghost; thinner are outlines that are a little off
+REACH, MARGIN = 12 / 640, 6 / 640  # shares of the longer side: soft edges, and shadows next to moving objects
+SPECK = 2 / 640  # half the width of the smallest ghost; thinner ones are displaced outlines
 SIDE = 640  # pixels of the longer side that a reduced picture has at least
 RESIDUAL = 0.25  # of the difference between what was there and the truth
 MEMORY_SECONDS, MEMORY_FRAMES = 2.0, 12
@@ -52,10 +53,10 @@ class Ghosts:
     """The ghosts of one picture.
 
     Args:
-        disoccluded: ``[h, w]``, where something was and the truth is as before; of the reduced picture.
-        ghosts: ``[h, w]``, those of them where the rendering is wrong.
-        pixels: how many pixels could be: those that count.
-        factor: pixels of the picture that a pixel of these masks is wide.
+        disoccluded: ``[h, w]`` mask of the disoccluded pixels of the reduced picture.
+        ghosts: ``[h, w]`` mask of the ghosts among them.
+        pixels: number of pixels that count.
+        factor: side of a pixel of these masks, in pixels of the picture.
         psnr: dB over the disoccluded pixels; None without any.
     """
 
@@ -67,7 +68,7 @@ class Ghosts:
 
     @property
     def disoccluded_share(self) -> float:
-        """Share of the pixels that count."""
+        """Disoccluded share of the pixels that count."""
         return int(np.count_nonzero(self.disoccluded)) / max(self.pixels, 1)
 
     @property
@@ -79,16 +80,16 @@ class Ghosts:
 
 @dataclass
 class GhostFinder:
-    """One camera's ghosts, frame after frame.
+    """Finds one camera's ghosts, frame by frame.
 
     Args:
-        memory: number of frames after which a pixel that something was on is one like others.
+        memory: number of frames after which an occupied pixel can no longer become a ghost.
         background: the present one, reduced; None before the first.
-        occupied: ``[h, w]`` number of the last frame in which something was on a pixel or near it.
-        left: the last truth of each pixel with something on it, reduced; the background where there was nothing.
-        before: the last rendering of each pixel with nothing on it, reduced.
-        seen: ``[h, w]``, where there is one.
-        stuck: ``[h, w]``, where the last picture had a ghost on a pixel that was seen before.
+        occupied: ``[h, w]`` number of the last frame in which the pixel, or one near it, was occupied.
+        left: reduced truth of each pixel when it was last occupied; the background for pixels that never were.
+        before: reduced rendering of each pixel when it was last not occupied.
+        seen: ``[h, w]`` mask of the pixels with a value in ``before``.
+        stuck: ``[h, w]`` mask of the last picture's ghosts among the pixels of ``seen``.
     """
 
     memory: int
@@ -100,7 +101,7 @@ class GhostFinder:
     stuck: Mask = field(default_factory=lambda: np.empty((0, 0), np.bool_))
 
     def begin(self, background: Picture) -> None:
-        """Take another background, reduced; where it differs from the last one, nothing is known of before."""
+        """Set another background, reduced; pixels where it differs from the last one are reset."""
         if self.background is None:
             shape = background.shape[:2]
             self.occupied = np.full(shape, NEVER, np.int32)
@@ -114,11 +115,11 @@ class GhostFinder:
         self.background = background
 
     def find(self, picture: Picture, truth: Picture, *, index: int, mask: Mask | None = None) -> Ghosts:
-        """The ghosts of the rendering of frame ``index``; frames are given in order, with a background before.
+        """The ghosts of the rendering of frame ``index``; call :meth:`begin` first, then this in order of frames.
 
         Args:
             picture: the rendering, ``[H, W, 3]``, as large as the truth.
-            truth: what the camera took.
+            truth: the camera's picture.
             index: number of the frame.
             mask: ``[H, W]``, the pixels that count; None for all.
         """
@@ -150,9 +151,9 @@ def pixels_of(share: float, picture: Picture) -> int:
 
 
 def shows(thing: Picture, drawn: Picture, true: Picture) -> Mask:
-    """Where the error of ``drawn`` holds :data:`RESIDUAL` or more of the colour of ``thing``, which is not the truth's.
+    """Mask ``[H, W]`` where the error of ``drawn`` contains at least :data:`RESIDUAL` of the colour of ``thing``.
 
-    All are ``[H, W, 3]``; the share is that of the error's projection onto the difference of thing and truth.
+    All are ``[H, W, 3]``. The share is that of the error's projection onto the difference of thing and truth.
     """
     error, whole = (np.subtract(one, true, dtype=np.int16).astype(np.int32) for one in (drawn, thing))
     lengths = whole[..., 0] ** 2 + whole[..., 1] ** 2 + whole[..., 2] ** 2
@@ -161,7 +162,7 @@ def shows(thing: Picture, drawn: Picture, true: Picture) -> Mask:
 
 
 def opened(mask: Mask, pixels: int) -> Mask:
-    """What squares that reach ``pixels`` from their middle to each side, and lie in ``mask`` ``[H, W]``, cover."""
+    """Morphological opening of ``mask`` ``[H, W]`` by a square that reaches ``pixels`` from its middle to each side."""
     return dilate(~dilate(~mask, pixels), pixels) & mask
 
 
@@ -183,10 +184,10 @@ class GhostSearch:
 
     Args:
         source: the capture, which is read again for the backgrounds.
-        names: of the cameras.
+        names: names of the cameras.
         frames: number of frames that are scored.
-        finders: by camera.
-        ends: number of the frame that the next section begins with.
+        finders: finder of each camera.
+        ends: number of the first frame of the next section.
     """
 
     source: FrameSource
@@ -212,7 +213,7 @@ class GhostSearch:
 
 
 def sections(frames: int, fps: float) -> Iterator[tuple[int, int]]:
-    """First frame and end of each of the equal parts, of about ten seconds, that have a background each."""
+    """First frame and end of each section: equal parts of about ten seconds that have a background each."""
     length = max(round(SECTION_SECONDS * fps), SECTION_FRAMES)
     count = max(1, round(frames / length))
     for number in range(count):
@@ -220,7 +221,7 @@ def sections(frames: int, fps: float) -> Iterator[tuple[int, int]]:
 
 
 def backgrounds(source: FrameSource, names: tuple[str, ...], *, first: int, end: int) -> Mapping[str, Picture]:
-    """The median picture of each camera over spread frames from ``first`` to ``end``, reduced; none of absent ones."""
+    """The reduced median picture of each camera over spread frames from ``first`` to ``end``; no absent cameras."""
     step = -(-(end - first) // SAMPLES)
     taken: dict[str, list[Picture]] = {}
     for frame in every_nth_frame(section(source, start=first, frames=end - first), step).frames():
@@ -231,7 +232,7 @@ def backgrounds(source: FrameSource, names: tuple[str, ...], *, first: int, end:
 
 
 def _median(pictures: list[Picture]) -> Picture:
-    """The median of each value; of an even number the mean of the middle two, so that a tie is neither."""
+    """The median of each value; for an even number of pictures the mean of the middle two."""
     ordered = np.sort(np.stack(pictures), axis=0)
     low, high = ordered[(len(pictures) - 1) // 2], ordered[len(pictures) // 2]
     return ((low.astype(np.uint16) + high) // 2).astype(np.uint8)

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """LPIPS (Zhang et al., 2018), version 0.1: distance of two pictures in the features of a classification network.
 
-The trunks are implemented in plain torch. The published heads come with the package (``lpips_heads.npz``, licence
-beside it); the trunks' weights are too large for that and must be installed (Note [Weights]). Without them LPIPS is not
+The trunks are implemented in plain torch. The published heads are part of the package (``lpips_heads.npz``, with their
+licence). The trunks' weights are too large for that and must be installed (Note [Weights]); without them LPIPS is not
 available.
 
 Note [Weights]
 ~~~~~~~~~~~~~~
 A trunk's weights are a torch file with torchvision's names of layers (``features.0.weight``). It is searched in this
 order: the given path; the environment variable ``STRUCTGSTREAM_LPIPS_WEIGHTS``; torch's hub cache, where torchvision
-stores it. A path may be a folder or one trunk's file. If a file name ends in eight digits of its SHA-256, as
+stores it. A path may be a folder or one trunk's file. If a file name ends with eight digits of its SHA-256, as
 torchvision's do, they are verified.
 """
 
@@ -35,12 +35,12 @@ DEVIATION = (0.458, 0.448, 0.450)
 EPSILON = 1e-10  # added to a feature vector's length
 
 Features = tuple[Tensor, ...]
-"""Of one picture: for each of five layers ``[C, h, w]``, each pixel's vector normalised to length 1 (or 0)."""
+"""Features of one picture: ``[C, h, w]`` for each of five layers, each pixel's vector of length 1 (or 0)."""
 
 
 @dataclass(frozen=True)
 class Layer:
-    """A convolution with ReLU, after a ``pool`` (size, stride) if any; ``tap``: LPIPS compares its output."""
+    """A convolution with ReLU, after a ``pool`` (size, stride) if any. LPIPS compares its output if ``tap`` is True."""
 
     index: int
     shape: tuple[int, int, int]  # channels out, channels in, kernel size
@@ -52,7 +52,7 @@ class Layer:
 
 @dataclass(frozen=True)
 class Trunk:
-    """A network up to its last tap. ``pattern`` and ``file`` name its weights, ``smallest`` the side it needs."""
+    """A network up to its last tap. ``pattern`` and ``file`` name its weights; ``smallest`` is the side it needs."""
 
     name: str
     title: str
@@ -99,8 +99,8 @@ class Lpips:
 
     Args:
         trunk: the network.
-        weights: of each of the trunk's layers, kernel and bias.
-        heads: of each tap, the weight ``[C]`` of each channel's squared difference.
+        weights: kernel and bias of each of the trunk's layers.
+        heads: for each tap the weight ``[C]`` of each channel's squared difference.
     """
 
     trunk: Trunk
@@ -124,7 +124,8 @@ class Lpips:
         return tuple(taps)
 
     def distance(self, a: Features, b: Features) -> float:
-        """LPIPS of two pictures by their features: over layers the sum, over pixels the mean of weighted squares."""
+        """LPIPS of two pictures: the weighted squared differences of their features, averaged over pixels and summed
+        over layers."""
         total = 0.0
         for head, x, y in zip(self.heads, a, b, strict=True):
             total += float(head @ (x - y).square_().flatten(1).mean(1))
@@ -205,7 +206,7 @@ def _tensor(state: object, name: str, shape: tuple[int, ...], path: Path, trunk:
     if not isinstance(value, Tensor) or tuple(value.shape) != shape:
         got = f"the shape {tuple(value.shape)}" if isinstance(value, Tensor) else "nothing"
         raise ConfigError(
-            f"{path} holds no weights of {trunk.title}: {name} must have the shape {shape}, got {got}; "
+            f"{path} contains no weights of {trunk.title}: {name} must have the shape {shape}, got {got}; "
             f"expected a state dict like torchvision's {trunk.file}."
         )
     return value.float()

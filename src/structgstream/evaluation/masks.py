@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Masks of the pixels that changed since the first frame, and of those that count.
+"""Masks of pixels that changed since the first frame, and of pixels that count.
 
-In typical captures nine of ten pixels are static, so a mean over all pixels hides the quality of moving parts. The
-masks are computed from the camera's pictures, never from renderings.
+In typical captures nine of ten pixels are static, so a mean over all pixels hides the quality of moving parts. Masks
+are computed from the camera's pictures, never from renderings.
 """
 
 import math
@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from structgstream.cameras import enlargement
 
 THRESHOLD = 0.1  # of full scale
-SMOOTHED = 1  # half width in pixels of a 3x3 mean against noise, which is of pixels at any size
+SMOOTHED = 1  # half width, pixels, of a 3x3 mean against noise, which does not depend on the picture's size
 REACH_PIXELS = 3  # of the dilation, which includes edges; multiplied by the picture's enlargement
 
 
 def blackened(picture: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
-    """``picture`` ``[H, W, 3]``, black where the mask ``[H, W]`` is False; None leaves it as it is."""
+    """``picture`` ``[H, W, 3]``, black where the mask ``[H, W]`` is False; unchanged without a mask."""
     return picture if mask is None else np.where(mask[..., None], picture, np.uint8(0))
 
 
@@ -36,7 +36,7 @@ def changed_pixels(
 
     The absolute difference of the two pictures ``[H, W, 3]``, averaged over channels and 3x3 pixels, is thresholded at
     0.1 of full scale, and the mask dilated by 3 pixels of a picture of the reference size
-    (:func:`structgstream.cameras.enlargement`). Pixels outside of ``mask`` have not changed.
+    (:func:`structgstream.cameras.enlargement`). Pixels outside ``mask`` count as not changed.
     """
     if mask is not None:
         return changed_pixels(blackened(truth, mask), blackened(first, mask)) & mask
@@ -46,8 +46,10 @@ def changed_pixels(
 
 
 def differing(one: NDArray[np.uint8], other: NDArray[np.uint8], levels: float) -> NDArray[np.bool_]:
-    """Where two pictures ``[H, W, 3]`` differ by more than ``levels`` of 255, absolute, averaged over channels and 3x3
-    pixels, ``[H, W]``."""
+    """Mask ``[H, W]`` of the pixels where two pictures ``[H, W, 3]`` differ by more than ``levels`` of 255.
+
+    The absolute difference is averaged over channels and 3x3 pixels.
+    """
     # Sums of integers: exact, and half the memory of floats.
     channels = np.abs(np.subtract(one, other, dtype=np.int16))
     difference = channels[..., 0] + channels[..., 1] + channels[..., 2]

@@ -97,7 +97,7 @@ def ms_ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float | Non
 def masked_ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8], mask: NDArray[np.bool_]) -> float:
     """Mean of :func:`ssim_map` over the pixels of ``mask`` ``[H, W]``, of pictures that are black in the others.
 
-    So a masked pixel is treated as one beyond the border.
+    A pixel outside the mask is therefore treated as one beyond the border.
     """
     return float(ssim_map(picture, truth)[:, torch.from_numpy(mask)].mean())
 
@@ -105,7 +105,7 @@ def masked_ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8], mask: NDAr
 def ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8], backend: Backend) -> float:
     """Mean of :func:`ssim_map` over pixels and channels, as Gaussian splatting papers report it.
 
-    On real pictures all back-ends agree within 1e-5; the C++ is the nearest to float64.
+    On real pictures all back-ends agree within 1e-5; the C++ one is the nearest to float64.
     """
     device = backend.device
     image, target = (torch.from_numpy(np.ascontiguousarray(p)).to(device) for p in (picture, truth))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics with further requirements: an optional package, weights, or the previous frame.
+"""Metrics with requirements: an optional package, weights, or the previous frame.
 
 If a requirement is missing, the metric is None, and the reason and its remedy are reported once.
 """
@@ -38,10 +38,10 @@ class OptionalMetrics:
 
     Args:
         flip: computes FLIP's features of a picture, or None.
-        lpips: by name of the trunk, those whose weights were found.
+        lpips: the trunks whose weights were found, by name.
         flow: backward flow, or None.
-        weights: by name of the trunk, the file of its weights.
-        not_available: for each missing metric the reason.
+        weights: the file of each trunk's weights, by name of the trunk.
+        not_available: the reason for each missing metric.
     """
 
     flip: Callable[[Picture], FlipFeatures] | None
@@ -53,9 +53,9 @@ class OptionalMetrics:
 
 @dataclass(frozen=True)
 class ComparedFrame:
-    """One camera's frame, kept for the temporal metrics of the next: pictures and their FLIP and LPIPS features.
+    """One camera's frame, stored for the temporal metrics of the next: pictures and their FLIP and LPIPS features.
 
-    Each pair is of truth and rendering, or None where that metric is not computed. Only the pixels of ``mask`` count.
+    Each pair is of truth and rendering, or None if that metric is not computed. Only the pixels of ``mask`` count.
     """
 
     truth: Picture
@@ -76,9 +76,9 @@ def load_optional_metrics(
     """The metrics that are available here for these cameras (by name) and this number of frames.
 
     Args:
-        cameras: those that are scored; a metric that needs larger pictures than one of them has is left out.
+        cameras: the scored cameras; a metric that needs larger pictures than one of them has is left out.
         frames: number of frames; temporal metrics need two.
-        device: computes LPIPS.
+        device: device that computes LPIPS.
         flow: exact flow; None estimates it.
         lpips_weights: folder or file with the trunks' weights (``lpips.py``, Note [Weights]).
 
@@ -128,8 +128,8 @@ def optional_scores(
 ) -> tuple[dict[str, float | None], ComparedFrame]:
     """Further scores of one picture, by their names in ``Scores``, and the state for the next frame.
 
-    FLIP, flicker and the warping error are of the pixels of ``mask``. MS-SSIM, LPIPS and the differences of changes
-    compare whole pictures, so with a mask they are None.
+    FLIP, flicker and the warping error are computed over the pixels of ``mask``. MS-SSIM, LPIPS and the differences of
+    changes compare whole pictures, so they are None with a mask.
 
     Args:
         optional_metrics: the available metrics.
@@ -167,7 +167,7 @@ def optional_scores(
 
 
 def _counting(field: FlowField, mask: Mask | None, before: Mask | None) -> FlowField:
-    """The flow of pixels that count now and counted where they were."""
+    """``field`` restricted to pixels that count in this frame and whose sources counted in the frame before."""
     seen = field.seen if mask is None else field.seen & mask
     if before is not None:
         seen = seen & (sampled(before.astype(np.float32)[..., None].repeat(3, axis=2), field.offsets)[..., 0] > 0.999)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a report's folder: worst frames first, then the course over time and the contact sheet."""
+"""The HTML page of a report's folder: worst frames first, then plots over time and the contact sheet."""
 
 from collections.abc import Sequence
 from html import escape
@@ -21,7 +21,7 @@ img.wide { max-width: 100%; }
 
 
 def write_worst(folder: Path, crops: Sequence[Crop]) -> list[str]:
-    """Writes each crop at full size as PNG below ``folder``; their names relative to it.
+    """Writes each crop at full size as a PNG file below ``folder``; returns their names relative to it.
 
     Raises:
         StorageError: a file cannot be written.
@@ -38,10 +38,10 @@ def write_page(folder: Path, crops: Sequence[Crop], *, title: str, pictures: Seq
     """Writes ``index.html`` and the crops into the folder of a report.
 
     Args:
-        folder: of the report.
+        folder: folder of the report.
         crops: the worst windows.
         title: heading.
-        pictures: file names of the pictures beside the page.
+        pictures: file names of further pictures in the folder.
 
     Raises:
         StorageError: a file cannot be written.
@@ -63,13 +63,13 @@ def write_page(folder: Path, crops: Sequence[Crop], *, title: str, pictures: Seq
 def _figure(name: str, crop: Crop) -> str:
     window, height = crop.window, crop.picture.shape[0]
     where = f"{window.width}x{window.height} pixels at ({window.x}, {window.y})"
-    caption = f"Frame {crop.frame}, camera {crop.camera}: {_told(crop)}; {where}"
+    caption = f"Frame {crop.frame}, camera {crop.camera}: {_caption(crop)}; {where}"
     shown = height * (2 if height < 200 else 1)
     image = f"<img src='{quote(name)}' height={shown} alt='{escape(caption)}'>"
     return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
-def _told(crop: Crop) -> str:
+def _caption(crop: Crop) -> str:
     if crop.reason == "changed":
         return f"{crop.scores['psnr_changed']:.2f} dB on changed pixels"
     return (

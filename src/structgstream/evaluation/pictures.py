@@ -37,7 +37,7 @@ def thumbnail(picture: Picture, largest: int = LARGEST_TILE) -> Picture:
 
 
 def spread_indices(count: int, columns: int) -> list[int]:
-    """At most ``columns`` frame numbers below ``count``, evenly spread, the first and the last among them."""
+    """At most ``columns`` frame numbers below ``count``, evenly spread, including the first and the last."""
     return sorted({round(i) for i in np.linspace(0, count - 1, min(columns, count))})
 
 

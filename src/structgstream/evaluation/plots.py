@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plots of a report over time in one picture: quality, bytes, counts, seconds."""
+"""Plots of a report over time, in one picture: quality, bytes, counts, seconds."""
 
 from collections.abc import Callable, Sequence
 from itertools import cycle, product
@@ -101,11 +101,11 @@ def _lines(axis: "Axes", report: Report, keys: Sequence[tuple[str, str]]) -> Non
         if points := _known(report, key):
             axis.plot(*zip(*points), color=colour, linewidth=1.5, label=label)
             largest = max(largest, *(value for _, value in points))
-    axis.set_ylim(0, 1.1 * largest or None)  # Margins of nearly constant values would cut the line.
+    axis.set_ylim(0, 1.1 * largest or None)  # Automatic margins of nearly constant values would cut the line.
 
 
 def _known(report: Report, key: str) -> list[tuple[int, float]]:
-    """Frame number and mean of a score, where there is one."""
+    """Frame number and mean of a score, for the frames that have one."""
     values = [(frame.index, getattr(frame.mean, key)) for frame in report.frames if frame.mean is not None]
     return [(index, value) for index, value in values if value is not None]
 
@@ -151,7 +151,7 @@ def _stacked(axis: "Axes", index: Sequence[int], values: dict[str, Any]) -> None
     whole = sum(array.sum() for array in values.values())
     shown = sorted((name for name in values if values[name].sum() > whole / 1000), key=lambda n: -values[n].sum())
     base = np.zeros(len(index))
-    # A second round through the colours is hatched, so that no two fields look alike.
+    # Colours that are used a second time are hatched, so that no two fields look alike.
     looks = cycle(product((None, "////", "...."), COLORS))
     for name in shown:
         hatch, colour = (None, OTHER) if name == "other" else next(looks)
@@ -171,7 +171,7 @@ def _stacked(axis: "Axes", index: Sequence[int], values: dict[str, Any]) -> None
 
 
 def _stages(frame: FrameScores) -> dict[str, float]:
-    """Seconds by stage and the remainder, without the log's totals, so that the bars add up to them."""
+    """Seconds by stage and the remainder, without the log's totals, so that the bars sum to the totals."""
     seconds = dict(frame.log.get("seconds", {}))
     total = seconds.pop("total", 0.0)
     seconds.pop("fit", None)

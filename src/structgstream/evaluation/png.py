@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes PNG files with the standard library, so that pictures need no optional package."""
+"""Writes PNG files with the standard library only, so that pictures need no optional package."""
 
 import struct
 import zlib
@@ -21,7 +21,7 @@ def png_bytes(picture: NDArray[np.uint8]) -> bytes:
     above = np.concatenate([np.zeros_like(rows[:1]), rows[:-1]])
     lines = np.empty((height, 1 + width * 3), np.uint8)
     lines[:, 0] = FILTER_UP
-    lines[:, 1:] = rows - above  # modulo 256, as the format has it
+    lines[:, 1:] = rows - above  # modulo 256, as the format defines
     header = struct.pack(">IIBBBBB", width, height, 8, RGB, 0, 0, 0)
     parts = (
         (b"IHDR", header),
@@ -33,7 +33,7 @@ def png_bytes(picture: NDArray[np.uint8]) -> bytes:
 
 
 def write_png(path: Path, picture: NDArray[np.uint8]) -> None:
-    """Writes ``picture`` ``[H, W, 3]``, whole or not at all, and makes the folder when it is missing.
+    """Writes ``picture`` ``[H, W, 3]`` atomically; creates the folder if it is missing.
 
     Raises:
         StorageError: the file cannot be written.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A small picture beside a stream of segments, which ``structgstream serve`` shows in its list."""
+"""A preview picture of a segmented stream, which ``structgstream serve`` shows in its list."""
 
 from contextlib import suppress
 from typing import Final
@@ -20,10 +20,10 @@ WIDTH: Final = 320
 
 
 class PreviewSink:
-    """Passes a stream on to ``sink``, and renders ``preview.png`` of each key frame into the same store.
+    """Forwards a stream to ``sink``, and writes ``preview.png`` of each key frame to the same store.
 
-    The picture is rendered on the processor from the decoded packet, so that the run's GPU memory and random numbers
-    do not change. A preview that cannot be written is left out.
+    The picture is rendered on the CPU from the decoded packet, so that the run's GPU memory and random numbers do not
+    change. A preview that cannot be written is skipped.
 
     Args:
         sink: receives the stream.
@@ -55,10 +55,10 @@ class PreviewSink:
 
 
 def preview(header: StreamHeader, packet: Packet) -> NDArray[np.uint8]:
-    """A key frame from the middle one of the training cameras, at most 320 pixels wide: ``[H, W, 3]`` 8-bit sRGB.
+    """A key frame ``[H, W, 3]`` (8-bit sRGB) from the middle training camera, at most 320 pixels wide.
 
     Args:
-        header: of the packet's period.
+        header: header of the packet's period.
         packet: a key packet.
     """
     name = header.rig.training[len(header.rig.training) // 2]

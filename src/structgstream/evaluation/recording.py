@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The protocol of files that can be evaluated: a drawable per frame, of this method or another."""
+"""The protocol of files that can be evaluated: one drawable per frame, of this method or another."""
 
 from collections.abc import Iterator, Sequence
 from typing import Protocol, runtime_checkable
@@ -16,7 +16,7 @@ from structgstream.scene.state import on_device
 
 @runtime_checkable
 class Movable(Drawable, Protocol):
-    """A drawable whose tensors can be on another device."""
+    """A drawable whose tensors can be moved to another device."""
 
     def on_device(self, device: torch.device) -> Drawable: ...
 
@@ -24,9 +24,9 @@ class Movable(Drawable, Protocol):
 class Recording(Protocol):
     """An opened file with one packet per frame, such as a ``StreamReader``.
 
-    ``scenes`` decodes a drawable in normalised units frame by frame; ``complete`` states whether the run that wrote the
-    file finished. A drawable that is no ``Scene`` has a length, its number of Gaussians, and, to be drawn on another
-    device than the CPU, ``on_device`` (:class:`Movable`).
+    ``scenes`` decodes a drawable in normalised units frame by frame. ``complete`` states whether the run that wrote the
+    file finished. The length of a drawable other than a ``Scene`` is its number of Gaussians. It needs ``on_device``
+    (:class:`Movable`) to be drawn on another device than the CPU.
     """
 
     @property

@@ -17,13 +17,13 @@ class Scores:
     """Scores of one picture, or their mean over several.
 
     Args:
-        psnr: dB, the headline.
+        psnr: dB, the main result.
         ssim: see ``metrics.ssim``.
         psnr_affine: dB after the best affine change of colour towards the truth (``affine.py``).
         psnr_camera_color: dB after a gain and a bias per channel, fitted to the camera's first frame (``affine.py``,
             Note [Colour of a camera]); None without a fit.
         psnr_changed: dB over the pixels that changed since the camera's first picture; None without any.
-        psnr_still: dB over the other pixels; None without any.
+        psnr_still: dB over the other, static pixels; None without any.
         changed_share: share of the pixels that changed.
         render_seconds: wall-clock time of the rendering, the picture in main memory.
         ms_ssim: see ``metrics.ms_ssim``. This and the following scores are None if not requested or not available;
@@ -39,11 +39,11 @@ class Scores:
         truth_flicker: that of the truth: the camera's noise.
         psnr_half: dB of a rendering at half size (``sizes.py``); None for pictures of one row or column.
         ssim_half: SSIM of it.
-        psnr_stored: dB of a rendering at the size of the stored pictures, where those are larger than the stream's;
-            None elsewhere, and in the frames that are not scored so.
+        psnr_stored: dB of a rendering at the size of the stored pictures, if those are larger than the stream's; None
+            otherwise, and in frames that are not scored at this size.
         ssim_stored: SSIM of it.
-        disoccluded_share: share of the pixels where something was and the truth is as before (``ghosts.py``).
-        ghost_share: share of these pixels where the rendering is not. This and the next are None without any of them.
+        disoccluded_share: share of disoccluded pixels (``ghosts.py``, Note [Ghosts]).
+        ghost_share: share of ghosts among the disoccluded pixels. This and the next are None without any of them.
         psnr_disoccluded: dB over these pixels.
     """
 
@@ -74,7 +74,7 @@ class Scores:
 
 
 OF_DISOCCLUDED = ("ghost_share", "psnr_disoccluded")
-"""Scores of the disoccluded pixels: a mean weighs each picture by its number of them, of which some have hardly any."""
+"""Scores of disoccluded pixels. A mean weighs each picture by its number of them, because some pictures have few."""
 
 
 @dataclass(frozen=True)
@@ -88,10 +88,10 @@ class FrameScores:
         bytes: length of the packet's record in the file.
         field_bytes: bytes by field of the state table.
         anchors: anchors of the decoded scene.
-        free: free Gaussians of the decoded scene; of another method's drawable all of them.
+        free: free Gaussians of the decoded scene; all Gaussians for another method's drawable.
         decode_seconds: wall-clock time from the file to the scene on its device.
         cameras: scores by camera name, without cameras that are absent from the frame.
-        mean: their mean; None without any.
+        mean: mean of these scores; None without any.
         log: the frame's entry in the trainer's log; empty without a log.
     """
 
@@ -128,7 +128,7 @@ class Report:
 
 
 def mean_scores(scores: Iterable[Scores]) -> Scores:
-    """The mean of each score; a None is left out, and the mean of Nones is None. See :data:`OF_DISOCCLUDED`."""
+    """The mean of each score without None; None if all are None. See :data:`OF_DISOCCLUDED`."""
     rows = list(scores)
     means = {}
     for entry in fields(Scores):
@@ -145,8 +145,7 @@ def slope(values: Sequence[float]) -> float:
 
 
 def psnr_trend(frames: Sequence[FrameScores]) -> dict[str, float | None]:
-    """PSNR over the frames: first, last, worst, slope, slope at equal shares, and the largest drop from the first, in
-    dB."""
+    """PSNR over the frames, dB: first, last, worst, slope, slope at equal shares, and largest drop from the first."""
     psnrs = [frame.mean.psnr for frame in frames if frame.mean]
     return {
         "psnr_first": psnrs[0],
@@ -159,10 +158,10 @@ def psnr_trend(frames: Sequence[FrameScores]) -> dict[str, float | None]:
 
 
 def slope_at_equal_shares(frames: Sequence[FrameScores]) -> float | None:
-    """Slope of PSNR if the changed pixels of a camera were the same share of its pixels in all frames, namely the mean.
+    """Slope of PSNR if a camera's share of changed pixels were constant over the frames, at its mean.
 
-    What moves is harder than what stands still, so PSNR falls as more has moved although neither gets worse. Frames in
-    which no camera has both kinds of pixels are left out; None if fewer than two have.
+    Changed pixels have a lower PSNR than static ones, so PSNR falls as more pixels have changed although neither kind
+    gets worse. Frames without a camera that has both kinds of pixels are left out; None if fewer than two remain.
     """
     shares: dict[str, list[float]] = {}
     for frame in frames:
@@ -231,7 +230,7 @@ def as_json(report: Report) -> dict[str, Any]:
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Writes ``content`` as JSON, whole or not at all, and makes the folder when it is missing.
+    """Writes ``content`` as JSON atomically; creates the folder if it is missing.
 
     Raises:
         StorageError: the file cannot be written.

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The log of a reconstruction: seconds and memory by stage, PSNR on training views.
 
-``OUT.log.jsonl`` beside ``OUT.sgs`` has one JSON object per line, written after each frame, so that a crash loses none
+``OUT.log.jsonl`` next to ``OUT.sgs`` has one JSON object per line, written after each frame, so that a crash loses none
 and a resumed run appends. ``stream`` is the stream's name: ``OUT`` and ``OUT.sgs`` would share a log, so the second is
-refused. ``peak_memory_bytes`` is the frame's largest peak; ``peak_memory_kind`` states whether peaks
-are of each stage (``stage``) or of the process since its start (``process``).
+refused. ``peak_memory_bytes`` is the frame's largest peak; ``peak_memory_kind`` states whether peaks are of each stage
+(``stage``) or of the process since its start (``process``).
 """
 
 import json
@@ -27,27 +27,28 @@ def log_path(stream: Path) -> Path:
 
 
 def begin_log(stream: Path, *, frames: int = 0) -> None:
-    """Removes the entries from frame ``frames`` on: all for a new run, those of unstored frames for a resumed one.
+    """Removes the entries from frame ``frames`` on: all for a new run, those of frames that were not stored for a
+    resumed one.
 
     Raises:
         StorageError: the file cannot be written, or it, or the metrics, are of another stream.
     """
     check_side_files(stream)
-    kept = [entry for index, entry in sorted(read_log(stream).items()) if index < frames]
-    write_whole(log_path(stream), _lines(kept), called="The log")
+    entries = [entry for index, entry in sorted(read_log(stream).items()) if index < frames]
+    write_whole(log_path(stream), _lines(entries), called="The log")
 
 
 def check_side_files(stream: Path) -> None:
-    """Check that the log and the metrics beside a stream are not those of another one.
+    """Check that the log and the metrics next to a stream do not belong to another stream.
 
     Raises:
-        StorageError: they are; nothing was changed.
+        StorageError: they do; nothing was changed.
     """
     metrics = side_path(stream, ".metrics.json")
     for path, entries in ((log_path(stream), read_log(stream).values()), (metrics, _metrics_in(metrics))):
         for name in {str(entry.get("stream", stream.name)) for entry in entries} - {stream.name}:
             if side_path(Path(name), "") != side_path(Path(stream.name), ""):
-                continue  # A stream that was renamed, with its files.
+                continue  # The stream was renamed together with its files.
             raise StorageError(
                 f"{path} belongs to the stream {name}, and {stream.name} would need a file of the same name; choose "
                 "another name for this stream, or move that file to another place."
@@ -69,7 +70,7 @@ def append_log(stream: Path, entry: Mapping[str, Any]) -> None:
 
 
 def log_entry(report: "FrameReport") -> dict[str, Any]:
-    """One line of the log: the frame's report as plain values, with seconds and memory of the whole frame beside it."""
+    """One line of the log: the frame's report as plain values, and seconds and memory of the whole frame."""
     entry = asdict(report)
     del entry["peak_device_bytes"]
     if not report.absent:
@@ -90,7 +91,7 @@ def log_entry(report: "FrameReport") -> dict[str, Any]:
 
 
 def read_log(stream: Path) -> dict[int, dict[str, Any]]:
-    """Frame number to entry; of two entries the later one, without lines truncated by a crash."""
+    """Entries by frame number; the later of two entries for a frame; lines truncated by a crash are skipped."""
     try:
         lines = log_path(stream).read_text().splitlines()
     except (OSError, UnicodeDecodeError):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scores of a picture: of all its pixels, and of those that have changed since frame 0."""
+"""The scores of a picture: over all its pixels, and over those that have changed since frame 0."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,7 @@ def score(
         seconds: duration of the rendering.
         color: the camera's colour response, fitted to frame 0; None to leave out that score.
         mask: ``[H, W]`` bool, the pixels that count; None for all. Pictures are black in the others.
-        first_mask: that of ``first``.
+        first_mask: mask of ``first``.
 
     Raises:
         CaptureError: the pictures have different sizes.
@@ -69,5 +69,5 @@ def score(
 
 
 def counting(mask: Mask | None, *pictures: Picture) -> tuple[Picture, ...]:
-    """The pixels of each picture ``[H, W, 3]`` that count, as a picture ``[P, 1, 3]``; without a mask as they are."""
+    """The pixels of each picture ``[H, W, 3]`` that count, as a picture ``[P, 1, 3]``; unchanged without a mask."""
     return pictures if mask is None else tuple(picture[mask][:, None] for picture in pictures)

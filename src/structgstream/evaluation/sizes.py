@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scores at other sizes than a scene was trained at: a player shows streams at the size of its screen."""
+"""Scores at other sizes than that of training, because a player shows streams at the size of its screen."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -23,13 +23,14 @@ Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
 STORED_FRAMES, STORED_SHARE = 5, 4
-"""Frames that are scored at the stored size: at most five, and one in four. Twice the size is four times the pixels."""
+"""At most five frames, and at most one in four, are scored at the stored size: twice the size has four times the
+pixels."""
 
 
 def block_means(picture: Picture, factor: int) -> Picture:
     """``picture`` ``[H, W, 3]`` reduced by a whole factor, by area mean, rounded.
 
-    Rows and columns at the end that fill no pixel are left out.
+    Rows and columns at the end that do not fill a pixel are left out.
     """
     if factor == 1:
         return picture
@@ -43,7 +44,7 @@ def block_means(picture: Picture, factor: int) -> Picture:
 
 
 def block_mask(mask: Mask, factor: int) -> Mask:
-    """``mask`` ``[H, W]`` reduced as :func:`block_means`: a pixel counts if all that it is made of counts."""
+    """``mask`` ``[H, W]`` reduced as in :func:`block_means`: a pixel counts if all its source pixels count."""
     height, width = mask.shape[0] // factor, mask.shape[1] // factor
     blocks = mask[: height * factor, : width * factor].reshape(height, factor, width, factor)
     return np.logical_and.reduce(blocks, axis=(1, 3))
@@ -61,9 +62,9 @@ def half_scores(
     """PSNR and SSIM, by their names in ``Scores``, of a rendering at half size against the area mean of the truth.
 
     Args:
-        scene: what is drawn.
-        camera: of the whole picture, scene units; as :func:`halved` where that is kept, so that it need not be made.
-        truth: what the camera took, ``[H, W, 3]``, black outside of ``mask``.
+        scene: the drawable.
+        camera: camera of the whole picture, or the result of :func:`halved` if the caller has it; scene units.
+        truth: the camera's picture ``[H, W, 3]``, black outside ``mask``.
         backend: the compute back-end.
         mask: ``[H, W]``, the pixels that count; None for all.
     """
@@ -80,7 +81,7 @@ class StoredSize:
         source: the capture at that size, the same frames.
         views: cameras of the stream by name, scene units.
         backend: the compute back-end.
-        frames: numbers of those that are scored.
+        frames: numbers of the scored frames.
     """
 
     source: FrameSource
@@ -90,10 +91,10 @@ class StoredSize:
     _frame: tuple[int, MultiViewFrame] | None = field(default=None, init=False)
 
     def scores(self, camera: str, scene: Drawable, *, index: int) -> dict[str, float | None]:
-        """PSNR and SSIM by their names in ``Scores``; none in frames that are not scored.
+        """PSNR and SSIM by their names in ``Scores``; empty for frames that are not scored.
 
         Raises:
-            CaptureError: the picture has gone.
+            CaptureError: the stored picture does not exist any more.
         """
         if index not in self.frames:
             return {}
@@ -110,7 +111,7 @@ class StoredSize:
 
 
 def stored_size(source: FrameSource, views: Mapping[str, Camera], *, backend: Backend, frames: int) -> StoredSize:
-    """Scores at the size of ``source``, in evenly spread ones of ``frames`` frames."""
+    """Scores at the size of ``source``, for evenly spread frames among the first ``frames``."""
     count = max(1, min(STORED_FRAMES, frames // STORED_SHARE))
     chosen = frozenset(spread_indices(frames, count) if count > 1 else [frames - 1])
     return StoredSize(select_cameras(source, tuple(views)), views, backend, chosen)

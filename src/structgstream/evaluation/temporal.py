@@ -11,7 +11,7 @@ Picture = NDArray[np.uint8]
 
 
 def warping_error(now: Picture, before: Picture, field: FlowField) -> float | None:
-    """E_warp of one pair: the mean squared difference of a rendering and the warped previous one.
+    """E_warp of one pair: the mean squared difference of a rendering and the warped previous rendering.
 
     ``before`` is warped by the truth's backward flow; the mean is over channels and over the pixels that were not
     occluded. Pictures are ``[H, W, 3]`` uint8, full scale 1. None if all pixels were occluded.
@@ -34,9 +34,10 @@ def difference_of_change(rendered: float, true: float) -> float:
 
 
 def flicker(now: Picture, before: Picture, still: NDArray[np.bool_]) -> float | None:
-    """Mean absolute difference of two consecutive pictures over the ``still`` pixels ``[H, W]``, in levels of 1/255.
+    """Mean absolute difference of two consecutive pictures over the static pixels ``still`` ``[H, W]``, in levels of
+    1/255.
 
-    None without still pixels.
+    None without static pixels.
     """
     count = int(np.count_nonzero(still))
     if not count:

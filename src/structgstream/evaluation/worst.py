@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The worst frames of a stream, and the worst window of each, chosen by the program.
+"""Selection of the worst frames of a stream and of the worst window of each.
 
 A frame is bad by its PSNR on changed pixels, or by its ghosts (``ghosts.py``). A mean over a picture or a stream hides
-both: what moves is a small part of it.
+both, because moving content is a small part of it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,13 +24,13 @@ Reason = Literal["changed", "ghosts"]
 REASONS: tuple[Reason, ...] = ("changed", "ghosts")
 MOST = 3
 LEAST_SHARE = 0.001
-"""Of the pixels must have changed for a PSNR over them to say something."""
+"""Smallest share of changed pixels over which a PSNR is meaningful."""
 WINDOW_SHARE = 0.25
-"""Side of a window, in longer sides of the picture."""
+"""Side of a window, as a share of the picture's longer side."""
 
 
 def badness(scores: Scores, reason: Reason) -> float | None:
-    """How bad a picture is, larger is worse; None if it is not bad in this way."""
+    """Measure of a picture's error, larger is worse; None if it is not bad for this reason."""
     if reason == "changed":
         few = scores.psnr_changed is None or scores.changed_share < LEAST_SHARE
         return None if few or scores.psnr_changed is None else -scores.psnr_changed
@@ -38,8 +38,8 @@ def badness(scores: Scores, reason: Reason) -> float | None:
 
 
 def worst_facts(frames: Sequence[FrameScores]) -> dict[str, dict[str, Any] | None]:
-    """By reason the worst picture: ``frame``, ``camera``, and ``psnr_changed`` or ``ghost_share`` and
-    ``disoccluded_share``; None if none is bad."""
+    """The worst picture by reason: ``frame``, ``camera``, and ``psnr_changed`` or ``ghost_share`` and
+    ``disoccluded_share``; None if no picture is bad."""
     found: dict[str, dict[str, Any] | None] = {}
     for reason in REASONS:
         rows = [
@@ -54,7 +54,7 @@ def worst_facts(frames: Sequence[FrameScores]) -> dict[str, dict[str, Any] | Non
 
 
 def shown(scores: Scores, reason: Reason) -> dict[str, float | None]:
-    """The scores that a picture is chosen by."""
+    """The scores by which a picture is chosen."""
     if reason == "changed":
         return {"psnr_changed": scores.psnr_changed}
     return {"ghost_share": scores.ghost_share, "disoccluded_share": scores.disoccluded_share}
@@ -67,8 +67,8 @@ class Window:
     Args:
         x: first column.
         y: first row.
-        width: of it.
-        height: of it.
+        width: number of columns.
+        height: number of rows.
     """
 
     x: int
@@ -87,10 +87,10 @@ class Crop:
 
     Args:
         reason: why it was chosen.
-        frame: its number.
-        camera: that saw it.
-        scores: of the whole picture.
-        window: where it is.
+        frame: number of the frame.
+        camera: name of the camera.
+        scores: scores of the whole picture.
+        window: position in the picture.
         picture: truth, rendering and their difference times four, side by side.
     """
 
@@ -104,26 +104,26 @@ class Crop:
 
 @dataclass
 class WorstPictures:
-    """Keeps the worst pictures while an evaluation goes over all: at most one a frame and three a reason."""
+    """Collects the worst pictures of an evaluation: at most one per frame and three per reason."""
 
-    _kept: dict[Reason, dict[int, tuple[float, "Compared"]]] = field(default_factory=dict, init=False)
+    _worst: dict[Reason, dict[int, tuple[float, "Compared"]]] = field(default_factory=dict, init=False)
 
     def see(self, index: int, compared: "Compared") -> None:
-        """Takes the picture if it is among the worst so far."""
+        """Stores the picture if it is among the worst so far."""
         for reason in REASONS:
-            bad, kept = badness(compared.scores, reason), self._kept.setdefault(reason, {})
-            if bad is None or (index in kept and kept[index][0] >= bad):
+            bad, worst = badness(compared.scores, reason), self._worst.setdefault(reason, {})
+            if bad is None or (index in worst and worst[index][0] >= bad):
                 continue
-            kept[index] = bad, compared
-            if len(kept) > MOST:
-                del kept[min(kept, key=lambda frame: kept[frame][0])]
+            worst[index] = bad, compared
+            if len(worst) > MOST:
+                del worst[min(worst, key=lambda frame: worst[frame][0])]
 
     def crops(self) -> list[Crop]:
         """The worst window of each, the worst picture of each reason first."""
         found = []
         for reason in REASONS:
-            kept = sorted(self._kept.get(reason, {}).items(), key=lambda item: -item[1][0])
-            found += [_crop(reason, index, compared) for index, (_, compared) in kept]
+            worst = sorted(self._worst.get(reason, {}).items(), key=lambda item: -item[1][0])
+            found += [_crop(reason, index, compared) for index, (_, compared) in worst]
         return found
 
 

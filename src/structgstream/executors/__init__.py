@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs commands that depend on each other: here, in processes of this machine, or on a Ray cluster."""
+"""Runs commands that depend on each other: in this process, in processes of this machine, or on a Ray cluster."""

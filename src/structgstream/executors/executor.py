@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What runs tasks: the protocol that callers see, that of an engine below it, and the queue between them."""
+"""The protocol of executors, which callers use, the protocol of engines, and the task queue between them."""
 
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -12,15 +12,15 @@ from structgstream.executors.task import Ending, Task
 
 
 class Executor(Protocol):
-    """Runs tasks as soon as those that they come after are done. A ``with`` block ends what still runs."""
+    """Runs each task as soon as its dependencies are done. The end of a ``with`` block stops running tasks."""
 
     def submit(self, task: Task, *, after: Iterable[str] = (), gpus: int = 0) -> None:
-        """Takes a task; it is begun in :meth:`wait`.
+        """Adds a task, which is started in :meth:`wait`.
 
         Args:
-            task: with a name that no other has.
-            after: names of tasks that must end well before it; they may be submitted later.
-            gpus: how many it needs, 0 or 1.
+            task: a task with a unique name.
+            after: names of tasks that must succeed first; they may be submitted later.
+            gpus: number of GPUs that it needs, 0 or 1.
 
         Raises:
             ConfigError: the name is taken, or there is no GPU.
@@ -28,25 +28,25 @@ class Executor(Protocol):
         ...
 
     def finished(self, name: str) -> None:
-        """Counts a task as done that is not submitted, for those that come after it."""
+        """Marks a task as done that was not submitted, for the tasks that depend on it."""
         ...
 
     def wait(self, seconds: float) -> Sequence[Ending]:
-        """Begins what can be begun, waits for at most ``seconds`` until a task has ended, and tells which did."""
+        """Starts tasks that are ready, waits up to ``seconds`` for a task to end, and returns the results."""
         ...
 
     @property
     def running(self) -> Sequence[str]:
-        """Names of the tasks that were handed to the engine and have not ended."""
+        """Names of the tasks that the engine runs."""
         ...
 
     @property
     def waiting(self) -> Sequence[str]:
-        """Names of the tasks that have not begun; with nothing running, those that wait for one that failed."""
+        """Names of the tasks that have not started; if none is running, they depend on a failed task."""
         ...
 
     def close(self) -> None:
-        """Ends what runs."""
+        """Stops running tasks."""
         ...
 
     def __enter__(self) -> "Executor": ...
@@ -57,48 +57,52 @@ class Executor(Protocol):
 
 
 class Engine(Protocol):
-    """Runs tasks that may run now."""
+    """Runs tasks whose dependencies are done."""
 
     @property
     def name(self) -> str:
-        """Of the kind, for messages."""
+        """Name of the engine, for messages."""
         ...
 
     @property
     def repeats(self) -> bool:
-        """Whether it begins tasks again itself that were killed."""
+        """Whether the engine itself restarts tasks that were killed."""
         ...
 
     def check(self, gpus: int) -> None:
-        """Raises ConfigError if a task that needs ``gpus`` GPUs would never run."""
+        """Check that a task that needs ``gpus`` GPUs can run.
+
+        Raises:
+            ConfigError: it would never run.
+        """
         ...
 
     def has_room(self, gpus: int) -> bool:
-        """Whether it takes a task now that needs ``gpus`` GPUs."""
+        """Whether a task that needs ``gpus`` GPUs can be started now."""
         ...
 
     def start(self, task: Task, *, gpus: int, attempt: int) -> None:
-        """Begins a task; there must be room."""
+        """Starts a task; there must be room for it."""
         ...
 
     def ended(self, seconds: float) -> list[Ending]:
-        """Waits for at most so long until one has ended; those that have."""
+        """Waits up to ``seconds`` for a task to end; returns the results of all that have ended."""
         ...
 
     def stop(self) -> None:
-        """Ends what runs, and gives back what the engine holds."""
+        """Stops running tasks and releases resources."""
         ...
 
 
 class TaskQueue:
-    """An :class:`Executor` over an engine: which tasks may run, which come next, and which are begun again.
+    """An :class:`Executor` on top of an engine: resolves dependencies, orders tasks and restarts killed ones.
 
-    Tasks are begun in the order in which they become ready, those submitted earlier first.
+    Tasks are started in the order in which they become ready; among equals, those submitted earlier first.
     """
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self._tasks: dict[str, tuple[Task, int]] = {}  # with the GPUs that they need, until they end
+        self._tasks: dict[str, tuple[Task, int]] = {}  # tasks that have not ended, with their number of GPUs
         self._missing: dict[str, set[str]] = {}
         self._followers: dict[str, list[str]] = {}
         self._ready: deque[str] = deque()
@@ -153,20 +157,20 @@ class TaskQueue:
         self._begin()
         if not self._running:
             return ()
-        told = []
-        for ending in self.engine.ended(seconds):
-            self._running.remove(ending.name)
-            task, _ = self._tasks[ending.name]
-            if ending.killed and not self.engine.repeats and self._attempts[ending.name] <= task.retries:
-                self._ready.appendleft(ending.name)
+        results = []
+        for result in self.engine.ended(seconds):
+            self._running.remove(result.name)
+            task, _ = self._tasks[result.name]
+            if result.killed and not self.engine.repeats and self._attempts[result.name] <= task.retries:
+                self._ready.appendleft(result.name)
                 continue
-            del self._tasks[ending.name]
-            attempts = self._attempts.pop(ending.name)
-            if ending.done:
-                self.finished(ending.name)
-            told.append(ending if self.engine.repeats else replace(ending, attempts=attempts))
+            del self._tasks[result.name]
+            attempts = self._attempts.pop(result.name)
+            if result.done:
+                self.finished(result.name)
+            results.append(result if self.engine.repeats else replace(result, attempts=attempts))
         self._begin()
-        return told
+        return results
 
     def close(self) -> None:
         """See :meth:`Executor.close`."""
@@ -174,7 +178,7 @@ class TaskQueue:
         self._running.clear()
 
     def _begin(self) -> None:
-        """Begins what is ready while there is room, past tasks that wait for a GPU."""
+        """Starts ready tasks while there is room; may overtake tasks that wait for a GPU."""
         passed = deque[str]()
         while self._ready and (self.engine.has_room(0) or self.engine.has_room(1)):
             name = self._ready.popleft()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The engine ``inline``: tasks run in this process, one after the other, where a debugger sees them."""
+"""The engine ``inline``: tasks run in this process, one after the other, which suits a debugger."""
 
 import io
 import os
@@ -18,11 +18,11 @@ from structgstream.executors.task import PYTHON, Ending, Task
 
 WAIT_SECONDS = 3600.0
 INTERRUPTED = 130
-"""The status of a command that Ctrl-C has ended."""
+"""Exit status of a command that was ended by Ctrl-C."""
 
 
 class InlineEngine:
-    """Runs ``{python} -m MODULE ...`` in this process; other commands as processes that it waits for."""
+    """Runs ``{python} -m MODULE ...`` in this process, and other commands as processes, one at a time."""
 
     name = "inline"
     repeats = False
@@ -42,15 +42,15 @@ class InlineEngine:
         self._next = task
 
     def ended(self, seconds: float) -> list[Ending]:
-        """See ``Engine.ended``; returns after the task has, however long that takes."""
+        """See ``Engine.ended``; returns when the task has ended, regardless of ``seconds``."""
         task, self._next = self._next, None
         if task is None:
             return []
         if task.command[:2] != (PYTHON, "-m"):
             return [_in_a_process(task)]
         begun = time.monotonic()
-        status, said = _called(task.command[2], list(task.command[3:]), task.environment, log=task.log)
-        return [Ending(task.name, status, time.monotonic() - begun, output=said)]
+        status, output = _called(task.command[2], list(task.command[3:]), task.environment, log=task.log)
+        return [Ending(task.name, status, time.monotonic() - begun, output=output)]
 
     def stop(self) -> None:
         """See ``Engine.stop``."""
@@ -62,18 +62,18 @@ def _in_a_process(task: Task) -> Ending:
     try:
         while True:
             waited_for([process], WAIT_SECONDS)
-            if (ending := process.ended()) is not None:
-                return ending
+            if (result := process.ended()) is not None:
+                return result
     except BaseException:
         process.stop()
         raise
 
 
 def _called(module: str, arguments: list[str], environment: Mapping[str, str], *, log: Path | None) -> tuple[int, str]:
-    """Runs a module as the program it is; the status it would end with, and the end of what it has printed.
+    """Runs a module as a program; returns its exit status and the end of its output.
 
     Raises:
-        KeyboardInterrupt: the user pressed Ctrl-C, also if the program ended because of it.
+        KeyboardInterrupt: the user pressed Ctrl-C, also if the program handled it and ended.
     """
     with opened_log(log) as file:
         began_at = file.tell()
@@ -86,14 +86,15 @@ def _called(module: str, arguments: list[str], environment: Mapping[str, str], *
 def _status_of(module: str) -> int:
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", category=RuntimeWarning, module="runpy")  # This process may know it.
+            # The module may be imported already.
+            warnings.filterwarnings("ignore", category=RuntimeWarning, module="runpy")
             runpy.run_module(module, run_name="__main__", alter_sys=True)
-    except SystemExit as ending:
-        if ending.code == INTERRUPTED:
+    except SystemExit as error:
+        if error.code == INTERRUPTED:
             raise KeyboardInterrupt from None
-        if isinstance(ending.code, str):
-            print(ending.code, file=sys.stderr)
-        return 0 if ending.code is None else ending.code if isinstance(ending.code, int) else 1
+        if isinstance(error.code, str):
+            print(error.code, file=sys.stderr)
+        return 0 if error.code is None else error.code if isinstance(error.code, int) else 1
     except Exception:
         traceback.print_exc()
         return 1
@@ -102,7 +103,7 @@ def _status_of(module: str) -> int:
 
 @contextmanager
 def _as_program(module: str, arguments: list[str], environment: Mapping[str, str]) -> Iterator[None]:
-    """The arguments and variables that a process of its own would have, taken back afterwards."""
+    """Sets the arguments and variables of a separate process, and restores them afterwards."""
     given, before = sys.argv, dict(os.environ)
     sys.argv = [module, *arguments]
     os.environ.update(environment)
@@ -119,6 +120,6 @@ def _as_program(module: str, arguments: list[str], environment: Mapping[str, str
 
 @contextmanager
 def _printing(text: IO[str]) -> Iterator[None]:
-    """What the block prints goes to ``text``."""
+    """Redirects the output of the block to ``text``."""
     with redirect_stdout(text), redirect_stderr(text):
         yield

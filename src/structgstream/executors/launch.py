@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Becomes the command that follows it, which then ends when the process that began it ends, however that came.
+"""Executes a command that is killed when its parent process ends for any reason.
 
-Run as a program, without this package: ``python -I -S launch.py PARENT COMMAND...``. The kernel's note to kill a
-process with its parent survives ``exec``, so nothing stands between the two; it is set here, and not between fork and
-exec of the parent, where threads of the parent may hold locks. Other systems than Linux do not have it.
+Run as a program, without this package: ``python -I -S launch.py PARENT COMMAND...``. The kernel's parent-death signal
+survives ``exec``, so no process remains between parent and command. It is set here, not between fork and exec of the
+parent, where threads of the parent may hold locks. It exists only on Linux.
 """
 
 import os
@@ -14,13 +14,13 @@ PR_SET_PDEATHSIG = 1
 
 
 def main() -> None:
-    """Ties itself to its parent, and executes the command."""
+    """Sets the parent-death signal and executes the command."""
     parent, command = int(sys.argv[1]), sys.argv[2:]
     if sys.platform == "linux":
         import ctypes
 
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-        if os.getppid() != parent:  # It ended before.
+        if os.getppid() != parent:  # The parent has ended already.
             return
     try:
         os.execvp(command[0], command)

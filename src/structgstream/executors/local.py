@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The engine ``local``: each task is a process of this machine, one at a time in each place."""
+"""The engine ``local``: each task is a process of this machine, one at a time in each worker slot."""
 
 from collections.abc import Sequence
 
@@ -36,7 +36,7 @@ class LocalEngine:
 
     def start(self, task: Task, *, gpus: int, attempt: int) -> None:
         """See ``Engine.start``."""
-        # A task without a GPU leaves those places to others as long as there are others.
+        # A task without a GPU prefers a slot without one.
         order = sorted(self._free, key=lambda place: (place.gpu is None) == bool(gpus))
         place = order[0]
         self._free.remove(place)
@@ -45,17 +45,17 @@ class LocalEngine:
     def ended(self, seconds: float) -> list[Ending]:
         """See ``Engine.ended``."""
         waited_for([process for process, _ in self._running.values()], seconds)
-        endings = []
+        results = []
         for name, (process, place) in list(self._running.items()):
-            ending = process.ended()
-            if ending is not None:
+            result = process.ended()
+            if result is not None:
                 del self._running[name]
                 self._free.append(place)
-                endings.append(ending)
-        return endings
+                results.append(result)
+        return results
 
     def stop(self) -> None:
-        """See ``Engine.stop``; all are asked to end at once."""
+        """See ``Engine.stop``; all tasks are asked to end at the same time."""
         for process, place in self._running.values():
             process.ask()
             self._free.append(place)

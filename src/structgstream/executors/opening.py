@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The executor that a caller names."""
+"""Opens an executor by name."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -14,14 +14,15 @@ ExecutorName = Literal["inline", "local", "ray"]
 
 @dataclass(frozen=True)
 class ExecutorOptions:
-    """What runs tasks.
+    """Options of an executor.
 
     Args:
         name: ``inline``: this process, one task after the other; ``local``: processes of this machine; ``ray``: a Ray
             cluster.
-        workers: tasks at a time; None for one a GPU, or one a core. A cluster that is joined has its own number.
-        threads: of each worker; None for its share of the cores, and one on a cluster.
-        address: of the Ray cluster; None begins one on this machine.
+        workers: number of concurrent tasks; None for one per GPU, or one per core. An existing cluster has its own
+            number.
+        threads: threads of each worker; None for its share of the cores, and 1 on a cluster.
+        address: address of the Ray cluster; None starts one on this machine.
     """
 
     name: ExecutorName = "local"
@@ -31,15 +32,15 @@ class ExecutorOptions:
 
 
 def open_executor(options: ExecutorOptions, *, cores: int, gpus: int = 0) -> TaskQueue:
-    """The executor, which its ``with`` block ends.
+    """The executor; use it as a context manager.
 
     Args:
-        options: which.
-        cores: of this machine that may be used.
-        gpus: of this machine that may be used.
+        options: options of the executor.
+        cores: number of cores of this machine that may be used.
+        gpus: number of GPUs of this machine that may be used.
 
     Raises:
-        ConfigError: less than one worker or thread, or a cluster that cannot be joined.
+        ConfigError: there is less than one worker or thread, or the cluster cannot be joined.
         MissingExtraError: a package is missing.
     """
     places = shared_out(workers=options.workers, cores=cores, gpus=gpus, threads=options.threads)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where tasks of one machine run: shares of its cores, and its GPUs."""
+"""Worker slots of one machine: shares of its cores, and its GPUs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,33 +11,33 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENC
 
 @dataclass(frozen=True)
 class Place:
-    """Room for one task: a number of threads, and which GPU where there is one."""
+    """A worker slot, which runs one task at a time: a number of threads, and the index of its GPU if it has one."""
 
     threads: int
     gpu: int | None = None
 
     def environment(self, *, gpus: int = 0) -> Mapping[str, str]:
-        """What a task that uses ``gpus`` GPUs, 0 or 1, sees of the machine."""
+        """Environment variables of a task that uses ``gpus`` GPUs, 0 or 1."""
         seen = str(self.gpu) if gpus and self.gpu is not None else ""
         return thread_environment(self.threads) | {"CUDA_VISIBLE_DEVICES": seen}
 
 
 def thread_environment(threads: int) -> dict[str, str]:
-    """The variables that make libraries compute with so many threads."""
+    """Environment variables that set the number of threads of libraries."""
     return dict.fromkeys(_THREADS, str(threads))
 
 
 def shared_out(*, workers: int | None, cores: int, gpus: int = 0, threads: int | None = None) -> tuple[Place, ...]:
-    """Places for ``workers`` tasks at a time: one for each GPU, which take turns; without GPUs one for each core.
+    """Slots for ``workers`` concurrent tasks, which use GPUs in turn.
 
     Args:
-        workers: None for one a GPU, or one a core.
-        cores: that may be used; each place gets its share, one at least.
+        workers: number of slots; None for one per GPU, or one per core without GPUs.
+        cores: number of cores that may be used; each slot gets its share, at least one.
         gpus: number of GPUs.
-        threads: of each place; None for its share of the cores.
+        threads: threads of each slot; None for its share of the cores.
 
     Raises:
-        ConfigError: less than one worker, or thread.
+        ConfigError: there is less than one worker or thread.
     """
     for name, value in (("workers", workers), ("threads", threads)):
         if value is not None and value < 1:

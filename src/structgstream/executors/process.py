@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A command as a process: begun, waited for, ended with everything that it began."""
+"""Runs a command as a process, and stops it together with its child processes."""
 
 import os
 import select
@@ -17,22 +17,22 @@ from structgstream.executors import launch
 from structgstream.executors.task import TAIL_BYTES, Ending, Task, words
 
 ENDING_SECONDS = 10.0
-"""How long a command may take to end by itself; then it is killed, which loses nothing that is whole."""
+"""Time in which a command may end by itself; then it is killed, which does not damage complete results."""
 
 
 class CommandProcess:
-    """A task's command, running. It dies with the process that made this.
+    """The running command of a task. It is killed when this process ends.
 
     Args:
-        task: what is run.
-        environment: variables of its place; the task's own come before them.
+        task: the task to run.
+        environment: variables of its worker slot; the task's own variables take precedence.
     """
 
     def __init__(self, task: Task, *, environment: Mapping[str, str]) -> None:
         self.name = task.name
         self._log = opened_log(task.log)
         self._began_at = self._log.tell()
-        self._begun = time.monotonic()
+        self._started = time.monotonic()
         tied = [sys.executable, "-I", "-S", str(Path(launch.__file__)), str(os.getpid())]
         self._process = subprocess.Popen(
             [*tied, *words(task.command)],
@@ -40,35 +40,35 @@ class CommandProcess:
             stdout=self._log,
             stderr=self._log,
             env={**os.environ, **environment, **task.environment},
-            start_new_session=True,  # Ctrl-C is for this process, which ends the others.
+            start_new_session=True,  # Ctrl-C must reach only this process, which stops the others.
         )
         self.descriptor = os.pidfd_open(self._process.pid)
 
     @property
     def pid(self) -> int:
-        """Of the command."""
+        """Process id of the command."""
         return self._process.pid
 
     def ended(self, *, attempts: int = 1) -> Ending | None:
-        """What came of it; None while it runs. Once it is ended, this may not be asked again."""
+        """Its result; None while it runs. Must not be called again after it has returned a result."""
         if os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
             return None
-        self._kill()  # What it began and left behind, while its number is still its own.
+        self._kill()  # Kills remaining child processes while the process id is still reserved.
         _, status, usage = os.wait4(self.pid, 0)
         self._process.returncode = code = os.waitstatus_to_exitcode(status)
         os.close(self.descriptor)
-        seconds = time.monotonic() - self._begun
+        seconds = time.monotonic() - self._started
         with self._log:
-            said = tail_of(self._log, self._began_at)
-        return Ending(self.name, code, seconds, attempts, usage.ru_maxrss * 1024, said)
+            output = tail_of(self._log, self._began_at)
+        return Ending(self.name, code, seconds, attempts, usage.ru_maxrss * 1024, output)
 
     def ask(self) -> None:
-        """Asks it to end."""
+        """Sends SIGTERM to the process group."""
         with suppress(ProcessLookupError):
             os.killpg(self.pid, signal.SIGTERM)
 
     def stop(self) -> None:
-        """Asks it to end, then kills it and all that it began."""
+        """Asks the command to end, then kills it and its child processes."""
         self.ask()
         waited_for([self], ENDING_SECONDS)
         self._kill()
@@ -81,7 +81,7 @@ class CommandProcess:
 
 
 def waited_for(processes: Sequence[CommandProcess], seconds: float) -> bool:
-    """Waits until one of them has ended, for at most so long; whether one has."""
+    """Waits up to ``seconds`` for one of the processes to end; returns whether one has."""
     poll = select.poll()
     for process in processes:
         poll.register(process.descriptor, select.POLLIN)
@@ -89,7 +89,7 @@ def waited_for(processes: Sequence[CommandProcess], seconds: float) -> bool:
 
 
 def opened_log(log: Path | None) -> BinaryIO:
-    """The file that output goes to, at its end; one without a name if there is none."""
+    """The log opened for appending; a temporary file if ``log`` is None."""
     if log is None:
         return tempfile.TemporaryFile()
     log.parent.mkdir(parents=True, exist_ok=True)
@@ -99,7 +99,7 @@ def opened_log(log: Path | None) -> BinaryIO:
 
 
 def tail_of(file: BinaryIO, begin: int) -> str:
-    """The end of what was written from byte ``begin`` on."""
+    """The last :data:`TAIL_BYTES` of what was written from byte ``begin`` on."""
     end = file.seek(0, os.SEEK_END)
     file.seek(max(begin, end - TAIL_BYTES))
     return file.read().decode(errors="replace")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The engine ``ray``: tasks on the machines of a Ray cluster, or on one that is begun on this machine.
+"""The engine ``ray``: tasks run on the machines of a Ray cluster, or of one that is started on this machine.
 
-Note [Ray's ports]: whoever reaches a cluster's ports and is let in runs any code on all of its machines. So a cluster
-is only joined, or begun, with token authentication, which Ray has from 2.52 on and leaves off by default.
+Note [Ray's ports]: anybody with access to a cluster's ports can run any code on all of its machines. So a cluster is
+joined or started only with token authentication, which Ray supports from 2.52 on and does not enable by default.
 """
 
 import os
@@ -21,23 +21,23 @@ from structgstream.executors.task import Ending, Task
 
 OLDEST = (2, 52)
 OBJECT_STORE_BYTES = 80 * 2**20
-"""Ray's least: commands and endings are all that travels."""
+"""The smallest size that Ray accepts; only commands and results are transferred."""
 IN_FLIGHT = 2
-"""Tasks handed to Ray for each worker: one runs, and one is there when it ends."""
+"""Tasks submitted to Ray per worker: one runs, and one is queued to follow it."""
 COUNT_SECONDS = 10.0
-"""How old the count of the cluster's workers may be."""
+"""Largest age of the cached number of workers."""
 TOKEN_FILE = Path(".ray") / "auth_token"
 
 
 @dataclass(frozen=True)
 class RayOptions:
-    """Which cluster, and what a worker is.
+    """Options of a Ray cluster and its workers.
 
     Args:
-        address: ``HOST:PORT`` of the cluster's head, or ``auto`` for one on this machine; None begins one here, for
-            this process alone, with ``workers``.
-        workers: of a cluster that is begun here.
-        cores: that a worker has.
+        address: ``HOST:PORT`` of the cluster's head, or ``auto`` for one on this machine; None starts one on this
+            machine, for this process only, with ``workers``.
+        workers: number of workers of a cluster that is started here.
+        cores: number of cores of a worker.
     """
 
     address: str | None = None
@@ -46,11 +46,11 @@ class RayOptions:
 
 
 class RayEngine:
-    """Tasks of a Ray cluster; see :class:`RayOptions`.
+    """Runs tasks on a Ray cluster; see :class:`RayOptions`.
 
     Raises:
         MissingExtraError: Ray is not installed.
-        ConfigError: it is too old, there is no token for the cluster, or the cluster cannot be joined.
+        ConfigError: Ray is too old, there is no token for the cluster, or the cluster cannot be joined.
     """
 
     name = "ray"
@@ -81,7 +81,7 @@ class RayEngine:
         return len(self._pending) < IN_FLIGHT * max(1, self.workers())
 
     def workers(self) -> int:
-        """How many tasks the machines of the cluster can run at a time, now."""
+        """Number of tasks that the machines of the cluster can run concurrently at present."""
         when, count = self._counted
         if time.monotonic() - when > COUNT_SECONDS:
             count = int(self._ray.cluster_resources().get("CPU", 0)) // self._options.cores
@@ -96,9 +96,9 @@ class RayEngine:
             num_gpus=gpus,
             max_retries=task.retries,
             retry_exceptions=[CommandKilled],
-            scheduling_strategy="SPREAD",  # Else one machine gets tasks after tasks while others begin their workers.
+            scheduling_strategy="SPREAD",  # Otherwise one machine gets all tasks while others start their workers.
         )
-        # A file of this machine is no place for what is printed on another.
+        # Another machine cannot write its output to a file of this machine.
         sent = replace(task, log=None)
         environment = thread_environment(self._options.cores)
         self._pending[options.remote(sent, environment)] = (task.name, time.monotonic())
@@ -117,7 +117,7 @@ class RayEngine:
             return Ending(name, -1, time.monotonic() - begun, output=reason)
 
     def stop(self) -> None:
-        """See ``Engine.stop``; a cluster that was joined goes on without this process."""
+        """See ``Engine.stop``; a cluster that was joined continues without this process."""
         for reference in self._pending:
             self._ray.cancel(reference)
         if self._pending:
@@ -128,7 +128,7 @@ class RayEngine:
 
 
 def _protect(*, begins_one: bool) -> None:
-    """Turns on token authentication, and off what Ray tells its makers, before Ray is loaded and reads this.
+    """Enables token authentication and disables usage statistics; must be called before Ray is imported.
 
     Raises:
         ConfigError: authentication is turned off, or there is no token for the cluster to join.
@@ -137,7 +137,7 @@ def _protect(*, begins_one: bool) -> None:
     if mode == "disabled":
         raise ConfigError(
             "RAY_AUTH_MODE is 'disabled', so that anybody who reaches the cluster's ports could run code on its "
-            "machines; begin the cluster with RAY_AUTH_MODE=token, and set the same here (docs/cluster.md)."
+            "machines; start the cluster with RAY_AUTH_MODE=token, and set the same here (docs/cluster.md)."
         )
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     given = "RAY_AUTH_TOKEN" in os.environ or "RAY_AUTH_TOKEN_PATH" in os.environ
@@ -146,9 +146,9 @@ def _protect(*, begins_one: bool) -> None:
     if not begins_one:
         raise ConfigError(
             f"There is no token for the Ray cluster: neither RAY_AUTH_TOKEN, RAY_AUTH_TOKEN_PATH nor ~/{TOKEN_FILE}; "
-            "copy the one that its head was begun with (docs/cluster.md)."
+            "copy the one that its head was started with (docs/cluster.md)."
         )
-    os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)  # Nobody else is to join it.
+    os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)  # Nobody else must join it.
 
 
 def _imported() -> Any:
@@ -163,10 +163,10 @@ def _imported() -> Any:
 
 
 def _join(ray: Any, options: RayOptions, folder: Path) -> None:
-    """Joins the cluster, or begins one.
+    """Joins the cluster, or starts one.
 
     Raises:
-        ConfigError: it is not reached, refuses the token, or does not begin.
+        ConfigError: it cannot be reached, refuses the token, or cannot be started.
     """
     given: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if options.address is None:
@@ -176,13 +176,13 @@ def _join(ray: Any, options: RayOptions, folder: Path) -> None:
         given["address"] = options.address
     try:
         ray.init(**given)
-    except Exception as error:  # Ray has its own, RuntimeError and ConnectionError for what all means one thing.
+    except Exception as error:  # Ray raises its own errors, RuntimeError and ConnectionError for the same reasons.
         reason = " ".join(str(error).split())[:300] or type(error).__name__
         if options.address is None:
             raise ConfigError(
-                f"A Ray cluster cannot be begun here ({reason}); try again when the machine does less."
+                f"A Ray cluster cannot be started here ({reason}); try again when the machine is less busy."
             ) from error
         raise ConfigError(
             f"The Ray cluster at {options.address} cannot be joined ({reason}); is its head running, and is the token "
-            "the one that it was begun with?"
+            "the one that it was started with?"
         ) from error

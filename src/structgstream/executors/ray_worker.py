@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a Ray worker does with a task: runs its command, and says how it ended."""
+"""Runs the command of a task in a Ray worker and returns its result."""
 
 from collections.abc import Mapping
 
@@ -10,25 +10,25 @@ POLL_SECONDS = 1.0
 
 
 class CommandKilled(Exception):
-    """A signal ended a command: Ray begins the task again."""
+    """A signal ended a command; Ray restarts the task."""
 
 
 def run_task(task: Task, environment: Mapping[str, str]) -> Ending:
-    """Runs the command in a process of this machine, which ends with this one.
+    """Runs the command in a process of this machine, which is killed when this process ends.
 
     Raises:
-        CommandKilled: a signal ended it; the message says which, and what it printed.
+        CommandKilled: a signal ended it; the message has the signal and the command's output.
     """
     process = CommandProcess(task, environment=environment)
     try:
-        # Ray cancels a task by an exception between two instructions, so that waiting must come up for air.
+        # Ray cancels a task by raising an exception between two Python instructions, so a wait must be short.
         while not waited_for([process], POLL_SECONDS):
             pass
     except BaseException:
         process.stop()
         raise
-    ending = process.ended()
-    assert ending is not None, "it was waited for"
-    if ending.killed:
-        raise CommandKilled(f"{task.name} was ended by signal {-ending.status}. {ending.output}")
-    return ending
+    result = process.ended()
+    assert result is not None, "the process has ended"
+    if result.killed:
+        raise CommandKilled(f"{task.name} was ended by signal {-result.status}. {result.output}")
+    return result

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A task is a command that may be run again at any time; its ending says what came of it."""
+"""Tasks, which are commands that may be repeated at any time, and their results."""
 
 import sys
 from collections.abc import Mapping
@@ -7,25 +7,25 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 PYTHON = "{python}"
-"""As a command's first word: the interpreter of the process that runs it, which lies elsewhere on other machines."""
+"""First word of a command that stands for the Python interpreter of the machine that runs it."""
 TAIL_BYTES = 4000
-"""How much of what a task has printed is kept in its ending."""
+"""Number of bytes of a task's output that its result contains."""
 
 
 @dataclass(frozen=True)
 class Task:
     """A command with a result.
 
-    It must be idempotent: begun again after it was killed, or run by two at once, it leaves the same result, which
-    appears in one step when it is whole.
+    It must be idempotent: restarted after it was killed, or run twice at the same time, it has the same result, which
+    it writes atomically.
 
     Args:
-        name: of its own among the tasks of an executor; a file name.
-        command: its words; the first may be :data:`PYTHON`.
-        result: path or URL of what it makes; frames never travel in any other way.
-        log: what it prints is appended to this file; None drops all but the last :data:`TAIL_BYTES`.
-        environment: variables to set, beside those of the place where it runs.
-        retries: how often it is begun again after it was killed. A command that fails by itself is not repeated.
+        name: a name that is unique in an executor, usable as a file name.
+        command: the argument vector; the first word may be :data:`PYTHON`.
+        result: path or URL of its result; frames are not transferred in any other way.
+        log: its output is appended to this file; None discards all but the last :data:`TAIL_BYTES`.
+        environment: variables to set, in addition to those of its worker slot.
+        retries: number of restarts after it was killed. A command that fails by itself is not repeated.
     """
 
     name: str
@@ -38,15 +38,15 @@ class Task:
 
 @dataclass(frozen=True)
 class Ending:
-    """What came of a task.
+    """The result of a task.
 
     Args:
-        name: of the task.
-        status: of the command; negative when a signal ended it, as :class:`subprocess.Popen` counts.
-        seconds: of the last attempt.
-        attempts: how often it was begun.
-        peak_bytes: largest resident memory of the command; 0 where it is not known.
-        output: the end of what it printed.
+        name: name of the task.
+        status: exit status of the command; the negative signal number if a signal ended it.
+        seconds: duration of the last attempt.
+        attempts: number of attempts.
+        peak_bytes: largest resident memory of the command; 0 if unknown.
+        output: the end of its output.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Ending:
 
     @property
     def done(self) -> bool:
-        """Whether the command ended well."""
+        """Whether the command succeeded."""
         return self.status == 0
 
     @property
@@ -68,5 +68,5 @@ class Ending:
 
 
 def words(command: tuple[str, ...]) -> list[str]:
-    """The command as it is run here."""
+    """The argument vector on this machine."""
     return [sys.executable if word == PYTHON and not i else word for i, word in enumerate(command)]

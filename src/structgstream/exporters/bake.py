@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bakes a scene, whose Gaussians depend on the camera, to plain Gaussians.
+"""Bakes a scene, whose Gaussians depend on the camera, into plain Gaussians.
 
 Note [Baking]
 ~~~~~~~~~~~~~
-The MLPs give a structured Gaussian's opacity, shape and colour for one camera; its mean is the same for all. A plain
-Gaussian has one opacity and one shape. They are averages over the training cameras, matched by id; the colour is a
-least-squares fit of spherical harmonics to the colours for these cameras. A ridge term shrinks all but the constant
-coefficient, because a dozen cameras on one side hardly constrain the other directions. ``docs/export.md`` has the
+The MLPs compute a structured Gaussian's opacity, shape and colour for one camera; its mean is the same for all cameras.
+A plain Gaussian has one opacity and one shape: averages over the training cameras, matched by id. Its colour is a
+least-squares fit of spherical harmonics to the colours for these cameras. A ridge term shrinks all coefficients except
+the constant one, because a dozen cameras on one side hardly constrain the other directions. ``docs/export.md`` has the
 measurements behind the defaults of :class:`BakingConfig`.
 """
 
@@ -29,7 +29,7 @@ from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
 
 LEAST_OPACITY = 1.0 / 255.0
-"""Below this a rasteriser does not draw a Gaussian."""
+"""Opacity below which a rasteriser does not draw a Gaussian."""
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,10 @@ class BakingConfig:
     """Configuration of baking.
 
     Args:
-        degree: of the spherical harmonics, 0 to 2.
-        ridge: weight of the squares of all coefficients but the constant one, against a mean of squared errors.
-        opacity: ``seen`` averages over the cameras with the anchor in view, with 0 where the Gaussian is not drawn;
-            ``drawn`` over the cameras that draw it.
+        degree: degree of the spherical harmonics, 0 to 2.
+        ridge: weight of the squares of all coefficients except the constant one, relative to the mean squared error.
+        opacity: ``seen`` averages over the cameras with the anchor in view, with 0 for those that do not draw the
+            Gaussian; ``drawn`` over the cameras that draw it.
         shape: ``parts`` averages log scales, and sign-aligned quaternions; ``covariance`` averages covariances.
         weight: weight of a camera for colour and shape: the Gaussian's ``opacity`` there, or its ``blend`` weight,
             summed over the picture, which accounts for occlusion.
@@ -56,11 +56,11 @@ class BakingConfig:
 def bake(
     scene: Scene, cameras: Iterable[Camera], backend: Backend, *, baking: BakingConfig | None = None
 ) -> BakedGaussians:
-    """Plain Gaussians that look from ``cameras``, and between them, like ``scene`` (Note [Baking]).
+    """Plain Gaussians that approximate ``scene`` as seen from ``cameras`` and between them (Note [Baking]).
 
     Args:
-        scene: on the device of ``backend``.
-        cameras: in the scene's units; the training cameras of a stream.
+        scene: the scene, on the device of ``backend``.
+        cameras: the training cameras of the stream, in the scene's units.
         backend: the compute back-end.
         baking: the configuration; the default when None.
 
@@ -84,20 +84,22 @@ def bake(
 
 
 def with_low_pass(gaussians: BakedGaussians, sampling: RigSampling, variance: float) -> BakedGaussians:
-    """``gaussians`` widened by ``variance`` squared sampling intervals (``scene/sampling.py``), as a viewer that draws
-    larger pictures than the training pictures needs them: its own low-pass is of its own, smaller pixels.
+    """``gaussians`` widened by ``variance`` squared sampling intervals (``scene/sampling.py``).
+
+    A viewer that draws larger pictures than the training pictures needs this, because its low-pass is that of its own,
+    smaller pixels.
 
     Args:
-        gaussians: in the scene's units.
-        sampling: of the scene's training cameras.
-        variance: in squared training pixels, at least 0; what a scene is trained with is 0.3.
+        gaussians: the Gaussians, in the scene's units.
+        sampling: sampling by the scene's training cameras.
+        variance: squared training pixels, at least 0; scenes are trained with 0.3.
     """
     intervals = sampling.intervals(gaussians.means)
     return replace(gaussians, scales=(gaussians.scales**2 + variance * intervals[:, None] ** 2).sqrt())
 
 
 def blend_weights(gaussians: Gaussians, camera: Camera, backend: Backend) -> Tensor:
-    """Sum ``[N]`` of each Gaussian's blending weights over the picture, in pixels (gradient by its colour)."""
+    """Sum ``[N]`` of each Gaussian's blending weights over the picture, in pixels."""
     colors = torch.zeros_like(gaussians.colors, requires_grad=True)
     shown = replace(gaussians, colors=colors)
     with torch.enable_grad():
@@ -107,7 +109,7 @@ def blend_weights(gaussians: Gaussians, camera: Camera, backend: Backend) -> Ten
 
 
 class _Sums:
-    """Sums over cameras, one row for each id."""
+    """Sums over cameras, one row per Gaussian id."""
 
     def __init__(self, count: int, like: Tensor, baking: BakingConfig) -> None:
         terms = (baking.degree + 1) ** 2
@@ -127,7 +129,7 @@ class _Sums:
         self.means[ids] = gaussians.means
         weight = gaussians.opacities
         if self.baking.weight == "blend":
-            # What is hidden everywhere still needs a shape and a colour.
+            # A Gaussian that is occluded in all cameras still needs a shape and a colour.
             weight = blend_weights(gaussians, camera, backend) + 1e-3 * weight
         self.weight[ids] += weight
         self._add_shapes(gaussians, weight)
@@ -146,7 +148,7 @@ class _Sums:
             return
         self.log_scales[ids] += weight[:, None] * gaussians.scales.log()
         before = self.quats[ids]
-        # A quaternion and its negative are the same rotation: each takes the sign that agrees with the sum so far.
+        # A quaternion and its negative are the same rotation; the sign that agrees with the sum so far is used.
         side = torch.where((before * quats).sum(1, keepdim=True) < 0.0, -1.0, 1.0)
         self.quats[ids] = before + weight[:, None] * side * quats
 
@@ -172,7 +174,7 @@ class _Sums:
         if self.covariance is None:
             return torch.nn.functional.normalize(self.quats[rows], dim=1), (self.log_scales[rows] / weight).exp()
         variances, axes = torch.linalg.eigh((self.covariance[rows] / weight[..., None]).double())
-        axes = axes * torch.linalg.det(axes)[:, None, None]  # a rotation, not a mirror: three axes change sign
+        axes = axes * torch.linalg.det(axes)[:, None, None]  # a rotation, not a reflection: three axes change sign
         return matrix_quaternions(axes).to(weight.dtype), variances.clamp(min=1e-14).sqrt().to(weight.dtype)
 
     def _coefficients(self, rows: Tensor, weight: Tensor) -> Tensor:

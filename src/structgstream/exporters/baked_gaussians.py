@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plain Gaussians as in files of 3D Gaussian splatting: fixed shape and opacity, direction-dependent colour.
+"""Plain Gaussians as in files of 3D Gaussian splatting: constant shape and opacity, direction-dependent colour.
 
-Colours are those of ``scene/harmonics.py``, Note [Spherical harmonics], clamped to 0 from below.
+Colours follow ``scene/harmonics.py``, Note [Spherical harmonics], with negative values set to 0.
 """
 
 import math
@@ -19,7 +19,7 @@ from structgstream.similarity import Similarity
 
 @dataclass(frozen=True)
 class BakedGaussians:
-    """``N`` Gaussians of which only the colour depends on the camera.
+    """``N`` Gaussians whose colour depends on the view direction.
 
     Args:
         means: ``[N, 3]``.
@@ -44,7 +44,7 @@ class BakedGaussians:
         return math.isqrt(self.sh.shape[1]) - 1
 
     def select(self, rows: Tensor) -> "BakedGaussians":
-        """The rows that a mask ``[N]`` or an index ``[n]`` names, in its order."""
+        """The rows of a mask ``[N]`` or of indices ``[n]``, in order of the indices."""
         return BakedGaussians(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     def to(self, device: torch.device) -> "BakedGaussians":
@@ -57,7 +57,7 @@ class BakedGaussians:
         return (0.5 + torch.einsum("ns,nsc->nc", basis, self.sh)).clamp(min=0.0)
 
     def gaussians(self, camera: Camera, backend: Backend) -> Gaussians:
-        """The Gaussians with their colours for ``camera``; ``backend`` is unused, part of the ``Drawable`` protocol."""
+        """The Gaussians with their colours for ``camera``. ``backend`` is not used (``Drawable`` protocol)."""
         return Gaussians(
             means=self.means,
             quats=self.quats,
@@ -68,6 +68,6 @@ class BakedGaussians:
         )
 
     def in_capture_units(self, similarity: Similarity) -> "BakedGaussians":
-        """The same Gaussians in the capture's units; a similarity has no rotation, so axes stay."""
+        """The same Gaussians in the capture's units; axes do not change, because a similarity has no rotation."""
         means = similarity.inverse_points(self.means.cpu().double()).to(self.means)
         return replace(self, means=means, scales=self.scales / similarity.scale)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames of a stream, baked and written one after the other."""
+"""Bakes frames of a stream and writes them one by one."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -33,16 +33,16 @@ def write_frames(
     degree: int | None = None,
     low_pass: float = 0.0,
 ) -> Iterator[WrittenFrame]:
-    """Bakes frames as the training cameras see them and writes each, in the units of the capture.
+    """Bakes frames for the training cameras and writes each in the units of the capture.
 
     Args:
         reader: the stream.
-        numbers: of the frames; one, if ``output`` names a file.
+        numbers: numbers of the frames; a single one if ``output`` is a file.
         output: the file, or a folder for ``frame_000000.ply`` and so on.
-        format: of the files.
+        format: format of the files.
         backend: evaluates the MLPs.
-        degree: of the spherical harmonics; None for the default.
-        low_pass: variance in squared training pixels that scales are widened by (``bake.with_low_pass``).
+        degree: degree of the spherical harmonics; None for the default.
+        low_pass: variance by which Gaussians are widened, squared training pixels (``bake.with_low_pass``).
 
     Raises:
         StreamError: a frame is lost.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ``.ply`` of 3D Gaussian splatting's own code (Kerbl et al. 2023), which every viewer and editor reads.
+"""The ``.ply`` format of the 3D Gaussian splatting code (Kerbl et al. 2023), which every viewer and editor reads.
 
-One element ``vertex`` in binary little endian, every property a float32: position, a normal that nobody uses, the
+It has one element ``vertex`` in binary little endian. Every property is a float32: position, an unused normal, the
 constant colour coefficients ``f_dc``, the others ``f_rest`` (all of red, then green, then blue), the logit of the
 opacity, logarithms of the scales, and a quaternion wxyz.
 """

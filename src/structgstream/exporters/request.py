@@ -16,17 +16,17 @@ def destination(
     frame: int | None,
     frames: tuple[int, int] | None,
 ) -> tuple[Path, Format | PageFormat]:
-    """Where to write and in which format.
+    """The path to write to, and the format.
 
     Args:
         stream: the stream's file.
-        output: the file or folder to write; None for one beside the stream.
+        output: the file or folder to write; None for one next to the stream.
         format: the format; None for the suffix of ``output``, else ``ply``.
         frame: the only frame to write, or None.
-        frames: the first and the last, or None.
+        frames: the first and the last frame, or None.
 
     Raises:
-        ConfigError: the suffix is no format, or another than ``format``; or both ``frame`` and ``frames`` are given.
+        ConfigError: the suffix is not a format or differs from ``format``, or both ``frame`` and ``frames`` are given.
     """
     if frame is not None and frames is not None:
         raise ConfigError("--frame names one frame, --frames the first and the last; give one of them.")
@@ -60,7 +60,7 @@ def check_page(*, frame: int | None, frames: tuple[int, int] | None, sh_degree: 
     """
     if frame is not None or frames is not None or sh_degree is not None or low_pass:
         raise ConfigError(
-            "a page holds the whole stream; --frame, --frames, --sh-degree and --low-pass are for other formats."
+            "a page contains the whole stream; --frame, --frames, --sh-degree and --low-pass are for other formats."
         )
 
 
@@ -68,7 +68,7 @@ def check_degree(degree: int | None, format: Format) -> int | None:
     """The degree to bake, or None for the default.
 
     Raises:
-        ConfigError: there is no such degree, or the format cannot hold it.
+        ConfigError: there is no such degree, or the format does not support it.
     """
     from structgstream.scene.harmonics import MAX_DEGREE
 
@@ -76,7 +76,7 @@ def check_degree(degree: int | None, format: Format) -> int | None:
         raise ConfigError(f"--sh-degree {degree} is not one of 0 to {MAX_DEGREE}.")
     if format == "splat":
         if degree:
-            raise ConfigError(f"a .splat file holds one colour a Gaussian; --sh-degree {degree} needs ply or spz.")
+            raise ConfigError(f"a .splat file has one colour per Gaussian; --sh-degree {degree} needs ply or spz.")
         return 0
     return degree
 
@@ -85,7 +85,7 @@ def check_low_pass(variance: float) -> float:
     """The variance, squared training pixels, by which exported Gaussians are widened.
 
     Raises:
-        ConfigError: it is below 0, above 1 or no number.
+        ConfigError: it is below 0, above 1 or not a number.
     """
     if not 0.0 <= variance <= 1.0:
         raise ConfigError(f"--low-pass {variance:g} is no variance in squared training pixels; expected 0 to 1.")
@@ -98,10 +98,10 @@ def choose_frames(
     """Numbers of the frames to write.
 
     Args:
-        runs: the frames that the stream can show.
-        output: where they go; a file whose name ends like a format holds one.
-        frame: the only one, or None.
-        frames: the first and the last, or None for all.
+        runs: the frames of the stream that can be decoded.
+        output: the destination; a file whose suffix is a format contains one frame.
+        frame: the only frame, or None.
+        frames: the first and the last frame, or None for all.
 
     Raises:
         ConfigError: there is no such frame, it is lost, or several would be written into one file.
@@ -120,10 +120,10 @@ def choose_frames(
             raise ConfigError(f"the stream has frames {have}; there is no {asked}.")
         numbers = list(range(first, last + 1))
     if is_one_file(output) and len(numbers) > 1:
-        raise ConfigError(f"{output.name} holds one frame: choose it with --frame, or name a folder and --format.")
+        raise ConfigError(f"{output.name} contains one frame: choose it with --frame, or name a folder and --format.")
     return numbers
 
 
 def is_one_file(output: Path) -> bool:
-    """Whether ``output`` names a file of one frame, not a folder."""
+    """Whether ``output`` is a file for one frame, not a folder."""
     return output.suffix.lower().lstrip(".") in FORMATS and not output.is_dir()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ``.splat`` of web viewers: 32 bytes a Gaussian and nothing else, the most important first.
+"""The ``.splat`` format of web viewers: 32 bytes per Gaussian without a header, the most important ones first.
 
-float32 position and scales (not logarithms), 8-bit red, green, blue and opacity, and an 8-bit quaternion wxyz whose
-components are ``(byte - 128) / 128``. There is one colour for all directions.
+A Gaussian has float32 position and scales (not logarithms), 8-bit red, green, blue and opacity, and an 8-bit quaternion
+wxyz with the components ``(byte - 128) / 128``. Its colour does not depend on the direction.
 """
 
 import numpy as np
@@ -26,11 +26,11 @@ def splat_bytes(gaussians: BakedGaussians) -> bytes:
     """A whole ``.splat`` file, in the units and axes of ``gaussians``.
 
     Raises:
-        ConfigError: colours depend on direction; their constant part alone is not the mean over the cameras.
+        ConfigError: colours depend on direction. Their constant coefficient alone is not the mean over the cameras.
     """
     if gaussians.degree:
         raise ConfigError(
-            f"A .splat file holds one colour a Gaussian, got spherical harmonics of degree {gaussians.degree}; "
+            f"A .splat file has one colour per Gaussian, got spherical harmonics of degree {gaussians.degree}; "
             "bake with degree 0."
         )
     gaussians = by_importance(gaussians)

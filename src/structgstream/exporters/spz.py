@@ -3,16 +3,15 @@
 
 Note [Axes of SPZ]
 ~~~~~~~~~~~~~~~~~~
-SPZ has x right, y up, z back; a capture has x right, y down, z forward. The change between them is half a turn around
-x: ``y`` and ``z`` of positions and quaternions change sign, and so does each spherical harmonic that is odd in them
+SPZ has x right, y up, z back; a capture has x right, y down, z forward. The conversion is half a turn around x: ``y``
+and ``z`` of positions and quaternions change sign, and so does each spherical harmonic of odd degree in ``y`` and ``z``
 together. Readers convert to the axes of their application.
 
 Note [Precision of SPZ]
 ~~~~~~~~~~~~~~~~~~~~~~~
-Positions are 24-bit fixed-point numbers. The format leaves the number of fractional bits to the writer; here it is
-the largest with which the farthest Gaussian still fits. Scales go from ``e^-10`` to ``e^5.9`` units in steps of 6 %;
-smaller and larger ones become these. Coefficients above the constant one are cut off at -1 and 1, and keep all of
-their 8 bits.
+Positions are 24-bit fixed-point numbers. The writer chooses the number of fractional bits: here the largest with which
+the farthest Gaussian fits. Scales are clamped to ``e^-10`` ... ``e^5.9`` units, in steps of 6 %. All coefficients
+except the constant one are clamped to -1 ... 1, and use all of their 8 bits.
 """
 
 import gzip
@@ -32,7 +31,7 @@ MAX_FRACTIONAL_BITS = 20
 COLOR_SCALE = 0.15
 LARGEST = 2**23 - 1
 SIGNS = (1, -1, -1, 1, -1, 1, 1, -1, 1)
-"""Of the spherical harmonics up to degree 2 under half a turn around x."""
+"""Sign changes of the spherical harmonics up to degree 2 under half a turn around x."""
 
 
 def fractional_bits(means: Tensor) -> int:
@@ -44,7 +43,7 @@ def fractional_bits(means: Tensor) -> int:
     farthest = float(means.abs().max()) if means.numel() else 0.0
     if not farthest <= LARGEST:
         raise ConfigError(
-            f"A Gaussian lies {farthest:g} units from the origin, and an .spz file reaches {LARGEST}; export a .ply."
+            f"A Gaussian is {farthest:g} units from the origin, and an .spz file reaches {LARGEST}; export a .ply."
         )
     return min(MAX_FRACTIONAL_BITS, int(math.log2(LARGEST / max(farthest, 1.0))))
 
@@ -60,7 +59,7 @@ def spz_bytes(gaussians: BakedGaussians) -> bytes:
     quats = torch.nn.functional.normalize(gaussians.quats, dim=1)
     quats = torch.where(quats[:, :1] < 0.0, -quats, quats)
     signs = gaussians.sh.new_tensor(SIGNS[1 : gaussians.sh.shape[1]])
-    # An opacity of 0 or 255 has no finite logit, which is what readers make of it.
+    # Readers convert opacities to logits, which are not finite for 0 and 255.
     opacities = _bytes(255.0 * gaussians.opacities).clip(1, 254)
     parts = [
         _fixed_point(gaussians.means * turned, bits),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Baked Gaussians of a stream's frames as files that others open."""
+"""Writes baked Gaussians in the formats of other programs."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields
@@ -27,15 +27,15 @@ def write_gaussians(path: Path, gaussians: BakedGaussians, *, format: Format) ->
 
     Args:
         path: the file.
-        gaussians: in the file's units, OpenCV axes.
-        format: of the file; ``splat`` holds degree 0 only.
+        gaussians: the Gaussians, in the file's units, OpenCV axes.
+        format: format of the file; ``splat`` supports only degree 0.
 
     Returns:
-        Bytes of the file.
+        size of the file, bytes.
 
     Raises:
-        ConfigError: the format cannot hold these Gaussians.
-        StreamError: a value is no number that a format can hold.
+        ConfigError: the format does not support these Gaussians.
+        StreamError: a value is not finite, or a scale is not positive.
         StorageError: the file cannot be written.
     """
     check_finite(gaussians)
@@ -45,10 +45,10 @@ def write_gaussians(path: Path, gaussians: BakedGaussians, *, format: Format) ->
 
 
 def check_finite(gaussians: BakedGaussians) -> None:
-    """Check that every value is finite, and every scale positive, as their logarithms are stored.
+    """Check that every value is finite and every scale is positive, because logarithms of scales are stored.
 
     Raises:
-        StreamError: naming the values.
+        StreamError: they are not; the message names the values.
     """
     for field in fields(gaussians):
         values = getattr(gaussians, field.name)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all groups share: the init record and frame 0 of a stream."""
+"""The part of a stream that all groups share: its init record and frame 0."""
 
 import hashlib
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from structgstream.scene.scene import Scene
 
 @dataclass(frozen=True)
 class GroupBase:
-    """The beginning of a stream: everything that a group is fitted from, apart from its pictures and the track.
+    """The beginning of a stream. A group is fitted from it, its pictures and the track.
 
     Args:
         name: of the file, for messages.
@@ -40,7 +40,7 @@ class GroupBase:
         """The beginning of the stream file ``path``, which may be longer.
 
         Raises:
-            StreamError: it is no stream, or is damaged or cut before the end of frame 0.
+            StreamError: the file is not a stream, or is damaged or truncated before the end of frame 0.
         """
         data = FileBytes(path)
         check_prefix(data, str(path))
@@ -66,7 +66,7 @@ class GroupBase:
         """The configuration of the stream, which is that of every group.
 
         Raises:
-            ConfigError: it cannot be read, has no motion start, without which no group begins, or has periods.
+            ConfigError: it cannot be read, has periods, or lacks the initial scene flow that groups need.
         """
         config = from_json(self.header.config)
         if config.codec != "compact" or not (config.online.motion.enabled and config.online.start.enabled):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which anchors move where one group ends and the next begins, from renderings of the two alone."""
+"""Selection of the anchors that move at the border of two groups, from renderings of both."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -28,11 +28,11 @@ def border_cameras(rig: CameraRig) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class BorderPictures:
-    """The two frames of a border, drawn; at 640 x 360 they take 50 MB.
+    """Renderings of the two frames at a border; at 640 x 360 they take 50 MB.
 
     Args:
-        before: by name of each of the :func:`border_cameras`, ``[H, W, 3]`` of the last frame of the group before.
-        first: the same of the first frame of the group.
+        before: rendering ``[H, W, 3]`` of the last frame of the group before, by name of the :func:`border_cameras`.
+        first: rendering ``[H, W, 3]`` of the first frame of the group, by the same names.
     """
 
     before: Mapping[str, Tensor]
@@ -57,20 +57,20 @@ def moving_at_border(
     earlier: Scene | None = None,
     second: Scene | None = None,
 ) -> Tensor | None:
-    """Mask ``[M]`` of the anchors of ``first`` that move; None where everything changes, as at a cut.
+    """Mask ``[M]`` of the anchors of ``first`` that move; None if everything changes, as at a cut.
 
     An anchor moves if the selection of an online frame finds it between the renderings of ``before`` and ``first``,
-    or if it changed from ``earlier`` to ``before`` or from ``first`` to ``second``: what moves slowly, and the plain
-    inside of what moves fast, changes the pictures by less than the two fits differ.
+    or if it changed from ``earlier`` to ``before`` or from ``first`` to ``second``. The second test is needed because
+    slow motion, and fast motion of an untextured surface, change the pictures by less than the two fits differ.
 
     Args:
         before: the last frame of the group before.
         first: the first frame of the group.
-        pictures: of these two.
+        pictures: renderings of these two frames.
         rig: in the units of the scene.
         backend: the compute back-end.
-        earlier: the last but one frame of the group before; None if it has no other.
-        second: the second frame of the group; None if it has no other.
+        earlier: the last but one frame of the group before; None if that group has one frame only.
+        second: the second frame of the group; None if it has one frame only.
     """
     config = MotionConfig(enabled=True, picture_scale=0.5)
     views, earlier_views = (_as_views(drawn, rig, backend) for drawn in (pictures.first, pictures.before))

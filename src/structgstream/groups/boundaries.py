@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where groups begin: at equal distances, or near them where little moves."""
+"""First frames of groups: at equal distances, or near these at frames with little motion."""
 
 from collections.abc import Mapping
 
@@ -7,10 +7,10 @@ from structgstream.errors import ConfigError
 
 
 def check_length(length: int, *, key_interval: int) -> None:
-    """Check that groups of ``length`` frames begin where the stream has key packets anyway.
+    """Check that groups of ``length`` frames begin at frames that are key packets anyway.
 
     Raises:
-        ConfigError: they do not, so that every group would cost a key packet more.
+        ConfigError: they do not, so every group would cost an additional key packet.
     """
     if length < 1 or length % key_interval:
         near = max(1, round(length / key_interval)) * key_interval
@@ -23,7 +23,8 @@ def check_length(length: int, *, key_interval: int) -> None:
 def equal_groups(frames: int, length: int) -> list[tuple[int, int]]:
     """Groups ``(first frame, end)`` of ``length`` frames; the last may be shorter, or one frame longer.
 
-    A last frame by itself goes to the group before: handing over needs a group's second frame (``hand_over.py``).
+    A single frame at the end joins the group before, because a seam blend needs a group's second frame
+    (``seam_blend.py``).
     """
     firsts = [*range(0, frames, length)]
     if length > 1 and len(firsts) > 1 and frames - firsts[-1] == 1:
@@ -32,20 +33,20 @@ def equal_groups(frames: int, length: int) -> list[tuple[int, int]]:
 
 
 def quiet_groups(frames: int, length: int, changed: Mapping[int, float]) -> list[tuple[int, int]]:
-    """Groups of about ``length`` frames that begin where little moves.
+    """Groups of about ``length`` frames that begin at frames with little motion.
 
-    Of all divisions into groups of at least half and at most one and a half times ``length``, the one in which the
-    sum of ``changed`` over the borders is least for their number; the last group may be shorter, but has at least
-    two frames.
+    Every group has at least half and at most one and a half times ``length`` frames; the last may be shorter, but has
+    at least two. Among all such divisions, this one minimizes the sum of ``changed`` over the borders, relative to
+    their number.
 
     Args:
-        frames: of all groups.
-        length: wanted.
+        frames: number of frames in all groups.
+        length: wanted frames per group.
         changed: share of pixels that changed, by frame at which a group may begin.
     """
     least, most = (length + 1) // 2, length + length // 2
     mean = sum(changed.values()) / max(len(changed), 1)
-    # A border costs its change and, so that there are about frames / length of them, the mean of all.
+    # The cost of a border is its change plus the mean of all changes, so that about frames / length borders are chosen.
     best: dict[int, tuple[float, int]] = {0: (0.0, -1)}
     for frame in sorted(changed):
         found = [(cost, first) for first, (cost, _) in best.items() if least <= frame - first <= most]

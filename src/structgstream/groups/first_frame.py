@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The first frame of a group: from the scene of frame 0 and tracked positions, without the frames between.
+"""Fit of a group's first frame from the scene of frame 0 and tracked positions, without the frames between.
 
-A jump to a far frame fails where things moved far, so anchors begin where ``tracking`` followed them to. Rounds of flow
-from the rendering to the pictures, births, and iterations do the rest. Changes are priced against frame 0, which a key
-packet is predicted from (``price``), and what neither moved nor looks wrong keeps frame 0's bits, so that the
-background of all groups is the same.
+Optimization alone cannot bridge large motion, so anchors start at their tracked positions (``tracking``). Rounds of
+flow from the rendering to the pictures, spawning and iterations follow. The rate term counts changes against frame 0,
+from which a key packet is predicted. Primitives that neither moved nor have a high error keep frame 0's exact values,
+so all groups have the same background.
 """
 
 from collections.abc import Mapping
@@ -32,8 +32,8 @@ from structgstream.training.result import FitResult, StepListener, Stopwatch
 from structgstream.training.views import View
 
 USUAL_FRAMES = 11
-"""A group's first frame has the iterations of so many online frames. With fewer, births stand in for what iterations
-would have mended, which costs bytes, and late groups fall behind (lab/notes/groups-measured.md)."""
+"""Iterations of a group's first frame, in those of an online frame. With fewer, spawned Gaussians replace what
+iterations would have corrected, which costs bytes, and late groups lose quality (lab/notes/groups-measured.md)."""
 
 
 @dataclass(frozen=True)
@@ -43,16 +43,18 @@ class GroupStartConfig:
     iterations: int | None = None
     """Optimisation steps of all rounds together; None for :data:`USUAL_FRAMES` times those of an online frame."""
     rounds: int = 3
-    """Rounds of flow, births and iterations."""
+    """Rounds of flow, spawning and iterations."""
     flow_rounds: int = 1
-    """Displacements by flow from the rendering to the pictures before the iterations of a round. Each adds noise."""
+    """Number of displacements by flow from the rendering to the pictures before the iterations of a round. Each adds
+    noise."""
     stragglers: LostAnchorConfig = LostAnchorConfig()
-    """Anchors that tracking lost."""
+    """Relocation of anchors that tracking lost."""
     births: int = 2000
-    """Largest number of births in a round: content that came since frame 0."""
+    """Largest number of Gaussians spawned in a round, for content that appeared since frame 0."""
     coherence_share: float = 0.25
-    """Weight of ``online.coherence``, which counts from frame 0 here, relative to that of other frames. All of it suits
-    bodies that move, but costs 0.8 dB where looks change in place, as displacements also stand in for them."""
+    """Weight of the motion smoothness ``online.coherence``, measured from frame 0 here, relative to that of other
+    frames. The full weight suits moving bodies, but costs 0.8 dB where the appearance changes in place, because
+    displacements also have to represent that change."""
 
 
 def fit_group_start(
@@ -76,16 +78,16 @@ def fit_group_start(
     Args:
         scene: of frame 0.
         displacements: ``[M + F, 3]`` of its primitives (Note [Primitives]) since frame 0, as tracked.
-        views: the pictures.
-        changes: of each of them since frame 0; a view without one does not vote.
-        frame_index: of the frame, for the identities of births.
-        config: of online frames.
-        start: of this fit.
+        views: the pictures of the frame.
+        changes: change of each picture since frame 0; a view with None does not vote.
+        frame_index: index of the frame, for the identities of spawned Gaussians.
+        config: configuration of online frames.
+        start: configuration of this fit.
         backend: the compute back-end.
-        seed: of all random numbers.
+        seed: seed of all random numbers.
         steps: quantization steps (Note [Bins]).
-        floor: residuals of frame 0; None for none.
-        light: of frame 0, for ``config.light``; None for none.
+        floor: baseline residuals of frame 0; None for none.
+        light: exposure reference of frame 0, for ``config.light``; None for none.
         on_step: called after every iteration.
     """
     iterations = USUAL_FRAMES * config.iterations if start.iterations is None else start.iterations
@@ -112,7 +114,7 @@ def fit_group_start(
 
 @dataclass(frozen=True)
 class _Rounds:
-    """What the rounds of a group's first frame share; ``first`` is frame 0."""
+    """State that the rounds of a group's first frame share; ``first`` is frame 0."""
 
     fit: FrameOptimizer
     start: GroupStartConfig
@@ -128,8 +130,8 @@ class _Rounds:
             split = self._partition(current)
             inliers = [self.views[number] for number in split.selection.inliers]
         with fit.watch.stage("recall stragglers"):
-            # What the first round's flow and iterations have found needs no help.
-            split, recalled = self._recalled(split, inliers) if again else (split, 0)
+            # In the first round, flow and iterations may still find these anchors.
+            split, relocated = self._relocated(split, inliers) if again else (split, 0)
         with fit.watch.stage("start motion"):
             displaced, lifted = self._displaced(split, inliers)
             active_tiles = find_active_tiles(displaced, inliers, config=config.motion, backend=backend)
@@ -161,11 +163,11 @@ class _Rounds:
             scene=displaced.merge(result.scene),
             pruned=result.pruned + int((~new.kept).sum()),
             spawned=result.spawned + len(new.new_free),
-            counts={**result.counts, "corrected": lifted, "recalled": recalled, **new.counts},
+            counts={**result.counts, "corrected": lifted, "recalled": relocated, **new.counts},
         )
 
     def _partition(self, current: Scene) -> DynamicSplit:
-        """What has changed, looks wrong, or is not where frame 0 has it, against the rest."""
+        """Dynamic: primitives that changed, have a high error or are displaced from frame 0. Static: all others."""
         fit, config = self.fit, self.fit.config
         measured = measure(
             current, self.views, self.changes, config=config.motion, backend=fit.backend, floor=self.floor
@@ -174,8 +176,8 @@ class _Rounds:
         away = (current.anchors.positions != self.first.anchors.positions).any(1)
         return DynamicSplit.of(current, replace(found, anchors=found.anchors | away, free=torch.ones_like(found.free)))
 
-    def _recalled(self, split: DynamicSplit, views: list[View]) -> tuple[DynamicSplit, int]:
-        """``split`` with its lost anchors where their neighbours are; how many they are."""
+    def _relocated(self, split: DynamicSplit, views: list[View]) -> tuple[DynamicSplit, int]:
+        """``split`` with its lost anchors moved to their neighbours, and the number of lost anchors."""
         fit, config = self.fit, self.fit.config
         dynamic, count = relocate_lost_anchors(
             split.dynamic,
@@ -191,7 +193,7 @@ class _Rounds:
         return replace(split, dynamic=dynamic), count
 
     def _displaced(self, split: DynamicSplit, views: list[View]) -> tuple[DynamicSplit, int]:
-        """``split`` after rounds of flow from its rendering to the pictures; how many primitives flow displaced."""
+        """``split`` after rounds of flow from its rendering to the pictures, and the number of displaced primitives."""
         fit, config = self.fit, self.fit.config
         chosen = flow_views(views, fit.frame_index, config.start)
         seen, lifted = [view for view in views if view.index in chosen], 0
@@ -209,13 +211,13 @@ class _Rounds:
         return split, lifted
 
     def _first_birth(self, free: FreeGaussians) -> int:
-        """The first identity of the frame that no birth of an earlier round has."""
+        """The first identity of the frame that no earlier round has used."""
         first = self.fit.frame_index * IDS_PER_FRAME
         return max(first, int(free.births.max()) + 1) if len(free) else first
 
 
 def _together(results: list[FitResult[Scene]]) -> FitResult[Scene]:
-    """The last round's result with the sums of all."""
+    """The last round's result, with counts and seconds summed over all rounds."""
     last = results[-1]
     return replace(
         last,

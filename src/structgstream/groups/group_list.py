@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The list of the groups that a track is for, beside the track: one ``a:b`` a line, from frame a to before frame b."""
+"""The text file next to a track that lists its groups: one ``a:b`` per line, from frame a to before frame b."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,7 +8,7 @@ from structgstream.errors import StreamError
 from structgstream.whole_files import write_whole
 
 Groups = Sequence[tuple[int, int]]
-"""First frame and end of each group, in their order."""
+"""First frame and end of each group, in order."""
 
 
 def groups_path(track: Path) -> Path:
@@ -17,7 +17,7 @@ def groups_path(track: Path) -> Path:
 
 
 def write_groups(track: Path, groups: Groups) -> None:
-    """Writes the list of a track, whole or not at all.
+    """Writes the list of a track atomically.
 
     Raises:
         StorageError: it cannot be written.
@@ -26,10 +26,10 @@ def write_groups(track: Path, groups: Groups) -> None:
 
 
 def read_groups(track: Path) -> Groups | None:
-    """The groups of a track of a whole capture; None while they are not decided.
+    """The groups of a track of a whole capture; None while the pass has not chosen them.
 
     Raises:
-        StreamError: they have gaps, or are no groups.
+        StreamError: the list has gaps or does not follow the format.
     """
     path = groups_path(track)
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that grow, and go on growing after an interruption, under another name until they are whole."""
+"""Append-only files that can be resumed, and have a temporary name until they are complete."""
 
 import os
 from contextlib import suppress
@@ -10,7 +10,7 @@ from structgstream.whole_files import give_name, open_alone, partial_path
 
 
 def name_finished(path: Path) -> None:
-    """Gives a file its name that is whole under the other one: who wrote it was killed just before that.
+    """Renames a complete file whose writer was killed just before it renamed it.
 
     Raises:
         StorageError: it cannot be renamed, or another process writes it.
@@ -20,13 +20,13 @@ def name_finished(path: Path) -> None:
 
 
 class GrowingFile:
-    """A file that grows under the name ``PATH.partial``, locked, and gets its own name at the end.
+    """A locked file that grows under the name ``PATH.partial`` and is renamed at the end.
 
-    What :meth:`append` has returned from is on the disk, and a failed write is cut off.
+    Data is on the disk when :meth:`append` returns; a failed write is truncated.
 
     Args:
         path: of the finished file.
-        keep: bytes that are there and stay; what follows them is cut off.
+        keep: existing bytes to retain; the file is truncated after them.
 
     Raises:
         StorageError: it cannot be written, another process writes it, or has changed it since ``keep`` was found.
@@ -55,7 +55,7 @@ class GrowingFile:
         """Adds ``data``; returns its length.
 
         Raises:
-            StorageError: it cannot be written; what was there before stays.
+            StorageError: it cannot be written; earlier data stays.
         """
         try:
             rest = memoryview(data)
@@ -71,7 +71,7 @@ class GrowingFile:
         return len(data)
 
     def finish(self) -> None:
-        """Gives the file its name, and closes it.
+        """Renames the file to its final name and closes it.
 
         Raises:
             StorageError: it cannot be renamed.
@@ -84,7 +84,7 @@ class GrowingFile:
             self.close()
 
     def close(self) -> None:
-        """Closes the file, which may go on later. A second call does nothing."""
+        """Closes the file, which can be resumed later. A second call does nothing."""
         self._file.close()
 
     def _failed(self, error: OSError) -> StorageError:

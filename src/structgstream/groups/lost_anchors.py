@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Anchors that tracking lost on the way to a group's first frame and that look wrong where they are.
+"""Relocation of anchors that tracking lost before a group's first frame.
 
-What covers few pixels at the rim of a body may get no vote for a while, stays behind as a speck on the background, and
-then nothing there changes any more. Iterations do not find the way back, which is far. But what was beside it in frame
-0 and looks alike has arrived: a lost anchor gets the displacement of these neighbours, and iterations do the rest.
+An anchor that covers few pixels at the rim of a body may get no vote in some frames. It then remains as a speck on the
+background, where nothing changes any more. Iterations cannot recover it, because it is too far away. A lost anchor
+therefore gets the displacement of its neighbours in frame 0 with similar features; iterations refine it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,16 +29,16 @@ MEDIAN_STEPS = 12
 
 @dataclass(frozen=True)
 class LostAnchorConfig:
-    """Anchors that are put where their neighbours went; not in the paper."""
+    """Relocation of lost anchors by the displacements of their neighbours; not in the paper."""
 
     enabled: bool = True
     neighbours: int = 32
-    """Number of nearest anchors of frame 0 that are not wrong, by whose displacements one is put."""
+    """Number of nearest inlier anchors of frame 0 whose displacements are used."""
     feature_bandwidth: float = 0.5
-    """Standard deviation of the Gaussian weight of a neighbour by the root mean square difference of features, in their
-    standard deviations."""
+    """A neighbour's weight is a Gaussian of the root mean square difference of features; this is its standard
+    deviation, in standard deviations of the features."""
     least_pixels: float = 3.0
-    """Anchors nearer to where their neighbours say stay."""
+    """Anchors that would move by no more pixels than this are not relocated."""
 
 
 def relocate_lost_anchors(
@@ -53,17 +53,17 @@ def relocate_lost_anchors(
     config: LostAnchorConfig,
     backend: Backend,
 ) -> tuple[Scene, int]:
-    """``dynamic`` with its lost anchors where neighbours are, and how many they are.
+    """``dynamic`` with its lost anchors moved to their neighbours, and the number of lost anchors.
 
     Args:
         dynamic: the dynamic part of a scene.
         first: its anchors in frame 0, in the same order.
-        views: of the frame.
-        active_tiles: by view index, with up-to-date renderings; views without one are skipped.
-        floor: residuals of frame 0; None for none.
-        least_pixels: views where an anchor covers fewer pixels do not count.
-        births: what is wrong, and by how many views.
-        config: of the neighbours.
+        views: views of the frame.
+        active_tiles: by view index, with up-to-date renderings; views without an entry are skipped.
+        floor: baseline residuals of frame 0; None for none.
+        least_pixels: views in which an anchor covers fewer pixels do not count.
+        births: thresholds of the outlier test.
+        config: configuration of the relocation.
         backend: the compute back-end.
 
     Raises:
@@ -73,20 +73,20 @@ def relocate_lost_anchors(
     if not config.enabled or pixel is None or len(first) < 2:
         return dynamic, 0
     with torch.no_grad():
-        wrong = _wrong_anchors(dynamic, views, active_tiles, floor, least_pixels, births, backend)
-        if not wrong.any() or wrong.all():
+        outliers = _outlier_anchors(dynamic, views, active_tiles, floor, least_pixels, births, backend)
+        if not outliers.any() or outliers.all():
             return dynamic, 0
         positions = dynamic.anchors.positions
         displacements = positions - first.positions
-        rows = wrong.nonzero()[:, 0]
-        expected = _displacements_of_neighbours(first, displacements, rows, ~wrong, config)
+        rows = outliers.nonzero()[:, 0]
+        expected = _displacements_of_neighbours(first, displacements, rows, ~outliers, config)
         far = (expected - displacements[rows]).norm(dim=1) > config.least_pixels * pixel
         rows, expected = rows[far], expected[far]
         positions = positions.index_copy(0, rows, first.positions[rows] + expected)
     return replace(dynamic, anchors=replace(dynamic.anchors, positions=positions)), len(rows)
 
 
-def _wrong_anchors(
+def _outlier_anchors(
     dynamic: Scene,
     views: Sequence[View],
     active_tiles: Mapping[int, ActiveTiles],
@@ -117,17 +117,19 @@ def _wrong_anchors(
 
 
 def _displacements_of_neighbours(
-    first: AnchorCloud, displacements: Tensor, rows: Tensor, right: Tensor, config: LostAnchorConfig
+    first: AnchorCloud, displacements: Tensor, rows: Tensor, inliers: Tensor, config: LostAnchorConfig
 ) -> Tensor:
-    """Weighted geometric median ``[R, 3]`` of the displacements of the neighbours in frame 0 of ``rows``, which are
-    ``right``: neighbours on another body do not pull it as they would a mean."""
-    among = right.nonzero()[:, 0]
+    """Weighted geometric median ``[R, 3]`` of the displacements of the neighbours of ``rows`` in frame 0.
+
+    Neighbours are chosen from the mask ``inliers``. Unlike a mean, the median ignores a few neighbours on another body.
+    """
+    among = inliers.nonzero()[:, 0]
     near, _ = nearest(first.positions[rows], first.positions[among], config.neighbours)
     near = among[near]
     features = first.features.detach()
     features = features / features.std(0).clamp(min=1e-6)
-    apart = (features[near] - features[rows][:, None]).square().mean(-1)
-    weights = torch.exp(-0.5 * apart / config.feature_bandwidth**2).clamp(min=1e-12)
+    differences = (features[near] - features[rows][:, None]).square().mean(-1)
+    weights = torch.exp(-0.5 * differences / config.feature_bandwidth**2).clamp(min=1e-12)
     values = displacements[near]
     median = (weights[..., None] * values).sum(1) / weights.sum(1, keepdim=True)
     for _ in range(MEDIAN_STEPS):  # Weiszfeld

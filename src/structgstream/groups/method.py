@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Struct-GStream from the middle of a capture on: a group's first frame from frame 0 and the track, then as usual."""
+"""Struct-GStream for a group: its first frame is fitted from frame 0 and the track, the others as in any stream."""
 
 import logging
 from collections.abc import Callable
@@ -26,20 +26,20 @@ from structgstream.training.online.split import with_displacements
 from structgstream.training.result import FitResult
 
 CATCH_UP_FRAMES = 6
-"""In so many frames from its first one on a group bears what the frames before it would have borne."""
+"""Number of frames, from a group's first one, that also spawn what the frames before the group would have spawned."""
 _log = logging.getLogger(__name__)
 _OUT_OF_MEMORY = (MemoryError, torch.OutOfMemoryError)
 
 
 @dataclass(frozen=True)
 class GroupEntry:
-    """Where a group begins.
+    """Start of a group.
 
     Args:
         frame: its first frame, after frame 0.
-        displacements: ``[M + F, 3]`` of frame 0's primitives (Note [Primitives]) since then.
-        velocities: ``[M + F, 3]`` since the frame before.
-        first_pictures: gives the pictures of frame 0.
+        displacements: ``[M + F, 3]`` displacements of frame 0's primitives (Note [Primitives]) since frame 0.
+        velocities: ``[M + F, 3]`` displacements since the frame before.
+        first_pictures: returns the pictures of frame 0.
     """
 
     frame: int
@@ -50,14 +50,14 @@ class GroupEntry:
 
 @dataclass
 class GroupMethod:
-    """The method of a group's frames; the state before its first frame is frame 0.
+    """The method of a group's frames. The state before its first frame is frame 0.
 
-    If memory is short it lowers its budget once, and fits the frame again.
+    If memory runs out it lowers its budget once and fits the frame again.
 
     Args:
-        config: of the stream.
-        start: of the first frame's fit.
-        entry: where the group begins; None for the group of frame 0, whose frames are those of any stream.
+        config: configuration of the stream.
+        start: configuration of the first frame's fit.
+        entry: start of the group; None for the group of frame 0, which is fitted as any stream.
         lowered: whether the budget has been lowered.
     """
 
@@ -72,7 +72,7 @@ class GroupMethod:
         return StructGStream(self.config)
 
     def _config_at(self, frame: int) -> StreamConfig:
-        """That of the stream, or where the group begins that for :data:`CATCH_UP_FRAMES`."""
+        """The configuration of a frame; that of :func:`catching_up` in the group's first :data:`CATCH_UP_FRAMES`."""
         first = None if self.entry is None else self.entry.frame
         return self.config if first is None or frame >= first + CATCH_UP_FRAMES else catching_up(self.config)
 
@@ -89,7 +89,7 @@ class GroupMethod:
     def observe(
         self, frame: MultiViewFrame, before: MultiViewFrame | None, *, rig: CameraRig, backend: Backend
     ) -> FramePictures:
-        """The training pictures and their changes: in the group's first frame those since frame 0."""
+        """The training pictures and their changes, which in the group's first frame are those since frame 0."""
         if self.entry is None or frame.index != self.entry.frame:
             return self._usual.observe(frame, before, rig=rig, backend=backend)
         online = self.config.online
@@ -98,12 +98,12 @@ class GroupMethod:
         return preprocess(frame, rig, before=first, motion=online.motion, start=without_flow, backend=backend)
 
     def first(self, task: FrameTask) -> FitResult[Scene]:
-        """Frame 0 is that of the header, so that none is fitted.
+        """Not supported: frame 0 is that of the header.
 
         Raises:
             ConfigError: always.
         """
-        raise ConfigError("A group begins from a header that has frame 0; give one with --init.")
+        raise ConfigError("A group needs a header with frame 0; give one with --init.")
 
     def prepare(self, state: Scene, task: Callable[[], FrameTask]) -> FrameZeroContext:
         """See ``StructGStream.prepare``."""
@@ -120,7 +120,7 @@ class GroupMethod:
             self.config = replace(self.config, online=lowered_budget(self.config.online))
             _log.warning(
                 "Frame %d: not enough memory. From here on flow is estimated in half of the views, and a quarter of "
-                "the births may come; results differ a little.",
+                "the Gaussians may be spawned; results differ slightly.",
                 task.frame.index,
             )
         found = self._fit(past, task)
@@ -156,15 +156,17 @@ class GroupMethod:
 
 
 def catching_up(config: StreamConfig) -> StreamConfig:
-    """``config`` for a group's first frames, which lack what the frames before them would have borne: thin births in
-    small clusters come also where there are many (``ThinSpawnConfig.crowded``)."""
+    """``config`` for a group's first frames, which lack what earlier frames would have spawned.
+
+    Thin content in small clusters is spawned although there are many of them (``ThinSpawnConfig.crowded``).
+    """
     births = config.online.births
     thin = replace(births.thin, crowded="small-clusters")
     return replace(config, online=replace(config.online, births=replace(births, thin=thin)))
 
 
 def lowered_budget(online: OnlineConfig) -> OnlineConfig:
-    """``online`` with less memory: flow in half of the views, a quarter of the births."""
+    """``online`` with less memory: flow in half of the views, a quarter of the spawned Gaussians."""
     return replace(
         online,
         start=replace(online.start, views=max(2, online.start.views // 2)),
@@ -173,12 +175,12 @@ def lowered_budget(online: OnlineConfig) -> OnlineConfig:
 
 
 def lowered_start(start: GroupStartConfig) -> GroupStartConfig:
-    """``start`` with a quarter of the births."""
+    """``start`` with a quarter of the spawned Gaussians."""
     return replace(start, births=start.births // 4)
 
 
 def _older(state: Scene, velocities: Tensor) -> Scene:
-    """The scene one frame before ``state``, the group's first: anchors where velocities say, without births."""
+    """The scene one frame before ``state``, the group's first: anchors moved back by their velocities."""
     anchors = state.anchors
     positions = anchors.positions - velocities[: len(anchors)].to(anchors.positions)
     return replace(state.without_free(), anchors=replace(anchors, positions=positions))

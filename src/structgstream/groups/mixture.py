@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where anchors of two fits side by side show what neither fit shows.
+"""Anchors of two fits that together show what neither fit shows.
 
-A hand-over mixes the values of the frame before with the group's own. On a plain body that moves, or where one fit has
-a free Gaussian and the other has anchors, the mixture is wrong although nothing there seems to change.
+A seam blend mixes values of the frame before with the group's own. On an untextured moving body, or where one fit has a
+free Gaussian and the other has anchors, the mixture is wrong although no change is detected there.
 """
 
 import torch
@@ -17,23 +17,23 @@ from structgstream.training.online.measure import accumulate, primitive_of, sum_
 from structgstream.training.views import area_mean
 
 TOLERANCE = 3.0 / 255.0
-"""A pixel may be so far outside of what the two fits show. With less, more flickers for nothing
+"""A pixel may be so far outside the range of the two fits. A smaller tolerance adds flicker without a gain
 (lab/notes/groups-measured.md)."""
 LEAST_EXCESS = 1.0 / 255.0
-"""Mean distance beyond it, over the pixels that an anchor covers, from which on the anchor shows."""
+"""An anchor is a visible mixture if the mean distance beyond the tolerance, over the pixels it covers, reaches this."""
 LEAST_PIXELS = 0.5
-"""What covers less, in the reduced pictures, does not count."""
-_SCALE = 0.5  # of pictures of the reference size
+"""Anchors that cover fewer pixels of the reduced pictures do not count."""
+_SCALE = 0.5  # relative to pictures of the reference size
 
 
 def visible_mixtures(mixed: Scene, pictures: BorderPictures, rig: CameraRig, backend: Backend) -> Tensor:
-    """Mask ``[M]`` of the anchors of ``mixed`` that cover pixels which are as in neither frame of the border.
+    """Mask ``[M]`` of the anchors of ``mixed`` that cover pixels that differ from both frames of the border.
 
     A pixel may have any colour between those of the two.
 
     Args:
-        mixed: the group's first frame with what is handed over.
-        pictures: of the last frame of the group before, and of the group's own first one.
+        mixed: the group's first frame, blended.
+        pictures: renderings of the last frame of the group before and of the group's own first frame.
         rig: in the units of the scene.
         backend: the compute back-end.
     """
@@ -56,7 +56,7 @@ def visible_mixtures(mixed: Scene, pictures: BorderPictures, rig: CameraRig, bac
 
 
 def _excess(mixed: Tensor, before: Tensor, first: Tensor) -> Tensor:
-    """How far each pixel of ``mixed`` ``[H, W, 3]`` is beyond the tolerance, ``[H, W]``, mean over channels."""
+    """Distance ``[H, W]`` of each pixel of ``mixed`` ``[H, W, 3]`` beyond the tolerance, mean over channels."""
     then, own, shown = (image.clamp(0.0, 1.0) for image in (before, first, mixed))
     allowed = shown.clamp(torch.minimum(then, own), torch.maximum(then, own))
     return ((shown - allowed).abs().mean(-1) - TOLERANCE).clamp(min=0.0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The capture of a group, opened as the shared header says, and a fingerprint of it."""
+"""Opens the capture of a group as the shared header describes it, and computes its fingerprint."""
 
 import hashlib
 from pathlib import Path
@@ -17,14 +17,14 @@ from structgstream.evaluation.capture import capture_of
 def open_for(header: StreamHeader, folder: Path, *, frames: int | None) -> FrameSource:
     """The first ``frames`` frames of the capture that the stream of ``header`` was made from, with its rig.
 
-    Size of the pictures, first frame, held-out cameras and near planes are the header's; frames count from its first.
+    Picture size, first frame, held-out cameras and near planes are those of the header; frames count from its first.
 
     Raises:
-        CaptureError: the capture has other cameras, or fewer frames.
+        CaptureError: the capture has other cameras or fewer frames.
     """
     source = capture_of(header, folder, frames=None)
     if frames is not None and frames > len(source):
-        raise CaptureError(f"The capture {source.name} has {len(source)} frames; frames up to {frames} were asked for.")
+        raise CaptureError(f"The capture {source.name} has {len(source)} frames, but {frames} are needed.")
     source = section(source, frames=frames)
     if differing := _differing(source.rig, header.rig):
         raise CaptureError(
@@ -36,7 +36,7 @@ def open_for(header: StreamHeader, folder: Path, *, frames: int | None) -> Frame
 
 
 def _differing(found: CameraRig, expected: CameraRig) -> list[str]:
-    """Names of the cameras that are not the same in both rigs."""
+    """Names of the cameras that differ between the rigs."""
 
     def same(name: str) -> bool:
         if name not in found.cameras or name not in expected.cameras:

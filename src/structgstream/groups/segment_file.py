@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The file of a group's frames, a segment: a stream whose first frame is not 0.
+"""Segment files, which contain the frames of one group: streams whose first frame may be other than 0.
 
 ::
 
     prefix | init record | note | key or delta record ... | index record | footer
 
 Prefix and init record are the header's bytes. The note is a record of type :data:`NOTE`, which readers of streams skip;
-it says what the segment was fitted from. A segment that is not whole has the name ``SEGMENT.partial``.
+it identifies what the segment was fitted from. An incomplete segment has the name ``SEGMENT.partial``.
 """
 
 import hashlib
@@ -36,13 +36,13 @@ _PACKETS = (RecordType.KEY, RecordType.DELTA)
 
 @dataclass(frozen=True)
 class SegmentIdentity:
-    """What decides the bytes of a segment, apart from the machine.
+    """Everything that determines the bytes of a segment, except the machine.
 
     Args:
-        header: SHA-256 of header and frame 0 (``base.GroupBase.sha256``), the configuration among them.
+        header: SHA-256 of header and frame 0 (``base.GroupBase.sha256``), including the configuration.
         capture: fingerprint of the capture.
         track: SHA-256 of the track's start at the first frame; empty for the group of frame 0.
-        options: of the group, as plain JSON values.
+        options: options of the group, as plain JSON values.
         first: the first frame.
         end: the frame after the last one.
     """
@@ -56,7 +56,7 @@ class SegmentIdentity:
 
     @property
     def sha256(self) -> str:
-        """Of all of it."""
+        """SHA-256 of all fields."""
         return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()
 
     def record(self) -> bytes:
@@ -67,17 +67,17 @@ class SegmentIdentity:
 
 @dataclass(frozen=True)
 class Segment:
-    """The whole records of a segment's file, up to the first that is missing or damaged.
+    """The complete records of a segment file, up to the first that is missing or damaged.
 
     Args:
-        name: of the file, for messages.
-        data: its bytes.
-        identity: what it was fitted from.
-        init: prefix and init record.
-        entries: of each packet: frame, type and offset.
-        end: offset after the last whole packet.
-        complete: whether every frame is there, index and footer are what they should be, and nothing follows.
-        reason: why it is not complete; None if it is.
+        name: name of the file, for messages.
+        data: bytes of the file.
+        identity: what the segment was fitted from.
+        init: bytes of prefix and init record.
+        entries: frame, type and offset of each packet.
+        end: offset after the last complete packet.
+        complete: whether every frame is present, index and footer are valid, and nothing follows.
+        reason: why the segment is not complete; None if it is.
     """
 
     name: str
@@ -107,10 +107,10 @@ class Segment:
 
 
 def open_segment(path: Path) -> Segment:
-    """What is whole of the segment's file ``path``; every byte is verified.
+    """Opens the segment file ``path``; every byte is verified.
 
     Raises:
-        StreamError: it is no segment, or is damaged before its first packet.
+        StreamError: the file is not a segment, or is damaged before its first packet.
     """
     data = FileBytes(path)
     try:
@@ -122,15 +122,15 @@ def open_segment(path: Path) -> Segment:
 
 @dataclass(frozen=True)
 class SegmentFacts:
-    """What :func:`inspect_segment` tells.
+    """Result of :func:`inspect_segment`.
 
     Args:
         first: first frame of the group.
         end: the frame after its last one.
-        frames: number of whole frames from the first on.
-        complete: whether it is finished and undamaged.
-        identity: SHA-256 of what it was fitted from.
-        reason: why it is not complete; None if it is.
+        frames: number of complete frames, from the first on.
+        complete: whether the segment is finished and undamaged.
+        identity: SHA-256 of what the segment was fitted from.
+        reason: why the segment is not complete; None if it is.
     """
 
     first: int
@@ -142,10 +142,10 @@ class SegmentFacts:
 
 
 def inspect_segment(path: Path) -> SegmentFacts:
-    """Verifies a segment's file.
+    """Verifies a segment file.
 
     Raises:
-        StreamError: as :func:`open_segment`.
+        StreamError: see :func:`open_segment`.
     """
     found = open_segment(path)
     found.close()
@@ -178,7 +178,7 @@ def _read(data: ByteSource, name: str) -> Segment:
 
 
 def _packets(data: ByteSource, offset: int, identity: SegmentIdentity) -> Iterator[Record]:
-    """The whole packets from byte ``offset`` on, in order, as far as they are those of the group."""
+    """The complete packets from byte ``offset`` on, up to the first that is not the group's next frame."""
     for frame in range(identity.first, identity.end):
         record = read_record(data, offset)
         if record is None or record.type not in _PACKETS or len(record.payload) < FRAME.size:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing a segment, and what a session sees of one that goes on."""
+"""Writes a segment, and provides the existing part of a segment that is resumed."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -25,13 +25,13 @@ _KINDS = {record: kind for kind, record in _TYPES.items()}
 
 
 class SegmentSink:
-    """Appends the packets of a group; the file gets its name when the last one is there.
+    """Appends the packets of a group; the file is renamed after the last one.
 
     Args:
-        path: of the finished segment.
-        base: what groups share.
-        identity: of the segment.
-        found: what is there of it and stays; None for nothing.
+        path: path of the finished segment.
+        base: the part of the stream that all groups share.
+        identity: identity of the segment.
+        found: existing part that is retained; None for a new segment.
 
     Raises:
         StorageError: it cannot be written, or another process writes it.
@@ -49,11 +49,11 @@ class SegmentSink:
                 self._file.append(base.first)
 
     def open(self, header: StreamHeader) -> int:
-        """The header is there already."""
+        """Does nothing and returns 0: the file begins with the header already."""
         return 0
 
     def begin(self, header: StreamHeader) -> int:
-        """Groups share one header.
+        """Not supported: groups share one header.
 
         Raises:
             ConfigError: always.
@@ -61,10 +61,10 @@ class SegmentSink:
         raise ConfigError("A group cannot begin another period; leave out --period.")
 
     def write(self, packet: Packet) -> int:
-        """Appends one packet; returns the bytes it took.
+        """Appends one packet; returns its size in bytes.
 
         Raises:
-            StorageError: it cannot be written, or the disk is nearly full; earlier packets stay.
+            StorageError: it cannot be written, or the disk is nearly full; earlier packets are not affected.
         """
         record = packed(_TYPES[packet.kind], packet.payload)
         self._largest = max(self._largest, len(record))
@@ -78,7 +78,7 @@ class SegmentSink:
         return size
 
     def close(self) -> None:
-        """Ends the segment if its last frame is there; otherwise it may go on later. A second call does nothing."""
+        """Completes the segment after its last frame; otherwise it can be resumed later. A second call does nothing."""
         if len(self._entries) == self._identity.end - self._identity.first:
             self._file.append(pack_index(self._entries, self._file.size))
             self._entries = []
@@ -88,14 +88,14 @@ class SegmentSink:
 
 @dataclass(frozen=True)
 class GroupSoFar:
-    """What a session continues from: frame 0, and the group's packets that are there.
+    """What a session resumes from: frame 0 and the packets of the group that exist.
 
-    Its length is the number of the next frame, as if the frames before the group were there.
+    Its length is the index of the next frame, as if the frames before the group existed.
 
     Args:
-        base: what groups share.
+        base: the part of the stream that all groups share.
         first: the group's first frame.
-        records: of the group's packets, framing included.
+        records: records of the group's packets, framing included.
     """
 
     base: GroupBase
@@ -104,15 +104,15 @@ class GroupSoFar:
 
     @property
     def header(self) -> StreamHeader:
-        """Of the stream."""
+        """Header of the stream."""
         return self.base.header
 
     def header_of(self, index: int) -> StreamHeader:
-        """Of the stream: there is one period."""
+        """Header of the stream, which has a single period."""
         return self.base.header
 
     def period(self, index: int) -> Period:
-        """The only one."""
+        """The only period."""
         return Period(0, 0, PREFIX.size, len(self.base.init) - PREFIX.size)
 
     @property
@@ -125,14 +125,14 @@ class GroupSoFar:
 
     @property
     def complete(self) -> bool:
-        """Never: whole segments are not continued."""
+        """Always False: a complete segment is not resumed."""
         return False
 
     def __len__(self) -> int:
         return self.first + len(self.records)
 
     def group(self, index: int) -> Iterator[Packet]:
-        """The packets that frame ``index`` needs; before the group's first frame that is frame 0."""
+        """The packets that frame ``index`` needs; frame 0 for indices before the group."""
         if index < self.first:
             yield self.base.packet
             return
@@ -158,14 +158,13 @@ def _packet(record: bytes) -> Packet:
 
 
 def resume_segment(path: Path, base: GroupBase, identity: SegmentIdentity) -> Segment | None:
-    """What is there of a segment: the finished file, else the longest whole part of an unfinished one.
+    """The existing part of a segment: the finished file, or the longest complete part of an unfinished one.
 
-    A finished file that is damaged becomes an unfinished one, and an unfinished file in which nothing is missing gets
-    its name: a run may have been killed just before that. A file that is damaged before its first packet counts as
-    nothing.
+    A damaged finished file becomes an unfinished one. An unfinished file with all frames is renamed, because a run may
+    have been killed just before it did so. A file that is damaged before its first packet is ignored.
 
     Raises:
-        ConfigError: what is there was fitted from something else.
+        ConfigError: the existing file was fitted from something else.
         StorageError: a file cannot be renamed, or another process writes it.
     """
     if path.exists():

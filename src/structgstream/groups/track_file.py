@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The file of a tracking pass: where primitives are when a group may begin.
+"""Track files, the result of a tracking pass: positions of primitives in each frame at which a group may begin.
 
 ::
 
     signature, version | head record | start record ... | end record
 
 Records are framed as those of a stream (``codec/container/records``), each with a CRC-32. The file grows under the name
-``TRACK.partial`` and gets its own name when the pass is done; a group may begin as soon as its start record is there.
+``TRACK.partial`` and is renamed when the pass is done. A group can be fitted as soon as its start record is written.
 """
 
 import json
@@ -44,15 +44,16 @@ class TrackRecord(IntEnum):
 
 @dataclass(frozen=True)
 class TrackStart:
-    """Where primitives (Note [Primitives]) are in a frame, in steps of positions; those that are not listed are where
-    frame 0 has them.
+    """Displacements of primitives (Note [Primitives]) in a frame, in quantization steps of positions.
+
+    Primitives that are not listed have not moved since frame 0.
 
     Args:
         frame: the frame.
         primitives: ``[r]`` int32, ascending.
         displacements: ``[r, 3]`` int32, since frame 0.
         velocities: ``[r, 3]`` int32, since the frame before.
-        changed: ``[n]`` float32, share of pixels that changed in each frame since the last start, this one included.
+        changed: ``[n]`` float32, share of changed pixels in each frame after the last start, up to this one.
     """
 
     frame: int
@@ -66,7 +67,7 @@ class TrackStart:
         shares = np.clip(np.round(self.changed / SHARE_UNIT), 0, 65535).astype("<u2")
         gaps = np.diff(self.primitives, prepend=np.int32(0)).astype(np.int32)
         table = np.column_stack([gaps, self.displacements, self.velocities]).astype("<i4")
-        # Bytes of one significance lie together: the upper ones of small numbers are all alike.
+        # Bytes of equal significance are stored together, because the upper bytes of small numbers are equal.
         planes = np.ascontiguousarray(table.T).view(np.uint8).reshape(-1, 4).T.tobytes()
         return START.pack(self.frame, len(self.primitives), len(shares)) + zlib.compress(shares.tobytes() + planes, 9)
 
@@ -92,15 +93,15 @@ class TrackStart:
 
 @dataclass(frozen=True)
 class TrackHead:
-    """What a track is of.
+    """What a track was made from.
 
     Args:
-        header: SHA-256 of the header and frame 0 that it begins with (``base.GroupBase.sha256``).
+        header: SHA-256 of the header and frame 0 (``base.GroupBase.sha256``).
         capture: fingerprint of the capture.
-        step: of positions, in units of the scene.
+        step: quantization step of positions, in units of the scene.
         primitives: number of primitives of frame 0.
         every: frames from one possible start to the next.
-        config: of the pass, as plain JSON values.
+        config: configuration of the pass, as plain JSON values.
     """
 
     header: str
@@ -112,17 +113,17 @@ class TrackHead:
 
 
 class TrackFile:
-    """A track that is read; of a pass that is not done, what is whole.
+    """Reads a track; of an unfinished pass, its complete records.
 
     Attributes:
-        head: what it is of.
+        head: what the track was made from.
         starts: the frames at which groups may begin, frame 0 not included.
-        groups: ``(first frame, end)`` of the groups that the pass chose; None if it is not done.
-        frames: number of tracked frames; None if it is not done.
-        end: offset after the last whole start record.
+        groups: ``(first frame, end)`` of the groups that the pass chose; None if it is not finished.
+        frames: number of tracked frames; None if the pass is not finished.
+        end: offset after the last complete start record.
 
     Raises:
-        StreamError: it is no track, or of another version.
+        StreamError: the file is not a track, or has another version.
     """
 
     def __init__(self, data: ByteSource, name: str) -> None:
@@ -148,7 +149,7 @@ class TrackFile:
         return [*self._offsets]
 
     def _scan(self, offset: int) -> int:
-        # Heads only: a start's checksum is verified when it is read.
+        # Record heads only: the checksum of a start is verified when it is read.
         while (found := read_head(self._data, offset)) is not None:
             kind, after = found.type, offset + found.bytes
             if kind == TrackRecord.START and found.length >= START.size:
@@ -165,10 +166,10 @@ class TrackFile:
         return offset
 
     def start(self, frame: int) -> TrackStart:
-        """Where primitives are in ``frame``.
+        """The start record of ``frame``.
 
         Raises:
-            StreamError: the pass has stored no start there, or it is damaged.
+            StreamError: the pass has stored no start at this frame, or it is damaged.
         """
         if frame not in self._offsets:
             near = ", ".join(map(str, self.starts[:8])) or "none"
@@ -194,10 +195,10 @@ class TrackFile:
 
 
 def open_track(path: Path) -> TrackFile:
-    """The track at ``path``, or what is there of it while its pass runs.
+    """Opens the track at ``path``, or its unfinished file while the pass runs.
 
     Raises:
-        StreamError: there is none, or it is no track.
+        StreamError: there is no file, or it is not a track.
     """
     partial = partial_path(path)
     found = partial if not path.exists() and partial.exists() else path
@@ -208,9 +209,9 @@ class TrackWriter:
     """Writes the track ``path``.
 
     Args:
-        path: of the finished track.
-        head: what it is of.
-        keep: bytes of an interrupted pass that stay; 0 to begin again.
+        path: path of the finished track.
+        head: what the track is made from.
+        keep: bytes of an interrupted pass to retain; 0 to start again.
 
     Raises:
         StorageError: it cannot be written.
@@ -223,15 +224,15 @@ class TrackWriter:
             self._file.append(packed(TrackRecord.HEAD, json.dumps(vars(head), sort_keys=True).encode()))
 
     def write(self, start: TrackStart) -> int:
-        """Appends a start; returns its bytes."""
+        """Appends a start; returns its size in bytes."""
         return self._file.append(packed(TrackRecord.START, start.packed()))
 
     def finish(self, frames: int, groups: Sequence[tuple[int, int]]) -> None:
-        """Ends the track, and gives it its name."""
+        """Completes the track and renames it."""
         facts = {"frames": frames, "groups": [list(group) for group in groups]}
         self._file.append(packed(TrackRecord.END, json.dumps(facts).encode()))
         self._file.finish()
 
     def close(self) -> None:
-        """Closes the file, which may go on later."""
+        """Closes the file, which can be resumed later."""
         self._file.close()

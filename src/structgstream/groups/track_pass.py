@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The serial pass: primitives of frame 0 followed through every frame of a capture, into a track.
+"""The serial tracking pass: follows the primitives of frame 0 through every frame of a capture into a track.
 
-At a start what is stored is rounded, and the pass goes on from the rounded values, so that an interrupted pass that
-goes on from its last start writes the same bytes.
+At each start the pass continues from the rounded values that it stores. A pass that is resumed from its last start
+therefore writes the same bytes.
 """
 
 import time
@@ -39,9 +39,9 @@ class TrackOptions:
 
     Args:
         length: frames of a group.
-        quiet: whether groups begin where little moves, rather than at equal distances.
-        after: a finished group, from whose last frame on is tracked, which corrects what tracking has lost before.
-        tracking: how primitives are followed.
+        quiet: whether groups begin at frames with little motion rather than at equal distances.
+        after: a finished group from whose last frame the pass starts, which corrects earlier tracking errors.
+        tracking: configuration of the tracking.
     """
 
     length: int
@@ -57,15 +57,15 @@ class TrackOptions:
 
 @dataclass(frozen=True)
 class TrackProgress:
-    """One tracked frame.
+    """Report of one tracked frame.
 
     Args:
         frame: its index.
-        moved: number of primitives that were followed.
-        changed: share of pixels that changed.
+        moved: number of primitives that were displaced.
+        changed: share of changed pixels.
         cpu_seconds: processor time of all threads.
         seconds: wall-clock seconds by stage.
-        stored_bytes: of its start record; 0 if it has none.
+        stored_bytes: size of its start record; 0 if it has none.
     """
 
     frame: int
@@ -79,16 +79,16 @@ class TrackProgress:
 def track_capture(
     path: Path, source: FrameSource, base: GroupBase, options: TrackOptions, backend: Backend
 ) -> Generator[TrackProgress, None, None]:
-    """Tracks through ``source`` into the file ``path``; goes on where an interrupted pass has stopped.
+    """Tracks through ``source`` into the file ``path``; resumes an interrupted pass.
 
-    The generator yields after each frame; a track in which nothing is missing yields nothing, and gets its name if the
-    pass was killed just before that.
+    The generator yields after each frame. A complete track yields nothing; it is renamed if the pass was killed just
+    before it did so.
 
     Raises:
-        ConfigError: ``path`` is another track.
+        ConfigError: ``path`` is a track of another header, capture or configuration.
         StorageError: it cannot be written.
     """
-    # Every second of key packets may be a quiet place; other passes need their own starts only.
+    # With ``quiet``, a group may begin at any key packet; otherwise only at multiples of its length.
     every = min(base.key_interval, options.length) if options.quiet else options.length
     head = TrackHead(
         header=base.sha256,
@@ -124,7 +124,7 @@ def track_capture(
 
 
 def _end(path: Path, groups: Groups) -> None:
-    """Does what a pass that was killed after its last record did not come to."""
+    """Completes the work of a pass that was killed after its last record."""
     if not groups_path(path).exists():
         write_groups(path, groups)
     if not path.exists():
@@ -132,7 +132,7 @@ def _end(path: Path, groups: Groups) -> None:
 
 
 def _groups(options: TrackOptions, frames: int, changed: Mapping[int, float]) -> list[tuple[int, int]]:
-    """The groups of a capture of ``frames`` frames, those after ``options.after`` only."""
+    """The groups of a capture of ``frames`` frames; with ``options.after`` only those after that group."""
     first = options.first
     if options.quiet:
         later = {frame - first: share for frame, share in changed.items() if frame > first}
@@ -143,7 +143,7 @@ def _groups(options: TrackOptions, frames: int, changed: Mapping[int, float]) ->
 
 
 def start_after(group: Segment, base: GroupBase) -> TrackStart:
-    """Where the primitives of frame 0 are in the last frame of a finished group, whose births are not among them.
+    """Start at the last frame of a finished group: displacements of frame 0's primitives, without spawned ones.
 
     Raises:
         ConfigError: the group is not finished, or has another header.
@@ -168,11 +168,11 @@ def start_after(group: Segment, base: GroupBase) -> TrackStart:
 
 
 def _existing(path: Path, head: TrackHead) -> TrackFile | None:
-    """What is there of the track; None without anything.
+    """The existing part of the track; None if there is none.
 
     Raises:
-        ConfigError: it is another track.
-        StreamError: it is finished, and damaged.
+        ConfigError: it is a track of another header, capture or configuration.
+        StreamError: it is finished but damaged.
     """
     if not path.exists() and not partial_path(path).exists():
         return None
@@ -193,14 +193,14 @@ def _existing(path: Path, head: TrackHead) -> TrackFile | None:
 
 @dataclass
 class Pass:
-    """The state of a pass.
+    """State of a pass.
 
     Args:
-        first: frame 0.
-        tracker: how primitives are followed.
-        step: of positions.
-        tracked: where primitives are in the last frame.
-        index: the last frame.
+        first: scene of frame 0.
+        tracker: follows primitives from frame to frame.
+        step: quantization step of positions, in units of the scene.
+        tracked: primitives in the last frame.
+        index: index of the last frame.
     """
 
     first: Scene
@@ -220,7 +220,7 @@ class Pass:
         return cls(scene, tracker, base.position_step, tracked_at(scene, start, step=base.position_step), start.frame)
 
     def start(self, changed: list[float]) -> TrackStart:
-        """The start record of the last frame; the state is rounded to it."""
+        """The start record of the last frame; rounds the state to it."""
         z = torch.cat([self.first.anchors.positions, self.first.free.means])
         now = torch.cat([self.tracked.scene.anchors.positions, self.tracked.scene.free.means])
         displacements = ((now - z) / self.step).round().to(torch.int32).cpu()
@@ -233,19 +233,19 @@ class Pass:
             velocities[rows].numpy(),
             np.asarray(changed, np.float32),
         )
-        stored = TrackStart.unpacked(found.packed())  # What a pass that goes on from here reads.
+        stored = TrackStart.unpacked(found.packed())  # A resumed pass reads these values.
         self.tracked = tracked_at(self.first, stored, step=self.step)
         return stored
 
 
 def tracked_at(first: Scene, start: TrackStart, *, step: float) -> Tracked:
-    """Where the primitives of frame 0 are at ``start``."""
+    """The primitives of frame 0, displaced as in ``start``."""
     displacements, velocities = dense(first, start, step=step)
     return Tracked(with_displacements(first, displacements), velocities)
 
 
 def dense(first: Scene, start: TrackStart, *, step: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Displacements since frame 0 and velocities at ``start``, ``[M + F, 3]`` each, in units of the scene."""
+    """Displacements since frame 0 and since the frame before ``start``, ``[M + F, 3]`` each, in units of the scene."""
     like, rows = first.anchors.positions, torch.from_numpy(start.primitives).to(first.anchors.positions.device).long()
     found = []
     for values in (start.displacements, start.velocities):
@@ -258,14 +258,14 @@ def dense(first: Scene, start: TrackStart, *, step: float) -> tuple[torch.Tensor
 def _frames(
     past: Pass, source: FrameSource, writer: TrackWriter, *, first: int, every: int, changed: dict[int, float]
 ) -> Generator[TrackProgress, None, None]:
-    """Tracks from the frame after ``past`` to the end, with a start at ``first`` and every so many frames after it.
+    """Tracks from the frame after ``past`` to the end, with starts at equal distances from ``first`` on.
 
-    ``changed`` gets the change at each start.
+    Adds the change at each start to ``changed``.
     """
     shares: list[float] = []
     began = time.process_time()
-    with Lookahead(_observed(past, source)) as observed:
-        for pictures in observed:
+    with Lookahead(_prepared_pictures(past, source)) as prepared:
+        for pictures in prepared:
             past.tracked = track_frame(past.tracker, past.tracked, pictures)
             past.index = index = pictures.index
             seconds = past.tracked.seconds
@@ -279,11 +279,11 @@ def _frames(
             began = now
 
 
-def _observed(past: Pass, source: FrameSource) -> Generator[TrackPictures, None, None]:
-    """Reduced pictures of every frame after that of ``past``, and what changed, made while another is tracked."""
+def _prepared_pictures(past: Pass, source: FrameSource) -> Generator[TrackPictures, None, None]:
+    """Reduced pictures and changes of every frame after that of ``past``; a thread prepares the next frame's."""
     frames = read_ahead(source).frames(past.index)
     before = past.tracker.pictures(next(frames), None).views
     for frame in frames:
         found = past.tracker.pictures(frame, before)
-        before = found.views or before  # Where no picture shows anything nothing moves.
+        before = found.views or before  # A frame without pictures is treated as static.
         yield found

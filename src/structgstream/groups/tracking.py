@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tracking: primitives follow lifted flow through every frame, without an iteration.
+"""Tracking: primitives follow scene flow through every frame, without optimization.
 
-What carries a sequential run through large motion is its scene flow (``training/online/scene_flow.py``), not its
-iterations. Tracking is that alone, made cheap: a part of the cameras in turn, only the tiles in which pictures changed,
-and sums of flow at a quarter of the size. Flow from the last pictures to these displaces the primitives, then flow from
-the rendering to these in a part of those cameras, which bounds drift, because renderings do not forget what things look
-like. A few cameras in every frame do that better than all in every second or third. Gaussians are generated once a
-camera and frame.
+A sequential run follows large motion by its scene flow (``training/online/scene_flow.py``), not by its iterations.
+Tracking does only this, at low cost: it uses some of the cameras in turn, only changed tiles, and sums of flow at a
+quarter of the size. First, flow from the last pictures to the present ones displaces the primitives. Then
+flow from the rendering to the pictures, in some of these cameras, bounds drift, because renderings retain the original
+appearance. A few cameras in every frame bound it better than all cameras in every second or third frame. Gaussians are
+generated once per camera and frame.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,7 +40,7 @@ from structgstream.training.result import Stopwatch
 from structgstream.training.views import View, area_mean, as_picture, blackened, training_views
 
 FEWEST_HALVED, MOST_CAMERAS = 6, 14
-"""Half of a rig's cameras are used in a frame if that is at least the first, and at most the second number."""
+"""A frame uses half of a rig's cameras if that number is within these bounds."""
 
 
 @dataclass(frozen=True)
@@ -50,16 +50,16 @@ class TrackConfig:
     scale: float = 1.0
     """Size of the pictures relative to those of the stream."""
     cameras: int | None = None
-    """Approximate upper bound of the cameras of a frame; of more, every second or third, in turn. None: half of them
-    (:data:`FEWEST_HALVED`, :data:`MOST_CAMERAS`)."""
+    """Approximate upper bound of the cameras used in a frame. Of a larger rig every second or third camera is used, in
+    turn. None: half of the cameras (:data:`FEWEST_HALVED`, :data:`MOST_CAMERAS`)."""
     picture_scale: float = 0.25
-    """Scale, relative to these pictures, at which coverage is computed."""
+    """Scale at which coverage is computed, relative to these pictures."""
     flow: FlowConfig = FlowConfig(apart=True, far=True)
-    """How flow is searched."""
+    """Configuration of optical flow."""
     prior: float = 0.7
-    """Primitives are initially displaced by this share of their last displacement."""
+    """Initial displacement of a primitive, as a share of its last displacement."""
     rendered_every: int = 3
-    """Flow from the rendering in every so-manieth of these cameras, in turn; 0: in none."""
+    """Flow from the rendering is computed in every n-th of these cameras, in turn; 0: in none."""
 
 
 @dataclass(frozen=True)
@@ -67,9 +67,9 @@ class TrackPictures:
     """Reduced pictures of one frame.
 
     Args:
-        index: of the frame.
-        views: of all cameras.
-        changes: by position in ``views``, of those that are tracked with: since the frame before, with flow.
+        index: index of the frame.
+        views: views of all cameras.
+        changes: change since the frame before, with flow, of the cameras in use, by position in ``views``.
     """
 
     index: int
@@ -78,7 +78,7 @@ class TrackPictures:
 
     @property
     def changed_share(self) -> float:
-        """Mean share of pixels that changed since the frame before; 0 without one."""
+        """Mean share of pixels that changed since the frame before; 0 for the first frame."""
         shares = [float(change.changed.float().mean()) for change in self.changes.values()]
         return sum(shares) / len(shares) if shares else 0.0
 
@@ -90,8 +90,8 @@ class Tracker:
     Args:
         config: sizes and cameras.
         motion: thresholds of the selection, for pictures of the stream.
-        lift: of the fit of displacements.
-        rig: of the stream, in the units of the scene.
+        lift: configuration of the scene flow.
+        rig: rig of the stream, in the units of the scene.
         backend: the compute back-end.
     """
 
@@ -102,14 +102,14 @@ class Tracker:
     backend: Backend
 
     def stride(self, cameras: int) -> int:
-        """Every so-manieth of ``cameras`` cameras is used in a frame."""
+        """Distance between used cameras in a rig of ``cameras`` cameras: 1 uses all of them."""
         half = -(-cameras // 2)
         usual = min(half if half >= FEWEST_HALVED else cameras, MOST_CAMERAS)
         most = usual if self.config.cameras is None else self.config.cameras
         return -(-cameras // max(most, 2))
 
     def pictures(self, frame: MultiViewFrame, before: Sequence[View] | None) -> TrackPictures:
-        """The reduced pictures of ``frame`` and what changed since those before, independent of the scene."""
+        """The reduced pictures of ``frame`` and their change since ``before``; independent of the scene."""
         views = [view.reduced(self.config.scale) for view in training_views(frame, self.rig, self.backend.device)]
         if before is None:
             return TrackPictures(frame.index, views)
@@ -131,13 +131,13 @@ class Tracker:
 
 @dataclass(frozen=True)
 class Tracked:
-    """Where the primitives of a scene are.
+    """The primitives of a scene after a tracked frame.
 
     Args:
-        scene: moved.
+        scene: the displaced scene.
         velocities: ``[M + F, 3]`` displacements by the last frame.
         seconds: wall-clock seconds by stage of the last frame.
-        moved: number of primitives in the last frame.
+        moved: number of primitives that the last frame displaced.
     """
 
     scene: Scene
@@ -147,31 +147,31 @@ class Tracked:
 
     @classmethod
     def at_rest(cls, scene: Scene) -> "Tracked":
-        """A scene that nothing is known of before."""
+        """A scene without a frame before: velocities are zero."""
         return cls(scene, torch.zeros(len(scene.anchors) + len(scene.free), 3).to(scene.anchors.positions))
 
 
 def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tracked:
-    """Where the primitives of ``past`` are one frame later.
+    """Displace the primitives of ``past`` to the next frame.
 
     Args:
         tracker: thresholds and cameras.
-        past: one frame before.
-        pictures: of this frame.
+        past: primitives in the frame before.
+        pictures: pictures of this frame.
     """
     watch, velocities = Stopwatch(), torch.zeros_like(past.velocities)
     scene = past.scene.with_folded_appearance()
     with torch.no_grad():
         with watch.stage("gate"):
-            seen = [_seen(tracker, scene, pictures.views[n], change) for n, change in pictures.changes.items()]
+            seen = [_measure_view(tracker, scene, pictures.views[n], change) for n, change in pictures.changes.items()]
             inliers = inlier_views([entry.change for entry in seen]) if seen else []
             seen = [entry for entry, good in zip(seen, inliers, strict=True) if good]
             if not seen:
                 return Tracked(past.scene, velocities, watch.seconds)
             votes = torch.stack([entry.votes for entry in seen]).sum(0)
-            # What moved goes on as long as one camera sees it: not all that see it are used in every frame.
-            goes_on = (past.velocities != 0).any(1) & (votes > 0)
-            moving = (votes >= tracker.motion.LEAST_VIEWS) | goes_on
+            # A moving primitive stays dynamic with a single vote, because not all cameras are used in each frame.
+            continued = (past.velocities != 0).any(1) & (votes > 0)
+            moving = (votes >= tracker.motion.LEAST_VIEWS) | continued
             moving[: len(scene.anchors)] |= _occluded(tracker.motion, scene, seen, moving[: len(scene.anchors)])
             primitives = moving.nonzero()[:, 0]
         with watch.stage("flow between pictures"):
@@ -199,9 +199,9 @@ def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tra
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """What one camera tells: its ``N`` Gaussians in changed tiles, the primitive and coverage ``[N]`` of each, votes
-    ``[E]`` and sums of flow ``[E, 7]``."""
+class _ViewEvidence:
+    """Measurements of one camera: its ``N`` Gaussians in changed tiles, their primitives and coverage ``[N]``, and
+    votes ``[E]`` and sums of flow ``[E, 7]`` of the ``E`` primitives."""
 
     view: View
     tiles: TileSelection
@@ -213,38 +213,38 @@ class _Seen:
     change: ViewChange
 
 
-def _seen(tracker: Tracker, scene: Scene, view: View, change: PictureChange) -> _Seen:
+def _measure_view(tracker: Tracker, scene: Scene, view: View, change: PictureChange) -> _ViewEvidence:
     backend, motion = tracker.backend, tracker.motion
     tiles = TileSelection.of(change.changed)
     gaussians = scene.with_free_gaussians(scene.structured(view.camera, backend, tiles=tiles))
     small = view.evidence(tracker.config.picture_scale)
     size = (small.camera.height, small.camera.width)
-    inside = area_mean(_counting(tiles, view)[None, None].float(), size)[0, 0]
+    inside = area_mean(_counted_pixels(tiles, view)[None, None].float(), size)[0, 0]
     part = area_mean(change.changed[None, None].float(), size)[0, 0]
-    assert change.flow is not None, "estimated for all that are tracked with"
-    # In the order of the evidence, then the changed part. All are zero outside the tiles, which then cost nothing.
+    assert change.flow is not None, "flow is estimated for every camera in use"
+    # Channels in the order of the evidence, then the changed part. Outside the tiles all are zero and cost nothing.
     colors = change.flow[..., 3:] * inside[..., None]
     maps = torch.cat([change.flow[..., :3], inside[..., None], colors, part[..., None]], dim=-1)
     primitives = primitive_of(gaussians, scene)
     sums = accumulate(gaussians, small.camera, maps, backend)
-    sums *= _enlarged(tracker, view, size)
+    sums *= _pixel_area(tracker, view, size)
     moved = sum_by_primitive(sums, primitives, scene)
     total, changed = moved[:, 3], moved[:, 7]
     votes = (changed > motion.LEAST_PIXELS) & (changed > motion.LEAST_SHARE * total)
     of_view = ViewChange(float(change.changed.float().mean()), 0.0, repeated=change.repeated)
-    return _Seen(view, tiles, gaussians, primitives, votes, sums[:, 3], moved[:, :7], of_view)
+    return _ViewEvidence(view, tiles, gaussians, primitives, votes, sums[:, 3], moved[:, :7], of_view)
 
 
-def _occluded(motion: MotionConfig, scene: Scene, seen: Sequence[_Seen], moving: Tensor) -> Tensor:
-    """Mask ``[M]`` of the anchors that are occluded in changed tiles and dynamic like their neighbours.
+def _occluded(motion: MotionConfig, scene: Scene, seen: Sequence[_ViewEvidence], moving: Tensor) -> Tensor:
+    """Mask ``[M]`` of the anchors that are occluded in changed tiles and whose neighbours are dynamic.
 
-    Nothing is known of anchors outside of these tiles: they are neither propagated to nor compared with.
+    Anchors outside these tiles are neither selected nor used as neighbours, because nothing is measured there.
 
     Args:
         motion: thresholds.
-        scene: whose anchors may be occluded.
-        seen: what the cameras tell.
-        moving: mask ``[M]`` of the anchors that move by themselves.
+        scene: the scene before the frame.
+        seen: measurements of the cameras.
+        moving: mask ``[M]`` of the anchors that are dynamic by votes.
     """
     anchors, occluded = len(moving), torch.zeros_like(moving)
     drawn, shown = (torch.zeros_like(moving, dtype=torch.int32) for _ in range(2))
@@ -260,7 +260,7 @@ def _occluded(motion: MotionConfig, scene: Scene, seen: Sequence[_Seen], moving:
     return occluded
 
 
-def _rendered_flow(tracker: Tracker, scene: Scene, seen: _Seen, velocities: Tensor) -> Tensor:
+def _rendered_flow(tracker: Tracker, scene: Scene, seen: _ViewEvidence, velocities: Tensor) -> Tensor:
     """Sums ``[E, 7]`` of the flow from the rendering of the displaced primitives to the picture."""
     view, backend, gaussians = seen.view, tracker.backend, seen.gaussians
     moved = replace(gaussians, means=gaussians.means + velocities[seen.primitives])
@@ -268,8 +268,8 @@ def _rendered_flow(tracker: Tracker, scene: Scene, seen: _Seen, velocities: Tens
         moved, view.camera.viewport(moved.means), background=scene.background(view.camera), tiles=seen.tiles
     )
     image = apply_camera_color(drawn.image, scene.camera_color, view.index)
-    counting = _counting(seen.tiles, view)
-    # Outside the tiles nothing was drawn: there the picture replaces the rendering.
+    counting = _counted_pixels(seen.tiles, view)
+    # Nothing is rendered outside the tiles: there the picture replaces the rendering.
     rendered = as_picture(image)
     picture = seen.tiles.choose(blackened(rendered, view.mask), view.image)
     small = view.evidence(tracker.config.picture_scale)
@@ -278,24 +278,24 @@ def _rendered_flow(tracker: Tracker, scene: Scene, seen: _Seen, velocities: Tens
     inside = area_mean(counting[None, None].float(), size)[0, 0]
     maps = torch.cat([found.maps, inside[..., None], small.colors * inside[..., None]], dim=-1)
     sums = accumulate(moved, small.camera, maps, backend)
-    sums *= _enlarged(tracker, view, size)
+    sums *= _pixel_area(tracker, view, size)
     return sum_by_primitive(sums, seen.primitives, scene)
 
 
-def _coverage(seen: Sequence[_Seen], scene: Scene) -> Tensor:
-    """Coverage by id in all views, ``[M * K + F]``."""
+def _coverage(seen: Sequence[_ViewEvidence], scene: Scene) -> Tensor:
+    """Sum of coverage over all views by Gaussian id, ``[M * K + F]``."""
     found = torch.zeros(slot_count(scene)).to(scene.anchors.positions)
     for entry in seen:
         found[entry.gaussians.ids] += entry.coverage
     return found
 
 
-def _enlarged(tracker: Tracker, view: View, size: tuple[int, int]) -> float:
-    """Pixels of the stream's pictures, at the reference size, for a pixel of the maps: thresholds are in these."""
+def _pixel_area(tracker: Tracker, view: View, size: tuple[int, int]) -> float:
+    """Pixels of the stream's pictures at the reference size, the unit of thresholds, per pixel of the maps."""
     width, height = (side / tracker.config.scale for side in (view.camera.width, view.camera.height))
     return width * height / enlargement(width, height) ** 2 / (size[0] * size[1])
 
 
-def _counting(tiles: TileSelection, view: View) -> Tensor:
-    """Mask ``[H, W]`` of the pixels in the tiles that count."""
+def _counted_pixels(tiles: TileSelection, view: View) -> Tensor:
+    """Mask ``[H, W]`` of the pixels in the tiles and in the view's mask."""
     return tiles.pixels() if view.mask is None else tiles.pixels() & view.mask

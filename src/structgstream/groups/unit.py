@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The unit of work: one group of frames, fitted from header and track into a segment, repeatable at any time."""
+"""The unit of work: fits one group of frames from header and track into a segment; can be repeated at any time."""
 
 import hashlib
 from dataclasses import asdict, dataclass, field, replace
@@ -27,7 +27,7 @@ from structgstream.training.result import StepListener
 from structgstream.whole_files import partial_path
 
 LEAST_PIXELS = 0.5
-"""A primitive that was tracked no further than this, pixels of a median camera, is where frame 0 has it."""
+"""A primitive whose tracked displacement is at most this, in pixels of a median camera, counts as not displaced."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,11 @@ class SegmentTask:
 
     Args:
         capture: folder of the capture.
-        header: a stream whose init record and frame 0 the groups share.
-        track: of the capture, from that header; may be None for the group of frame 0.
+        header: stream file whose init record and frame 0 the groups share.
+        track: track of the capture, made from that header; may be None for the group of frame 0.
         first: the first frame, counted from the header's.
         end: the frame after the last one.
-        start: how the first frame is fitted.
+        start: configuration of the first frame's fit.
     """
 
     capture: Path
@@ -60,30 +60,30 @@ def fit_segment(
     on_step: StepListener | None = None,
     remarks: LogExtras | None = None,
 ) -> Run | None:
-    """Fits a group into the segment ``path``; goes on where it was interrupted.
+    """Fits a group into the segment ``path``; resumes an interrupted fit.
 
-    The call checks what is there; the file is written as the run's reports are consumed, whose frames are numbered as
-    in the stream.
+    The call checks existing files. The segment is written while the run's reports are consumed; frames have the indices
+    of the stream.
 
     Args:
-        path: of the segment.
+        path: path of the segment.
         task: the group.
         backend: the compute back-end.
-        overwrite: remove what is there.
+        overwrite: remove an existing segment.
         on_step: called after every optimisation step.
         remarks: see ``recorder.LogExtras``.
 
     Returns:
-        the run; None if the segment is finished and undamaged.
+        the run; None if the segment exists, finished and undamaged.
 
     Raises:
-        ConfigError: the range is not one, what is there is of another group, or the header is of another version.
-        CaptureError: the capture is not the header's, or has not these frames.
-        StreamError: header or track are damaged, or the track has no start at the first frame.
+        ConfigError: the range is empty, the existing segment is of another group, or the header has another version.
+        CaptureError: the capture is not that of the header, or lacks these frames.
+        StreamError: header or track is damaged, or the track has no start at the first frame.
         StorageError: the segment cannot be written, or another process writes it.
     """
     if not 0 <= task.first < task.end:
-        raise ConfigError(f"A group of frames {task.first}:{task.end}; the first must be from 0 to before the end.")
+        raise ConfigError(f"Frames {task.first}:{task.end} are no group; the first must be from 0 to before the end.")
     base = GroupBase.read(task.header)
     source = open_for(base.header, task.capture, frames=task.end)
     start, captured = _start(task, base), fingerprint(source)
@@ -99,7 +99,7 @@ def fit_segment(
 
 
 def _start(task: SegmentTask, base: GroupBase) -> TrackStart | None:
-    """Where primitives are in the first frame; None in frame 0."""
+    """The track's start at the first frame; None for frame 0."""
     if task.first == 0:
         return None
     if task.track is None:
@@ -107,7 +107,7 @@ def _start(task: SegmentTask, base: GroupBase) -> TrackStart | None:
     track = open_track(task.track)
     if track.head.header != base.sha256:
         raise ConfigError(
-            f"The track {task.track} begins with another header than {task.header}; track again with that one."
+            f"The track {task.track} was made from another header than {task.header}; track again with that one."
         )
     return track.start(task.first)
 
@@ -147,7 +147,7 @@ def _run(
 
 def _entry(start: TrackStart, base: GroupBase, source: FrameSource) -> GroupEntry:
     displacements, velocities = dense(base.scene(), start, step=base.position_step)
-    # Tracking is not as exact as that: what it moved by less has probably not moved, and keeps frame 0's bits.
+    # Smaller displacements are within the tracking error; these primitives retain frame 0's exact values.
     least = LEAST_PIXELS / base.config.online.rounding.at_quality("position_pixels") * base.position_step
     displacements[(displacements.abs() <= least).all(1)] = 0.0
 

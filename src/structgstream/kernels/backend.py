@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compute back-ends: the table of their operations, and which function each back-end has for them.
+"""Compute back-ends: the table of their operations, and the function of each back-end for each of them.
 
 ``reference`` is pure torch and runs anywhere, ``cpu`` is this package's C++, ``cuda`` is gsplat and this package's CUDA
 kernels. An operation is defined by its function in ``reference_*``: the signature, the contract, and the results that
@@ -16,7 +16,7 @@ The same on every back-end:
 - Cameras, targets, masks and numbers get no gradient; every other tensor gets one if it requires it. ``ids``,
   ``anchors``, ``raw_opacities`` and ``radii`` of results have no graph.
 - Indices are int64 and ascending, masks bool.
-- If memory is short a kernel raises ``OutOfMemoryError``. Tensors that a back-end does not support raise
+- A kernel without enough memory raises ``OutOfMemoryError``. Tensors that a back-end does not support raise
   ``BackendError``, which names a back-end that supports them.
 """
 
@@ -42,7 +42,7 @@ Result = TypeVar("Result")
 
 
 class Operation(Generic[Parameters, Result]):
-    """A row of the table in :class:`Backend`; of a back-end it is the function that computes the operation there.
+    """A row of the table in :class:`Backend`. As an attribute of a back-end it is the function of that back-end.
 
     Args:
         oracle: the pure-torch function that defines the operation.
@@ -62,16 +62,16 @@ class Operation(Generic[Parameters, Result]):
 
 @dataclass(frozen=True, eq=False)
 class Backend:
-    """The operations that rendering and training need, and where and by whom they are computed.
+    """The operations that rendering and training need, and how one back-end computes them.
 
-    The cpu back-end has a C++ function for each. The cuda back-end runs the reference's where no comment says
-    otherwise, and without NVIDIA's compiler in place of its own kernels.
+    The cpu back-end has a C++ function for each. The cuda back-end runs the reference's function unless a comment
+    states otherwise; without NVIDIA's compiler it also runs the reference's in place of its own kernels.
 
     Args:
         name: ``reference``, ``cpu`` or ``cuda``.
-        device: of its tensors.
-        functions: for each operation's name its function, with the signature of the oracle.
-        recorder: makes a recorder of iterations (``kernels.cuda_graph``); None where they are run one by one.
+        device: device of its tensors.
+        functions: function of each operation by name, with the signature of the oracle.
+        recorder: creates a recorder of iterations (``kernels.cuda_graph``); None if operations are queued one by one.
     """
 
     name: str
@@ -91,7 +91,7 @@ class Backend:
     adam_step = Operation(reference_losses.adam_step)  # cuda: torch's fused kernel
     changed_pixels = Operation(reference_motion.changed_pixels)
     picture_residual = Operation(reference_motion.picture_residual)
-    confident_flow = Operation(reference_motion.confident_flow)  # cuda: on the CPU, where flow is found
+    confident_flow = Operation(reference_motion.confident_flow)  # cuda: on the CPU, where flow is estimated
     lift = Operation(reference_motion.lift)
     sweep = Operation(reference_motion.sweep)  # cuda: own kernels
     plane_scores = Operation(reference_motion.plane_scores)  # cuda: on the CPU
@@ -110,12 +110,12 @@ class Backend:
 
 
 def _functions_of(*modules: ModuleType) -> dict[str, Callable[..., Any]]:
-    """The modules' functions that are named as an operation."""
+    """The modules' functions that have the name of an operation."""
     return {name: getattr(module, name) for module in modules for name in Backend.operations() if hasattr(module, name)}
 
 
 def reference_backend() -> Backend:
-    """Pure torch on the CPU: slow, always available, the oracle of the others."""
+    """Pure torch on the CPU: slow, always available, the oracle of the other back-ends."""
     return Backend("reference", torch.device("cpu"), {name: row.oracle for name, row in Backend.operations().items()})
 
 
@@ -140,7 +140,7 @@ def processor_backend() -> Backend:
 
 
 def cuda_backend() -> Backend:
-    """gsplat's rasteriser, and this package's loss and generation of Gaussians on an NVIDIA GPU, torch for the rest.
+    """An NVIDIA GPU: gsplat's rasteriser, this package's kernels of loss, anchors and sweeps, and torch for the rest.
 
     Raises:
         BackendError: no GPU, or gsplat is not installed or does not load.
@@ -178,9 +178,9 @@ def cuda_backend() -> Backend:
 def nonblocking(backend: Backend, budget: PairBudget) -> Backend:
     """The cuda back-end with shapes that do not depend on data, so that an iteration has no host synchronisation.
 
-    ``generate_structured`` gives all Gaussians (``kernels.cuda_anchors``, Note [Shapes without waiting]); it and the
-    tile lists run in this package's kernels if those were compiled, else in torch. A picture has
-    at most ``budget.capacity`` (Gaussian, tile) pairs (``kernels.cuda_tiles``, Note [Pairs without waiting]); check
+    ``generate_structured`` returns all Gaussians (``kernels.cuda_anchors``, Note [Shapes without waiting]). It and the
+    tile lists run in this package's kernels if those were compiled, else in torch. A picture has at most
+    ``budget.capacity`` (Gaussian, tile) pairs (``kernels.cuda_tiles``, Note [Pairs without waiting]); check
     ``budget.shortage()`` at the end.
 
     Raises:
@@ -208,7 +208,7 @@ def backend_reasons() -> dict[str, str | None]:
 
 
 def backend_remarks() -> dict[str, str]:
-    """Remarks about available back-ends for the user: what computes the cuda back-end's own operations."""
+    """Remarks about available back-ends for the user: whether the cuda back-end has its own kernels."""
     from structgstream.kernels.cuda_library import kernel_plan
 
     return {"cuda": kernel_plan()[1]}

@@ -16,7 +16,7 @@ from structgstream.kernels.values import TileSelection
 
 @dataclass(frozen=True)
 class Comparison:
-    """The arguments of ``l1_ssim`` other than ``image``, for CPU and CUDA: contiguous, gains and biases float32."""
+    """The arguments of ``l1_ssim`` except ``image``, for CPU and CUDA: contiguous, gains and biases float32."""
 
     target: Tensor
     gains: Tensor | None
@@ -61,7 +61,7 @@ class _L1SSIM(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, comparison: Comparison) -> tuple[Tensor, Tensor]:
         gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
-        sums = torch.empty(2, image.shape[0], dtype=torch.float64)  # of rows; added here in a fixed order
+        sums = torch.empty(2, image.shape[0], dtype=torch.float64)  # sums of rows; added here in a fixed order
         native_library().sgs_l1_ssim(*comparison.arguments(image), gradient, sums[0], sums[1], torch.get_num_threads())
         ctx.comparison = comparison
         ctx.save_for_backward(image, gradient)
@@ -164,7 +164,7 @@ def excess(offsets: Tensor, log_scales: Tensor, limit: float) -> Tensor:
 
 
 class _WithGradients(torch.autograd.Function):
-    """A sum whose C++ function gives its gradients, too."""
+    """A sum whose C++ function also computes its gradients."""
 
     @staticmethod
     def forward(ctx: Any, total: float, gradients: list[Tensor], *values: Tensor) -> Tensor:

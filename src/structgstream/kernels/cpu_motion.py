@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What changed between pictures and how it moved, in this package's C++; ``reference_motion`` defines the operations.
+"""Changes and motion between pictures, in this package's C++; ``reference_motion`` defines the operations.
 
 All of them are float32, and their results do not depend on the number of threads.
 """
@@ -69,7 +69,7 @@ def picture_residual(
     Raises:
         OutOfMemoryError: there is no memory for the differences.
     """
-    assert (tiles is None) == (outside is None), "tiles need a picture for what is outside of them"
+    assert (tiles is None) == (outside is None), "tiles need a picture for the pixels outside them"
     assert (gains is None) == (biases is None), "gains and biases belong together"
     assert picture.dtype == torch.uint8, picture.dtype
     assert outside is None or outside.shape == rendering.shape, (outside.shape, rendering.shape)

@@ -17,7 +17,7 @@ from structgstream.kernels.values import RasterOutput, TileSelection
 
 
 class _State:
-    """Owns the native state that forward keeps for backward."""
+    """Owns the native state that forward stores for backward."""
 
     def __init__(self, address: int | None) -> None:
         if not address:
@@ -28,7 +28,7 @@ class _State:
 
 @dataclass(frozen=True)
 class _View:
-    """The arguments of a rendering other than Gaussians: float32, contiguous, without gradient."""
+    """The arguments of a rendering except Gaussians: float32, contiguous, without gradient."""
 
     viewport: Viewport
     background: Tensor | None

@@ -153,8 +153,8 @@ def _filtered(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Radii, conics and opacities ``[N]`` with the low-pass of the training pictures in place of gsplat's.
 
-    What gsplat's own low-pass leaves outside of the picture is not drawn: of a picture that is larger than the training
-    pictures a few pixels at the border lack it.
+    Gaussians that are outside the picture with gsplat's own low-pass are not drawn. They are missing in a few pixels at
+    the border of a picture that is larger than the training pictures.
     """
     assert gaussians.sampling_intervals is not None
     trained, total = screen_low_pass(

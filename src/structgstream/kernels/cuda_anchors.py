@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Anchors to Gaussians on a GPU: this package's kernels around torch's matrix products, or torch alone.
 
-An online iteration is bound by the host, which queues each operation: in torch they are some 190 forward and 130
-backward, and with the kernels some 30.
+An online iteration is bound by the host, which queues each operation: about 190 forward and 130 backward in torch, and
+about 30 with the kernels.
 
 Note [Shapes without waiting]
 ~~~~~~~~~~~~~~~~~~~~~~~~~~~~~
-The numbers of anchors in view and of Gaussians with positive opacity are known on the GPU only; to gather these rows
-the host would have to synchronise. So all ``M * K`` Gaussians are generated. Those that are not drawn have opacity 0
+The numbers of anchors in view and of Gaussians with positive opacity are known only on the GPU, and the host would have
+to synchronise to gather these rows. So all ``M * K`` Gaussians are generated. Those that are not drawn have opacity 0
 and scale 0: every rasteriser skips them, they add nothing to the volume, and no gradient passes through them. The
-number of Gaussians is therefore the count of ``opacities > 0``.
+number of drawn Gaussians is the count of ``opacities > 0``.
 """
 
 from typing import Any, NamedTuple
@@ -176,7 +176,7 @@ def generate_structured(
 ) -> StructuredGaussians:
     """See ``reference_anchors.generate_structured``; float32. The host waits for the number of Gaussians.
 
-    With ``every`` it gives all ``N = M * K`` Gaussians, as :func:`generate_all_in_torch` does, and waits for nothing.
+    With ``every`` it returns all ``N = M * K`` Gaussians, as :func:`generate_all_in_torch` does, without waiting.
 
     Raises:
         BackendError: a precision or device that the kernels do not support.

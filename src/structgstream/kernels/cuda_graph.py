@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Work on a GPU that is recorded once and then queued again as one launch (CUDA graphs).
+"""Records work on a GPU once and then repeats it with a single launch (CUDA graphs).
 
 Note [Recorded work]
 ~~~~~~~~~~~~~~~~~~~~
-A graph repeats the same kernels on the same memory. So recorded work must not wait for the GPU, must not take its
-shapes from numbers (``kernels.backend.nonblocking``), and reads what differs from one time to the next, such as a
-learning rate, from a tensor that is written in between. Recording runs nothing; the results are tensors that each
-replay writes anew. Recordings share their memory: what one of them needs for a moment may be another's result, so that
-a result lasts until the next replay of any.
+A graph repeats the same kernels on the same memory. So recorded work must not wait for the GPU, and its shapes must not
+depend on data (``kernels.backend.nonblocking``). It reads values that differ between replays, such as a learning rate,
+from tensors that are written in between. Recording runs nothing; each replay overwrites the result tensors. Recordings
+share their memory: temporary memory of one may be the result of another, so a result is valid until the next replay of
+any recording.
 """
 
 import warnings
@@ -25,7 +25,7 @@ class Recorder(Protocol[Result]):
 
     @property
     def replays(self) -> int:
-        """How often recorded work was run."""
+        """Number of replays so far."""
         ...
 
     def __len__(self) -> int:
@@ -41,15 +41,15 @@ class Recorder(Protocol[Result]):
         ...
 
     def replay(self, key: Hashable) -> Result:
-        """Run what was recorded under ``key``; its result lasts until the next replay of any key."""
+        """Run what was recorded under ``key``; its result is valid until the next replay of any key."""
         ...
 
 
 class GraphMemory:
-    """A stream and memory for graphs, shared by all recorders of a back-end; reserved at the first recording.
+    """A CUDA stream and memory for graphs, shared by all recorders of a back-end; reserved at the first recording.
 
-    Memory of a pool goes back to the driver when its last graph is gone, so that each frame would have to ask for it
-    anew. Therefore one graph that does nothing stays.
+    A pool returns its memory to the driver when its last graph is deleted, and each frame would have to allocate it
+    again. Therefore one empty graph is retained.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -57,7 +57,7 @@ class GraphMemory:
         self._reserved: tuple[torch.cuda.Stream, Any, torch.cuda.CUDAGraph] | None = None
 
     def recorder(self) -> "GraphRecorder[Any]":
-        """A recorder whose graphs live as long as it."""
+        """A recorder, which owns its graphs."""
         return GraphRecorder(self)
 
     def capture(self, work: Callable[[], Result]) -> tuple[torch.cuda.CUDAGraph, Result]:
@@ -71,7 +71,7 @@ class GraphMemory:
 
 
 def _captured(stream: torch.cuda.Stream, pool: Any, work: Callable[[], Result]) -> tuple[torch.cuda.CUDAGraph, Result]:
-    # torch.cuda.graph would wait for the GPU and give all its free memory back at every recording.
+    # torch.cuda.graph would wait for the GPU and return all its free memory at every recording.
     graph = torch.cuda.CUDAGraph()
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
@@ -80,7 +80,7 @@ def _captured(stream: torch.cuda.Stream, pool: Any, work: Callable[[], Result]) 
         try:
             result = work()
         except BaseException:
-            # The recording is spoilt, or empty; what spoilt it is the error to tell.
+            # The recording is invalid or empty; the error that caused it is the one to report.
             with suppress(RuntimeError), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 graph.capture_end()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """This package's CUDA kernels: compiles them once per GPU architecture, caches the library, and calls its functions.
 
-The sources are installed with the package, because a wheel is seldom built on the machine that has the GPU.
+The sources are installed with the package, because a wheel is rarely built on the machine that has the GPU.
 """
 
 import ctypes
@@ -51,7 +51,7 @@ class KernelLibrary:
     Args:
         library: the loaded library.
         device_type: ``cuda``; ``cpu`` for the emulation that tests build.
-        stream: gives a device's stream as an integer (0: the default stream).
+        stream: returns a device's CUDA stream as an integer (0: the default stream).
     """
 
     library: ctypes.CDLL
@@ -73,10 +73,10 @@ class KernelLibrary:
             raise BackendError(f"The CUDA kernels failed ({message}); take the cpu back-end, or report this.")
 
     def check_devices(self, *tensors: Tensor | None) -> None:
-        """Raises unless the kernels can read all of ``tensors``.
+        """Check that the kernels can read all of ``tensors``.
 
         Raises:
-            BackendError: one lies elsewhere.
+            BackendError: a tensor is on another device.
         """
         elsewhere = [t.device for t in tensors if t is not None and t.device.type != self.device_type]
         if elsewhere:
@@ -91,7 +91,7 @@ def cuda_stream(device: torch.device) -> int:
 
 
 def source_folder() -> Path:
-    """Where the sources are installed."""
+    """The folder of the installed sources."""
     return Path(str(files("structgstream") / "_native" / "cuda"))
 
 
@@ -122,7 +122,7 @@ def compiled(architecture: str, *, nvcc: Path, sources: Path, cache: Path) -> Pa
     """
     units = sorted(sources.glob("*.cu"))
     if not units:
-        raise BackendError(f"No CUDA sources lie in {sources}; install structgstream again.")
+        raise BackendError(f"There are no CUDA sources in {sources}; install structgstream again.")
     virtual = architecture.replace("sm_", "compute_")
     flags = [*FLAGS, "-gencode", f"arch={virtual},code={architecture}"]
     state = hashlib.sha256("\n".join([_output([str(nvcc), "--version"]), *flags]).encode())
@@ -151,7 +151,7 @@ def _output(command: list[str]) -> str:
 
 
 def kernel_plan() -> tuple[Path | None, str]:
-    """NVIDIA's compiler or None, and a sentence that says what runs the back-end's own operations. Compiles nothing."""
+    """NVIDIA's compiler or None, and a sentence on what runs the back-end's own operations. Compiles nothing."""
     nvcc = find_nvcc(os.environ)
     if nvcc is None:
         return None, (

@@ -108,10 +108,10 @@ def tile_lists(means2d: Tensor, radii: Tensor, depths: Tensor, *, width: int, he
         nth = places - (ends - counts)[owners]
         wide = across.clamp(min=1)[owners]
         tile = (low[owners, 1] + nth // wide) * columns + low[owners, 0] + nth % wide
-        # Spread over the tiles below the picture, so that none has a long list.
+        # Unused places are spread over the tiles below the picture, so that none has a long list.
         tile = torch.where(places < needed, tile, rows * columns + places % columns)
         short = torch.int16 if (rows + 1) * columns < torch.iinfo(torch.int16).max else torch.int32
-        sorted_tiles, by_tile = tile.to(short).sort(stable=True)  # A stable sort keeps the order of depth in a tile.
+        sorted_tiles, by_tile = tile.to(short).sort(stable=True)  # A stable sort preserves depth order in a tile.
         every = torch.arange((rows + 1) * columns, dtype=short, device=means2d.device)
         starts = torch.searchsorted(sorted_tiles, every, out_int32=True)
     return TileLists(starts.reshape(rows + 1, columns), order[owners[by_tile]].to(torch.int32), needed)
@@ -159,7 +159,7 @@ def tile_lists_in_kernels(
         *(means2d, radii, order, ends, count, columns, rows, capacity, tiles, ids),
         device=device,
     )
-    sorted_tiles, by_tile = tiles.sort(stable=True)  # A stable sort keeps the order of depth in a tile.
+    sorted_tiles, by_tile = tiles.sort(stable=True)  # A stable sort preserves depth order in a tile.
     library.call(
         "sgs_cuda_tile_starts",
         *(sorted_tiles, by_tile, ids, capacity, columns, rows, starts, sorted_ids),

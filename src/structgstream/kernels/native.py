@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""This package's C++ library: loads it once, with the types of its functions, or says why it cannot be loaded.
+"""This package's C++ library: loads it once and declares its functions, or states why it cannot be loaded.
 
-Its prototypes let ctypes convert plain numbers and reject a call with other arguments. A tensor is passed as the
-address of its first number, so it must be contiguous.
+The declarations let ctypes convert plain numbers and reject calls with wrong arguments. A tensor is passed as the
+address of its first element, so it must be contiguous.
 """
 
 import ctypes
@@ -17,7 +17,7 @@ from torch import Tensor
 from structgstream.errors import BackendError
 
 ABI_VERSION = 8
-"""As in csrc/include/structgstream.h, which states when it is incremented."""
+"""Equal to the version in csrc/include/structgstream.h, which states when it is incremented."""
 ISA_NAMES = ("baseline", "avx2", "avx512")
 TYPES: Mapping[str, Any] = {
     "p": ctypes.c_void_p,
@@ -67,7 +67,7 @@ PROTOTYPES: Mapping[str, tuple[str, str]] = {
 
 
 class _Pointer:
-    """The type of arguments that are pointers: a tensor, an address, what ctypes takes for one, or None for null."""
+    """The type of pointer arguments: a tensor, an address, a ctypes pointer, or None for null."""
 
     @staticmethod
     def from_param(value: Any) -> Any:
@@ -78,7 +78,7 @@ def declare(library: ctypes.CDLL, prototypes: Mapping[str, tuple[str, str]]) -> 
     """Sets the types of every function.
 
     Raises:
-        AttributeError: the library lacks one.
+        AttributeError: the library lacks a function.
     """
     for name, (result, arguments) in prototypes.items():
         function = getattr(library, name)
@@ -87,7 +87,7 @@ def declare(library: ctypes.CDLL, prototypes: Mapping[str, tuple[str, str]]) -> 
 
 
 def addresses(*tensors: Tensor | None) -> list[int | None]:
-    """Address of each tensor's numbers for a C structure's pointers; None, which is C's null, for None."""
+    """Address of each tensor's data, for the pointers of a C structure; None (null) for None."""
     return [None if tensor is None else tensor.data_ptr() for tensor in tensors]
 
 
@@ -102,7 +102,7 @@ def members(of_type: Any, names: str) -> list[tuple[str, Any]]:
 
 
 def library_path() -> Path:
-    """Where the library is installed."""
+    """The path of the installed library."""
     return Path(str(files("structgstream") / "_native" / "libstructgstream.so"))
 
 

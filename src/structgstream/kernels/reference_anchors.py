@@ -21,7 +21,7 @@ BALL_DEVIATIONS = 3.4
 BOX_MARGIN_PIXELS = 2.0
 """Margin for the rasteriser's low-pass filter, which widens the smallest Gaussian to this."""
 BALL_INTERVALS = BALL_DEVIATIONS * LOW_PASS_PIXELS**0.5
-"""By so many sampling intervals the low-pass of a Gaussian widens its ball."""
+"""The low-pass of a Gaussian widens its ball by so many sampling intervals."""
 
 
 def visible_anchor_mask(
@@ -100,7 +100,8 @@ def generate_structured(
         viewport: the camera.
         distance_input: whether the distance is an input of the heads.
         tiles: if given, only anchors that reach one of these tiles.
-        sampling_intervals: ``[M]`` of the anchors, by which their balls grow for the rasteriser's low-pass.
+        sampling_intervals: ``[M]`` sampling intervals of the anchors, by which the rasteriser's low-pass enlarges their
+            balls.
     """
     visible = visible_anchors(anchors, viewport, tiles, sampling_intervals)
     return activate_anchors(anchors, mlps, viewport.center, visible, distance_input=distance_input)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Losses and the optimiser's step in pure torch: the oracles, and what a GPU without kernels of its own runs.
+"""Losses and the optimiser's step in pure torch: the oracles, which also run on a GPU without compiled kernels.
 
 SSIM (Wang et al., 2004) as 3D Gaussian splatting trains with it: 11 x 11 Gaussian window with sigma 1.5, zero padding,
 C1 = 0.01^2, C2 = 0.03^2, mean over pixels and channels.
@@ -108,15 +108,15 @@ def excess(offsets: Tensor, log_scales: Tensor, limit: float) -> Tensor:
 
 
 def neighbour_difference(values: Tensor, neighbours: Tensor, shares: Tensor, *, slack: float) -> Tensor:
-    """How much rows differ from their neighbours: the sum ``[]`` of shares times smoothed distances.
+    """Difference of rows from their neighbours: the sum ``[]`` of shares times smoothed distances.
 
     The distance of two rows is ``sqrt(|difference|^2 + slack^2) - slack``. Gradients flow to ``values``.
 
     Args:
         values: ``[M, 3]``.
-        neighbours: ``[M, N]`` int64, rows that each is compared with.
+        neighbours: ``[M, N]`` int64, rows to compare each row with.
         shares: ``[M, N]`` weights of these pairs.
-        slack: positive; far below it distances count in proportion to their square.
+        slack: positive; distances far below it are squared, distances far above it are linear.
     """
     # index_select and its gradient take four fifths of the time of indexing by a matrix.
     others = values.index_select(0, neighbours.reshape(-1)).reshape(*neighbours.shape, 3)
@@ -125,8 +125,7 @@ def neighbour_difference(values: Tensor, neighbours: Tensor, shares: Tensor, *, 
 
 
 class _ChangeBits(torch.autograd.Function):
-    """Autograd's own graph of it takes twice the time. Operations are on lists of tensors, which on a GPU is one launch
-    for all of them."""
+    """Takes half the time of autograd's own graph. Operations on lists of tensors need a single launch on a GPU."""
 
     @staticmethod
     def forward(ctx: Any, before: list[Tensor], steps: list[float], *values: Tensor) -> Tensor:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What changed between pictures and how it moved, in pure torch: the oracles."""
+"""Changes and motion between pictures, in pure torch: the oracles."""
 
 from collections.abc import Sequence
 
@@ -42,18 +42,17 @@ def picture_residual(
     outside: Tensor | None = None,
     mask: Tensor | None = None,
 ) -> Tensor:
-    """Mean absolute difference ``[h, w]`` of a rendering to a picture, over channels and the 3 x 3 pixels around each
-    that exist, in 0 ... 1; without graph.
+    """Mean absolute difference ``[h, w]`` of a rendering to a picture, in 0 ... 1; without graph.
 
-    The rendering is compared as its camera would have recorded it: ``gains * rendering + biases``, clamped to 0 ... 1,
-    and averaged down to the picture's size.
+    The mean is over channels and the 3 x 3 neighbourhood inside the picture. The rendering is compared as its camera
+    would have recorded it: ``gains * rendering + biases``, clamped to 0 ... 1 and averaged down to the picture's size.
 
     Args:
         rendering: ``[H, W, 3]``.
         picture: ``[h, w, 3]`` uint8, not larger than the rendering.
         gains: ``[3]``; one when None.
         biases: ``[3]``; given with ``gains``.
-        tiles: outside of these tiles of the rendering ``outside`` takes its place.
+        tiles: ``outside`` replaces the rendering outside these tiles.
         outside: ``[H, W, 3]`` uint8; given with ``tiles``.
         mask: ``[h, w]`` bool; pixels where it is False do not differ.
     """
@@ -73,7 +72,7 @@ def confident_flow(flow: Tensor, back: Tensor, mask: Tensor | None, *, relative:
     consistency, Sundaram et al., 2010), else 0.
 
     With ``f`` the flow and ``b`` the flow back: ``|f(p) + b(p + f(p))|^2 <= relative (|f(p)|^2 + |b(p + f(p))|^2) +
-    absolute``, and ``p + f(p)`` lies inside the outermost pixel centres. Tensors are on the CPU, where flow is found.
+    absolute``, and ``p + f(p)`` lies inside the outermost pixel centres. Tensors are on the CPU, as estimated flow is.
 
     Args:
         flow: ``[H, W, 2]`` float32, pixels.
@@ -100,8 +99,7 @@ def confident_flow(flow: Tensor, back: Tensor, mask: Tensor | None, *, relative:
 MIN_TOLERANCE, TOLERANCE_SHARE = 1.0, 0.1
 """Tolerance of an observed flow f: the first plus the second times |f|, in the unit of f.
 
-The unit is the error of the flow of what hardly moves (``training/online/scene_flow.py``). The second covers what grows
-with the
+The unit is the error of small flow (``training/online/scene_flow.py``). The second covers errors that grow with the
 displacement: the linearised projection, rotation of the object (one displacement fits several neighbours), and errors
 of the search on large motion, together 5 to 10 per cent of |f|."""
 ROBUST_SCALES = (4.0, 2.5, 1.5, 1.5, 1.0, 1.0)
@@ -129,14 +127,14 @@ def lift(centers: Tensor, seen: ViewFlows, neighbors: Neighbors, priors: Tensor,
     Minimises ``sum g W rho(J d - f) + reg |d - prior|^2`` over neighbours and views by iteratively reweighted least
     squares: one round without robust weights, then Geman-McClure weights ``1 / (1 + r^2 / (s tau)^2)^2`` of decreasing
     scale s (``ROBUST_SCALES``), with the residual ``r = |J d - f|`` and the tolerance ``tau = 1 +
-    0.1 |f|``. What has ``r < 1.5 tau`` in the end is an inlier. ``reg`` is ``0.02 sum + 0.05`` times the mean
+    0.1 |f|``. A flow with ``r < 1.5 tau`` in the end is an inlier. ``reg`` is ``0.02 sum + 0.05`` times the mean
     square of J, with the sum of the present weights.
 
     Args:
-        centers: ``[E, 3]`` of the dynamic anchors and Gaussians.
+        centers: ``[E, 3]`` centres of the dynamic anchors and Gaussians.
         seen: their W and f in each view.
-        neighbours: of each target, and g.
-        priors: ``[T, 3]`` displacements.
+        neighbors: neighbours of each target, and g.
+        priors: ``[T, 3]`` expected displacements.
         share: as in :class:`Lifted`.
     """
     jacobians = projection_jacobians(centers, seen.viewmats, seen.Ks, seen.near)
@@ -263,12 +261,12 @@ UNSEEN = -1.0
 def plane_scores(
     picture: Tensor, neighbours: Sequence[Tensor], homographies: Tensor, *, window: int, noise: float
 ) -> Tensor:
-    """How well a picture correlates with its neighbours seen through each of ``P`` planes: ``[P, H, W]``.
+    """Correlation ``[P, H, W]`` of a picture with its neighbours, warped through each of ``P`` planes.
 
     For each neighbour the zero-mean normalised cross-correlation over ``window`` x ``window`` pixels of the picture
-    with the neighbour's bilinear samples; -1 where it does not see the whole window. A score is the mean of the better
-    half of the neighbours (rounded up), in which one that does not see the window counts half of the best. Tensors
-    are on the CPU.
+    with the neighbour's bilinear samples; -1 if it does not see the whole window. A score is the mean of the better
+    half of the neighbours (rounded up), where one that does not see the window counts half of the best. Tensors are on
+    the CPU.
 
     Args:
         picture: ``[H, W]`` grey, in 0 ... 1.
@@ -297,8 +295,8 @@ def plane_scores(
 
 
 def _warped(picture: Tensor, homography: Tensor, size: torch.Size) -> tuple[Tensor, Tensor]:
-    """Bilinear samples of ``picture`` at the places of pixels of a picture of ``size``, 0 where it does not see them;
-    and the mask of those that it sees."""
+    """Bilinear samples of ``picture`` at the warped pixels of a picture of ``size``, 0 outside it, and the mask of the
+    pixels inside it."""
     height, width = picture.shape
     rows, columns = (torch.arange(length).to(picture) for length in size)
     places = torch.stack([columns.expand(*size), rows[:, None].expand(*size), torch.ones(size).to(picture)], dim=-1)

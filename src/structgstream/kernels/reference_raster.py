@@ -4,8 +4,8 @@
 Definition (as gsplat 1.5): perspective projection of the covariance with the point clamped to 1.3 times the field of
 view, a low-pass of 0.3 square pixels (of the picture, or of the training pictures: :func:`screen_low_pass`), alpha =
 opacity * exp(-power) used from 1/255 on and clamped at 0.999, front to back by camera depth until the transmittance
-would fall to 1e-4, pixel centres at +0.5. Gaussians that less than 1/255 of a pixel's light reaches are drawn there,
-and get no gradient from it.
+would fall to 1e-4, pixel centres at +0.5. A Gaussian behind a transmittance below 1/255 is drawn in that pixel, but
+gets no gradient from it.
 """
 
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from structgstream.kernels.values import TILE_PIXELS, Rasterizer, RasterOutput, 
 LOW_PASS_PIXELS = 0.3
 """Variance of the low-pass, square pixels."""
 SCREEN_LOW_PASS_PIXELS = 0.15
-"""Variance that a picture needs against aliasing, square pixels, where Gaussians have a low-pass of their own."""
+"""Variance that a picture needs against aliasing, square pixels, if Gaussians have a low-pass of their own."""
 MIN_ALPHA = 1.0 / 255.0
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4
@@ -64,7 +64,7 @@ def _project(gaussians: Gaussians, viewport: Viewport, screen_offsets: Tensor | 
     low_pass, opacities = LOW_PASS_PIXELS, opacities[rows]
     if gaussians.sampling_intervals is not None:
         trained, low_pass = screen_low_pass(gaussians.sampling_intervals[rows], z.detach(), K)
-        # That of the projection alone is the square of a cross product, which does not cancel for needles.
+        # The determinant without low-pass is the square of a cross product, which does not cancel for needles.
         square = torch.linalg.cross(axes[:, 0].detach(), axes[:, 1].detach()).square().sum(1)
         size = (xx + yy).detach()
         before, after = (square + variance * (size + variance) for variance in (trained, low_pass))
@@ -92,10 +92,10 @@ def _project(gaussians: Gaussians, viewport: Viewport, screen_offsets: Tensor | 
 
 
 def screen_low_pass(intervals: Tensor, depths: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
-    """Variances ``[n]``, square pixels, of a Gaussian's low-pass on a picture: of the training pictures, and in all.
+    """Variances ``[n]``, square pixels, of a Gaussian's low-pass on a picture: of the training pictures, and in total.
 
-    The first leaves the opacity as it is. The second is larger on pictures that are smaller than the training pictures,
-    against aliasing; what is added keeps the Gaussian's light: the opacity is multiplied by the root of the ratio of
+    The first does not change the opacity. The second is larger on pictures that are smaller than the training pictures,
+    against aliasing. The addition preserves the Gaussian's light: the opacity is multiplied by the root of the ratio of
     the covariance's determinants before and after. Both count as constants in gradients.
 
     Args:
@@ -120,8 +120,8 @@ def rasterize(
 ) -> RasterOutput:
     """Draw ``N`` Gaussians (paper, equations for mu_2D, Sigma_2D and alpha blending).
 
-    A Gaussian that less than 1/255 of a pixel's light reaches is drawn there, and gets no gradient from the pixel; with
-    gsplat (``cuda``) it does. The low-pass is :func:`screen_low_pass`; it counts as a constant.
+    A Gaussian behind a transmittance below 1/255 is drawn in that pixel, but gets no gradient from it; with gsplat
+    (``cuda``) it does. The low-pass is :func:`screen_low_pass`; it counts as a constant.
 
     Args:
         gaussians: to draw; their ids are not read.
@@ -130,8 +130,8 @@ def rasterize(
         screen_offsets: ``[N, 2]`` pixels, added to the projected means; its gradient is the view-space positional
             gradient.
         tiles: the tiles to draw, all when None. A Gaussian that reaches none of them has radius 0.
-        onto: ``[H, W, 3]`` without gradient, contiguous, only with ``tiles``: the picture that is drawn into in
-            place (Note [Ownership]), so that the other tiles keep its pixels; they are zero when None.
+        onto: ``[H, W, 3]`` without gradient, contiguous, only with ``tiles``: the picture that is drawn into in place
+            (Note [Ownership]); its other tiles do not change. None: the other tiles are zero.
         trained: only the first ``trained`` Gaussians get gradients; all when None.
     """
     gaussians, screen_offsets = detach_untrained(gaussians, screen_offsets, trained)
@@ -176,7 +176,7 @@ def detach_untrained(
 def restrict_to_tiles(
     image: Tensor, alpha: Tensor, radii: Tensor, tiles: TileSelection | None, onto: Tensor | None
 ) -> RasterOutput:
-    """Restricts a full rendering to ``tiles``; other tiles keep ``onto``, or are zero."""
+    """Restricts a full rendering to ``tiles``; other tiles are those of ``onto``, or zero."""
     if tiles is None:
         assert onto is None, "a picture to draw onto needs tiles"
         return RasterOutput(image, alpha, radii)
@@ -191,7 +191,7 @@ def restrict_to_tiles(
 def blending_weights(gaussians: Gaussians, viewport: Viewport, maps: Tensor) -> Tensor:
     """Sums ``[N, C]`` over the pixels of each Gaussian's blending weight times each map, without graph.
 
-    Weights are the gradients of :func:`rasterize` by colour: those of Gaussians that hardly any light reaches are zero.
+    Weights are the gradients of :func:`rasterize` with respect to colour, which are zero behind a low transmittance.
 
     Args:
         gaussians: to draw; their colours and ids are not read.
@@ -245,7 +245,7 @@ def picture_and_weights_by_gradient(
     *,
     background: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """:func:`picture_and_weights` of any rasteriser: one after the other."""
+    """:func:`picture_and_weights` of any rasteriser, in two passes."""
     with torch.no_grad():
         image = rasterizer(gaussians, viewport, background=background).image
     return image, weights_by_gradient(rasterizer, gaussians, viewport, maps)
@@ -268,7 +268,7 @@ def _tile(
 ) -> tuple[Tensor, Tensor]:
     """Blend the Gaussians ``here``, ordered by depth, over one tile: ``[h, w, 3]`` and coverage ``[h, w]``.
 
-    Those that less than ``MIN_GRADIENT_TRANSMITTANCE`` of a pixel's light reaches get no gradient from it.
+    A Gaussian behind a transmittance below ``MIN_GRADIENT_TRANSMITTANCE`` gets no gradient from the pixel.
     """
     like, colors = projected.means2d, gaussians.colors
     if here.numel() == 0:

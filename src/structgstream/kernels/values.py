@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Values that operations take and give: selections of tiles, renderings, anchors, flow in many views, sweeps."""
+"""Arguments and results of operations: selections of tiles, renderings, anchors, flow in several views, sweeps."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ class TileSelection:
 
     @classmethod
     def of(cls, pixels: Tensor) -> "TileSelection":
-        """The tiles that hold a pixel of the mask ``[H, W]``."""
+        """The tiles that contain a pixel of the mask ``[H, W]``."""
         height, width = pixels.shape
         rows, columns = tile_grid(width, height)
         padded = pixels.new_zeros(rows * TILE_PIXELS, columns * TILE_PIXELS)
@@ -150,7 +150,7 @@ class ViewFlows(NamedTuple):
 
     Args:
         weights: ``[V, E]`` W, sums of their blending weights over the pixels with reliable flow.
-        flows: ``[V, E, 2]`` f, in a unit of which it is known to one.
+        flows: ``[V, E, 2]`` f, in units of its error.
         viewmats: ``[V, 4, 4]``.
         Ks: ``[V, 3, 3]``, pixels in that unit.
         near: ``[V]`` distance of the near plane along z.

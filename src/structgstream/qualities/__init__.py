@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several qualities of one stream, made of the same frames by one process."""
+"""Several qualities of one stream, fitted to the same frames by one process."""

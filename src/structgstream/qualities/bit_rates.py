@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bit rates in the list of qualities: expected at the beginning, measured as soon as there are some packets."""
+"""The bit rates in the list of qualities: estimated at first, measured as soon as there are enough packets."""
 
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -12,21 +12,21 @@ from structgstream.frame_report import FrameReport
 from structgstream.qualities.ladder import Quality
 
 EXPECTED_BITS = 2e6
-"""Bits a second of quality 0, where nothing is known: 1.9 and 2.9 Mbit/s in lab/notes/compact-measured.md. One more
-doubles it."""
+"""Estimated bits per second of quality 0, from 1.9 and 2.9 Mbit/s in lab/notes/compact-measured.md. Each further unit
+of quality doubles it."""
 LEAST_PACKETS = 5
 MOST_PACKETS = 60
-"""Packets over which a rate is taken: two groups of a second, or more where frames are left out."""
+"""Number of packets over which a rate is measured: two groups of one second, or more if frames are skipped."""
 CHANGE = 0.1
-"""The list is written anew when a rate is off by this share."""
+"""The list is rewritten when a rate differs from the listed one by this share."""
 
 
 class BitRates:
-    """The list of qualities in a folder, kept up to date.
+    """Maintains the list of qualities in a folder.
 
     Args:
-        folder: holds the list, and a folder of segments for each quality.
-        qualities: what it lists.
+        folder: contains the list and a folder of segments for each quality.
+        qualities: the listed qualities.
     """
 
     def __init__(self, folder: Path, qualities: Sequence[Quality]) -> None:
@@ -35,7 +35,7 @@ class BitRates:
         self._packets = {quality.name: deque[tuple[float, int]](maxlen=MOST_PACKETS + 1) for quality in qualities}
 
     def begin(self, *, resume: bool) -> None:
-        """Writes the list, with the rates of an earlier run if that is resumed.
+        """Writes the list, with the rates of the earlier run if it is resumed.
 
         Raises:
             StorageError: it cannot be written.
@@ -45,17 +45,17 @@ class BitRates:
         self._write()
 
     def add(self, name: str, report: FrameReport) -> None:
-        """Takes a stored frame of a quality."""
+        """Adds a stored frame of a quality to the measurement."""
         self._packets[name].append((report.pts_seconds, report.bytes))
 
     def refresh(self, *, last: bool = False) -> None:
-        """Writes the list if a measured rate is another than the list says.
+        """Rewrites the list if a measured rate differs from the listed one.
 
         Args:
-            last: no frame follows, so that what was measured counts, however little it is.
+            last: no frame follows, so the rates of any number of packets are listed.
 
         Raises:
-            StorageError: it cannot be written; the list of before stays.
+            StorageError: it cannot be written; the earlier list is not affected.
         """
         known = {
             name: bits
@@ -73,21 +73,21 @@ class BitRates:
 
 
 def expected_bits(quality: Quality) -> float:
-    """Bits a second that a quality may take before any is known; only their order is meant to be right."""
+    """Estimated bits per second of a quality before any measurement; only the order of qualities is reliable."""
     return EXPECTED_BITS * 2.0**quality.fineness
 
 
 def bits_per_second(packets: Sequence[tuple[float, int]]) -> float | None:
-    """Bits a second of media, of packets with their times and bytes; at least 1, None where no time has passed.
+    """Bits per second of media, at least 1, from times and sizes of packets; None if they have the same time.
 
-    What the first one of them takes is left out, as the time before it is: frame 0's packet is nearly empty.
+    The first packet only marks the start time; its bytes do not count, because frame 0's packet is nearly empty.
     """
     seconds = packets[-1][0] - packets[0][0]
     return max(8 * sum(size for _, size in [*packets][1:]) / seconds, 1.0) if seconds > 0 else None
 
 
 def listed_bits(folder: Path) -> Mapping[str, float]:
-    """What the list in a folder says, by name; empty without one that can be read."""
+    """Bit rates of the list in a folder, by name; empty if there is no readable list."""
     try:
         return {quality.name: quality.bits_per_second for quality in read_list(folder) or ()}
     except StreamError:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame of all qualities: what they took together, and its line in the log of the run."""
+"""The joint report of a frame in all qualities, and its line in the log of the run."""
 
 import math
 from collections.abc import Mapping
@@ -9,11 +9,11 @@ from typing import Any
 from structgstream.frame_report import FrameReport
 
 FIGURES = ("kind", "bytes", "train_psnr", "total_seconds", "cpu_seconds", "anchors", "free", "begins")
-"""What a line of the joint log has of each quality, from the line of that one's own log."""
+"""Keys that a line of the joint log contains for each quality, copied from that quality's own log."""
 
 
 def joint_report(reports: Mapping[str, FrameReport]) -> FrameReport:
-    """The sums of bytes and seconds, and what is the same in all; the rest is that of the finest one, the last."""
+    """The sums of bytes and seconds; all other values are those of the finest quality, the last."""
     each = [*reports.values()]
     stages = dict.fromkeys(name for report in each for name in report.seconds)
     return replace(
@@ -30,8 +30,8 @@ def joint_entry(report: FrameReport, entries: Mapping[str, Mapping[str, Any]]) -
     """One line of the run's log.
 
     Args:
-        report: of all qualities that were fitted now.
-        entries: the frame's line in the log of each quality, by name; also of one that had the frame before.
+        report: joint report of all qualities that were fitted now.
+        entries: the frame's line in the log of each quality, by name, including qualities that had the frame already.
     """
     each = {name: {key: entry[key] for key in FIGURES if key in entry} for name, entry in entries.items()}
     return {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which qualities a run makes: their names, and how fine each one is."""
+"""The qualities of a run: names and fineness."""
 
 import re
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ class Quality:
     """One of the qualities.
 
     Args:
-        name: of its folder.
+        name: name of its folder.
         fineness: ``online.rounding.quality``: 0 is the preset's own, 1 halves every quantization step.
     """
 
@@ -27,10 +27,10 @@ class Quality:
 
 
 def qualities_in(given: Sequence[str]) -> tuple[Quality, ...]:
-    """The qualities of texts such as ``low=-1``, the coarsest first: viewers begin with that one.
+    """The qualities of texts such as ``low=-1``, the coarsest first, which viewers load first.
 
     Raises:
-        ConfigError: a text is none, two have one name or are equally fine, or they are too few or too many.
+        ConfigError: a text is malformed, two qualities have the same name or fineness, or their number is out of range.
     """
     qualities = sorted(map(_parsed, given), key=lambda quality: quality.fineness)
     if not 2 <= len(qualities) <= MOST_QUALITIES:
@@ -38,7 +38,7 @@ def qualities_in(given: Sequence[str]) -> tuple[Quality, ...]:
             f"--qualities takes 2 to {MOST_QUALITIES} qualities, which is what players choose from, got "
             f"{len(qualities)}; for a single one give --quality."
         )
-    # Not every file system tells large letters from small ones.
+    # Some file systems do not distinguish upper and lower case.
     for what, values in (("name", [q.name.lower() for q in qualities]), ("Q", [f"{q.fineness:g}" for q in qualities])):
         if twice := [one for one, other in pairwise(sorted(values)) if one == other]:
             raise ConfigError(
@@ -48,10 +48,10 @@ def qualities_in(given: Sequence[str]) -> tuple[Quality, ...]:
 
 
 def configured(config: StreamConfig, quality: Quality) -> StreamConfig:
-    """``config`` with a quality, as ``--quality`` makes it.
+    """``config`` with a quality, as set by ``--quality``.
 
     Raises:
-        ConfigError: the codec has no such knob.
+        ConfigError: the codec does not support qualities.
     """
     if config.codec != "compact":
         raise ConfigError(

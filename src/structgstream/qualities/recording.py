@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several qualities of one stream, written frame by frame from one reading of the cameras.
+"""Records several qualities of one stream frame by frame, reading the cameras once.
 
 Note [In step]
 ~~~~~~~~~~~~~~
-Each quality is a session of its own, as a run with that quality alone would be. The one with the fewest frames is
-always advanced, the coarsest first where several have as many. So all are given the same frames (Note [Readers]), no
-two are more than one frame apart whenever the process is killed, and one that lacks a frame gets it before any other
-goes on.
+Each quality is a session of its own, equal to that of a run with a single quality. The session with the fewest frames
+is always advanced next, the coarsest first among equals. So all sessions receive the same frames (Note [Readers]), and
+they differ by at most one frame when the process is killed. After resuming, a quality that lacks a frame gets it before
+any other continues.
 """
 
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -39,11 +39,11 @@ from structgstream.training.result import StepListener
 
 @dataclass(frozen=True)
 class QualityReport:
-    """A stored frame of a quality.
+    """Report of a stored frame of a quality.
 
     Args:
-        quality: its name.
-        report: of the frame.
+        quality: name of the quality.
+        report: report of the frame.
         whole: whether all qualities have the frame now.
     """
 
@@ -57,8 +57,9 @@ class QualitiesRun:
     """A reconstruction into several qualities.
 
     Args:
-        done: number of frames that all of them had before.
-        reports: of the further frames; advancing the generator fits, stores and logs one frame of one quality.
+        done: number of frames that all qualities had at the start.
+        reports: reports of the further frames; each step of the generator fits, stores and logs one frame of one
+            quality.
     """
 
     done: int
@@ -67,7 +68,7 @@ class QualitiesRun:
 
 @dataclass(frozen=True)
 class _Opened:
-    """A quality before it goes on: its name and pipeline, its sink, and the frames that it has."""
+    """An opened quality: its name, pipeline and sink, and its existing frames."""
 
     name: str
     pipeline: Pipeline[Scene, Any]
@@ -80,7 +81,7 @@ class _Opened:
 
     @property
     def start(self) -> int:
-        """The first frame that its session reads: the one before the next, if changes since that are needed."""
+        """The first frame that its session reads: the one before the next, if changes since then are needed."""
         return max(self.done - self.pipeline.method.needs_before, 0)
 
     @property
@@ -102,33 +103,33 @@ def record_qualities(
     on_step: StepListener | None = None,
     metrics: RunMetrics | None = None,
 ) -> QualitiesRun:
-    """Reconstructs a capture in several qualities (Note [In step]), with a log of each and of the run.
+    """Reconstructs a capture in several qualities (Note [In step]), with a log of each quality and of the run.
 
     The call checks existing streams, starts the logs and writes the list of qualities; streams are written as the
     reports are consumed.
 
     Args:
-        folder: holds ``qualities.json`` and a folder for each quality; logs lie beside what they are of.
+        folder: contains ``qualities.json`` and a folder for each quality; logs are next to these.
         source: the capture, or live cameras.
-        config: of all qualities but for their fineness.
+        config: configuration of all qualities, without their fineness.
         qualities: at least one, the coarsest first.
         backend: the compute back-end.
-        storages: opens the sink of each, by name.
-        resume: continue after the last whole frame of each.
+        storages: opens the sink of each quality, by name.
+        resume: continue after the last complete frame of each quality.
         metadata: plain JSON values for the headers.
         on_step: called after every optimisation step.
-        metrics: is told of every frame, and has these qualities.
+        metrics: receives every frame; has these qualities.
 
     Raises:
         ConfigError: a stream to resume was made with another configuration or from another capture.
         StreamError: a stream to resume is damaged so that it cannot be continued.
-        StorageError: a stream, a log or the list cannot be written; whole frames stay.
+        StorageError: a stream, a log or the list cannot be written; complete frames are not affected.
     """
     work = SharedWork()
     opened = []
     for quality in qualities:
         sink, stored = storages[quality.name](resume)
-        # Frames are denoised once for all, below.
+        # Frames are denoised below, once for all qualities.
         pipeline = replace(shared_pipeline(configured(config, quality), work), denoising=DenoisingConfig())
         opened.append(_Opened(quality.name, pipeline, sink, stored))
     starts, firsts = [one.start for one in opened], [one.first for one in opened]
@@ -144,18 +145,18 @@ def record_qualities(
     rates, least = BitRates(folder, qualities), min(done.values())
     rates.begin(resume=resume)
     begin_log(folder, frames=least)
-    return QualitiesRun(least, _told(_in_step(reports, done, frames.close), folder, [*done], rates, metrics))
+    return QualitiesRun(least, _reported(_in_step(reports, done, frames.close), folder, [*done], rates, metrics))
 
 
 def _in_step(
     reports: Mapping[str, Generator[FrameReport, None, None]], done: Mapping[str, int], close: Callable[[], object]
 ) -> Generator[QualityReport, None, None]:
-    """The reports of all sessions, always of the one with the fewest frames (Note [In step]).
+    """The reports of all sessions; always advances the one with the fewest frames (Note [In step]).
 
     Args:
-        reports: of each session, by name; they are closed with the result.
-        done: number of frames that each has.
-        close: called after that.
+        reports: reports of each session, by name; closed with the result.
+        done: number of frames of each session.
+        close: called after these are closed.
     """
     frames, going = dict(done), [*reports]
     with ExitStack() as stack:
@@ -172,14 +173,14 @@ def _in_step(
             yield QualityReport(name, report, min(frames.values()) > report.index)
 
 
-def _told(
+def _reported(
     reports: Generator[QualityReport, None, None],
     folder: Path,
     names: Sequence[str],
     rates: BitRates,
     metrics: RunMetrics | None,
 ) -> Generator[QualityReport, None, None]:
-    """The reports, each told to the list, the metrics and the run's log before it is yielded."""
+    """The reports, each added to the list, the metrics and the run's log before it is yielded."""
     now: dict[str, FrameReport] = {}
     try:
         with closing(reports):
@@ -196,12 +197,12 @@ def _told(
                     now = {}
                 yield one
     finally:
-        with suppress(StorageError):  # The streams are closed; what ended the run is to be told.
+        with suppress(StorageError):  # The error that ended the run must be raised instead.
             rates.refresh(last=True)
 
 
 def _lines(folder: Path, names: Sequence[str], now: Mapping[str, FrameReport]) -> dict[str, Mapping[str, Any]]:
-    """What the log of each quality says of a frame; of those that had it when the run was resumed, it is read."""
+    """A frame's entry in the log of each quality; read from the log for qualities that had it before the run."""
     (index,) = {report.index for report in now.values()}
     lines = {name: log_entry(now[name]) if name in now else read_log(folder / name).get(index) for name in names}
     return {name: line for name, line in lines.items() if line is not None}

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is the same in all qualities of a stream is computed once: pictures, their changes, first frames.
+"""Computes once what all qualities of a stream have in common: pictures, their changes, first frames.
 
 Note [Shared work]
 ~~~~~~~~~~~~~~~~~~
-Qualities differ in quantization steps and in the price of a bit. Neither is used in preprocessing pictures, nor in the
-fit of frame 0 (or of a period that begins from points), which is quantized only afterwards. So each is computed for the
-quality that asks first, and the others get the same values: their bytes are those of a run of their own. Qualities
-fit a frame one after the other, so few results are wanted again; older ones are dropped.
+Qualities differ in quantization steps and in the weight of the rate term. Neither affects the preprocessing of
+pictures, nor the fit of frame 0 (or of a period that begins from points), which is quantized only afterwards. So each
+of these is computed for the first quality that requests it, and the others receive the same values; their bytes equal
+those of separate runs. Qualities fit a frame one after the other, so only the latest results are cached.
 """
 
 import threading
@@ -28,14 +28,14 @@ from structgstream.training.result import FitResult
 
 Value = TypeVar("Value")
 PICTURES_KEPT = 3
-"""Of the frame that is fitted, of the one after it, which may be read ahead, and of one before, where one lacks it."""
+"""Results of the current frame, the next one, which may be read ahead, and the previous one, if a quality lacks it."""
 
 
 class Once(Generic[Value]):
-    """Values that are computed for whoever asks first; others wait for them. Thread-safe.
+    """A cache that computes each value at its first request; concurrent requests wait for it. Thread-safe.
 
     Args:
-        most: number of values that are kept.
+        most: largest number of cached values.
     """
 
     def __init__(self, most: int) -> None:
@@ -44,7 +44,7 @@ class Once(Generic[Value]):
         self._lock = threading.Lock()
 
     def value(self, key: Hashable, make: Callable[[], Value]) -> tuple[Value, bool]:
-        """The value of ``key``, and whether it was made now. What ``make`` raises, all who wait for it get."""
+        """The value of ``key``, and whether it was computed now. All waiting requests receive an error of ``make``."""
         with self._lock:
             found = self._found.get(key)
             mine = found is None
@@ -61,7 +61,7 @@ class Once(Generic[Value]):
         return found.result(), mine
 
     def clear(self) -> None:
-        """Forgets all of them."""
+        """Removes all values."""
         with self._lock:
             self._found.clear()
 
@@ -72,11 +72,11 @@ class Once(Generic[Value]):
 
 @dataclass(frozen=True)
 class SharedWork:
-    """What the qualities of one run have in common.
+    """Shared results of the qualities of one run.
 
     Args:
-        pictures: preprocessed, by the numbers of a frame and of the one before it.
-        first: fits of first frames, by their numbers.
+        pictures: preprocessed pictures, by the numbers of a frame and of the frame before.
+        first: fits of first frames, by frame number.
     """
 
     pictures: Once[FramePictures] = field(default_factory=lambda: Once(PICTURES_KEPT))
@@ -88,7 +88,7 @@ class SharedMethod(StructGStream):
     """The method of one of several qualities (Note [Shared work]).
 
     Args:
-        shared: what they have in common.
+        shared: the shared results.
     """
 
     shared: SharedWork = field(default_factory=SharedWork)
@@ -102,14 +102,14 @@ class SharedMethod(StructGStream):
         return self.shared.pictures.value(key, lambda: observe(frame, before, rig=rig, backend=backend))[0]
 
     def first(self, task: FrameTask) -> FitResult[Scene]:
-        """See ``StructGStream``; the seconds of the fit are told once."""
+        """See ``StructGStream``; only the quality that computed the fit reports its seconds."""
         first = super().first
         fit, mine = self.shared.first.value(task.frame.index, lambda: first(task))
         return fit if mine else replace(fit, seconds={})
 
     def next(self, past: Past[Scene, FrameZeroContext], task: FrameTask) -> FitResult[Scene]:
         """See ``StructGStream``."""
-        if task.begins is None:  # Every quality has the frame before, so the fit of a first one is not needed again.
+        if task.begins is None:  # All qualities have the previous frame, so no first frame is needed again.
             self.shared.first.clear()
         return super().next(past, task)
 

@@ -17,11 +17,11 @@ class ActiveTiles:
     within them, at a cost proportional to the tiles.
 
     Args:
-        tiles: those that dynamic Gaussians reach.
-        picture: ``[H, W, 3]`` the full picture outside the tiles, at least as far as the loss window reads beyond them.
-            Drawn into in place: its tiles hold the last drawing.
-        static: Gaussians that reach the tiles and do not move; without gradient.
-        changed: those of the tiles in which something has changed; None if that is not known.
+        tiles: the tiles that dynamic Gaussians reach.
+        picture: ``[H, W, 3]`` rendering outside the tiles, at least as far as the loss window reads beyond them. It is
+            drawn into in place, so its tiles contain the last rendering.
+        static: static Gaussians that reach the tiles; without gradient.
+        changed: the tiles whose pixels changed; None if unknown.
         background: ``[3]`` colour behind the scene; None for black.
     """
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Dynamic appearance: anchor features may change after frame 0 along their first principal components.
 
-The paper keeps f_v static, so that changes of appearance (lighting, folds, rotation) are left to free Gaussians. To
-send all D features of an anchor would cost more bits than its motion; R principal components cost a few bits.
+In the paper f_v is static, and free Gaussians represent changes of appearance (lighting, folds, rotation). Coding all D
+features of an anchor would cost more bits than its motion; R principal components cost a few bits.
 """
 
 from dataclasses import replace
@@ -15,8 +15,8 @@ from structgstream.scene.scene import Scene
 def with_appearance(scene: Scene, rank: int) -> Scene:
     """``scene`` with dynamic appearance along the first ``rank`` principal components of its features.
 
-    The norm of a basis row is the features' standard deviation along it. The appearance starts at zero, so renderings
-    do not change.
+    The norm of a basis row is the features' standard deviation along it. The appearance starts at zero, which does not
+    change renderings.
     """
     features = scene.anchors.features.double()
     centred = features - features.mean(0)

@@ -27,8 +27,8 @@ def environment(coefficients: Tensor, directions: Tensor) -> Tensor:
 def background(coefficients: Tensor | None, camera: Camera) -> Tensor | None:
     """One background colour ``[3]`` for a whole picture: the environment along ``camera``'s axis; None without one.
 
-    Used in training: a constant background costs nothing in the rasteriser, and is accurate enough where little of it
-    shows.
+    Used in training: a constant background costs nothing in the rasteriser, and is accurate enough because little of it
+    is visible.
     """
     if coefficients is None:
         return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Free Gaussians, which patch what the anchors cannot represent (paper, Global Free 3DGs Patching Strategy)."""
+"""Free Gaussians, which represent what the anchors cannot (paper, Global Free 3DGs Patching Strategy)."""
 
 from dataclasses import dataclass, fields
 
@@ -19,7 +19,7 @@ class FreeGaussians:
         quats: ``[F, 4]`` wxyz, normalised when drawn.
         logit_opacities: ``[F]``.
         colors: ``[F, 3]`` sRGB, independent of the view direction.
-        births: ``[F]`` int64 identities, ascending, each used once in a stream.
+        births: ``[F]`` int64 identities, assigned when a Gaussian is spawned; ascending, each used once in a stream.
     """
 
     means: Tensor

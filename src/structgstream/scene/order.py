@@ -51,7 +51,7 @@ def morton_order(positions: Tensor, *, step: float | None = None) -> Tensor:
 
 
 def in_morton_order(scene: Scene, *, step: float | None = None) -> Scene:
-    """``scene`` with its anchors in :func:`morton_order`. It must have no free Gaussians, whose ids would change."""
+    """``scene`` with its anchors in :func:`morton_order`. It must not have free Gaussians, because ids would change."""
     assert not len(scene.free), "ids of free Gaussians follow those of anchors"
     order = morton_order(scene.anchors.positions, step=step)
     return replace(scene, anchors=scene.anchors.select(order))

@@ -56,9 +56,9 @@ def draw(
         gaussians: the drawable set, in the units of the camera.
         camera: the view.
         backend: the compute back-end.
-        track_screen: keep the view-space positional gradient (see :class:`Rendering`).
-        active: draw only its tiles, into its picture and together with its still Gaussians. ``radii``, ``gaussians``
-            and ``screen_offsets`` of the result cover ``gaussians`` alone.
+        track_screen: compute the view-space positional gradient (see :class:`Rendering`).
+        active: draw only its tiles, into its picture and together with its static Gaussians. ``radii``, ``gaussians``
+            and ``screen_offsets`` of the result cover only ``gaussians``.
         background: ``[3]`` background colour; None for black.
     """
     means, count = gaussians.means, len(gaussians)
@@ -81,14 +81,15 @@ def draw(
 
 
 class Drawable(Protocol):
-    """A model that gives Gaussians for a camera: a ``Scene``, or another method's model."""
+    """A model that generates Gaussians for a camera: a ``Scene``, or another method's model."""
 
     def gaussians(self, camera: Camera, backend: Backend) -> Gaussians: ...
 
 
 def render(scene: Drawable, camera: Camera, backend: Backend) -> Rendering:
-    """Draw ``scene`` for ``camera`` (in the scene's units), without gradient, with the mean colour correction (the
-    identity) and over the environment, if it has one.
+    """Draw ``scene`` for ``camera`` (in the scene's units), without gradient.
+
+    The colour correction is the mean one, the identity. The background is the scene's environment, if it has one.
     """
     with torch.no_grad():
         rendering = draw(scene.gaussians(camera, backend), camera, backend)

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How finely the training cameras sampled a scene: the size of a training pixel at a point.
+"""Sampling interval of a scene by its training cameras: the size of a training pixel at a point.
 
 Note [Drawn as it was trained]
 ~~~~~~~~~~~~~~~~~~~~~~~~~~~~~~
-A scene is trained through the low-pass of a rasteriser, 0.3 square pixels *of the training pictures*. It is a part of
-what was trained: drawn three times as large with 0.3 square pixels of the larger picture, nine tenths of it are missing
-and edges look hairy; drawn at half the size everything becomes too thick. So the low-pass belongs to the scene, as a
-variance of 0.3 squared sampling intervals at each Gaussian, and only where that is less than the picture at hand needs
-against aliasing is the rest added, without adding light (``kernels.reference_raster.screen_low_pass``). At a training
-camera's own size the two are the same. The interval (Mip-Splatting's term) is a mean over the cameras that see a point.
+A scene is trained with the rasteriser's low-pass, 0.3 square pixels *of the training pictures*, and the Gaussians adapt
+to it. If the scene is drawn three times as large with 0.3 square pixels of the larger picture, nine tenths of the
+low-pass are missing and edges look hairy; at half the size everything becomes too thick. So the low-pass belongs to the
+scene, as a variance of 0.3 squared sampling intervals at each Gaussian. If the drawn picture needs more against
+aliasing, the difference is added without adding light (``kernels.reference_raster.screen_low_pass``). At a training
+camera's own size the two are equal. The interval (Mip-Splatting's term) is a mean over the cameras that see a point.
 """
 
 import weakref
@@ -20,22 +20,23 @@ from torch import Tensor
 from structgstream.cameras import Camera, CameraRig
 
 INNER_SHARE = 0.55
-"""Up to this share of a picture's size from its middle a camera counts fully: a little beyond the border."""
+"""A camera has full weight for points up to this share of the picture's size from its middle, slightly beyond the
+border."""
 BORDER_SHARE = 0.1
-"""Over this share of the picture's size its weight then falls to that of cameras that do not see the point, so that
-nothing pops when anchors move across a border."""
+"""Over this share of the picture's size the weight then falls to that of cameras that do not see the point. A sudden
+change would be visible when anchors move across a border."""
 UNSEEN_WEIGHT = 1e-4
-"""Of a camera in front of which a point lies outside of its picture: it decides where no camera sees the point."""
+"""Weight of a camera for a point in front of it but outside its picture: decisive if no camera sees the point."""
 _REMEMBERED = 4
 
 
 @dataclass(frozen=True)
 class RigSampling:
-    """The training cameras, as far as :meth:`intervals` needs them.
+    """The properties of the training cameras that :meth:`intervals` needs.
 
     Args:
-        projections: ``[V, 3, 4]`` float64, scene to picture as shares of its width and height, times the depth.
-        focals: ``[V]`` float64, pixels, the geometric mean of a camera's two.
+        projections: ``[V, 3, 4]`` float64, from scene to shares of the picture's width and height, times the depth.
+        focals: ``[V]`` float64, geometric mean of a camera's two focal lengths, pixels.
     """
 
     projections: Tensor
@@ -49,15 +50,15 @@ class RigSampling:
 
     @classmethod
     def of(cls, rig: CameraRig) -> "RigSampling":
-        """Of the training cameras of ``rig``, in its units."""
+        """The sampling by the training cameras of ``rig``, in its units."""
         cameras = [rig[name] for name in rig.training]
         return cls(torch.stack([_projection(camera) for camera in cameras]), torch.stack(list(map(_focal, cameras))))
 
     def intervals(self, points: Tensor) -> Tensor:
         """The side ``[N]`` of a training pixel at each of ``points`` ``[N, 3]``, scene units, without gradient.
 
-        The weighted mean of depth over focal length; zero where all cameras look away. Kept for the last few tensors
-        that are not trained.
+        The weighted mean of depth over focal length; zero if a point is behind all cameras. Results for the last few
+        tensors that are not trained are cached.
         """
         if points.requires_grad:
             return self._intervals(points.detach())
@@ -80,7 +81,7 @@ class RigSampling:
         return weights.mul_(depths).matmul(1.0 / focals).div_(total)
 
     def _on(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """The cameras with the dtype and device of ``points``; kept, because a copy to a GPU blocks the host."""
+        """The cameras with the dtype and device of ``points``; cached, because a copy to a GPU blocks the host."""
         key = (points.dtype, points.device)
         if key not in self._moved:
             self._moved[key] = self.projections.to(points), self.focals.to(points)
@@ -88,7 +89,7 @@ class RigSampling:
 
 
 def _inside(share: Tensor) -> Tensor:
-    """Weight by a coordinate as a share of the picture's size, in place."""
+    """Weight of a coordinate given as a share of the picture's size; computed in place."""
     edge = INNER_SHARE + BORDER_SHARE
     return share.sub_(0.5).abs_().neg_().add_(edge).div_(BORDER_SHARE).clamp_(0.0, 1.0)
 

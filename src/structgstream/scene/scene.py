@@ -30,10 +30,10 @@ class Scene:
         appearance_basis: ``[R, D]`` directions along which the anchors' features change after frame 0; None without
             ``appearance``.
         environment: ``[(degree + 1)^2, 3]`` background coefficients (``scene/environment.py``); None for black.
-        sampling: of the training cameras, by which Gaussians are filtered (``scene/sampling.py``); None: by the
-            picture.
-        anchor_intervals: ``[M]`` sampling intervals that are held while iterations move the anchors, which is by far
-            less than their depth; None: those of the positions.
+        sampling: sampling by the training cameras, which sets the low-pass of Gaussians (``scene/sampling.py``); None:
+            the low-pass is that of the drawn picture.
+        anchor_intervals: ``[M]`` sampling intervals that stay constant during iterations, because anchors move by far
+            less than their depth; None: computed from the positions.
     """
 
     anchors: AnchorCloud

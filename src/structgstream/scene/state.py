@@ -3,10 +3,10 @@
 
 Note [State table]
 ~~~~~~~~~~~~~~~~~~
-This is the only list of fields. The optimiser takes the parameters of the dynamic fields and their learning rates from
-it, the quantiser their steps; the init record carries the static fields and packets the dynamic ones in the coding
-stated here; size accounting sums over both. Half of the paper's ablations are edits of the dynamic set. The order of
-rows is the order of fields in a stream.
+This is the only list of fields. The optimiser reads the parameters of the dynamic fields and their learning rates from
+it, and the quantiser their steps. The init record contains the static fields and packets the dynamic ones, in the
+coding stated here. Half of the paper's ablations are edits of the dynamic set. The order of rows is the order of fields
+in a stream.
 """
 
 from collections.abc import Iterable, Mapping
@@ -56,7 +56,7 @@ ParameterName = (
 Granularity = Literal["anchor", "free", "camera", "shared"]
 """The object that a row of a field describes; ``shared`` fields belong to the whole scene."""
 InitCoding = Literal["uncoded", "positions", "rows", "numbers"]
-"""How the init record of a compact stream holds a field (docs/bitstream.md, section Coded init fields)."""
+"""Coding of a field in the init record of a compact stream (docs/bitstream.md, section Coded init fields)."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Parameter:
 
     Args:
         name: its name in configurations and in the header's steps.
-        path: of the attribute in a :class:`Scene`.
+        path: path of the attribute in a :class:`Scene`.
         columns: number of its columns in the field; one column is a vector in the scene. 0: the whole field.
         step: the field of ``RoundingConfig`` with its quantization step after frame 0; None: never quantized.
         online_rate: the field of ``OnlineRates`` with its learning rate after frame 0; None: not trained.
@@ -86,12 +86,12 @@ class Parameter:
 
     @cached_property
     def holder(self) -> str:
-        """The part of the scene that holds the attribute; empty for the scene itself."""
+        """The part of the scene that has the attribute; empty for the scene itself."""
         return self.path.rpartition(".")[0]
 
     @cached_property
     def attribute(self) -> str:
-        """The attribute's name in the part of the scene that holds it."""
+        """The attribute's name in :attr:`holder`."""
         return self.path.rpartition(".")[2]
 
 
@@ -104,14 +104,14 @@ class StateField:
         code: its number in a stream; never reused.
         symbol: the paper's symbol.
         granularity: the object that a row describes.
-        shape: numbers, and letters that stand for one size in all fields (docs/bitstream.md, section Fields).
-        path: of the attribute in a :class:`Scene`; empty for a field with ``parts``.
+        shape: numbers, and letters that denote the same size in all fields (docs/bitstream.md, section Fields).
+        path: path of the attribute in a :class:`Scene`; empty for a field with ``parts``.
         parts: the parameters whose columns make up the field, if it is not a single parameter.
         dynamic: whether the paper trains it after frame 0.
         optional: group of optional fields, which are present together or not at all. None: required.
-        integers: whether it holds int64 instead of float32.
-        outputs: of an MLP, its outputs per structured Gaussian; 0 for other fields.
-        init_coding: how the init record of a compact stream holds it.
+        integers: whether the values are int64 instead of float32.
+        outputs: an MLP's outputs per structured Gaussian; 0 for other fields.
+        init_coding: coding in the init record of a compact stream.
         step, online_rate, first_rate: as in :class:`Parameter`.
         init_step: the field of ``RoundingConfig`` with its quantization step in frame 0; ``sensitivity``: chosen from
             the sensitivity of the renderings; ``own``: chosen by the code that creates the field. None: as ``step``.
@@ -141,7 +141,7 @@ class StateField:
 
     @property
     def quantized(self) -> bool:
-        """Whether packets of a compact stream can carry the field (as bins)."""
+        """Whether packets of a compact stream can contain the field, as quantization indices."""
         return all(parameter.step for parameter in self.parameters)
 
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Streams in browsers: the web application of ``serve``, that of ``play``, the player's module and its pages."""
+"""Serves streams to browsers: the web applications of ``serve`` and ``play``, the player's module and its pages."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The query of a request, and whether its token gives access."""
+"""Parses the query of a request and checks its access token."""
 
 import re
 import time
@@ -25,7 +25,7 @@ _REASONS: Mapping[Access, str] = {
 
 
 class Refused(Exception):
-    """A request that is refused: status, a sentence, and headers."""
+    """A request is refused; has the response's status, sentence and headers."""
 
     def __init__(self, status: int, text: str, headers: Mapping[str, str] | None = None) -> None:
         super().__init__(text)
@@ -36,10 +36,10 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Query:
-    """The parameters of a query that the server knows; others are ignored.
+    """The query parameters that the server knows; others are ignored.
 
     Args:
-        token: access token; None without.
+        token: access token; None if there is none.
         after: sequence of the manifest that the client has; None if it does not wait for a newer one.
     """
 
@@ -48,14 +48,14 @@ class Query:
 
 
 def parsed_query(raw: bytes, headers: Mapping[str, str]) -> Query:
-    """The query of a request; the token of the header ``Authorization`` precedes that of the query.
+    """The query of a request; a token in the header ``Authorization`` takes precedence over one in the query.
 
     Args:
-        raw: as the client wrote it, without question mark.
-        headers: by their names in lower case.
+        raw: the query as the client wrote it, without question mark.
+        headers: headers by their names in lower case.
 
     Raises:
-        Refused: it has too many parameters, one of them twice, or ``after`` is no number.
+        Refused: it has too many parameters, one of them twice, or ``after`` is not a number.
     """
     try:
         pairs = parse_qsl(raw.decode("ascii"), keep_blank_values=True, max_num_fields=MAX_PARAMETERS, errors="strict")

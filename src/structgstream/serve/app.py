@@ -3,9 +3,9 @@
 
 Note [What is served]
 ~~~~~~~~~~~~~~~~~~~~~
-Addresses name streams and files with plain names, and each name is looked up: only streams of the folder, and of those
-only the files that a sink writes, previews and the numbers of the run. With keys every address but ``/health`` and
-``/player.js`` needs a token; it is checked before the stream is looked up, so that responses do not reveal which
+Addresses consist of plain names, and each name is looked up. Only streams of the folder are served, and of these only
+the files that a sink writes, previews and the metrics of the run. With keys every address except ``/health`` and
+``/player.js`` needs a token. The token is checked before the stream is looked up, so that responses do not reveal which
 streams exist.
 
 ==================================  ==========================================================
@@ -70,12 +70,12 @@ _NOTHING_HERE: Final = "There is nothing at this address."
 
 @dataclass(frozen=True)
 class ServerSettings:
-    """What is served, and to whom.
+    """Settings of the server.
 
     Args:
-        folder: holds the streams, or is one.
+        folder: contains the streams, or is one.
         keys: secrets of access tokens; None gives everyone access.
-        origins: whose pages may read, ``*`` for all; none: only pages of this server.
+        origins: origins whose pages may read responses, ``*`` for all; empty: only pages of this server.
         hosts: host names that requests may have; ``*`` for any.
         wait_seconds: longest time that a request waits for a newer manifest.
     """
@@ -91,7 +91,7 @@ def application(settings: ServerSettings, *, clock: Callable[[], float] = time.t
     """The application (Note [What is served]).
 
     Args:
-        settings: what is served, and to whom.
+        settings: settings of the server.
         clock: Unix seconds.
 
     Raises:
@@ -122,7 +122,7 @@ def application(settings: ServerSettings, *, clock: Callable[[], float] = time.t
             OSError: _unreadable,
         },
     )
-    application.router.redirect_slashes = False  # It would lead to this server's own name, also behind a proxy.
+    application.router.redirect_slashes = False  # A redirect would name this server's host, also behind a proxy.
     return application
 
 
@@ -142,7 +142,7 @@ class _Routes:
         self._module = bundle()
 
     def all(self) -> list[Route]:
-        """The routes, in the order in which they are tried."""
+        """The routes, in order of matching."""
         return [
             Route("/", self.index),
             Route("/streams.json", self.listing),
@@ -190,13 +190,13 @@ class _Routes:
         return Response(content, headers={**self._headers, "Content-Type": CONTENT_TYPE})
 
     async def without_slash(self, request: Request) -> Response:
-        """Redirects to the page; relative, so that it holds behind a proxy."""
+        """Redirects to the page; the redirect is relative, so that it works behind a proxy."""
         _check_plain(request)
         name, query = request.path_params["name"], request.scope["query_string"].decode("ascii")
         return RedirectResponse(f"{name}/{'?' if query else ''}{query}", 307, self._headers)
 
     async def page(self, request: Request) -> Response:
-        """The player of a stream, with the token in the address that it loads."""
+        """The page of a stream, which passes the token to the player."""
         stream = await self._stream(request)
         request.scope["counted_as"] = (stream.name, "page")
         address = f"{stream.kind.source}{self._authorizer.page_query(request)}"
@@ -242,7 +242,7 @@ class _Routes:
         """The entries of the streams that the token gives access to; addresses are relative.
 
         Raises:
-            Refused: the token gives access to no stream that could be.
+            Refused: the token gives access to no stream.
         """
         request.scope["counted_as"] = ("", "list")
         streams = (await self._streams()).values()
@@ -314,7 +314,7 @@ class _Routes:
         return JSONResponse(values, headers=self._headers)
 
     async def _preview(self, stream: ServedStream, request: Request) -> Response:
-        """``preview.png`` or ``.jpg`` of segments, else ``NAME.preview.png`` or ``.jpg`` beside the stream."""
+        """``preview.png`` or ``.jpg`` of segments, else ``NAME.preview.png`` or ``.jpg`` next to the stream."""
         request.scope["counted_as"] = (stream.name, "preview")
         content = await _content(await to_thread.run_sync(_open_preview, stream), MAX_PICTURE_BYTES)
         media_type = next((kind for start, kind in _PICTURES.items() if (content or b"").startswith(start)), None)
@@ -325,7 +325,7 @@ class _Routes:
 
 
 def _check_plain(request: Request) -> None:
-    """Check that the path is written with plain names.
+    """Check that the path consists of plain names.
 
     Raises:
         Refused: it is not.
@@ -336,7 +336,7 @@ def _check_plain(request: Request) -> None:
 
 def _open_preview(stream: ServedStream) -> OpenedFile | None:
     for suffix in (".png", ".jpg"):
-        segments = stream.segments[-1:]  # of renditions the best
+        segments = stream.segments[-1:]  # the best of several renditions
         opened = segments[0].open(f"preview{suffix}") if segments else stream.open_beside(f".preview{suffix}")
         if opened is not None:
             return opened

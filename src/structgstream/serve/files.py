@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names that may stand in an address, and opening files below a folder, never outside it.
+"""Names that an address may contain, and opening of files below a folder, never outside it.
 
 Note [Plain names]
 ~~~~~~~~~~~~~~~~~~
-Streams and their files have names of letters, digits, dots, dashes and underscores. So every address is written in one
-way only, without percent signs, and no address leads out of a folder.
+Names of streams and their files consist of letters, digits, dots, dashes and underscores. So every address has a single
+spelling, without percent signs, and no address leads out of a folder.
 
 Note [No links]
 ~~~~~~~~~~~~~~~
 Each part of a path is opened relative to the folder before it, and none may be a symbolic link. So a folder cannot be
-exchanged for a link between the check and the opening. Only regular files are opened; opening a pipe does not wait for
-its writer.
+replaced by a link between check and opening. Only regular files are opened; opening a pipe does not wait for its
+writer.
 """
 
 import errno
@@ -45,13 +45,13 @@ def hash_in_name(file: str) -> str | None:
 
 
 def is_plain_path(raw: bytes) -> bool:
-    """Whether a path, as the client wrote it, holds plain names only (Note [Plain names])."""
+    """Whether a path, as the client wrote it, consists of plain names (Note [Plain names])."""
     return _PATH.fullmatch(raw) is not None and not {b".", b".."} & set(raw.split(b"/"))
 
 
 @dataclass(frozen=True)
 class FileStamp:
-    """What changes when a file is replaced or grows."""
+    """Properties of a file that change when it is replaced or grows."""
 
     inode: int
     modified_ns: int
@@ -73,7 +73,7 @@ class OpenedFile:
         return self.read(start, max(stop - start, 0))
 
     def read(self, start: int, count: int) -> bytes:
-        """Up to ``count`` bytes from ``start`` on; fewer only where the file has become shorter."""
+        """Up to ``count`` bytes from ``start`` on; fewer if the file has become shorter."""
         pieces = []
         while count and (piece := os.pread(self.file.fileno(), count, start)):
             pieces.append(piece)
@@ -113,7 +113,7 @@ def open_below(folder: Path, *parts: str) -> OpenedFile | None:
         return None
     file = FileIO(handle, "rb")
     opened = OpenedFile(file, FileStamp(status.st_ino, status.st_mtime_ns, status.st_size))
-    # Requests are cancelled anywhere, also between opening in a thread and taking what was opened.
+    # A request may be cancelled between the opening in a thread and the receipt of its result.
     weakref.finalize(opened, file.close)
     return opened
 

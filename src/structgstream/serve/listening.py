@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Listening on an address, running an application on uvicorn, and checks of the options of ``serve``."""
+"""Checks the network options of ``serve``, listens on an address, and runs an application on uvicorn."""
 
 import ipaddress
 import os
@@ -20,7 +20,7 @@ KEEP_ALIVE_SECONDS: Final = 15
 SHUTDOWN_SECONDS: Final = 2
 MAX_HEADER_BYTES: Final = 16 * 1024
 SEND_BUFFER_BYTES: Final = 256 * 1024
-"""Of a connection, in the kernel: bounds what a slow client occupies."""
+"""Send buffer of a connection in the kernel, which bounds the memory of a slow client."""
 
 
 def checked_address(host: str, *, tokens: bool, public: bool) -> str:
@@ -28,11 +28,11 @@ def checked_address(host: str, *, tokens: bool, public: bool) -> str:
 
     Args:
         host: an IP address of this machine, or ``localhost``.
-        tokens: whether access tokens are needed.
+        tokens: whether access tokens are required.
         public: whether the user allows access without tokens.
 
     Raises:
-        ConfigError: it is no address, or others could see the streams without a token and the user did not allow it.
+        ConfigError: it is not an address, or others could see the streams without a token and ``public`` is False.
     """
     try:
         address = ipaddress.ip_address(LOOPBACK if host == "localhost" else host)
@@ -47,7 +47,7 @@ def checked_address(host: str, *, tokens: bool, public: bool) -> str:
 
 
 def accepted_hosts(address: str, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Host names that requests may have: this machine's and ``names``; any, if a public address has no name."""
+    """Host names that requests may have: this machine's and ``names``; any for a public address without names."""
     if not names and not ipaddress.ip_address(address).is_loopback:
         return ("*",)
     return (*LOOPBACK_NAMES, *names)
@@ -57,7 +57,7 @@ def checked_proxies(proxies: tuple[str, ...]) -> tuple[str, ...]:
     """Addresses or networks of proxies.
 
     Raises:
-        ConfigError: one is neither.
+        ConfigError: a text is neither.
     """
     for proxy in proxies:
         try:
@@ -71,7 +71,7 @@ def checked_origins(origins: tuple[str, ...]) -> tuple[str, ...]:
     """Origins as a browser writes them.
 
     Raises:
-        ConfigError: one is none.
+        ConfigError: a text is not an origin.
     """
     for origin in origins:
         scheme, separator, host = origin.partition("://")
@@ -82,11 +82,11 @@ def checked_origins(origins: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def bound(port: int, *, address: str = LOOPBACK) -> socket.socket:
-    """A listening socket: connections are accepted, and wait, before the server runs.
+    """A listening socket, which queues connections before the server runs.
 
     Args:
-        port: 0 takes a free one.
-        address: IPv4 or IPv6 address of this machine.
+        port: the port; 0 for a free one.
+
 
     Raises:
         PlayerError: the port is taken, or may not be used.
@@ -114,7 +114,7 @@ def server(app: ASGIApp, *, proxies: Sequence[str] = (), connections: int | None
     Args:
         app: the application.
         proxies: addresses or networks whose ``X-Forwarded-For`` and ``-Proto`` are trusted.
-        connections: number from which on requests are answered with 503; None for no bound.
+        connections: number of connections above which requests are answered with 503; None for no limit.
     """
     config = uvicorn.Config(
         app,
@@ -123,7 +123,7 @@ def server(app: ASGIApp, *, proxies: Sequence[str] = (), connections: int | None
         ws="none",
         lifespan="off",
         log_level="error",
-        access_log=False,  # Queries may hold tokens.
+        access_log=False,  # Queries may contain tokens.
         server_header=False,
         proxy_headers=bool(proxies),
         forwarded_allow_ips=list(proxies),
@@ -140,8 +140,8 @@ def run(server: uvicorn.Server, *, port: int, address: str = LOOPBACK, on_start:
 
     Args:
         server: see :func:`server`.
-        port: 0 takes a free one.
-        address: to listen on.
+        port: the port; 0 for a free one.
+        address: the address to listen on.
         on_start: called with the server's address once the port is bound.
 
     Raises:
@@ -155,6 +155,6 @@ def run(server: uvicorn.Server, *, port: int, address: str = LOOPBACK, on_start:
 
 
 def open_browser(address: str, *, environ: Mapping[str, str] = os.environ) -> bool:
-    """Open ``address``; False without a screen, where a text browser would take over the terminal."""
+    """Opens ``address``; returns False without a screen, because a text browser would use the terminal."""
     graphical = any(environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
     return graphical and webbrowser.open(address)

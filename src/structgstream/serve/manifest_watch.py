@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The current manifest of a segments folder, and waiting for a newer one.
+"""Reads the current manifest of a segments folder, and waits for a newer one.
 
 Note [One watcher]
 ~~~~~~~~~~~~~~~~~~
@@ -31,7 +31,7 @@ FORMAT: Final = "structgstream-segments"
 
 
 class BrokenManifest(Exception):
-    """The file ``manifest.json`` is not a manifest; the message says why."""
+    """The file ``manifest.json`` is not a manifest; the message states why."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class ManifestWatch:
         self._lock = asyncio.Lock()
         self._read_at = -float("inf")
         self._stamp: FileStamp | None = None
-        self._found: Snapshot | str | None = None  # a text is the error in the manifest
+        self._found: Snapshot | str | None = None  # a string is the error in the manifest
         self._changed = asyncio.Event()
         self._watching: asyncio.Task[None] | None = None
         self.waiters = 0
@@ -90,7 +90,7 @@ class ManifestWatch:
     async def newer(self, after: int, *, seconds: float) -> Snapshot | None:
         """The manifest when its sequence exceeds ``after`` or it changes, or the current one after ``seconds``.
 
-        That of a finished stream is returned at once.
+        The manifest of a finished stream is returned immediately.
 
         Raises:
             BrokenManifest: the file is no manifest.
@@ -149,7 +149,7 @@ def snapshot(content: bytes) -> Snapshot:
     """The manifest in a file.
 
     Raises:
-        BrokenManifest: it is none.
+        BrokenManifest: it is not a manifest.
     """
     try:
         values = json.loads(content)

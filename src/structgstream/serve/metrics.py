@@ -48,7 +48,7 @@ class Metrics:
         requests: number of responses by stream, kind and status.
         sent_bytes: bytes of response bodies by stream.
         in_progress: number of requests that are being answered.
-        viewers: who watches.
+        viewers: present viewers of each stream.
     """
 
     def __init__(self) -> None:
@@ -58,7 +58,7 @@ class Metrics:
         self.viewers = Viewers()
 
     def families(self) -> list[Metric]:
-        """The counters as families of Prometheus."""
+        """The counters as Prometheus metric families."""
         requests = CounterMetricFamily("structgstream_requests", "Responses.", labels=("stream", "kind", "status"))
         for (stream, kind, status), count in sorted(self.requests.items()):
             requests.add_metric((stream, kind, str(status)), count)
@@ -125,10 +125,10 @@ def stream_families(
     """Gauges of streams and of the runs that write them.
 
     Args:
-        manifests: by stream.
+        manifests: manifests by stream.
         waiters: number of requests that wait for a manifest, by stream.
-        runs: numbers of a run by their names, by stream.
-        unix_seconds: now.
+        runs: metrics of a run by name, by stream.
+        unix_seconds: the present time.
     """
     published = {name: one.edge("published_unix_seconds") for name, one in manifests.items()}
     ages = {name: None if then is None else unix_seconds - then for name, then in published.items()}
@@ -149,7 +149,7 @@ def stream_families(
 
 
 class _Collected:
-    """Families as a registry of Prometheus."""
+    """Adapter from metric families to a Prometheus registry."""
 
     def __init__(self, families: Iterable[Metric]) -> None:
         self._families = families
@@ -166,7 +166,8 @@ def exposition(families: Iterable[Metric]) -> bytes:
 def run_numbers(content: bytes) -> dict[str, float]:
     """The numbers in a run's ``OUT.metrics.json`` by the path to them, joined by ``_``: at most 500.
 
-    Lists and texts are left out. Content that is no JSON object has none: the run may be of another version.
+    Lists and strings are skipped. The result is empty for content that is not a JSON object, because the run may be of
+    another version.
     """
     try:
         values = json.loads(content)

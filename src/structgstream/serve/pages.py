@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The player's module, the HTML pages that contain a player, and the page that lists streams.
+"""The player's module, HTML pages with a player, and the page that lists streams.
 
-``player.js`` is one JavaScript module that ``scripts/build-player`` makes of ``viewer/packages``. It is part of the
+``player.js`` is one JavaScript module that ``scripts/build-player`` builds from ``viewer/packages``. It is part of the
 repository and the wheel, so that installing the package does not need Node; a test rebuilds and compares it.
 
 Note [Own origin only]
 ~~~~~~~~~~~~~~~~~~~~~~
-Every page has a Content-Security-Policy that allows loading from its own origin only, the single page from nowhere. So
-neither the content of a stream nor the parameters of a link can make a browser contact a third party. Workers are blobs
-of the module itself; styles are inline, because they are in the element's shadow root.
+The Content-Security-Policy of a page allows loading only from its own origin, and that of the single page no loading at
+all. So neither the content of a stream nor the parameters of a link can make a browser contact a third party. Workers
+are blobs of the module itself; styles are inline, because they are in the element's shadow root.
 """
 
 import base64
@@ -24,7 +24,7 @@ from structgstream.codec.container.byte_source import ByteSource
 from structgstream.errors import PlayerError
 
 MAX_PAGE_STREAM_BYTES: Final = 256 * 10**6
-"""Largest stream in a page: browsers cannot hold a string of twice this length."""
+"""Largest stream in a page: browsers do not support a string of twice this length."""
 
 _POLICY: Final = {
     "default-src": "'none'",
@@ -52,7 +52,7 @@ p{margin:0;padding:.5rem .75rem;display:flex;justify-content:space-between;gap:1
 </style>
 """
 REFRESH_SECONDS: Final = 60
-"""After which the list is loaded again, because streams begin and end."""
+"""Interval at which the list is reloaded, because streams begin and end."""
 _NO_SCRIPT: Final = "<noscript>This page plays a free-viewpoint video and needs JavaScript.</noscript>"
 
 
@@ -100,10 +100,10 @@ def linked_page(
     """A page that loads the player and the stream, for a server.
 
     Args:
-        title: of the window.
+        title: title of the window.
         stream: address of the stream, relative to the page.
         module: address of the player, relative to the page.
-        attributes: further ones of the element.
+        attributes: further attributes of the element.
     """
     script = f'<script type="module" src="{html.escape(module)}"></script>'
     body = f"{_element({'src': stream, **(attributes or {})})}\n{_NO_SCRIPT}"
@@ -111,10 +111,10 @@ def linked_page(
 
 
 def single_page(title: str, *, module: str, stream: ByteSource) -> bytes:
-    """A page that holds player and stream, and opens from a disk without a server.
+    """A page that contains player and stream, and can be opened from a disk without a server.
 
     Args:
-        title: of the window.
+        title: title of the window.
         module: the player's source.
         stream: the whole stream file.
 
@@ -123,8 +123,9 @@ def single_page(title: str, *, module: str, stream: ByteSource) -> bytes:
     """
     if len(stream) > MAX_PAGE_STREAM_BYTES:
         raise PlayerError(
-            f"The stream has {len(stream) / 1e6:.0f} MB, and a page holds up to {MAX_PAGE_STREAM_BYTES / 1e6:.0f}; "
-            "watch it with structgstream play, or put the folder that --format site writes on a web server."
+            f"The stream has {len(stream) / 1e6:.0f} MB, and a page can contain up to "
+            f"{MAX_PAGE_STREAM_BYTES / 1e6:.0f}; watch it with structgstream play, or put the folder that "
+            "--format site writes on a web server."
         )
     inlined = inline_module(module)
     digest = base64.b64encode(hashlib.sha256(inlined.encode()).digest()).decode()
@@ -142,7 +143,7 @@ def inline_module(source: str) -> str:
     In JavaScript these letters occur only in strings and regular expressions, where a backslash before the slash has no
     effect.
     """
-    # After <!-- a parser takes <script> and </script> for a nested pair. Our bundle never writes it.
+    # After <!-- a parser treats <script> and </script> as a nested pair. Our bundle does not contain it.
     assert "<!--" not in source, "an HTML comment cannot be inlined"
     return re.sub(r"</(?=script)", r"<\\/", source, flags=re.IGNORECASE)
 
@@ -156,7 +157,7 @@ def html_page(title: str, *, head: str, body: str, rules: str) -> str:
     """A whole page.
 
     Args:
-        title: of the window, as plain text.
+        title: title of the window, as plain text.
         head: further elements of the head, as HTML.
         body: content, as HTML.
         rules: its Content-Security-Policy.
@@ -183,7 +184,7 @@ def list_page(streams: Sequence[Mapping[str, Any]], *, query: str) -> str:
 
     Args:
         streams: entries of ``streams.json``.
-        query: added to every address: empty, or ``?token=...``.
+        query: appended to every address: empty, or ``?token=...``.
     """
     entries = "\n".join(_entry(stream, query) for stream in streams)
     body = f"<h1>Streams</h1>\n<ul>\n{entries}\n</ul>" if streams else "<h1>Streams</h1>\n<p>There is none yet.</p>"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The web application of ``structgstream play``: page, player, one stream, and the capture's pictures.
+"""The web application of ``structgstream play``: page, player, one stream, and pictures of the capture.
 
 Note [Loopback only]
 ~~~~~~~~~~~~~~~~~~~~
@@ -41,11 +41,11 @@ class Truth:
 
     Args:
         source: the part of the capture that the stream was made from, at the stream's size.
-        cameras: names of the cameras that both have.
+        cameras: names of the cameras that are in both capture and stream.
         max_cached_bytes: size of the cache of encoded pictures.
 
     Raises:
-        MissingExtraError: OpenCV, which encodes, is not installed.
+        MissingExtraError: OpenCV, which encodes pictures, is not installed.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class Truth:
         return data.tobytes()
 
     def _at(self, camera: str, frame: int) -> MultiViewFrame:
-        open_video, self._open = self._open, None  # A decoder that raised is not used again.
+        open_video, self._open = self._open, None  # A decoder is not used again after an error.
         if open_video is not None and open_video[0] == camera and 0 <= frame - open_video[1] <= MAX_SKIPPED:
             frames = open_video[2]
         else:

@@ -14,12 +14,12 @@ from starlette.responses import Response, StreamingResponse
 from structgstream.errors import StreamError
 
 PIECE_BYTES: Final = 256 * 1024
-"""Of a file that are in memory for each connection."""
+"""Bytes of a file that are in memory per connection."""
 
 NO_STORE_HEADERS: Final[Mapping[str, str]] = {
     "Cache-Control": "no-store",
     "Cross-Origin-Resource-Policy": "same-origin",
-    "Referrer-Policy": "no-referrer",  # The page's address may hold a token.
+    "Referrer-Policy": "no-referrer",  # The page's address may contain a token.
     "X-Content-Type-Options": "nosniff",
 }
 _ONE_RANGE = re.compile(r"bytes=\s*(\d{0,18})-(\d{0,18})\s*", re.ASCII | re.IGNORECASE)
@@ -115,9 +115,9 @@ def file_response(
     Args:
         opened: the file at its current length.
         request: GET or HEAD.
-        headers: of the response.
+        headers: headers of the response.
         etag: strong validator of the bytes.
-        media_type: of the bytes.
+        media_type: media type of the bytes.
     """
     if etag is not None:
         headers = {**headers, "ETag": etag}
@@ -133,7 +133,7 @@ def file_response(
 
 
 async def _pieces(opened: OpenBytes, wanted: range) -> AsyncIterator[bytes]:
-    """The bytes ``wanted`` of a file, which is closed after them; they end early if the file becomes shorter."""
+    """The bytes ``wanted`` of a file, which is closed afterwards; fewer if the file becomes shorter."""
     try:
         for start in range(wanted.start, wanted.stop, PIECE_BYTES):
             end = min(start + PIECE_BYTES, wanted.stop)

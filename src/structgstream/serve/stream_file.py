@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stream file that may grow, or a folder of segments, as bytes; and pages written from it."""
+"""The bytes of a stream file that may grow, or of a folder of segments, and pages written from them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -33,15 +33,15 @@ class StreamFile:
         """The open stream at its present length.
 
         Raises:
-            StreamError: it cannot be read, or frames of it have left the window.
+            StreamError: it cannot be read, or its first frames have been removed from the window.
         """
         if not is_segments(self.path):
             return FileBytes(self.path)
         stored = open_segments(self.path)
         if stored.gone:
             raise StreamError(
-                f"{self.path} keeps a window, and its first frames have left it; it cannot be shown as one file. Show "
-                "it with structgstream serve."
+                f"{self.path} stores a window of frames, and the first frames have been removed; it cannot be shown as "
+                "one file. Show it with structgstream serve."
             )
         return stored
 

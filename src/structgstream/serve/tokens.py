@@ -4,9 +4,9 @@
 Note [Tokens]
 ~~~~~~~~~~~~~
 EXPIRES is in Unix seconds; STREAM is the name of a stream, or ``~`` for every stream and the metrics. SIGNATURE is the
-HMAC-SHA256 of both under the secret, in base64 without padding. Tokens are not stored: whoever has the secret can check
-one. A token cannot be withdrawn, so it should expire soon; all tokens of a secret end when the server is started
-without it. All characters may stand in a query and in a header without escapes.
+HMAC-SHA256 of both under the secret, in base64 without padding. Tokens are not stored: the secret is sufficient to
+check one. A token cannot be revoked, so it should expire soon; all tokens of a secret become invalid when the server
+is started without it. All characters can be used in a query and in a header without escapes.
 """
 
 import base64
@@ -42,7 +42,7 @@ class Access(Enum):
 
 @dataclass(frozen=True)
 class TokenKeys:
-    """Secrets: the first one signs, each is accepted, so that a secret can be replaced while its tokens are valid."""
+    """Secrets. The first one signs and all are accepted, so a secret can be replaced while its tokens are valid."""
 
     secrets: tuple[bytes, ...]
 
@@ -59,14 +59,14 @@ class TokenKeys:
         return f"v1.{expires_unix_seconds}.{_signature(self.secrets[0], expires_unix_seconds, stream)}.{stream}"
 
     def access(self, token: str | None, stream: str, *, unix_seconds: float) -> Access:
-        """Check ``token`` for a stream at a time; its other parts are read only if the signature is right."""
+        """Check ``token`` for a stream at a time; its other parts are parsed only if the signature is valid."""
         if not token:
             return Access.MISSING
         found = _TOKEN.fullmatch(token) if len(token) <= MAX_TOKEN_BYTES else None
         if found is None:
             return Access.FORGED
         expires, signature, name = int(found[1]), found[2].encode(), found[3]
-        # Every secret is tried, so that the time does not depend on which one signed.
+        # All secrets are tried, so that the time does not depend on which one signed.
         right = [hmac.compare_digest(signature, _signature(key, expires, name).encode()) for key in self.secrets]
         if not any(right):
             return Access.FORGED

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The packets of groups one after the other, each coded again after what stands still was handed over to it."""
+"""Seam blends of consecutive groups, whose packets are coded again."""
 
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -12,8 +12,8 @@ from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.groups.border import draw_border, moving_at_border
-from structgstream.groups.hand_over import HandOver
 from structgstream.groups.mixture import visible_mixtures
+from structgstream.groups.seam_blend import SeamBlend
 from structgstream.groups.segment_file import Segment
 from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
@@ -22,30 +22,30 @@ from structgstream.scene.state import on_device
 _TYPES = {PacketKind.KEY: RecordType.KEY, PacketKind.DELTA: RecordType.DELTA}
 _KINDS = {record: kind for kind, record in _TYPES.items()}
 WITHDRAWING_ROUNDS = 3
-"""At most. What is withdrawn changes the mixture around it, which is looked at again."""
+"""Largest number of rounds. Withdrawing an anchor changes the mixture around it, which is then tested again."""
 
 
 @dataclass(frozen=True)
 class Border:
-    """What happened where a group begins.
+    """Result of the seam blend at the beginning of a group.
 
     Args:
         frame: the group's first frame.
-        handed: number of anchors with values of the frame before.
-        withdrawn: number of those that would have had them, had the mixture not shown.
+        blended: number of anchors that start with the values of the frame before.
+        withdrawn: number of anchors that do not, because the mixture would be visible.
     """
 
     frame: int
-    handed: int
+    blended: int
     withdrawn: int
 
 
-class Handing:
-    """The records of a stream's groups, which are given in order; four scenes are in memory at most.
+class GroupBlender:
+    """Blends the groups of a stream, which must be given in order; at most four scenes are in memory.
 
     Args:
         header: of the stream.
-        backend: the compute back-end, which draws the frames around borders.
+        backend: the compute back-end that renders the frames around borders.
         on_border: called for each border, in order.
     """
 
@@ -59,8 +59,8 @@ class Handing:
         self._on_border = on_border or (lambda border: None)
 
     def follow(self, segment: Segment) -> None:
-        """Begin after a group whose last two frames are shown as they are: the first one, or one of
-        :data:`~structgstream.groups.hand_over.OWN_FRAMES` or more.
+        """Start after a group whose last two frames are not blended: the first group, or one of at least
+        :data:`~structgstream.groups.seam_blend.OWN_FRAMES` frames.
 
         Raises:
             StreamError: a packet is damaged.
@@ -68,7 +68,7 @@ class Handing:
         self._shown.extend(scene for _, scene in self._decoded(segment))
 
     def records(self, segment: Segment) -> Iterator[bytes]:
-        """The records of the packets of ``segment``; those of the first group are its own.
+        """The records of the packets of ``segment``, blended; those of the first group are unchanged.
 
         Raises:
             StreamError: a packet is damaged.
@@ -80,16 +80,16 @@ class Handing:
             return
         frames = self._decoded(segment)
         begun = [next(frames)] + [frame for frame in (next(frames, None),) if frame is not None]
-        hand_over = self._begin(begun[0][0].index, [scene for _, scene in begun])
+        seam_blend = self._begin(begun[0][0].index, [scene for _, scene in begun])
         encoder = SceneEncoder(self._header)
         for packet, scene in chain(begun, frames):
-            shown = scene if hand_over is None else hand_over.scene(scene)
+            shown = scene if seam_blend is None else seam_blend.scene(scene)
             made = encoder.encode(shown, index=packet.index, pts_seconds=packet.pts_seconds, kind=packet.kind)
             self._shown.append(made.reconstruction)
             yield packed(_TYPES[packet.kind], made.packet.payload)
 
-    def _begin(self, frame: int, begun: list[Scene]) -> HandOver | None:
-        """The hand-over to a group from its first one or two frames; None where everything changes."""
+    def _begin(self, frame: int, begun: list[Scene]) -> SeamBlend | None:
+        """The seam blend of a group, from its first one or two frames; None if everything changes."""
         device = self._backend.device
         *earlier, before = (on_device(scene, device) for scene in self._shown)
         first, *second = (on_device(scene, device) for scene in begun)
@@ -106,15 +106,15 @@ class Handing:
         if moving is None:
             self._on_border(Border(frame, 0, 0))
             return None
-        hand_over, withdrawn = HandOver(self._shown[-1], begun[0], moving.cpu(), steps=self._header.steps), 0
+        seam_blend, withdrawn = SeamBlend(self._shown[-1], begun[0], moving.cpu(), steps=self._header.steps), 0
         for _ in range(WITHDRAWING_ROUNDS):
-            mixed = on_device(hand_over.first, device)
-            more = hand_over.withdraw(visible_mixtures(mixed, pictures, self._rig, self._backend).cpu())
+            mixed = on_device(seam_blend.first, device)
+            more = seam_blend.withdraw(visible_mixtures(mixed, pictures, self._rig, self._backend).cpu())
             if not more:
                 break
             withdrawn += more
-        self._on_border(Border(frame, hand_over.handed, withdrawn))
-        return hand_over
+        self._on_border(Border(frame, seam_blend.blended, withdrawn))
+        return seam_blend
 
     def _decoded(self, segment: Segment) -> Iterator[tuple[Packet, Scene]]:
         decoder = SceneDecoder(self._header)

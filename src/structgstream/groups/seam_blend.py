@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The frames of a group without a jump from the group before: what stands still is handed over as it moves.
+"""Seam blend: removes the visible jump between static content of two groups.
 
-Note [Hand-over]
+Note [Seam blend]
 ~~~~~~~~~~~~~~~~
-Two groups that were fitted apart show the same surface with different errors, so that what stands still flickers once
-at the border. Therefore anchors that stand still there keep their values of the frame before: the group's own values
-plus a difference. Two fits side by side show neither well, so whole neighbourhoods are handed over, and differences
-fade: to zero in the frames after the border, in equal steps, so that no step is seen, and besides by half in each frame
-in which the anchor or most of its neighbours change, where motion hides that. They are bins (Note [Bins]), hence exact;
-most are of one or two, so each value is rounded by a threshold of its own, else all of these would go in one frame.
+Two groups that were fitted independently show the same surface with different errors, so static content flickers once
+at the border. Therefore static anchors start with their values of the frame before: the group's own values plus a
+difference. Anchors of two fits next to each other show neither well, so whole neighbourhoods are blended. The
+differences fade to zero in equal steps in the frames after the border. They are also halved in each frame in which the
+anchor or most of its neighbours change, because motion hides the step. Differences are quantization indices
+(Note [Bins]), hence exact. Most are 1 or 2, so each value is rounded by a threshold of its own; otherwise all of them
+would vanish in the same frame.
 
-A mixture of the two fits may show what neither does (``mixture``): there nothing is handed over (``withdraw``).
+A mixture of the two fits may show what neither fit shows (``mixture``); anchors there are not blended (``withdraw``).
 
-Free Gaussians cannot be paired, and are the group's own: what is new is there at once. The light
-(``training/online/exposure.py``), which each group follows by itself, is that of the frame before and goes over in
-equal steps: a jump of it would show everywhere.
+Free Gaussians of two groups cannot be paired, so a group starts with its own. The exposure
+(``training/online/exposure.py``), which each group fits independently, changes from that of the frame before in equal
+steps, because a jump would be visible everywhere.
 """
 
 from collections.abc import Mapping
@@ -28,40 +29,40 @@ from structgstream.training.neighbours import nearest
 from structgstream.training.online.select import changed_primitives
 
 NEIGHBOURS = 65
-"""Anchors, itself included, that are handed over together."""
+"""Size of a neighbourhood that is blended as a whole, the anchor included."""
 MOVING_SHARE = 0.6
-"""An anchor is in motion if this share of its neighbours, or more, is."""
+"""An anchor counts as dynamic if at least this share of its neighbourhood is."""
 FADE_FRAMES = 5
-"""Frames after that of the border in which differences fade."""
+"""Frames after the first one of a group in which differences fade."""
 OWN_FRAMES = FADE_FRAMES + 3
-"""The last two frames of a group of so many are its own: nothing is left of what was handed over."""
+"""In a group of so many frames or more, the last two are not blended any more."""
 WITHDRAWN_NEIGHBOURS = 16
-"""Anchors, itself included, with which one is withdrawn."""
+"""Size of the neighbourhood that decides whether an anchor is withdrawn, the anchor included."""
 WITHDRAWN_SHARE = 0.3
-"""An anchor is withdrawn if this share of its neighbours, or more, shows as a mixture."""
+"""An anchor is withdrawn if at least this share of its neighbourhood is a visible mixture."""
 _GOLDEN = 0.6180339887498949
 
 
-class HandOver:
-    """The frames of one group, after another one's.
+class SeamBlend:
+    """Blends the frames of one group with the last frame of the group before (Note [Seam blend]).
 
     Args:
-        before: the decoded frame before the group, as it is shown.
+        before: the decoded last frame of the group before, itself blended.
         first: the group's own first frame.
         moving: mask ``[M]`` of the anchors that move at the border.
-        steps: quantization steps by field; a field without one is the group's own.
+        steps: quantization steps by field; a field without one is not blended.
     """
 
     def __init__(self, before: Scene, first: Scene, moving: Tensor, *, steps: Mapping[str, float]) -> None:
         self._neighbours = nearest(first.anchors.positions, first.anchors.positions, NEIGHBOURS)[0]
         self._last, self._left_frames = first, FADE_FRAMES + 1
-        kept = ~self._most_neighbours(moving)
+        blended = ~self._most_neighbours(moving)
         then, now = state_of(before), state_of(first)
         self._steps: dict[FieldName, float] = {
             name: steps[name] for name in fields_of("anchor") if name in steps and name in now
         }
         self._differences: dict[FieldName, Tensor] = {
-            name: torch.where(kept[:, None], _bins(then[name] - now[name], step), 0)
+            name: torch.where(blended[:, None], _bins(then[name] - now[name], step), 0)
             for name, step in self._steps.items()
         }
         self._thresholds = {name: _thresholds(difference) for name, difference in self._differences.items()}
@@ -71,34 +72,34 @@ class HandOver:
                 self._light[name], self._steps[name] = difference, steps[name]
 
     @property
-    def handed(self) -> int:
-        """Number of anchors that have values of the frame before."""
-        return int(self._handed().sum())
+    def blended(self) -> int:
+        """Number of anchors that have the values of the frame before."""
+        return int(self._blended().sum())
 
     @property
     def first(self) -> Scene:
-        """The group's first frame as it is handed over."""
+        """The group's first frame, blended."""
         return self._shown(self._last)
 
     def withdraw(self, mask: Tensor) -> int:
-        """Hands the anchors in the mask ``[M]``, and those between them, not over; returns how many were. It has to be
-        called before :meth:`scene`."""
+        """Excludes the anchors in the mask ``[M]``, and those between them, from the blend; returns how many were
+        blended. Must be called before :meth:`scene`."""
         share = mask[self._neighbours[:, :WITHDRAWN_NEIGHBOURS]].float().mean(1)
         withdrawn = mask | (share >= WITHDRAWN_SHARE)
-        count = int((withdrawn & self._handed()).sum())
+        count = int((withdrawn & self._blended()).sum())
         for name, difference in self._differences.items():
             self._differences[name] = torch.where(withdrawn[:, None], 0, difference)
         return count
 
     def scene(self, found: Scene) -> Scene:
-        """A frame of the stream instead of the group's own, ``found``; frames are given in order."""
+        """The blended frame for the group's own frame ``found``; must be called for every frame, in order."""
         self._advance(found)
         shown = self._shown(found)
         self._last, self._left_frames = found, max(0, self._left_frames - 1)
         return shown
 
-    def _handed(self) -> Tensor:
-        """Mask ``[M]`` of the anchors that differ from the group's own."""
+    def _blended(self) -> Tensor:
+        """Mask ``[M]`` of the anchors with a difference."""
         found = torch.zeros(len(self._neighbours), dtype=torch.bool)
         for difference in self._differences.values():
             found |= difference.any(1)
@@ -121,7 +122,7 @@ class HandOver:
         return mask[self._neighbours].float().mean(1) >= MOVING_SHARE
 
     def _faded(self, name: FieldName) -> Tensor:
-        """What is left in this frame of a field's differences, in bins."""
+        """The differences of a field that remain in this frame, in quantization steps."""
         share = self._left_frames / (FADE_FRAMES + 1)
         if name in self._light:
             return (self._light[name].double() * share).round().long()
@@ -129,9 +130,9 @@ class HandOver:
 
 
 def _thresholds(values: Tensor) -> Tensor:
-    """For each of the ``values`` a number from 0 to just below 1, so that ``floor(whole + threshold)`` is ``whole``.
+    """Numbers in [0, 1) of the shape of ``values``, so that ``floor(integer + threshold)`` is ``integer``.
 
-    They are multiples of the golden section, which spread evenly however many there are.
+    They are the fractional parts of multiples of the golden ratio, which spread evenly for any count.
     """
     numbers = torch.arange(values.numel(), dtype=torch.float64).reshape(values.shape)
     return (numbers * _GOLDEN).frac()

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hand-overs of a run of groups in a process of its own, so that many borders are handed over side by side.
+"""Seam blends of a run of consecutive groups in a process of its own, so that runs are blended in parallel.
 
-A hand-over needs the group before it, and of that only frames that no hand-over has changed any more if the group is
-long enough. So runs of groups do not need each other, and give the bytes that one process would.
+A seam blend needs the last two frames of the group before. If that group is long enough, its own blend has faded by
+then. A run that starts after such a group is independent of other runs, and gives the same bytes as a single process.
 
-Run as a program: ``python -m structgstream.groups.handing_run DEVICE OUTPUT PREVIOUS SEGMENT...``.
+Run as a program: ``python -m structgstream.groups.blending_run DEVICE OUTPUT PREVIOUS SEGMENT...``.
 """
 
 import json
@@ -18,31 +18,31 @@ from structgstream.codec.container.records import PREFIX, read_record
 from structgstream.codec.header import unpack_header
 from structgstream.codec.packets import StreamHeader
 from structgstream.executors.task import PYTHON, Task
-from structgstream.groups.hand_over import OWN_FRAMES
-from structgstream.groups.handing import Border, Handing
+from structgstream.groups.blending import Border, GroupBlender
+from structgstream.groups.seam_blend import OWN_FRAMES
 from structgstream.groups.segment_file import open_segment
 from structgstream.kernels.backend import BackendName, select_backend
 from structgstream.whole_files import write_whole
 
 MOST_GROUPS = 8
-"""Of a run: a process takes two seconds to start, and its result is reported when it ends."""
+"""Largest number of groups in a run: a process takes two seconds to start, and reports its result when it ends."""
 
 
 @dataclass(frozen=True)
-class HandedRun:
-    """What a run has made.
+class BlendedRun:
+    """Result of a run.
 
     Args:
-        borders: what happened at each, in order.
-        records: of the packets of all its groups, in order.
+        borders: result at each border, in order.
+        records: records of the packets of all its groups, in order.
     """
 
     borders: tuple[Border, ...]
     records: tuple[bytes, ...]
 
     @classmethod
-    def read(cls, path: Path) -> "HandedRun":
-        """The run that :func:`main` has written to ``path``."""
+    def read(cls, path: Path) -> "BlendedRun":
+        """Reads the run that :func:`main` has written to ``path``."""
         data = path.read_bytes()
         at = data.index(b"\n") + 1
         borders, records = tuple(Border(**border) for border in json.loads(data[:at])), list[bytes]()
@@ -55,11 +55,11 @@ class HandedRun:
 
 
 def runs_of(lengths: Sequence[int], *, workers: int) -> list[range]:
-    """Runs of groups that do not need each other, without the first group, to which nothing is handed over.
+    """Independent runs of groups, without the first group, which is not blended.
 
     Args:
         lengths: number of frames of each group, in order.
-        workers: at least so many runs, where groups are long enough.
+        workers: number of processes; there are at least as many runs if groups are long enough.
     """
     size = min(MOST_GROUPS, -(-(len(lengths) - 1) // workers))
     runs, begin = [], 1
@@ -71,9 +71,9 @@ def runs_of(lengths: Sequence[int], *, workers: int) -> list[range]:
 
 
 def run_task(paths: Sequence[Path], output: Path, *, device: str) -> Task:
-    """The task of handing over to the groups ``paths[1:]``, of which ``paths[0]`` is before the first."""
-    words = (PYTHON, "-m", "structgstream.groups.handing_run", device, str(output), *map(str, paths))
-    return Task(output.name, words, str(output))
+    """The task of blending the groups ``paths[1:]``, which follow the group ``paths[0]``."""
+    argv = (PYTHON, "-m", "structgstream.groups.blending_run", device, str(output), *map(str, paths))
+    return Task(output.name, argv, str(output))
 
 
 def header_of(init: bytes) -> StreamHeader:
@@ -83,21 +83,21 @@ def header_of(init: bytes) -> StreamHeader:
     return unpack_header(record.payload)
 
 
-def _records(handing: Handing, paths: Sequence[Path]) -> Iterator[bytes]:
+def _records(blender: GroupBlender, paths: Sequence[Path]) -> Iterator[bytes]:
     for path in paths:
         segment = open_segment(path)
-        yield from handing.records(segment)
+        yield from blender.records(segment)
         segment.close()
 
 
 def main(arguments: list[str]) -> None:
-    """Writes the borders as a line of JSON, and the records after it."""
+    """Writes the borders as a line of JSON, followed by the records."""
     device, output, previous, *paths = arguments
     before, borders = open_segment(Path(previous)), list[Border]()
-    handing = Handing(header_of(before.init), select_backend(cast(BackendName, device)), on_border=borders.append)
-    handing.follow(before)
+    blender = GroupBlender(header_of(before.init), select_backend(cast(BackendName, device)), on_border=borders.append)
+    blender.follow(before)
     before.close()
-    records = b"".join(_records(handing, [Path(path) for path in paths]))
+    records = b"".join(_records(blender, [Path(path) for path in paths]))
     write_whole(Path(output), json.dumps([asdict(border) for border in borders]).encode() + b"\n" + records)
 
 
