@@ -81,7 +81,7 @@ def open_posed(
         if videos := videos_in(root):
             partial = not complete or calibration.unposed
             videos = _posed(videos, calibration, root) if partial else videos
-            return undistort(*_of_videos(path, videos, root=root, calibration=calibration), target=target)
+            return undistort(*of_videos(path, videos, root=root, calibration=calibration), target=target)
         if folders := pictures_in(root):
             return pictured(root, _layout(folders, calibration), partial=bool(calibration.unposed))
     for root in roots_of(path):
@@ -128,7 +128,7 @@ def _posed(files: Mapping[str, Of], calibration: Calibration, root: Path) -> Map
     return {name: file for name, file in files.items() if name in poses}
 
 
-def _of_videos(
+def of_videos(
     path: Path, videos: Mapping[str, Path], *, root: Path, calibration: Calibration
 ) -> tuple[VideoSource, Mapping[str, LensCamera]]:
     """The videos as they are, and their cameras with lenses."""
