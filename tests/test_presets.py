@@ -14,10 +14,12 @@ from structgstream.presets import (
     DEMO_PRESET,
     PAPER_METHOD_PRESET,
     PRESETS,
+    RENAMED,
     WITHDRAWN,
     StreamConfig,
     completed,
     from_json,
+    renamed,
     to_json,
 )
 from structgstream.training.frame0.fit import InitialRates
@@ -79,14 +81,35 @@ def test_a_configuration_of_an_older_version_has_the_defaults_of_what_it_lacks()
     assert completed(other) == other
 
 
+def with_former_names(config: StreamConfig) -> dict[str, Any]:
+    """The configuration as an earlier version wrote it: a field that had another name has that."""
+    values = json.loads(json.dumps(to_json(config)))
+    for path, name in sorted(RENAMED.items(), key=lambda item: -item[0].count(".")):
+        *parents, former = path.split(".")
+        group = group_at(values, renamed(".".join(parents)))
+        if name in group:
+            group[former] = group.pop(name)
+    return values
+
+
+def group_at(values: dict[str, Any], path: str) -> dict[str, Any]:
+    for part in path.split("."):
+        values = values[part]
+    return values
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_former_names_of_fields_are_read(name: str) -> None:
+    values = with_former_names(PRESETS[name])
+    assert {"births", "start"} < values["online"].keys()
+    assert from_json(values) == PRESETS[name]
+
+
 def test_fields_of_mechanisms_that_are_gone_are_ignored() -> None:
-    values = json.loads(json.dumps(to_json(PRESETS["compact"])))
+    values = with_former_names(PRESETS["compact"])
     for path in WITHDRAWN:
-        *parts, name = path.split(".")
-        inner = values
-        for part in parts:
-            inner = inner[part]
-        inner[name] = 0.5
+        group, _, name = path.rpartition(".")
+        group_at(values, group)[name] = 0.5
     assert from_json(values) == PRESETS["compact"]
 
 
@@ -100,7 +123,7 @@ def test_a_former_field_is_ignored_if_it_has_the_value_of_its_constant_or_its_gr
     assert from_json(values) == PRESETS["compact"]
     values["initial"]["rates"]["offsets"] = {"initial": 0.02, "final": 0.001}
     values["initial"]["rates"]["positions"] = {"initial": 0.0, "final": 0.0}
-    values["initial"]["solidity"]["every"] = 4
+    values["initial"]["depth_distortion"]["every"] = 4
     assert from_json(values) == PRESETS["compact"]
     values["environment"]["degree"] = 1
     with pytest.raises(ConfigError, match=r"environment.degree = 1, which is always 2 in this version"):
@@ -113,7 +136,7 @@ def test_a_former_field_is_ignored_if_it_has_the_value_of_its_constant_or_its_gr
     ("edit", "said"),
     [
         ({"later": 1}, "the field later, which this version of structgstream does not have"),
-        ({"online": {"births": {"later": 1}}}, "the field online.births.later"),
+        ({"online": {"spawn": {"later": 1}}}, "the field online.spawn.later"),
         ({"seed": "0"}, "seed is '0'; expected a whole number"),
         ({"seed": True}, "seed is True; expected a whole number"),
         ({"online": 5}, "of another kind than its field"),

@@ -128,7 +128,7 @@ def test_a_target_that_is_missed_is_said_once(caplog: pytest.LogCaptureFixture) 
     assert controller.rate_mbits == pytest.approx(1.92)
     assert [record.getMessage() for record in caplog.records] == [
         "Frame 29: the last 30 frames take 1.92 Mbit/s, the target is 1; nothing more can be saved: take coarser steps "
-        "(online.rounding.quality), spawn fewer Gaussians (online.births.most) or take a higher target."
+        "(online.rounding.quality), spawn fewer Gaussians (online.spawn.most) or take a higher target."
     ]
 
 

@@ -53,7 +53,7 @@ CONFIG = replace(
         iterations=8,
         patching=replace(COMPACT.online.patching, iteration=4),
         motion=replace(COMPACT.online.motion, picture_scale=0.5),
-        births=varied(COMPACT.online.births, RULES=SpawnRules(most_missing_share=1.0)),
+        spawn=varied(COMPACT.online.spawn, RULES=SpawnRules(most_missing_share=1.0)),
     ),
 )
 """Everything that the preset compact does with pictures, in seconds."""
@@ -253,16 +253,16 @@ def test_a_scene_that_no_picture_shows_is_held_and_found_again(world: World, tmp
     ]
     whole = tmp_path / "whole.sgs"
     # Nothing is carried along: in this small world that would be all that stands still.
-    motion = replace(CONFIG.online.motion, carried_share=0.0)
+    motion = replace(CONFIG.online.motion, occluded_share=0.0)
     config = replace(CONFIG, online=replace(CONFIG.online, motion=motion))
     reports = run(source, whole, config=config)
-    assert [dict(report.counts).get("held", 0) for report in reports] == [0, 0, 1, 0]
+    assert [dict(report.counts).get("repeated", 0) for report in reports] == [0, 0, 1, 0]
     assert set(world.rig.training) <= set(reports[2].absent)
     assert reports[2].bytes < 100 < reports[3].bytes
     assert "the scene is held" in summary(reports[2], 4)
     counts = dict(reports[3].counts)
-    assert counts["jumps"] == 0, "it is compared with frame 1, not with black pictures"
-    assert counts["lifted"] > 0
+    assert counts["scene cuts"] == 0, "it is compared with frame 1, not with black pictures"
+    assert counts["displaced"] > 0
     assert 0 < reports[3].moving < reports[3].anchors
     scenes = decoded(whole)
     assert torch.equal(scenes[2].anchors.positions, scenes[1].anchors.positions)

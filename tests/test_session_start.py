@@ -32,7 +32,7 @@ CONFIG = replace(
         COMPACT.online,
         iterations=6,
         motion=varied(COMPACT.online.motion, REACH_PIXELS=1),
-        births=varied(COMPACT.online.births, RULES=SpawnRules(least_hits=2, residual_threshold=0.2)),
+        spawn=varied(COMPACT.online.spawn, RULES=SpawnRules(least_hits=2, residual_threshold=0.2)),
     ),
 )
 
@@ -51,9 +51,9 @@ def whole() -> tuple[bytes, list[FrameReport]]:
 def test_every_part_acts_and_is_counted() -> None:
     counts = [report.counts for report in whole()[1]]
     assert not counts[0]
-    assert all(count["lifted"] > 0 for count in counts[1:])
+    assert all(count["displaced"] > 0 for count in counts[1:])
     assert all(count["corrected"] > 0 for count in counts[1:])
-    assert not any(count["jumps"] or count["views left out"] for count in counts[1:])
+    assert not any(count["scene cuts"] or count["views left out"] for count in counts[1:])
 
 
 def test_the_same_again_is_the_same_file() -> None:
@@ -92,11 +92,11 @@ def test_bad_pictures_bring_no_flood(kind: str) -> None:
     reports = run(sink := MemorySink(), pictures=spoiled(change, frame=1, cameras=cameras))
     usual = whole()[1]
     assert len(StreamReader(bytes(sink.data))) == FRAMES, "nothing is lost"
-    assert reports[1].free - reports[0].free <= CONFIG.online.births.most
+    assert reports[1].free - reports[0].free <= CONFIG.online.spawn.most
     if kind == "light":
-        assert [r.counts["jumps"] for r in reports[1:]] == [1, 1, 0], "on, and off again"
-        assert reports[1].counts["born"] == 0
-        everything = 40 * (len(WORLD.scene.anchors) + CONFIG.online.births.most)
+        assert [r.counts["scene cuts"] for r in reports[1:]] == [1, 1, 0], "on, and off again"
+        assert reports[1].counts["spawned"] == 0
+        everything = 40 * (len(WORLD.scene.anchors) + CONFIG.online.spawn.most)
         assert all(r.bytes < everything for r in reports[1:])
         return
     assert reports[1].bytes < 2 * usual[1].bytes

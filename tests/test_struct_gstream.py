@@ -22,7 +22,7 @@ WORLD = moving_world(1)
 def with_parts(*, residuals: bool, light: bool) -> StreamConfig:
     online = COMPACT.online
     motion = replace(online.motion, residual_threshold=0.1 if residuals else 0.0)
-    return replace(COMPACT, online=replace(online, motion=motion, light=replace(online.light, enabled=light)))
+    return replace(COMPACT, online=replace(online, motion=motion, exposure=replace(online.exposure, enabled=light)))
 
 
 def task(method: StructGStream, *, begins: str | None = None) -> FrameTask:
@@ -65,7 +65,7 @@ def test_earlier_pictures_and_frames_are_asked_for_where_they_are_used() -> None
 
     def of(*, motion: bool, prior: float, ease: float) -> StreamConfig:
         online = COMPACT.online
-        selection = replace(online.motion, enabled=motion, moved_ease=ease)
+        selection = replace(online.motion, enabled=motion, hysteresis=ease)
         return replace(COMPACT, online=replace(online, motion=selection, motion_prior=prior))
 
     assert asks(PAPER) == (False, False)

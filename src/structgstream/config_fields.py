@@ -11,7 +11,7 @@ from structgstream.errors import ConfigError
 
 SIGNED = frozenset({"quality", "tiles_around"})
 """Fields that may be negative."""
-SHARES = frozenset({"mean_of_last", "motion_prior", "picture_scale", "dropped_share", "carried_share"})
+SHARES = frozenset({"mean_of_last", "motion_prior", "picture_scale", "dropped_share", "occluded_share"})
 """Fields that are at most 1."""
 POSITIVE = frozenset({"picture_scale", "key_interval_seconds"})
 """Fields that must not be 0."""
@@ -102,6 +102,16 @@ def without_fields(values: Mapping[str, Any], paths: Collection[str], path: str 
     return {
         name: without_fields(item, paths, f"{path}{name}.") if isinstance(item, Mapping) else item
         for name, item in left.items()
+    }
+
+
+def with_present_names(values: Mapping[str, Any], renamed: Mapping[str, str], path: str = "") -> dict[str, Any]:
+    """``values`` of an earlier version with the present name of each field; ``renamed`` has them by earlier path."""
+    return {
+        renamed.get(f"{path}{name}", name): with_present_names(item, renamed, f"{path}{name}.")
+        if isinstance(item, Mapping)
+        else item
+        for name, item in values.items()
     }
 
 

@@ -13,6 +13,7 @@ from structgstream.config_fields import (
     plain_value,
     read_value,
     unknown_fields,
+    with_present_names,
     without_constants,
     without_fields,
 )
@@ -101,17 +102,42 @@ WITHDRAWN = frozenset(
 """Fields of earlier versions whose mechanisms are gone. A stream that has them goes on by this version's method."""
 
 
+RENAMED: Mapping[str, str] = {
+    "initial.disturbance": "perturbation",
+    "initial.free_space": "floaters",
+    "initial.solidity": "depth_distortion",
+    "online.births": "spawn",
+    "online.births.blame_share": "outlier_share",
+    "online.births.blame_views": "outlier_views",
+    "online.births.crowded": "overflow",
+    "online.births.thin.crowded": "overflow",
+    "online.coherence": "smoothness",
+    "online.light": "exposure",
+    "online.motion.carried_share": "occluded_share",
+    "online.motion.moved_ease": "hysteresis",
+    "online.start": "scene_flow",
+}
+"""The names that fields of earlier versions, by their whole path, have now."""
+
+
+def renamed(path: str) -> str:
+    """The present path of a field or a group that had ``path`` in an earlier version."""
+    parts = path.split(".")
+    return ".".join(RENAMED.get(".".join(parts[: n + 1]), part) for n, part in enumerate(parts))
+
+
 def from_json(values: Mapping[str, Any]) -> StreamConfig:
     """The configuration that :func:`to_json` turned into ``values``, such as a stream's header has.
 
-    Fields that ``values`` lacks, as those of an older version do, have their defaults. :data:`WITHDRAWN` ones are
-    ignored, and so are constants of the classes that were fields and have the constant's value.
+    Fields that ``values`` lacks, as those of an older version do, have their defaults; :data:`RENAMED` ones are read by
+    their earlier names. :data:`WITHDRAWN` ones are ignored, and so are those that are constants now and have the
+    constant's value.
 
     Raises:
         ConfigError: there is a field that this version does not have, another value than that of a constant, or a value
             that no field can have.
     """
-    values = without_constants(StreamConfig, without_fields(values, WITHDRAWN))
+    values = without_constants(StreamConfig, with_present_names(without_fields(values, WITHDRAWN), RENAMED))
     if unknown := [*unknown_fields(StreamConfig, values)]:
         raise ConfigError(
             f"The header's configuration has the field {unknown[0]}, which this version of structgstream does not "
@@ -296,9 +322,9 @@ COMPACT = replace(
             room_until=1600,
         ),
         losses=replace(MOTION.initial.losses, l1=0.6, ssim=0.45),
-        disturbance=PerturbationConfig(dropped_share=0.2, noise_scales=0.5),
-        solidity=DepthDistortionConfig(weight=0.05),
-        free_space=FreeSpaceConfig(enabled=True),
+        perturbation=PerturbationConfig(dropped_share=0.2, noise_scales=0.5),
+        depth_distortion=DepthDistortionConfig(weight=0.05),
+        floaters=FreeSpaceConfig(enabled=True),
         random_background=True,
         sampling_filter=True,
     ),
@@ -312,21 +338,21 @@ COMPACT = replace(
         rates=OnlineRates(final_share=0.4),
         patching=replace(MOTION.online.patching, spawn="off"),
         dynamic=MOTION.online.dynamic.difference(["covariance_mlp"]).union(["base_scales", "appearance", "color_mlp"]),
-        light=ExposureConfig(enabled=True),
+        exposure=ExposureConfig(enabled=True),
         motion=replace(
             MOTION.online.motion,
-            moved_ease=0.5,
-            carried_share=0.4,
+            hysteresis=0.5,
+            occluded_share=0.4,
             residual_threshold=0.05,
             picture_scale=0.5,
             tiles_around=1,
             rest_every=3,
         ),
-        start=SceneFlowConfig(enabled=True),
-        births=SpawnConfig(enabled=True, thin=ThinSpawnConfig(enabled=True)),
+        scene_flow=SceneFlowConfig(enabled=True),
+        spawn=SpawnConfig(enabled=True, thin=ThinSpawnConfig(enabled=True)),
         motion_prior=0.7,
         sampling_filter=True,
-        coherence=SmoothnessConfig(weight=8e-4),
+        smoothness=SmoothnessConfig(weight=8e-4),
         rounding=RoundingConfig(free_priced=True),
     ),
 )

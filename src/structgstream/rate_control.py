@@ -130,7 +130,7 @@ class RateController:
         if self.missed and not self._said:
             remedy = (
                 "nothing more can be saved: take coarser steps (online.rounding.quality), spawn fewer Gaussians "
-                "(online.births.most) or take a higher target"
+                "(online.spawn.most) or take a higher target"
             )
             _log.warning(
                 "Frame %d: the last %d frames take %.3g Mbit/s, the target is %.3g; %s.",

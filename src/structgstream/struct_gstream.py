@@ -65,7 +65,7 @@ class StructGStream:
     ) -> FramePictures:
         """The training pictures and their changes."""
         online = self.config.online
-        return preprocess(frame, rig, before=before, motion=online.motion, start=online.start, backend=backend)
+        return preprocess(frame, rig, before=before, motion=online.motion, start=online.scene_flow, backend=backend)
 
     def first(self, task: FrameTask) -> FitResult[Scene]:
         """Fit frame 0, with its environment if enabled."""
@@ -94,7 +94,7 @@ class StructGStream:
 
     def prepare(self, state: Scene, task: Callable[[], FrameTask]) -> FrameZeroContext:
         """The residual floor of frame 0, if residuals are used, and its light, if that is followed."""
-        motion, light = self.config.online.motion, self.config.online.light
+        motion, light = self.config.online.motion, self.config.online.exposure
         if motion.residual_threshold <= 0.0 and not light.enabled:
             return FrameZeroContext()
         first = task()

@@ -54,10 +54,10 @@ def test_a_frame_in_which_nothing_was_trained_has_no_score() -> None:
 
 def test_a_line_tells_which_pictures_were_not_believed() -> None:
     out = Console(file=io.StringIO(), force_terminal=False, width=300)
-    counts = {"lifted": 40, "views left out": 2, "jumps": 0, "births refused": 1}
+    counts = {"displaced": 40, "views left out": 2, "scene cuts": 0, "spawning refused": 1}
     with display(20, console=out) as shown:
         shown.frame(replace(REPORT, counts=counts))
-        shown.frame(replace(REPORT, counts={"lifted": 40, "views left out": 0}))
+        shown.frame(replace(REPORT, counts={"displaced": 40, "views left out": 0}))
     odd, usual = text(out).splitlines()
     assert "[2 views left out: only their pictures changed, or theirs did not]  [no births" in odd
     assert usual.endswith("2,301 free (+5 -1)")

@@ -133,7 +133,8 @@ def test_every_second_frame_is_resumed_and_scored_against_the_same_frames(
         (["--preset", "compact", "--mbits", "0"], 2, "--mbits 0 is no rate"),
         (["--preset", "compact", "--mbits", "inf"], 2, "--mbits inf is no rate"),
         (["--preset", "compact", "--mbits", "5M"], 2, "5M"),
-        (["--online.births.least-hits", "3"], 2, "--online.births.least-hits is no option any more: it is always 4."),
+        (["--online.births.most", "3"], 2, "--online.births.most is called --online.spawn.most now."),
+        (["--online.spawn.least-hits", "3"], 2, "--online.spawn.least-hits is no option any more: it is always 4."),
     ],
 )
 def test_wrong_options_are_told_before_anything_is_written(

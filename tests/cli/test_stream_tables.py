@@ -50,8 +50,8 @@ def packet(changes: dict[str, int], counts: dict[str, int]) -> dict[str, Any]:
 
 def test_what_a_stream_is_in_a_line_for_each_fact() -> None:
     packets = [
-        packet({"grown": 5, "removed": 2}, {"lifted": 3}),
-        packet({"spawned": 4}, {"lifted": 4, "jumps": 0}),
+        packet({"grown": 5, "removed": 2}, {"displaced": 3}),
+        packet({"spawned": 4}, {"displaced": 4, "scene cuts": 0}),
     ]
     lines = shown(facts_table(HEADER, rows(2), packets=packets))
     for line in (

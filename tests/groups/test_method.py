@@ -39,7 +39,7 @@ class Usual:
     fails: int = 0
 
     def __call__(self, config: Any) -> "Usual":
-        self.thin.append(config.online.births.thin.crowded)
+        self.thin.append(config.online.spawn.thin.overflow)
         return self
 
     def observe(self, frame: Any, before: Any, **options: Any) -> str:
@@ -57,7 +57,7 @@ class Usual:
         if self.fails:
             self.fails -= 1
             raise OutOfMemoryError("to test")
-        return FitResult(SCENE, 1, 30.0, moving=0, counts={"jumps": 2})
+        return FitResult(SCENE, 1, 30.0, moving=0, counts={"scene cuts": 2})
 
 
 @pytest.fixture
@@ -95,7 +95,7 @@ def test_the_first_frame_begins_where_tracking_has_followed_things(usual: Usual)
     assert (kind, given.frame_index, given.seed, given.start) == ("start", FIRST, 3, START)
     assert torch.equal(given.displacements, torch.arange(21, dtype=torch.float32).reshape(7, 3))
     assert given.changes == [None, None], "a change for each view"
-    assert found.counts == {"jumps": 2}
+    assert found.counts == {"scene cuts": 2}
 
 
 def test_the_second_frame_knows_how_things_have_moved_and_later_ones_are_usual(usual: Usual) -> None:
@@ -123,7 +123,7 @@ def test_the_first_frames_catch_up(usual: Usual) -> None:
     made = group()
     for index in range(FIRST, FIRST + CATCH_UP_FRAMES + 2):
         made.next(Past(SCENE, FrameZeroContext()), task(index))
-    assert usual.asked[0][1].config.births.thin.crowded == "small-clusters"
+    assert usual.asked[0][1].config.spawn.thin.overflow == "small-clusters"
     assert usual.thin == ["small-clusters"] * (CATCH_UP_FRAMES - 1) + ["none"] * 2
 
 
@@ -142,10 +142,10 @@ def test_short_memory_lowers_the_budget_once_and_is_told(
 ) -> None:
     made, usual.fails = group(), 1
     found = made.next(Past(SCENE, FrameZeroContext()), task(index))
-    assert found.counts == {"jumps": 2, "lowered budgets": 1}
+    assert found.counts == {"scene cuts": 2, "lowered budgets": 1}
     assert (made.lowered, made.start, made.config.online) == (True, lowered_start(START), lowered_budget(TINY.online))
     assert f"Frame {index}: not enough memory." in caplog.text
-    assert made.next(Past(SCENE, FrameZeroContext()), task(index)).counts == {"jumps": 2}
+    assert made.next(Past(SCENE, FrameZeroContext()), task(index)).counts == {"scene cuts": 2}
     usual.fails = 1
     with pytest.raises(OutOfMemoryError):
         made.next(Past(SCENE, FrameZeroContext()), task(index))
@@ -154,16 +154,16 @@ def test_short_memory_lowers_the_budget_once_and_is_told(
 
 def test_lower_is_half_of_the_views_and_a_quarter_of_the_births() -> None:
     online = TINY.online
-    wide = replace(online, start=replace(online.start, views=9), births=replace(online.births, most=100))
-    assert (lowered_budget(wide).start.views, lowered_budget(wide).births.most) == (4, 25)
-    two = replace(wide, start=replace(online.start, views=2))
-    assert lowered_budget(two).start.views == 2, "flow needs two"
+    wide = replace(online, scene_flow=replace(online.scene_flow, views=9), spawn=replace(online.spawn, most=100))
+    assert (lowered_budget(wide).scene_flow.views, lowered_budget(wide).spawn.most) == (4, 25)
+    two = replace(wide, scene_flow=replace(online.scene_flow, views=2))
+    assert lowered_budget(two).scene_flow.views == 2, "flow needs two"
     assert lowered_start(START) == replace(START, births=10)
 
 
 def test_a_group_catches_up_by_thin_births_in_small_clusters_and_is_else_as_any_stream() -> None:
-    found, births = catching_up(TINY), TINY.online.births
-    assert (births.thin.crowded, found.online.births.thin.rules.crowded) == ("none", "small-clusters")
-    assert found.online.births.rules.crowded == births.rules.crowded == "coarser"
-    thin = replace(found.online.births.thin, crowded="none")
-    assert replace(found, online=replace(found.online, births=replace(births, thin=thin))) == TINY
+    found, births = catching_up(TINY), TINY.online.spawn
+    assert (births.thin.overflow, found.online.spawn.thin.rules.overflow) == ("none", "small-clusters")
+    assert found.online.spawn.rules.overflow == births.rules.overflow == "coarser"
+    thin = replace(found.online.spawn.thin, overflow="none")
+    assert replace(found, online=replace(found.online, spawn=replace(births, thin=thin))) == TINY

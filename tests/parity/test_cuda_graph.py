@@ -69,7 +69,7 @@ def test_a_frame_of_recorded_iterations_is_that_of_single_ones(device: str) -> N
         iterations=60,
         patching=PatchingConfig(spawn="off", iteration=30),
         motion=MotionConfig(enabled=True, rest_every=3),
-        coherence=SmoothnessConfig(weight=1e-4),
+        smoothness=SmoothnessConfig(weight=1e-4),
         mean_of_last=0.25,
     )
     single = quickest_backend() if device == "cpu" else replace(cuda_backend(), recorder=None)
@@ -87,7 +87,7 @@ def test_a_frame_of_recorded_iterations_is_that_of_single_ones(device: str) -> N
                 world.rig,
                 before=world.frames[0],
                 motion=config.motion,
-                start=config.start,
+                start=config.scene_flow,
                 backend=backend,
             ),
             steps={str(name): step for name, step in config.rounding.steps(0.01).items()},

@@ -14,6 +14,7 @@ from structgstream.scene.render import render
 from structgstream.training.frame0.fit import InitialConfig, fit_first_frame
 from structgstream.training.frame0.seeding import EnvironmentConfig, fit_environment
 from structgstream.training.views import training_views
+from tests.varied import varied
 from worlds import moving_world
 
 BACKEND, RIG = reference_backend(), arc_rig(5)
@@ -37,7 +38,7 @@ def views(color: CameraColor):
 def test_what_is_behind_nothing_is_found() -> None:
     color = CameraColor(gains=torch.tensor([[0.9] * 3, [1.1] * 3, [1.0] * 3, [1.0] * 3]), biases=torch.zeros(4, 3))
     scene = replace(random_scene(0, cameras=4), camera_color=color)
-    config = EnvironmentConfig(degree=1, smoothness=1e-9)
+    config = varied(EnvironmentConfig(), DEGREE=1, SMOOTHNESS=1e-9)
     found = fit_environment(scene, views(color), config=config, backend=BACKEND)
     assert found.shape == (4, 3)
     image = render(replace(scene, environment=found), RIG["cam00"], BACKEND).image
@@ -51,7 +52,7 @@ def test_it_is_the_same_every_time_and_smooth_where_nobody_looks() -> None:
     one, two = (fit_environment(scene, views(color), config=EnvironmentConfig(), backend=BACKEND) for _ in range(2))
     assert torch.equal(one, two)
     directions = torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(1)), dim=1)
-    smooth = fit_environment(scene, views(color), config=EnvironmentConfig(smoothness=10.0), backend=BACKEND)
+    smooth = fit_environment(scene, views(color), config=varied(EnvironmentConfig(), SMOOTHNESS=10.0), backend=BACKEND)
     assert environment(smooth, directions).std(0).max() < 0.02 < environment(one, directions).std(0).max()
 
 

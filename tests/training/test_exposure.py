@@ -136,8 +136,8 @@ def test_masked_pixels_say_nothing() -> None:
 
 def test_light_needs_the_color_mlp_in_packets() -> None:
     with pytest.raises(ConfigError, match="color_mlp"):
-        OnlineConfig(light=ExposureConfig(enabled=True))
+        OnlineConfig(exposure=ExposureConfig(enabled=True))
     online = COMPACT.online
-    assert online.light.enabled
+    assert online.exposure.enabled
     assert "color_mlp" not in online.trained
-    assert replace(online, light=ExposureConfig()).trained == online.dynamic
+    assert replace(online, exposure=ExposureConfig()).trained == online.dynamic

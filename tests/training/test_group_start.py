@@ -31,8 +31,8 @@ MOTION = MotionConfig(enabled=True, picture_scale=0.5, residual_threshold=0.05)
 CONFIG = OnlineConfig(
     rates=varied(OnlineRates(), ANCHOR_POSITIONS=1e-3),
     motion=MOTION,
-    start=SceneFlowConfig(enabled=True),
-    births=varied(SpawnConfig(enabled=True), RULES=SpawnRules(picture_width=128)),
+    scene_flow=SceneFlowConfig(enabled=True),
+    spawn=varied(SpawnConfig(enabled=True), RULES=SpawnRules(picture_width=128)),
     patching=PatchingConfig(spawn="off", iteration=4),
 )
 START = GroupStartConfig(iterations=16, rounds=2, births=40)
@@ -114,7 +114,7 @@ def test_motion_is_coherent_since_frame_0_and_not_since_the_round_began() -> Non
     noisy[:60] += 0.01 * torch.randn(60, 3, generator=torch.Generator().manual_seed(3))
 
     def spread(weight: float) -> float:
-        found = fit(world, noisy, config=replace(CONFIG, coherence=SmoothnessConfig(weight)))
+        found = fit(world, noisy, config=replace(CONFIG, smoothness=SmoothnessConfig(weight)))
         return float((found.scene.anchors.positions - world.scene.anchors.positions)[:60].std(0).norm())
 
     assert spread(4.0) < 0.8 * spread(0.0)
@@ -124,7 +124,7 @@ def test_births_of_several_rounds_have_identities_of_their_own() -> None:
     world = moving_world(FRAME + 1, cameras=6, emerges_at=1, movers=0, width=96, height=64)
     none = torch.zeros(len(world.scene.anchors) + len(world.scene.free), 3)
     motion = MotionConfig(enabled=True, picture_scale=1.0)
-    config = replace(CONFIG, motion=motion, births=varied(SpawnConfig(enabled=True), RULES=SpawnRules(least_hits=2)))
+    config = replace(CONFIG, motion=motion, spawn=varied(SpawnConfig(enabled=True), RULES=SpawnRules(least_hits=2)))
     found = fit(world, none, start=replace(START, flow_rounds=0), config=config)
     births = found.scene.free.births
     assert len(births) > 0

@@ -66,7 +66,7 @@ def test_neighbours_move_more_alike_where_that_has_a_price() -> None:
     world = moving_world(2)
     truth = world.frames[1].images["cam00"]  # Held out.
     free = fit(world.scene, world, 1, config=without_patching(QUICK))
-    config = replace(without_patching(QUICK), coherence=SmoothnessConfig(weight=3e-3))
+    config = replace(without_patching(QUICK), smoothness=SmoothnessConfig(weight=3e-3))
     priced = fit(world.scene, world, 1, config=config)
 
     def scatter(scene: Scene) -> float:
@@ -76,8 +76,8 @@ def test_neighbours_move_more_alike_where_that_has_a_price() -> None:
     assert scatter(priced.scene) < 0.7 * scatter(free.scene)
     scores = [psnr(rendered(result.scene, world, "cam00"), truth) for result in (free, priced)]
     assert scores[1] > scores[0] - 0.3
-    assert priced.losses["coherence"] > 0.0
-    assert "coherence" not in free.losses
+    assert priced.losses["smoothness"] > 0.0
+    assert "smoothness" not in free.losses
 
 
 def test_static_fields_keep_every_bit() -> None:
@@ -152,7 +152,9 @@ FOLLOWING = replace(
 
 def followed(scene, world, index, *, config=FOLLOWING, seed=0, backend: Backend | None = None, **past):
     backend, frame, before = backend or quickest_backend(), world.frames[index], world.frames[index - 1]
-    pictures = preprocess(frame, world.rig, before=before, motion=config.motion, start=config.start, backend=backend)
+    pictures = preprocess(
+        frame, world.rig, before=before, motion=config.motion, start=config.scene_flow, backend=backend
+    )
     return fit_next_frame(scene, frame, world.rig, config=config, backend=backend, seed=seed, pictures=pictures, **past)
 
 

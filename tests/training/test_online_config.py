@@ -27,7 +27,7 @@ def test_the_papers_rates_are_constant() -> None:
 def test_following_the_light_needs_its_field_and_takes_it_from_the_optimiser() -> None:
     light = ExposureConfig(enabled=True)
     with pytest.raises(ConfigError, match=r"add color_mlp to online\.dynamic"):
-        OnlineConfig(light=light)
-    config = OnlineConfig(light=light, dynamic=PAPER_DYNAMIC.union(["color_mlp"]))
+        OnlineConfig(exposure=light)
+    config = OnlineConfig(exposure=light, dynamic=PAPER_DYNAMIC.union(["color_mlp"]))
     assert config.trained == PAPER_DYNAMIC
     assert OnlineConfig().trained == PAPER_DYNAMIC

@@ -51,7 +51,7 @@ def hooks_of(start: StartingPoint, *, patch_at: int = 4, patches: bool = True, r
         parameters=parameters,
         losses=LossWeights(),
         rate_term=None,
-        coherence=None,
+        smoothness=None,
         free_set=free_set,
         patch_at=patch_at,
         patches=patches,

@@ -198,14 +198,14 @@ def test_the_second_sweep_bears_nothing_where_it_would_bear_more_than_thin_conte
             reference_backend(), config=replace(BLIND, thin=varied(THIN, RULES=replace(THIN.RULES, most=most)))
         )
         assert len(found.new_free) == found.thin_count == born
-        assert found.counts["thin births refused"] == number - born, "told in the log"
+        assert found.counts["refused thin"] == number - born, "told in the log"
 
 
 def test_a_cap_that_makes_births_coarser_is_told_in_the_log() -> None:
     free = len(renewed(reference_backend(), config=CONFIG).new_free)
     capped = renewed(reference_backend(), config=replace(CONFIG, most=free - 1))
     assert 0 < len(capped.new_free) < free
-    assert capped.counts["births merged"] == free - len(capped.new_free)
+    assert capped.counts["merged"] == free - len(capped.new_free)
 
 
 def test_the_second_sweep_bears_nothing_where_much_is_missing() -> None:

@@ -38,7 +38,7 @@ def test_the_anchors_that_moved_are_found_and_few_others() -> None:
 
 
 def test_anchors_that_no_two_views_show_go_with_their_neighbours() -> None:
-    alone, carried = (moving(config=replace(CONFIG, carried_share=share)) for share in (0.0, 0.5))
+    alone, carried = (moving(config=replace(CONFIG, occluded_share=share)) for share in (0.0, 0.5))
     assert alone.occluded_count == 0
     assert torch.equal(carried.anchors & alone.anchors, alone.anchors)
     assert carried.occluded_count == int((carried.anchors & ~alone.anchors).sum()) > 0
@@ -46,8 +46,8 @@ def test_anchors_that_no_two_views_show_go_with_their_neighbours() -> None:
 
 @pytest.mark.parametrize("share", [-0.1, 1.1])
 def test_a_share_beyond_one_is_refused(share: float) -> None:
-    with pytest.raises(ConfigError, match="carried_share"):
-        MotionConfig(carried_share=share)
+    with pytest.raises(ConfigError, match="occluded_share"):
+        MotionConfig(occluded_share=share)
 
 
 def test_nothing_moves_between_equal_pictures() -> None:
@@ -75,7 +75,7 @@ def test_each_view_tells_which_gaussians_it_shows() -> None:
 
 
 def test_what_moved_before_moves_more_easily() -> None:
-    strict = varied(replace(CONFIG, moved_ease=0.2), LEAST_SHARE=0.9)
+    strict = varied(replace(CONFIG, hysteresis=0.2), LEAST_SHARE=0.9)
     views, earlier = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (1, 0))
 
     def found(older: Scene | None) -> torch.Tensor:

@@ -106,7 +106,7 @@ def lines(*lengths: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(
-    ("crowded", "most", "rows", "refused"),
+    ("overflow", "most", "rows", "refused"),
     [
         ("none", 9, [], 15),
         ("none", 15, [0, 1, 2], 0),
@@ -117,10 +117,10 @@ def lines(*lengths: int) -> torch.Tensor:
     ],
 )
 def test_where_there_are_too_many_whole_clusters_are_born_or_none(
-    crowded: str, most: int, rows: list[int], refused: int
+    overflow: str, most: int, rows: list[int], refused: int
 ) -> None:
     points = lines(4, 8, 3)
-    rules = replace(RULES, crowded=crowded, most=most, least_hits=1)
+    rules = replace(RULES, overflow=overflow, most=most, least_hits=1)
     found = _merge_points(points, torch.rand(15, 3), torch.ones(15), first_birth=7, rules=rules)
     assert found.refused_count == refused
     assert sorted({round(float(y) / 50) for y in found.free.means[:, 1]}) == rows
@@ -129,7 +129,7 @@ def test_where_there_are_too_many_whole_clusters_are_born_or_none(
 
 
 def test_where_there_are_too_many_births_are_coarser() -> None:
-    rules = replace(RULES, crowded="coarser", most=9, least_hits=1)
+    rules = replace(RULES, overflow="coarser", most=9, least_hits=1)
     found = _merge_points(lines(4, 8, 3), torch.rand(15, 3), torch.ones(15), first_birth=0, rules=rules)
     assert (0 < len(found.free) <= 9, found.refused_count) == (True, 0)
     assert found.merged_count == 15 - len(found.free), "a cap that binds is told"

@@ -21,15 +21,15 @@ def world(*, speed: float = SPEED, movers: int = 60) -> World:
     return moving_world(FRAMES, cameras=6, movers=movers, speed=speed, width=128, height=96)
 
 
-def tracker(scenery: World, config: TrackConfig = CONFIG, *, carried_share: float = 0.0) -> Tracker:
-    motion = MotionConfig(enabled=True, carried_share=carried_share)
+def tracker(scenery: World, config: TrackConfig = CONFIG, *, occluded_share: float = 0.0) -> Tracker:
+    motion = MotionConfig(enabled=True, occluded_share=occluded_share)
     return Tracker(config, motion, LiftConfig(), scenery.rig, quickest_backend())
 
 
 def tracked(
-    scenery: World, config: TrackConfig = CONFIG, *, frames: int = FRAMES, carried_share: float = 0.0
+    scenery: World, config: TrackConfig = CONFIG, *, frames: int = FRAMES, occluded_share: float = 0.0
 ) -> Tracked:
-    chosen, past = tracker(scenery, config, carried_share=carried_share), Tracked.at_rest(scenery.scene)
+    chosen, past = tracker(scenery, config, occluded_share=occluded_share), Tracked.at_rest(scenery.scene)
     before = chosen.pictures(scenery.frames[0], None).views
     for frame in scenery.frames[1:frames]:
         pictures = chosen.pictures(frame, before)
@@ -49,7 +49,7 @@ def test_movers_are_followed_over_many_frames() -> None:
 def test_hidden_anchors_go_along_with_what_hides_them() -> None:
     scenery = world()
     start = scenery.scene.anchors.positions
-    alone, carried = (tracked(scenery, carried_share=share).scene.anchors.positions for share in (0.0, 0.4))
+    alone, carried = (tracked(scenery, occluded_share=share).scene.anchors.positions for share in (0.0, 0.4))
     left = (alone == start).all(1) & (carried != start).any(1)
     assert int(left.sum()) > 0
     travelled = (carried - start)[left, 0] / ((FRAMES - 1) * SPEED)

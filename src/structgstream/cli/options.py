@@ -149,13 +149,17 @@ def resolve_config(
     """The preset with the fields set on the command line by their path (``--online.iterations 50``), and its name.
 
     Raises:
-        UsageError: there is no such preset, the seed is negative, or a field is a constant now.
+        UsageError: there is no such preset, the seed is negative, or a field has another name or is
+            a constant now.
     """
     from structgstream.config_fields import constant_at
-    from structgstream.presets import DEFAULT_PRESET, StreamConfig, preset_named
+    from structgstream.presets import DEFAULT_PRESET, StreamConfig, preset_named, renamed
 
     for option in (override.partition("=")[0] for override in overrides if override.startswith("--")):
-        if (value := constant_at(StreamConfig, option.removeprefix("--").replace("-", "_"))) is not None:
+        path = option.removeprefix("--").replace("-", "_")
+        if (now := renamed(path)) != path:
+            raise UsageError(f"{option} is called --{now.replace('_', '-')} now.")
+        if (value := constant_at(StreamConfig, path)) is not None:
             raise UsageError(f"{option} is no option any more: it is always {value}.")
     name = DEFAULT_PRESET if preset is None else preset
     with usage_errors():

@@ -70,13 +70,13 @@ def change(came: int, went: int) -> str:
 def remarks(counts: Mapping[str, int]) -> str:
     """Remarks on a frame's pictures: outlier views and refused births (``training/online/select.py``)."""
     found = []
-    if counts.get("held"):
+    if counts.get("repeated"):
         found.append("no pictures show anything: the scene is held")
     if counts.get("views left out"):
         found.append(f"{counts['views left out']} views left out: only their pictures changed, or theirs did not")
-    if counts.get("jumps"):
+    if counts.get("scene cuts"):
         found.append("the pictures changed everywhere: motion segmentation skipped")
-    if counts.get("births refused"):
+    if counts.get("spawning refused"):
         found.append("no births: too many pixels are missing at once")
     return "".join(f"  [{remark}]" for remark in found)
 

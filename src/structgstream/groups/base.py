@@ -69,10 +69,10 @@ class GroupBase:
             ConfigError: it cannot be read, has periods, or lacks the initial scene flow that groups need.
         """
         config = from_json(self.header.config)
-        if config.codec != "compact" or not (config.online.motion.enabled and config.online.start.enabled):
+        if config.codec != "compact" or not (config.online.motion.enabled and config.online.scene_flow.enabled):
             raise ConfigError(
                 f"{self.name} was made with codec {config.codec} and motion start "
-                f"{'on' if config.online.start.enabled else 'off'}; groups need the codec compact and the motion "
+                f"{'on' if config.online.scene_flow.enabled else 'off'}; groups need the codec compact and the motion "
                 "start, as the presets compact and fast have them."
             )
         if config.period.enabled:

@@ -47,12 +47,12 @@ class GroupStartConfig:
     flow_rounds: int = 1
     """Number of displacements by flow from the rendering to the pictures before the iterations of a round. Each adds
     noise."""
-    stragglers: LostAnchorConfig = LostAnchorConfig()
+    lost_anchors: LostAnchorConfig = LostAnchorConfig()
     """Relocation of anchors that tracking lost."""
     births: int = 2000
     """Largest number of Gaussians spawned in a round, for content that appeared since frame 0."""
-    coherence_share: float = 0.25
-    """Weight of the motion smoothness ``online.coherence``, measured from frame 0 here, relative to that of other
+    smoothness_share: float = 0.25
+    """Weight of the motion smoothness ``online.smoothness``, measured from frame 0 here, relative to that of other
     frames. The full weight suits moving bodies, but costs 0.8 dB where the appearance changes in place, because
     displacements also have to represent that change."""
 
@@ -87,19 +87,19 @@ def fit_group_start(
         seed: seed of all random numbers.
         steps: quantization steps (Note [Bins]).
         floor: baseline residuals of frame 0; None for none.
-        light: exposure reference of frame 0, for ``config.light``; None for none.
+        light: exposure reference of frame 0, for ``config.exposure``; None for none.
         on_step: called after every iteration.
     """
     iterations = USUAL_FRAMES * config.iterations if start.iterations is None else start.iterations
     each = replace(
         config,
         iterations=-(-iterations // start.rounds),
-        births=replace(config.births, most=start.births),
-        coherence=replace(config.coherence, weight=start.coherence_share * config.coherence.weight),
+        spawn=replace(config.spawn, most=start.births),
+        smoothness=replace(config.smoothness, weight=start.smoothness_share * config.smoothness.weight),
     )
-    if config.light.enabled and light is not None:
+    if config.exposure.enabled and light is not None:
         step = None if steps is None else steps.get("color_mlp")
-        scene = with_exposure_of(scene, views, light, config=config.light, step=step)
+        scene = with_exposure_of(scene, views, light, config=config.exposure, step=step)
 
     optimizer = FrameOptimizer(
         each, backend, frame_index, torch.Generator().manual_seed(seed), Stopwatch(), steps or {}, on_step
@@ -129,7 +129,7 @@ class _Rounds:
         with fit.watch.stage("find motion"):
             split = self._partition(current)
             inliers = [self.views[number] for number in split.selection.inliers]
-        with fit.watch.stage("recall stragglers"):
+        with fit.watch.stage("relocate lost anchors"):
             # In the first round, flow and iterations may still find these anchors.
             split, relocated = self._relocated(split, inliers) if again else (split, 0)
         with fit.watch.stage("start motion"):
@@ -144,7 +144,7 @@ class _Rounds:
                 floor=self.floor,
                 room=config.patching.max_free - len(split.static.free),
                 least_pixels=config.motion.LEAST_PIXELS,
-                config=config.births,
+                config=config.spawn,
                 backend=backend,
             )
         dynamic = replace(displaced.dynamic, free=displaced.dynamic.free.select(new.kept))
@@ -163,7 +163,7 @@ class _Rounds:
             scene=displaced.merge(result.scene),
             pruned=result.pruned + int((~new.kept).sum()),
             spawned=result.spawned + len(new.new_free),
-            counts={**result.counts, "corrected": lifted, "recalled": relocated, **new.counts},
+            counts={**result.counts, "corrected": lifted, "relocated": relocated, **new.counts},
         )
 
     def _partition(self, current: Scene) -> DynamicSplit:
@@ -186,8 +186,8 @@ class _Rounds:
             find_active_tiles(split, views, config=config.motion, backend=fit.backend),
             floor=self.floor,
             least_pixels=config.motion.LEAST_PIXELS,
-            births=config.births.rules,
-            config=self.start.stragglers,
+            births=config.spawn.rules,
+            config=self.start.lost_anchors,
             backend=fit.backend,
         )
         return replace(split, dynamic=dynamic), count
@@ -195,7 +195,7 @@ class _Rounds:
     def _displaced(self, split: DynamicSplit, views: list[View]) -> tuple[DynamicSplit, int]:
         """``split`` after rounds of flow from its rendering to the pictures, and the number of displaced primitives."""
         fit, config = self.fit, self.fit.config
-        chosen = flow_views(views, fit.frame_index, config.start)
+        chosen = flow_views(views, fit.frame_index, config.scene_flow)
         seen, lifted = [view for view in views if view.index in chosen], 0
         for _ in range(self.start.flow_rounds if chosen else 0):
             found = residual_flow(
@@ -203,7 +203,7 @@ class _Rounds:
                 seen,
                 find_active_tiles(split, seen, config=config.motion, backend=fit.backend),
                 scale=config.motion.picture_scale,
-                config=config.start,
+                config=config.scene_flow,
                 backend=fit.backend,
             )
             lifted = int(found.lifted.sum())

@@ -93,7 +93,7 @@ class GroupMethod:
         if self.entry is None or frame.index != self.entry.frame:
             return self._usual.observe(frame, before, rig=rig, backend=backend)
         online = self.config.online
-        without_flow = replace(online.start, enabled=False)
+        without_flow = replace(online.scene_flow, enabled=False)
         first = self.entry.first_pictures()
         return preprocess(frame, rig, before=first, motion=online.motion, start=without_flow, backend=backend)
 
@@ -158,19 +158,19 @@ class GroupMethod:
 def catching_up(config: StreamConfig) -> StreamConfig:
     """``config`` for a group's first frames, which lack what earlier frames would have spawned.
 
-    Thin content in small clusters is spawned although there are many of them (``ThinSpawnConfig.crowded``).
+    Thin content in small clusters is spawned although there are many of them (``ThinSpawnConfig.overflow``).
     """
-    births = config.online.births
-    thin = replace(births.thin, crowded="small-clusters")
-    return replace(config, online=replace(config.online, births=replace(births, thin=thin)))
+    spawn = config.online.spawn
+    thin = replace(spawn.thin, overflow="small-clusters")
+    return replace(config, online=replace(config.online, spawn=replace(spawn, thin=thin)))
 
 
 def lowered_budget(online: OnlineConfig) -> OnlineConfig:
     """``online`` with less memory: flow in half of the views, a quarter of the spawned Gaussians."""
     return replace(
         online,
-        start=replace(online.start, views=max(2, online.start.views // 2)),
-        births=replace(online.births, most=online.births.most // 4),
+        scene_flow=replace(online.scene_flow, views=max(2, online.scene_flow.views // 2)),
+        spawn=replace(online.spawn, most=online.spawn.most // 4),
     )
 
 

@@ -116,14 +116,14 @@ class Tracker:
         stride = self.stride(len(views))
         chosen = [n for n in range(len(views)) if n % stride == frame.index % stride]
         taken = [views[n] for n in chosen]
-        motion = replace(
-            self.motion,
-            reach_pixels=max(1, round(self.motion.REACH_PIXELS * self.config.scale)),
-            picture_scale=self.config.picture_scale,
-        )
-        indices = [view.index for view in taken]
         found = detect_changes(
-            taken, before, config=motion, backend=self.backend, flow_from=indices, flow=self.config.flow
+            taken,
+            before,
+            config=replace(self.motion, picture_scale=self.config.picture_scale),
+            backend=self.backend,
+            flow_from=[view.index for view in taken],
+            flow=self.config.flow,
+            reach_pixels=max(1, round(self.motion.REACH_PIXELS * self.config.scale)),
         )
         changes = {n: change for n, change in zip(chosen, found, strict=True) if change is not None}
         return TrackPictures(frame.index, views, changes)
@@ -255,7 +255,7 @@ def _occluded(motion: MotionConfig, scene: Scene, seen: Sequence[_ViewEvidence],
         shown += entry.flows[:anchors, 3] > motion.LEAST_PIXELS
     among = ((drawn >= motion.LEAST_VIEWS) | (shown >= motion.LEAST_VIEWS)).nonzero()[:, 0]
     occluded[among] = occluded_dynamic(
-        scene.anchors.positions[among], moving[among], shown[among] >= motion.LEAST_VIEWS, share=motion.carried_share
+        scene.anchors.positions[among], moving[among], shown[among] >= motion.LEAST_VIEWS, share=motion.occluded_share
     )
     return occluded
 

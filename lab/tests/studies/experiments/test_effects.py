@@ -38,7 +38,7 @@ def test_what_the_switches_are() -> None:
     assert ROWS[FULL].config == RIG
     assert ROWS[BETTER_FIRST].config == replace(RIG, initial=COMPACT.initial, denoising=COMPACT.denoising)
     calm = ROWS["compact-without-disturbance"].config
-    assert calm.initial == replace(COMPACT.initial, disturbance=RIG.initial.disturbance)
+    assert calm.initial == replace(COMPACT.initial, perturbation=RIG.initial.perturbation)
     plain = ROWS["compact-paper-losses"].config.initial.losses
     assert (plain.l1, plain.ssim) == (RIG.initial.losses.l1, RIG.initial.losses.ssim) == (1.0, 0.2)
     many = ROWS["compact-offsets"].config.initial
@@ -51,12 +51,12 @@ def test_what_the_switches_are() -> None:
     assert whole.dynamic - online["compact-without-base-scales"].dynamic == {"base_scales"}
     barren = online["compact-without-free"]
     assert barren.patching.spawn == "off"
-    assert not barren.births.enabled
-    assert whole.births.enabled
+    assert not barren.spawn.enabled
+    assert whole.spawn.enabled
     assert (whole.patching.spawn, online["compact-gradient-births"].patching.spawn) == ("off", "gradient")
-    assert whole.start.enabled
-    assert not online["compact-without-start"].start.enabled
-    assert (whole.start.rounds, online["compact-one-round"].start.rounds) == (2, 1)
+    assert whole.scene_flow.enabled
+    assert not online["compact-without-start"].scene_flow.enabled
+    assert (whole.scene_flow.rounds, online["compact-one-round"].scene_flow.rounds) == (2, 1)
     assert online["compact-without-residuals"].motion.residual_threshold == 0.0 < whole.motion.residual_threshold
     assert whole.rounding.free_priced
     assert not online["compact-free-unpriced"].rounding.free_priced
@@ -69,25 +69,25 @@ def test_what_the_switches_are() -> None:
     assert whole.iterations == 140
     assert online["compact-rank-8"].appearance_rank == 8 != whole.appearance_rank
     dark = online["compact-without-light"]
-    assert whole.light.enabled
-    assert not dark.light.enabled
+    assert whole.exposure.enabled
+    assert not dark.exposure.enabled
     assert whole.dynamic - dark.dynamic == {"color_mlp"}
-    assert online["compact-without-coherence"].coherence.weight == 0.0 < whole.coherence.weight
-    assert whole.births.thin.enabled
-    assert not online["compact-without-thin-births"].births.thin.enabled
+    assert online["compact-without-coherence"].smoothness.weight == 0.0 < whole.smoothness.weight
+    assert whole.spawn.thin.enabled
+    assert not online["compact-without-thin-births"].spawn.thin.enabled
 
 
 def test_what_is_off_is_tried_and_what_is_on_is_left_out() -> None:
     online = COMPACT.online
-    given = {"moved_ease": 0.3, "carried_share": 0.7}
-    none = {"moved_ease": 1.0, "carried_share": 0.0}
+    given = {"hysteresis": 0.3, "occluded_share": 0.7}
+    none = {"hysteresis": 1.0, "occluded_share": 0.0}
     on = replace(online, motion=replace(online.motion, **given))
     off = replace(online, motion=replace(online.motion, **none))
     tried = (off, EASED, CARRIED_SHARE)
     for whole, ease, carried in ((on, 1.0, 0.0), tried):
         rows = effects(replace(COMPACT, online=whole), paper=RIG)
-        assert rows["compact-memory"].config.online.motion.moved_ease == ease
-        assert rows["compact-carrying"].config.online.motion.carried_share == carried
+        assert rows["compact-memory"].config.online.motion.hysteresis == ease
+        assert rows["compact-carrying"].config.online.motion.occluded_share == carried
 
 
 @pytest.mark.parametrize(("whole", "other"), [(0.0, 1.0), (0.7, 0.0)])

@@ -88,9 +88,9 @@ class InitialConfig:
     sampling_filter: bool = False
     """Train through the low-pass with which players draw (``scene/sampling.py``, Note [Drawn as it was trained]), also
     on reduced pictures (paper: no, 0.3 square pixels of each picture)."""
-    disturbance: PerturbationConfig = field(default_factory=PerturbationConfig)
-    solidity: DepthDistortionConfig = field(default_factory=DepthDistortionConfig)
-    free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
+    perturbation: PerturbationConfig = field(default_factory=PerturbationConfig)
+    depth_distortion: DepthDistortionConfig = field(default_factory=DepthDistortionConfig)
+    floaters: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
     losses: InitialLossWeights = InitialLossWeights()
     rates: InitialRates = field(default_factory=InitialRates)
     growth: GrowthConfig = field(default_factory=GrowthConfig)
@@ -162,7 +162,7 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
             weights=config.losses,
             track_screen=self.densifier.collects(iteration),
             watch=self.watch,
-            perturbation=perturbation_at(iteration, config.iterations, config.disturbance, self.numbers),
+            perturbation=perturbation_at(iteration, config.iterations, config.perturbation, self.numbers),
             background=torch.rand(3, generator=generator).to(self.backend.device) if config.random_background else None,
         )
         if config.losses.offset_distance:
@@ -171,10 +171,10 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
                     scene.anchors, voxel_size=config.voxel_size, weights=config.losses, backend=self.backend
                 )
                 loss = with_term(loss, "offset_distance", distance, weight=config.losses.offset_distance)
-        if weight := config.solidity.weight_at(iteration, config.iterations):
+        if weight := config.depth_distortion.weight_at(iteration, config.iterations):
             with self.watch.stage("rasterise"):
                 spread = depth_distortion(
-                    loss.unperturbed, sample.camera, scale=config.solidity.SCALE, backend=self.backend
+                    loss.unperturbed, sample.camera, scale=config.depth_distortion.SCALE, backend=self.backend
                 )
                 loss = with_term(loss, "depth_distortion", spread, weight=weight)
         self.last_pass.add(iteration, loss, sample)
@@ -279,12 +279,12 @@ def _fit(
     schedule = Schedule(config.iterations, lambda iteration: rates_at(iteration, config, extent=extent), done=done)
     iterations = minimize(adam, samples, schedule, hooks, watch=watch, on_step=on_step)
     scene, counts = detached(hooks.scene), {}
-    if config.free_space.enabled:
+    if config.floaters.enabled:
         with watch.stage("densify"):
             cameras = [view.camera for view in views]
-            floating = in_free_space(scene, cameras, config=config.free_space, backend=backend)
+            floating = in_free_space(scene, cameras, config=config.floaters, backend=backend)
             scene = replace(scene, anchors=scene.anchors.select(~floating))
-            counts["in free space"] = int(floating.sum())
+            counts["floaters"] = int(floating.sum())
     return FitResult(
         scene=scene,
         iterations=iterations,

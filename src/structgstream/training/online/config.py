@@ -62,10 +62,10 @@ class MotionConfig:
     (full scale 1) exceeds this; above the sensors' noise."""
     residual_threshold: float = 0.0
     """A pixel has also changed if its residual exceeds frame 0's by this (full scale 1). 0: residuals are not used."""
-    moved_ease: float = 1.0
+    hysteresis: float = 1.0
     """Factor (hysteresis) on the thresholds of pixels and shares for primitives that the last frame changed. 1:
     none."""
-    carried_share: float = 0.0
+    occluded_share: float = 0.0
     """An anchor that fewer than ``LEAST_VIEWS`` views show is trained if at least this share of its nearest shown ones
     is: it lies in or behind what moves. 0: none."""
     picture_scale: float = 0.25
@@ -88,8 +88,8 @@ class MotionConfig:
     """Tiles within this many pixels of dynamic Gaussians are drawn too, so that these get gradients where they move."""
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.carried_share <= 1.0:
-            raise ConfigError(f"online.motion.carried_share is {self.carried_share:g}; expected a share from 0 to 1.")
+        if not 0.0 <= self.occluded_share <= 1.0:
+            raise ConfigError(f"online.motion.occluded_share is {self.occluded_share:g}; expected a share from 0 to 1.")
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class SpawnRules:
     """Least number of ray points within 1.8 voxels of a new Gaussian."""
     most: int = 5000
     """Largest number of new Gaussians: more than who walks in needs, since below that number all of it is haze."""
-    crowded: Literal["coarser", "none", "small-clusters"] = "coarser"
+    overflow: Literal["coarser", "none", "small-clusters"] = "coarser"
     """Where there would be more than ``most``: Gaussians in larger voxels, none, or those in the smallest clusters."""
     most_missing_share: float = 0.25
     """If a larger share of the pictures is missing nothing is spawned: the light changed, or a camera moved."""
@@ -159,9 +159,9 @@ class SpawnRules:
     """Standard deviation of a new Gaussian, in units of the distance between neighbouring swept rays."""
     opacity: float = 0.7
     """Of a new Gaussian."""
-    blame_share: float = 0.5
+    outlier_share: float = 0.5
     """A free Gaussian is an outlier in a view if more than this share of its pixels is wrong."""
-    blame_views: int = 2
+    outlier_views: int = 2
     """A free Gaussian is removed if it is an outlier in at least this many views and in half of those that show it."""
 
 
@@ -175,8 +175,8 @@ class ThinSpawnConfig:
 
     enabled: bool = False
     """Spawn thin content by a second sweep."""
-    crowded: Literal["coarser", "none", "small-clusters"] = "none"
-    """Where there would be more than 150 (``SpawnRules.crowded``). Thin content needs few Gaussians. More candidates
+    overflow: Literal["coarser", "none", "small-clusters"] = "none"
+    """Where there would be more than 150 (``SpawnRules.overflow``). Thin content needs few Gaussians. More candidates
     mean that dynamic anchors are misplaced, as in a throw: new Gaussians in their place follow worse and cost more. A
     group of frames that is fitted separately lacks what earlier frames would have spawned: its first frames spawn what
     lies in small clusters."""
@@ -196,7 +196,7 @@ class ThinSpawnConfig:
     @property
     def rules(self) -> SpawnRules:
         """The rules of the second sweep."""
-        return replace(self.RULES, crowded=self.crowded)
+        return replace(self.RULES, overflow=self.overflow)
 
 
 @dataclass(frozen=True)
@@ -325,17 +325,17 @@ class OnlineConfig:
     rates: OnlineRates = field(default_factory=OnlineRates)
     patching: PatchingConfig = field(default_factory=PatchingConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
-    start: SceneFlowConfig = field(default_factory=SceneFlowConfig)
+    scene_flow: SceneFlowConfig = field(default_factory=SceneFlowConfig)
     """Initial displacements of primitives; only with ``motion``."""
-    births: SpawnConfig = field(default_factory=SpawnConfig)
+    spawn: SpawnConfig = field(default_factory=SpawnConfig)
     """Spawning of free Gaussians from geometry, and pruning of outliers; only with ``motion``."""
-    coherence: SmoothnessConfig = field(default_factory=SmoothnessConfig)
+    smoothness: SmoothnessConfig = field(default_factory=SmoothnessConfig)
     """The price of moving unlike the neighbours."""
     motion_prior: float = 0.0
     """Moving anchors are initially displaced by this share of their last displacement (paper: 0)."""
     mean_of_last: float = 0.0
     """The result is the mean of this share of the iterations, the last ones (paper: 0, the last step)."""
-    light: ExposureConfig = field(default_factory=ExposureConfig)
+    exposure: ExposureConfig = field(default_factory=ExposureConfig)
     """Following the global light by the output biases of F_c."""
     rounding: RoundingConfig = field(default_factory=RoundingConfig)
     sampling_filter: bool = False
@@ -343,13 +343,13 @@ class OnlineConfig:
     trained]), also where pictures are reduced (paper: no, 0.3 square pixels of each picture)."""
 
     def __post_init__(self) -> None:
-        if self.light.enabled and "color_mlp" not in self.dynamic:
-            raise ConfigError("online.light changes F_c, which packets do not carry; add color_mlp to online.dynamic.")
+        if self.exposure.enabled and "color_mlp" not in self.dynamic:
+            raise ConfigError("online.exposure changes F_c, which is not sent; add color_mlp to online.dynamic.")
 
     @property
     def trained(self) -> frozenset[FieldName]:
         """The dynamic fields that optimisation changes: F_c, if it follows the light, is not among them."""
-        return self.dynamic.difference(["color_mlp"]) if self.light.enabled else self.dynamic
+        return self.dynamic.difference(["color_mlp"]) if self.exposure.enabled else self.dynamic
 
 
 def online_rates(config: OnlineConfig, share: float) -> dict[ParameterName, float]:

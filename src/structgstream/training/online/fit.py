@@ -63,11 +63,11 @@ def fit_next_frame(
         older: the decoded scene two frames before, if :func:`needs_older`; None for none.
         intervals: media time since the previous frame, in times of that between the two before, for the motion prior.
         floor: residuals of frame 0, for ``config.motion.residual_threshold`` and for spawning; None for none.
-        light: frame 0's, for ``config.light``; None for none.
+        light: frame 0's, for ``config.exposure``; None for none.
         on_step: called after every iteration.
     """
     if pictures is None:
-        pictures = preprocess(frame, rig, before=None, motion=config.motion, start=config.start, backend=backend)
+        pictures = preprocess(frame, rig, before=None, motion=config.motion, start=config.scene_flow, backend=backend)
     views = pictures.views
     if len(views) < min(LEAST_CAMERAS, len(rig.training)):
         return held(scene)
@@ -75,9 +75,9 @@ def fit_next_frame(
         scene = scene.without_free()
     scene = replace(scene, sampling=RigSampling.of(rig) if config.sampling_filter else None)
     counts: dict[str, int] = {}
-    if config.light.enabled and light is not None:
+    if config.exposure.enabled and light is not None:
         step = None if steps is None else steps.get("color_mlp")
-        lit = with_exposure_of(scene, views, light, config=config.light, step=step)
+        lit = with_exposure_of(scene, views, light, config=config.exposure, step=step)
         counts["light changed"] = int(lit is not scene)
         scene = lit
 
@@ -95,7 +95,7 @@ def fit_next_frame(
         inliers = [views[number] for number in selection.inliers]
     with watch.stage("start motion"):
         flow = apply_scene_flow(
-            split, inliers, prior[selection.primitives], config=config.start, motion=config.motion, backend=backend
+            split, inliers, prior[selection.primitives], config=config.scene_flow, motion=config.motion, backend=backend
         )
     with watch.stage("renew"):
         spawned = prune_and_spawn(
@@ -106,7 +106,7 @@ def fit_next_frame(
             floor=floor,
             room=config.patching.max_free - len(split.static.free),
             least_pixels=config.motion.LEAST_PIXELS,
-            config=config.births,
+            config=config.spawn,
             backend=backend,
         )
     start = StartingPoint(
@@ -121,16 +121,16 @@ def fit_next_frame(
     return replace(
         result,
         scene=split.merge(result.scene),
-        pruned=result.pruned + spawned.counts["blamed"],
+        pruned=result.pruned + spawned.counts["pruned outliers"],
         spawned=result.spawned + len(spawned.new_free),
         counts={
             **result.counts,
             **flow.counts,
             **spawned.counts,
-            "carried": selection.occluded_count,
+            "propagated": selection.occluded_count,
             "far boxes": sum(change.far_boxes for change in pictures.changes if change is not None),
             "views left out": len(views) - len(inliers),
-            "jumps": int(selection.scene_cut),
+            "scene cuts": int(selection.scene_cut),
             **counts,
         },
     )
@@ -138,12 +138,12 @@ def fit_next_frame(
 
 def held(scene: Scene) -> FitResult[Scene]:
     """The result of a frame whose pictures show nothing: the scene as it was."""
-    return FitResult(detached(scene), iterations=0, train_psnr=math.nan, counts={"held": 1})
+    return FitResult(detached(scene), iterations=0, train_psnr=math.nan, counts={"repeated": 1})
 
 
 def needs_older(config: OnlineConfig) -> bool:
     """Whether a frame depends on the two decoded frames before it, instead of one."""
-    return config.motion_prior != 0.0 or (config.motion.enabled and config.motion.moved_ease != 1.0)
+    return config.motion_prior != 0.0 or (config.motion.enabled and config.motion.hysteresis != 1.0)
 
 
 def prior_displacements(scene: Scene, older: Scene | None, share: float) -> Tensor:

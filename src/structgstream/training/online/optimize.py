@@ -158,7 +158,9 @@ class FrameOptimizer:
             parameters=parameters,
             losses=config.losses,
             rate_term=rate_term,
-            coherence=MotionSmoothness.of(start.known, [view.camera for view in start.views], config=config.coherence),
+            smoothness=MotionSmoothness.of(
+                start.known, [view.camera for view in start.views], config=config.smoothness
+            ),
             free_set=free_set,
             patch_at=math.ceil(config.patching.iteration * len(seen) / len(start.views)),
             patches="free" in config.dynamic,
@@ -239,7 +241,7 @@ class OnlineHooks(Hooks[View, SceneLoss]):
         parameters: of the scene.
         losses: weights of the terms.
         rate_term: the price of changing bins; None for none.
-        coherence: the price of incoherent motion; None for none.
+        smoothness: the price of incoherent motion; None for none.
         free_set: of the free Gaussians.
         patch_at: the iteration after which free Gaussians are pruned and spawned.
         patches: whether they are.
@@ -257,7 +259,7 @@ class OnlineHooks(Hooks[View, SceneLoss]):
     parameters: Parameters
     losses: LossWeights
     rate_term: RateTerm | None
-    coherence: MotionSmoothness | None
+    smoothness: MotionSmoothness | None
     free_set: FreeSet
     patch_at: int
     patches: bool
@@ -287,9 +289,9 @@ class OnlineHooks(Hooks[View, SceneLoss]):
 
     def _with_regularizers(self, loss: SceneLoss) -> SceneLoss:
         values = self.parameters.values
-        if self.coherence is not None:
-            difference = self.coherence.difference(values["anchor_positions"], self.backend)
-            loss = with_term(loss, "coherence", difference, weight=self.coherence.weight)
+        if self.smoothness is not None:
+            difference = self.smoothness.difference(values["anchor_positions"], self.backend)
+            loss = with_term(loss, "smoothness", difference, weight=self.smoothness.weight)
         if self.rate_term is None:
             return loss
         return replace(loss, total=loss.total + self.rate_term.value(values, self.backend))

@@ -138,10 +138,10 @@ class SceneFlow:
     def counts(self) -> dict[str, int]:
         """How much of what moves was displaced, for the log."""
         return {
-            "lifted": self.lifted,
+            "displaced": self.lifted,
             "corrected": self.corrected,
             "fast": self.fast,
-            "fast lifted": self.fast_lifted,
+            "fast displaced": self.fast_lifted,
         }
 
 

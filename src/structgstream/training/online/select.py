@@ -118,12 +118,12 @@ def select_dynamic(
         measured: by :func:`~structgstream.training.online.measure.measure`, of each view.
         config: thresholds.
         backend: the compute back-end.
-        older: the scene two frames before, for ``moved_ease``; None for none.
+        older: the scene two frames before, for ``hysteresis``; None for none.
     """
     anchors = len(scene.anchors)
     ease = torch.ones(anchors + len(scene.free), device=scene.anchors.positions.device)
     if older is not None:
-        ease[changed_primitives(older, scene)] = config.moved_ease
+        ease[changed_primitives(older, scene)] = config.hysteresis
 
     view_changes = [of_view.change for of_view in measured]
     for number in outlier_candidates(view_changes):
@@ -139,7 +139,7 @@ def select_dynamic(
             shown += of_view.covered > config.LEAST_PIXELS
     dynamic = votes >= config.LEAST_VIEWS
     occluded = occluded_dynamic(
-        scene.anchors.positions, dynamic[:anchors], shown[:anchors] >= config.LEAST_VIEWS, share=config.carried_share
+        scene.anchors.positions, dynamic[:anchors], shown[:anchors] >= config.LEAST_VIEWS, share=config.occluded_share
     )
 
     found = DynamicSelection(

@@ -110,8 +110,8 @@ def outlier_mask(coverage: Tensor, wrong: Tensor, *, least_pixels: float, rules:
         rules: the rule.
     """
     seen = coverage > least_pixels
-    bad = (seen & (wrong > rules.blame_share * coverage)).sum(0)
-    return (bad >= rules.blame_views) & (2 * bad >= seen.sum(0))
+    bad = (seen & (wrong > rules.outlier_share * coverage)).sum(0)
+    return (bad >= rules.outlier_views) & (2 * bad >= seen.sum(0))
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class Spawned:
     Args:
         free: the new free Gaussians.
         refused_count: how many more there were, if these are more than ``SpawnRules.most``; always 0
-            where Gaussians are coarser then (``SpawnRules.crowded``).
+            where Gaussians are coarser then (``SpawnRules.overflow``).
         merged_count: how many more there would be, had they not been made coarser for that reason.
     """
 
@@ -218,9 +218,9 @@ def _merge_points(points: Tensor, colors: Tensor, spacings: Tensor, *, first_bir
         finest = wanted if finest is None else finest
         if wanted <= rules.most or voxel > COARSEST * float(spacings.median()):
             break
-        if rules.crowded == "none":
+        if rules.overflow == "none":
             return Spawned(FreeGaussians.empty(points), wanted)
-        if rules.crowded == "small-clusters":
+        if rules.overflow == "small-clusters":
             enough[enough.clone()] = _in_small_clusters(means[enough, :3], CLUSTER_VOXELS * voxel, most=rules.most)
             break
         voxel *= 2.0**0.5  # Too many: what is missing is large, and coarser Gaussians fill it.
@@ -240,8 +240,8 @@ def _merge_points(points: Tensor, colors: Tensor, spacings: Tensor, *, first_bir
             colors=looks.contiguous(),
             births=first_birth + torch.arange(count, device=points.device),
         ),
-        refused_count=wanted - count if rules.crowded == "small-clusters" else 0,
-        merged_count=max(0, finest - count) if rules.crowded == "coarser" else 0,
+        refused_count=wanted - count if rules.overflow == "small-clusters" else 0,
+        merged_count=max(0, finest - count) if rules.overflow == "coarser" else 0,
     )
 
 
@@ -453,12 +453,12 @@ class SpawnResult:
     def counts(self) -> dict[str, int]:
         """How often each part acted, for the log."""
         return {
-            "born": len(self.new_free),
-            "born thin": self.thin_count,
-            "thin births refused": self.thin_refused_count,
-            "births merged": self.merged_count,
-            "blamed": int((~self.kept).sum()),
-            "births refused": int(self.refused),
+            "spawned": len(self.new_free),
+            "spawned thin": self.thin_count,
+            "refused thin": self.thin_refused_count,
+            "merged": self.merged_count,
+            "pruned outliers": int((~self.kept).sum()),
+            "spawning refused": int(self.refused),
         }
 
 

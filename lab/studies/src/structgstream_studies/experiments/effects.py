@@ -21,7 +21,7 @@ WHOLE = "compact"
 """Key of the compact stream with everything, as ``structgstream compare`` calls it."""
 BETTER_FIRST = "paper-better-first"
 """Key of paper mode with the compact stream's frame 0."""
-DISTURBANCE_FIELDS = tuple(f"initial.disturbance.{name}" for name in ("dropped_share", "noise_scales"))
+DISTURBANCE_FIELDS = tuple(f"initial.perturbation.{name}" for name in ("dropped_share", "noise_scales"))
 LOSS_FIELDS = ("initial.losses.l1", "initial.losses.ssim")
 OFFSET_FIELDS, PAPER_OFFSETS = ("initial.offsets_per_anchor", "initial.all_drawn"), 5
 CARRIED_SHARE, EASED, OTHER_RANK = 0.4, 0.5, 8
@@ -104,7 +104,7 @@ class _Rows:
 
 def _of_frame_0(rows: _Rows) -> None:
     full = rows.full
-    calm = replace(full, initial=replace(full.initial, disturbance=PerturbationConfig()))
+    calm = replace(full, initial=replace(full.initial, perturbation=PerturbationConfig()))
     rows.row("without-disturbance", "frame 0 w/o dropout and perturbation", calm, *DISTURBANCE_FIELDS)
     paper = LossWeights()
     losses = replace(full.initial.losses, l1=paper.l1, ssim=paper.ssim)
@@ -123,12 +123,12 @@ def _with_first_of(config: StreamConfig, full: StreamConfig) -> StreamConfig:
 def _of_the_gate(rows: _Rows) -> None:
     motion = rows.whole.motion
     rows.gated("without-gate", "w/o change gate", replace(motion, enabled=False), "enabled")
-    eased = EASED if motion.moved_ease == 1.0 else 1.0
+    eased = EASED if motion.hysteresis == 1.0 else 1.0
     title = "hysteresis of the gate" if eased != 1.0 else "w/o hysteresis of the gate"
-    rows.gated("memory", title, replace(motion, moved_ease=eased), "moved_ease")
-    carried = CARRIED_SHARE if motion.carried_share == 0.0 else 0.0
+    rows.gated("memory", title, replace(motion, hysteresis=eased), "hysteresis")
+    carried = CARRIED_SHARE if motion.occluded_share == 0.0 else 0.0
     title = "hidden anchors are carried along" if carried else "hidden anchors stay behind"
-    rows.gated("carrying", title, replace(motion, carried_share=carried), "carried_share")
+    rows.gated("carrying", title, replace(motion, occluded_share=carried), "occluded_share")
 
 
 def _of_coding(rows: _Rows) -> None:
@@ -141,8 +141,8 @@ def _of_coding(rows: _Rows) -> None:
     prior = 0.0 if whole.motion_prior else 1.0
     title = "with motion prior" if prior else "w/o motion prior"
     rows.online("motion-prior", title, replace(whole, motion_prior=prior), "motion_prior")
-    incoherent = replace(whole, coherence=replace(whole.coherence, weight=0.0))
-    rows.online("without-coherence", "w/o price of incoherent motion", incoherent, "coherence.weight")
+    incoherent = replace(whole, smoothness=replace(whole.smoothness, weight=0.0))
+    rows.online("without-coherence", "w/o price of incoherent motion", incoherent, "smoothness.weight")
 
 
 def _of_iterations(rows: _Rows) -> None:
@@ -154,10 +154,10 @@ def _of_iterations(rows: _Rows) -> None:
 
 
 def _of_the_start(rows: _Rows) -> None:
-    whole, start = rows.whole, rows.whole.start
+    whole, start = rows.whole, rows.whole.scene_flow
     off, single = replace(start, enabled=False), replace(start, rounds=1)
-    rows.online("without-start", "w/o motion start", replace(whole, start=off), "start.enabled")
-    rows.online("one-round", "motion start in one round", replace(whole, start=single), "start.rounds")
+    rows.online("without-start", "w/o motion start", replace(whole, scene_flow=off), "scene_flow.enabled")
+    rows.online("one-round", "motion start in one round", replace(whole, scene_flow=single), "scene_flow.rounds")
     motion = replace(whole.motion, residual_threshold=0.0)
     rows.gated("without-residuals", "gate w/o residuals", motion, "residual_threshold")
 
@@ -167,20 +167,20 @@ def _of_free_gaussians(rows: _Rows) -> None:
     spawn = "gradient" if patching.spawn == "off" else "off"
     title = "births by gradients too" if spawn == "gradient" else "w/o births by gradients"
     rows.online("gradient-births", title, replace(whole, patching=replace(patching, spawn=spawn)), "patching.spawn")
-    births = replace(whole.births, enabled=False)
-    none = replace(whole, births=births, patching=replace(patching, spawn="off"))
-    rows.online("without-free", "w/o free 3DGs", none, "births.enabled", "patching.spawn")
-    large = replace(whole.births, thin=replace(whole.births.thin, enabled=False))
-    rows.online(
-        "without-thin-births", "w/o births of thin content", replace(whole, births=large), "births.thin.enabled"
-    )
+    births = replace(whole.spawn, enabled=False)
+    none = replace(whole, spawn=births, patching=replace(patching, spawn="off"))
+    rows.online("without-free", "w/o free 3DGs", none, "spawn.enabled", "patching.spawn")
+    large = replace(whole.spawn, thin=replace(whole.spawn.thin, enabled=False))
+    rows.online("without-thin-births", "w/o births of thin content", replace(whole, spawn=large), "spawn.thin.enabled")
     rows.priced("free-unpriced", "free 3DGs not priced", replace(whole.rounding, free_priced=False), "free_priced")
 
 
 def _of_the_light(rows: _Rows) -> None:
     whole = rows.whole
-    dark = replace(whole, light=replace(whole.light, enabled=False), dynamic=whole.dynamic.difference(["color_mlp"]))
-    rows.online("without-light", "global light not followed", dark, "light.enabled", "dynamic")
+    dark = replace(
+        whole, exposure=replace(whole.exposure, enabled=False), dynamic=whole.dynamic.difference(["color_mlp"])
+    )
+    rows.online("without-light", "global light not followed", dark, "exposure.enabled", "dynamic")
 
 
 def require_compact(config: StreamConfig) -> None:

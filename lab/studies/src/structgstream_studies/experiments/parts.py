@@ -13,7 +13,7 @@ from structgstream_studies.experiments.variants import Variant
 PARTS_TABLE = "parts"
 NONE = f"{WHOLE}-without-parts"
 """Key of the row without any of the parts of later frames."""
-DENOISING, FREE_SPACE = "denoising.frames", "initial.free_space.enabled"
+DENOISING, FREE_SPACE = "denoising.frames", "initial.floaters.enabled"
 """Switches of the parts of frame 0, which are only left out: whatever follows needs some frame 0."""
 
 
@@ -33,9 +33,11 @@ class Part:
 
 
 PARTS: Mapping[str, Part] = {
-    "start": Part("motion start", "start.enabled", lambda c: replace(c, start=replace(c.start, enabled=False))),
+    "start": Part(
+        "motion start", "scene_flow.enabled", lambda c: replace(c, scene_flow=replace(c.scene_flow, enabled=False))
+    ),
     "births": Part(
-        "births from geometry", "births.enabled", lambda c: replace(c, births=replace(c.births, enabled=False))
+        "births from geometry", "spawn.enabled", lambda c: replace(c, spawn=replace(c.spawn, enabled=False))
     ),
     "residuals": Part(
         "gate that sees residuals",
@@ -44,13 +46,13 @@ PARTS: Mapping[str, Part] = {
     ),
     "carrying": Part(
         "hidden anchors carried along",
-        "motion.carried_share",
-        lambda c: replace(c, motion=replace(c.motion, carried_share=0.0)),
+        "motion.occluded_share",
+        lambda c: replace(c, motion=replace(c.motion, occluded_share=0.0)),
     ),
     "coherence": Part(
         "price of incoherent motion",
-        "coherence.weight",
-        lambda c: replace(c, coherence=replace(c.coherence, weight=0.0)),
+        "smoothness.weight",
+        lambda c: replace(c, smoothness=replace(c.smoothness, weight=0.0)),
     ),
     "prior": Part("motion prior", "motion_prior", lambda c: replace(c, motion_prior=0.0)),
 }
@@ -76,7 +78,7 @@ def parts(full: StreamConfig) -> dict[str, Variant]:
         rows.append(_without(full, f"{WHOLE}-only-{name}", f"{part.title} alone", others))
     noisy = replace(full, denoising=replace(full.denoising, frames=1))
     rows.append(Variant(f"{WHOLE}-less-denoising", "frame 0 of one picture a camera", noisy, frozenset([DENOISING])))
-    floating = replace(full.initial, free_space=replace(full.initial.free_space, enabled=False))
+    floating = replace(full.initial, floaters=replace(full.initial.floaters, enabled=False))
     hazy = replace(full, initial=floating)
     rows.append(Variant(f"{WHOLE}-less-free-space", "anchors in free space are kept", hazy, frozenset([FREE_SPACE])))
     for row in rows:

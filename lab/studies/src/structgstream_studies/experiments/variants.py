@@ -156,7 +156,7 @@ def variants(full: StreamConfig) -> dict[str, Variant]:
             frozenset({"initial.losses.offset_distance"}),
         )
     )
-    dark = replace(full.online.light, enabled=False)
-    still = replace(full.online, iterations=0, dynamic=frozenset(), patching=replace(patch, spawn="off"), light=dark)
+    dark = replace(full.online.exposure, enabled=False)
+    still = replace(full.online, iterations=0, dynamic=frozenset(), patching=replace(patch, spawn="off"), exposure=dark)
     online("held", "frame 0 held", still, "iterations", "dynamic", "patching.spawn")
     return {variant.key: variant for variant in rows}
