@@ -244,6 +244,15 @@ def write_transforms(folder: Path, cameras: Sequence[Truth], *, pattern: str = "
     return folder / "transforms.json"
 
 
+def write_projections(folder: Path, cameras: Sequence[Truth]) -> Path:
+    """As PMVS has them: K [R | t] alone, up to scale, so without lens and size."""
+    for camera in cameras:
+        matrix = -3.0 * camera.K @ np.column_stack([camera.R, camera.T])
+        rows = "\n".join(" ".join(map(repr, row)) for row in matrix.tolist())
+        (folder / f"{camera.name}.txt").write_text(f"CONTOUR\n{rows}\n")
+    return folder / f"{cameras[0].name}.txt"
+
+
 WRITERS: dict[str, Callable[[Path, Sequence[Truth]], Path]] = {
     "anipose": write_anipose,
     "easymocap": write_easymocap,
@@ -256,3 +265,5 @@ WRITERS: dict[str, Callable[[Path, Sequence[Truth]], Path]] = {
     "openpose": write_openpose,
     "transforms": write_transforms,
 }
+OF_PINHOLES = {"projections": write_projections}
+"""Of tools that know no lens."""

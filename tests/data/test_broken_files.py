@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrations import WRITERS, truths
+from calibrations import OF_PINHOLES, WRITERS, truths
 from captures import (
     HEIGHT,
     WIDTH,
@@ -96,9 +96,9 @@ def check_mutants(
     assert refused > count // 10 or not noticed  # what is cut is noticed
 
 
-@pytest.mark.parametrize("tool", WRITERS)
+@pytest.mark.parametrize("tool", WRITERS | OF_PINHOLES)
 def test_files_of_tools(tool: str, tmp_path: Path) -> None:
-    WRITERS[tool](tmp_path, truths())
+    (WRITERS | OF_PINHOLES)[tool](tmp_path, truths())
     names = {"kalibr": ("cam0", "cam1", "cam2"), "cmu_panoptic": ("00_00", "00_01", "00_02")}
     sizes = dict.fromkeys(names.get(tool, ("cam00", "cam01", "cam02")), (WIDTH, HEIGHT))
 

@@ -12,9 +12,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calibrations import NAMES, WRITERS, Truth, opencv_matrix, truths, write_anipose, write_kalibr, write_opencv
+from calibrations import (
+    NAMES,
+    WRITERS,
+    Truth,
+    opencv_matrix,
+    truths,
+    write_anipose,
+    write_easymocap,
+    write_kalibr,
+    write_opencv,
+    write_projections,
+)
 from captures import HEIGHT, WIDTH, numbers, picture, small_rig, write_picture, write_text_model, write_videos
 from structgstream.data.found_calibrations import read_calibrated
+from structgstream.data.lenses import from_integer_centers
 from structgstream.data.open import open_capture
 from structgstream.errors import CalibrationError, CaptureError
 
@@ -88,6 +100,95 @@ def test_projects_given_whole(tmp_path: Path, videos: str, calibration: str) -> 
     if videos not in ("videos", "synchronized_videos"):
         with pytest.raises(CaptureError, match=r"videos in several folders .*Give the folder of one take"):
             open_capture(tmp_path)
+
+
+def projection(camera: Truth) -> np.ndarray:
+    return 2.5 * camera.K @ np.column_stack([camera.R, camera.T])
+
+
+def write_idr(folder: Path) -> None:
+    matrices = (np.vstack([projection(camera), [0, 0, 0, 1]]) for camera in PINHOLES)
+    worlds = {f"world_mat_{number}": matrix for number, matrix in enumerate(matrices)}
+    np.savez(folder / "cameras_sphere.npz", allow_pickle=False, scale_mat_0=np.eye(4), **worlds)
+
+
+def write_storage(folder: Path) -> None:
+    for camera in PINHOLES:
+        matrix = opencv_matrix("proj_matrix", projection(camera))
+        (folder / f"{camera.name}.yml").write_text(f"%YAML:1.0\n---\n{matrix}")
+
+
+PINHOLES = truths(dist=(0, 0, 0, 0, 0))
+
+
+@pytest.mark.parametrize("write", [lambda folder: write_projections(folder, PINHOLES), write_idr, write_storage])
+def test_projection_matrices_alone(tmp_path: Path, write: Callable[[Path], None]) -> None:
+    """Of any scale, also negative: they are K [R | t]."""
+    write(tmp_path)
+    write_videos(tmp_path, NAMES, frames=2)
+    check_opens(tmp_path)
+    for truth, camera in zip(PINHOLES, open_capture(tmp_path).rig.cameras.values(), strict=True):
+        np.testing.assert_allclose(camera.viewmat[:3], np.column_stack([truth.R, truth.T]), atol=1e-9)
+        np.testing.assert_allclose(camera.K, from_integer_centers(truth.K), atol=1e-9)
+
+
+def test_matrices_of_opencv_as_lists_in_json(tmp_path: Path) -> None:
+    write_videos(tmp_path, NAMES, frames=2)
+    content = {
+        camera.name: {
+            "cameraMatrix": camera.K.tolist(), "distCoeffs": [[0, 0, 0, 0, 0]], "imageSize": [WIDTH, HEIGHT],
+            "rvec": camera.rvec.tolist(), "tvec": [[number] for number in camera.T.tolist()],
+        }
+        for camera in PINHOLES
+    }  # fmt: skip
+    (tmp_path / "calibration.json").write_text(json.dumps(content))
+    check_opens(tmp_path)
+
+
+def test_thumbnails_among_the_pictures_are_refused(tmp_path: Path) -> None:
+    pictures(tmp_path, "images/CAM/frame_FRAME.png")
+    model(tmp_path / "sparse/0")
+    write_picture(tmp_path / "images/cam01/thumb_000000.png", picture(1, 0)[::2, ::2])
+    with pytest.raises(CaptureError, match=r"camera 'cam01' in .* are of several sizes, frame_000000.png of .*thumb_0"):
+        open_capture(tmp_path)
+
+
+@pytest.mark.parametrize("beside", ["depth", "mask"])
+def test_one_picture_a_camera_beside_maps_of_the_same_names(tmp_path: Path, beside: str) -> None:
+    for camera, name in enumerate(NAMES):
+        write_picture(tmp_path / "image" / f"{name}.png", picture(camera, 0))
+        write_picture(tmp_path / beside / f"{name}.png", picture(7, 7))
+    model(tmp_path / "sparse/0")
+    check_opens(tmp_path, frames=1)
+
+
+def test_poses_without_intrinsics_are_no_projection_matrices(tmp_path: Path) -> None:
+    for camera in PINHOLES:
+        np.savetxt(tmp_path / f"{camera.name}.txt", np.column_stack([camera.R, camera.T]))
+    with pytest.raises(
+        CalibrationError, match=r"Camera 'cam00' .*\(a pose without intrinsics, in place of a projection"
+    ):
+        read_calibrated(tmp_path)
+
+
+@pytest.mark.parametrize("place", ["optimized/cameras", "meta/calib"])
+def test_a_calibration_two_folders_below(tmp_path: Path, place: str) -> None:
+    """As EasyVolcap has it."""
+    write_videos(tmp_path / "videos", NAMES, frames=2)
+    (tmp_path / place).mkdir(parents=True)
+    write_easymocap(tmp_path / place, PINHOLES)
+    check_opens(tmp_path)
+
+
+def test_pieces_of_videos(tmp_path: Path) -> None:
+    calibrated(tmp_path)
+    for name in NAMES:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "chunk-stream0-00001.m4s").write_bytes(b"styp")
+    with pytest.raises(
+        CaptureError, match=r"cam00.chunk-stream0-00001.m4s is a piece of a video: join the pieces of each"
+    ):
+        open_capture(tmp_path)
 
 
 def test_a_folder_per_camera_with_its_own_file(tmp_path: Path) -> None:
@@ -191,7 +292,7 @@ def test_the_largest_model_is_taken(tmp_path: Path, caplog: pytest.LogCaptureFix
     model(tmp_path / "sparse/1")
     write_text_model(tmp_path / "sparse/0", RIG, [("cam00.png", "cam00"), ("cam01.png", "cam01")])
     check_opens(tmp_path)
-    assert "several models: 1 of 3 pictures is taken, 0 of 2 left out" in caplog.text
+    assert "several models: number 1 of 3 pictures is taken, number 0 of 2 left out" in caplog.text
     caplog.clear()
 
 

@@ -87,7 +87,7 @@ def test_nan_names_the_camera(tmp_path: Path) -> None:
 def test_a_singular_pose_names_the_camera(tmp_path: Path) -> None:
     write_shared_intrinsics(tmp_path)
     edit(tmp_path, lambda content: content["cams"].__setitem__(1, [[0.0] * 4] * 4))
-    with pytest.raises(CalibrationError, match=r"'cam01' of .*cameras\.json has a pose"):
+    with pytest.raises(CalibrationError, match=r"'cam01' of .*cameras\.json cannot be read .*expected a pose"):
         open_json_videos(tmp_path)
 
 

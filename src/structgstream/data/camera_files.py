@@ -25,15 +25,15 @@ from structgstream.errors import CaptureError
 log = logging.getLogger(__name__)
 
 REDUCED = ("images_2", "images_4", "images_8")
-ROOTS = ("frames", "images", "videos", "hdvideos", "hdimgs", "synchronized_videos", "", *REDUCED)
+ROOTS = ("frames", "images", "image", "videos", "hdvideos", "hdimgs", "synchronized_videos", "", *REDUCED)
 """In the order in which they are looked through, in lower case; hdVideos and hdImgs are the CMU Panoptic toolbox's, the
 synchronized ones FreeMoCap's."""
-NO_TAKES = ("masks", "board", "recordings", "calibration", "annotated_videos", "work", REPORT)
+NO_TAKES = ("masks", "mask", "board", "recordings", "calibration", "annotated_videos", "work", REPORT)
 NO_CAMERAS = (*ROOTS, *NO_TAKES)
 """Folders that are no camera's and no frame's: of ``masks.py``, of the check, and of the tools that calibrate."""
 UNREAD = frozenset({
-    ".3fr", ".arw", ".bag", ".braw", ".cr2", ".cr3", ".dng", ".exr", ".gif", ".hdr", ".insv", ".jxl", ".mcap", ".nef",
-    ".orf", ".r3d", ".raf", ".raw", ".rw2", ".svo", ".svo2", ".tga",
+    ".3fr", ".arw", ".bag", ".braw", ".cr2", ".cr3", ".dng", ".exr", ".gif", ".hdr", ".insv", ".jxl", ".m4s", ".mcap",
+    ".nef", ".orf", ".r3d", ".raf", ".raw", ".rw2", ".svo", ".svo2", ".tga",
 })  # fmt: skip
 """What cameras write that is not read here."""
 INSIDE = ("images", "data", "DCIM")
@@ -113,9 +113,15 @@ def other_roots(where: Path, *, pictures: bool = False) -> Iterator[Path]:
 
 def unread_files(where: Path) -> str:
     """What cameras wrote in ``where``, or up to three folders below, that is not read here, for messages."""
-    files = (file for depth in range(4) for file in where.glob("*/" * depth + "*") if file.suffix.lower() in UNREAD)
+    inside = (sorted(where.glob("*/" * depth + "*")) for depth in range(4))
+    files = (file for level in inside for file in level if file.suffix.lower() in UNREAD)
     if (file := next(files, None)) is None:
         return ""
+    if file.suffix.lower() == ".m4s":
+        return (
+            f"; {file.relative_to(where)} is a piece of a video: join the pieces of each camera, after that with the "
+            "header (init.mp4), to one .mp4"
+        )
     return (
         f"; {file.relative_to(where)} is of a kind that is not read: convert pictures to PNG or JPEG, videos to H.264 "
         "or HEVC in mp4, keeping the time of each frame"

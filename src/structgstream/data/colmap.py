@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.calibration_files.reading import readable
 from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential
 from structgstream.data.posed import Calibration, PosedCamera, intrinsics
-from structgstream.data.text_files import BROKEN, Unreadable, number, pixels, read_text, reason, whole
+from structgstream.data.text_files import Unreadable, number, pixels, read_text, whole
 from structgstream.data.timeline import natural
 from structgstream.errors import CalibrationError
 
@@ -79,8 +80,8 @@ def warn_of_other_models(folder: Path) -> None:
     if folder.parent.name == "sparse" and others:
         rest = ", ".join(f"{other.name} of {_registered(other)}" for other in sorted(others))
         log.warning(
-            "%s holds several models: %s of %d pictures is taken, %s left out; merge them (colmap model_merger) if "
-            "cameras lack",
+            "%s holds several models: number %s of %d pictures is taken, number %s left out; merge them (colmap "
+            "model_merger) if cameras lack",
             folder.parent, folder.name, _registered(folder), rest,
         )  # fmt: skip
 
@@ -93,7 +94,7 @@ def read_model(folder: Path) -> Calibration:
     """
     warn_of_other_models(folder)
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
-    try:
+    with readable(f"The COLMAP model in {folder}", "cameras, images and points3D as COLMAP writes them"):
         if binary:
             cameras = _binary_cameras(folder / "cameras.bin")
             images = _binary_images(folder / "images.bin", cameras)
@@ -101,12 +102,6 @@ def read_model(folder: Path) -> Calibration:
             cameras = _text_cameras(folder / "cameras.txt")
             images = _text_images(folder / "images.txt", cameras)
         points = _points(folder)
-    except CalibrationError:
-        raise
-    except BROKEN as error:
-        raise CalibrationError(
-            f"The COLMAP model in {folder} cannot be read ({reason(error)}); export it again."
-        ) from None
     ordered = tuple(sorted(images, key=lambda image: image.name))
     return Calibration(folder, ordered, points if len(points) else None, turned_by_exif=False)
 

@@ -20,6 +20,7 @@ from structgstream.data.calibration_files import (
     kalibr,
     multical,
     opencv_cameras,
+    projections,
     qualisys,
     transforms,
     zju_mocap,
@@ -57,7 +58,7 @@ OF_OPENCV = (anipose, easymocap, multical, opencv_cameras)
 """Tools that read pictures with OpenCV, which turns them as their EXIF orientation says."""
 CONVERTERS = tuple(
     Converter(tool.find, tool.read, True if tool in OF_OPENCV else None)
-    for tool in (anipose, easymocap, multical, kalibr, cmu_panoptic, qualisys, zju_mocap, opencv_cameras)
+    for tool in (anipose, easymocap, multical, kalibr, cmu_panoptic, qualisys, zju_mocap, projections, opencv_cameras)
 )
 
 
@@ -116,10 +117,18 @@ def has_calibration(folder: Path) -> bool:
 def calibration_below(path: Path) -> Path | None:
     """The one folder in ``path`` that holds the calibration of what was filmed elsewhere in ``path``; None for none.
 
+    It may lie one deeper, as EasyVolcap's ``optimized/cameras``.
+
     Raises:
         CalibrationError: there are several.
     """
-    found = [folder for folder in inner_folders(path) if has_calibration(folder) and not _is_capture(folder)]
+    inner = inner_folders(path)
+    found = [folder for folder in inner if has_calibration(folder) and not _is_capture(folder)]
+    if not found and any(videos_in(root) or pictures_in(root) for root in roots_of(path)):
+        deeper = (
+            own for folder in inner if not (videos_in(folder) or pictures_in(folder)) for own in folders_of(folder)
+        )
+        found = [folder for folder in deeper if has_calibration(folder) and not _is_capture(folder)]
     frames = pictures_in(path)
     if found and all(folder.name in frames for folder in found):
         return found[0]  # of the first frame, as 3DGStream has it

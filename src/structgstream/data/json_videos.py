@@ -17,13 +17,13 @@ import numpy as np
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_names
-from structgstream.data.calibration_files.reading import positive
+from structgstream.data.calibration_files.reading import positive, readable
 from structgstream.data.camera_files import roots_of, videos_in
-from structgstream.data.text_files import BROKEN, mapping, pixels, read_json, reason, whole
+from structgstream.data.text_files import mapping, pixels, read_json, whole
 from structgstream.data.timeline import natural
 from structgstream.data.video import VideoSource, synchronised
 from structgstream.data.video_index import scan_videos
-from structgstream.errors import CalibrationError, CaptureError
+from structgstream.errors import CaptureError
 
 FILE = "cameras.json"
 
@@ -57,18 +57,12 @@ def read_cameras(file: Path) -> tuple[CameraRig, float | None, int]:
     """The rig of a ``cameras.json``, its frames a second (None where it does not say) and the number of frames.
 
     Raises:
-        CaptureError: the file cannot be read.
-        CalibrationError: broken numbers.
+        CalibrationError: the file cannot be read, or has broken numbers.
     """
-    try:
+    with readable(file, "width, height and cameras with K and viewmat, or w, h, fl_x, fl_y, cx, cy and cams"):
         content = mapping(read_json(file))
         rig = _own_rig(content, file) if "cameras" in content else _shared_intrinsics_rig(content, file)
         return rig, positive(content, "fps") if "fps" in content else None, whole(content.get("frames", 1))
-    except BROKEN as error:
-        raise CaptureError(
-            f"{file} cannot be read ({reason(error)}); expected width, height and cameras "
-            "with K and viewmat, or w, h, fl_x, fl_y, cx, cy and cams."
-        ) from None
 
 
 def _own_rig(content: dict[str, Any], file: Path) -> CameraRig:
@@ -87,11 +81,7 @@ def _shared_intrinsics_rig(content: dict[str, Any], file: Path) -> CameraRig:
     cameras: dict[str, Camera] = {}
     for number, pose in enumerate(content["cams"]):
         name = f"cam{number:02d}"
-        try:
+        with readable(f"Camera {name!r} of {file}", "a pose of 4x4 numbers that can be inverted"):
             viewmat = np.linalg.inv(np.array(pose, dtype=np.float64).reshape(4, 4))
-        except BROKEN:
-            raise CalibrationError(
-                f"Camera {name!r} of {file} has a pose that cannot be inverted; expected 4x4 numbers."
-            ) from None
         cameras[name] = calibrated_camera(name, viewmat=viewmat, K=K, width=width, height=height, where=file)
     return calibrated_rig(cameras, ("cam00",), where=file)

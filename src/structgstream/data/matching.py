@@ -8,14 +8,13 @@ pixel's centre at (0.5, 0.5).
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
-from structgstream.errors import MissingExtraError
+from structgstream.data.images import opencv
 
 Pair = tuple[str, str]
 """Names of two cameras."""
@@ -44,7 +43,7 @@ def sift_features(
     Raises:
         MissingExtraError: cv2 is not installed.
     """
-    cv2 = load_cv2()
+    cv2 = opencv()
     # Without the precise upscale every keypoint would be off by a quarter of a pixel.
     sift = cv2.SIFT.create(
         nfeatures=count,
@@ -61,19 +60,6 @@ def sift_features(
     pixels = np.array([keypoint.pt for keypoint in keypoints], np.float64) + 0.5
     rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9), dtype=np.float32)
     return Features(pixels, rooted)
-
-
-def load_cv2() -> ModuleType:
-    """OpenCV, which only capturing needs.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
-    try:
-        import cv2
-    except ImportError:
-        raise MissingExtraError("cv2", "capture") from None
-    return cv2
 
 
 def project(camera: Camera, points: Floats) -> tuple[Floats, Floats]:

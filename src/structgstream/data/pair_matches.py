@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera, enlargement
 from structgstream.data.arrays import Floats
 from structgstream.data.descriptor_matches import mutual_matches
+from structgstream.data.images import opencv
 from structgstream.data.matching import (
     Features,
     Pair,
     angles,
     epipolar_errors,
     fundamental_matrix,
-    load_cv2,
     neighbor_views,
     rays,
     sift_features,
@@ -115,7 +115,7 @@ class PairMatcher:
         rows, columns = mutual_matches(first.descriptors, second.descriptors, ratio=config.ratio).T
         if len(rows) < config.min_inliers:
             return empty
-        cv2 = load_cv2()
+        cv2 = opencv()
         pixels1, pixels2 = first.pixels[rows], second.pixels[columns]
         height, width = np.maximum(*(self._images[name].shape[:2] for name in pair))
         most = config.inlier_pixels * enlargement(width, height)

@@ -12,8 +12,9 @@ import numpy as np
 
 from structgstream.cameras import Camera
 from structgstream.data.calibration import calibrated_camera, calibrated_rig
+from structgstream.data.calibration_files.reading import readable
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, common_pictures
-from structgstream.data.text_files import BROKEN, NamedFiles, mapping, path_parts, pixels, read_json, reason
+from structgstream.data.text_files import NamedFiles, mapping, path_parts, pixels, read_json
 from structgstream.data.timeline import natural
 from structgstream.errors import CalibrationError, CaptureError
 
@@ -54,7 +55,7 @@ def open_panoptic(path: Path) -> ImageSource:
 
 def _read_meta(meta: Path) -> tuple[dict[str, Camera], dict[str, dict[str, Path]]]:
     """Cameras of one file, and those pictures of each that exist, by the name of the instant."""
-    try:
+    with readable(meta, "w, h, k, w2c, fn and cam_id, the last four as lists over frames and cameras"):
         content = mapping(read_json(meta))
         width, height = pixels((content["w"], content["h"]))
         pictures = NamedFiles(meta.parent / "ims", PICTURE_SUFFIXES)
@@ -63,11 +64,6 @@ def _read_meta(meta: Path) -> tuple[dict[str, Camera], dict[str, dict[str, Path]
             for frame in zip(content["cam_id"], content["k"], content["w2c"], content["fn"], strict=True)
             for name, K, viewmat, file in zip(*frame, strict=True)
         ]
-    except BROKEN as error:
-        raise CaptureError(
-            f"{meta} cannot be read as PanopticSports metadata ({reason(error)}); "
-            "expected the keys w, h, k, w2c, fn and cam_id, the last four as lists over frames and cameras."
-        ) from None
     first: dict[str, tuple[Any, Any]] = {}
     files: dict[str, dict[str, Path]] = {name: {} for name, *_ in rows}
     for name, K, viewmat, picture, file in rows:

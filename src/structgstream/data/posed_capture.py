@@ -29,7 +29,7 @@ from structgstream.data.exif import read_exif
 from structgstream.data.folder_files import by_stem, files_of
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, common_pictures
 from structgstream.data.lenses import LensCamera
-from structgstream.data.picture_size import picture_size
+from structgstream.data.picture_size import check_one_series, picture_size
 from structgstream.data.posed import Calibration, PosedCamera
 from structgstream.data.rectilinear import rectilinear
 from structgstream.data.source import FrameSource
@@ -77,18 +77,20 @@ def open_posed(
         filmed = of_pictures(path, files, _poses(calibration, files), root=root, calibration=calibration, fps=fps)
         return undistort(*filmed, target=target)
 
+    known = [root for root in roots_of(path) if root == path or root.name.lower() in ("images", "image", *REDUCED)]
+    stills = [(root, found) for root in known if (found := by_stem(files_of(root, PICTURE_SUFFIXES)))]
     for root in chain(filmed_roots(path), other_roots(path)):
         if videos := videos_in(root):
             partial = not complete or calibration.unposed
             videos = _posed(videos, calibration, root) if partial else videos
             return undistort(*of_videos(path, videos, root=root, calibration=calibration), target=target)
         if folders := pictures_in(root):
-            return pictured(root, _layout(folders, calibration), partial=bool(calibration.unposed))
-    for root in roots_of(path):
-        known = root == path or root.name.lower() in ("images", *REDUCED)
-        if known and (stills := by_stem(files_of(root, PICTURE_SUFFIXES))):
-            # Structure from motion often leaves out some photos.
-            return pictured(root, {name: {"0": file} for name, file in stills.items()}, partial=True)
+            files = _layout(folders, calibration)
+            if root != path or not stills or _poses(calibration, files):  # else depth maps, say, beside images/CAMERA
+                return pictured(root, files, partial=bool(calibration.unposed))
+    if stills:
+        # Structure from motion often leaves out some photos.
+        return pictured(stills[0][0], {name: {"0": file} for name, file in stills[0][1].items()}, partial=True)
     for root in other_roots(path, pictures=True):
         return pictured(root, _layout(pictures_in(root), calibration), partial=bool(calibration.unposed))
     raise NoFrames(
@@ -131,7 +133,12 @@ def _posed(files: Mapping[str, Of], calibration: Calibration, root: Path) -> Map
 def of_videos(
     path: Path, videos: Mapping[str, Path], *, root: Path, calibration: Calibration
 ) -> tuple[VideoSource, Mapping[str, LensCamera]]:
-    """The videos as they are, and their cameras with lenses."""
+    """The videos as they are, and their cameras with lenses.
+
+    Raises:
+        CaptureError: a video cannot be read.
+        CalibrationError: ``videos`` are of other cameras, or have other proportions.
+    """
     poses = _poses(calibration, videos)
     _check(poses, videos, calibration=calibration, root=root)
     tracks = scan_videos({name: videos[name] for name in sorted(poses, key=natural)})
@@ -158,6 +165,8 @@ def of_pictures(
     _check(poses, files, calibration=calibration, root=root)
     held_out = set(calibration.held_out)
     names = sorted(poses, key=natural)
+    for name in names:
+        check_one_series(name, files[name].values())
     common = common_pictures(
         {name: files[name] for name in names}, where=path, training=[name for name in names if name not in held_out]
     )
@@ -214,7 +223,7 @@ def _layout(folders: Pictures, calibration: Calibration) -> Pictures:
     """Folders per camera or per frame: whichever gives every camera one pose, and the more cameras."""
     per_frame: dict[str, dict[str, Path]] = {}
     for folder, pictures in folders.items():
-        for stem, file in pictures.items():
+        for stem, file in pictures.items() if re.search(r"\d", folder) else ():  # frames have numbers
             per_frame.setdefault(stem, {})[folder] = file
     found: list[tuple[int, Pictures]] = []
     reasons: list[CalibrationError] = []

@@ -24,7 +24,7 @@ from structgstream.data.images import PICTURE_SUFFIXES, ImageSource
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
 from structgstream.data.picture_size import picture_size
 from structgstream.data.source import FrameSource
-from structgstream.data.text_files import BROKEN, Unreadable, mapping, number, pixels, read_json, reason
+from structgstream.data.text_files import Unreadable, mapping, number, pixels, read_json
 from structgstream.data.timeline import Clock, common_slots, natural, picture_slots
 from structgstream.data.undistortion import UndistortedSource
 from structgstream.data.video import synchronised
@@ -254,7 +254,7 @@ def _camera_entry(camera: PreparedCamera) -> dict[str, Any]:
 
 
 def _read_camera(name: str, entry: dict[str, Any], file: Path) -> PreparedCamera:
-    try:
+    with readable(f"Camera {name!r} of {file}", EXPECTED):
         width, height = pixels(entry["size"])
         filmed = calibrated_camera(name, viewmat=entry["viewmat"], K=entry["K"], width=width, height=height, where=file)
         parameters = {key: number(value) for key, value in entry["lens"].items() if key != "model"}
@@ -268,9 +268,3 @@ def _read_camera(name: str, entry: dict[str, Any], file: Path) -> PreparedCamera
             raise CalibrationError(f"The pinhole of camera {name!r} of {file}: {error}") from None
         clock = Clock(number(entry["clock"]["offset_seconds"]), positive(entry["clock"], "rate"))
         return PreparedCamera(str(entry["files"]), LensCamera(filmed, lens), pinhole, clock)
-    except CalibrationError:
-        raise
-    except BROKEN as error:
-        raise CalibrationError(
-            f"Camera {name!r} of {file} cannot be read ({reason(error)}); expected {EXPECTED}."
-        ) from None

@@ -159,7 +159,8 @@ def _scan(path: Path) -> VideoTrack:
         whole = sum(not packet.is_corrupt for packet in packets)
         count = len(packets)
         if packets and container.format.name == "avi" and packets[-1].dts is not None:
-            count = packets[-1].dts + 1  # an empty packet stands for a frame that the recorder dropped
+            # An empty packet stands for a frame that the recorder dropped, also after the last one.
+            count = packets[-1].dts + max(packets[-1].duration or 1, 1)
         if not whole or count < stream.frames or (packets[-1].is_corrupt and not packets[-1].is_keyframe):
             raise CaptureError(
                 f"The video {path} is truncated: its index announces {stream.frames or 'some'} frames, "

@@ -4,13 +4,14 @@
 from contextlib import AbstractContextManager
 from fractions import Fraction
 from pathlib import Path
-from types import ModuleType, TracebackType
+from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.errors import MissingExtraError, StorageError
+from structgstream.data.video_index import load_av
+from structgstream.errors import StorageError
 from structgstream.whole_files import give_name, partial_path
 
 BT709, LIMITED_RANGE, FULL_RANGE = 1, 1, 2  # values of ISO/IEC 23091-2 and of libavutil
@@ -34,7 +35,7 @@ class VideoWriter(AbstractContextManager["VideoWriter"]):
     """
 
     def __init__(self, path: Path, *, fps: float, crf: int = 18) -> None:
-        av = _av()
+        av = load_av()
         self.path = path
         self._part = partial_path(path)
         self._fps = Fraction(fps).limit_denominator(1001)
@@ -103,7 +104,7 @@ def bt709_frame(picture: NDArray[np.uint8], *, pixels: str = "yuv420p") -> Any:
     Raises:
         MissingExtraError: PyAV is not installed.
     """
-    frame = _av().VideoFrame.from_ndarray(picture, format="rgb24")
+    frame = load_av().VideoFrame.from_ndarray(picture, format="rgb24")
     frame = frame.reformat(
         format=pixels,
         src_colorspace=BT709,
@@ -114,11 +115,3 @@ def bt709_frame(picture: NDArray[np.uint8], *, pixels: str = "yuv420p") -> Any:
     )
     frame.color_range, frame.colorspace = LIMITED_RANGE, BT709
     return frame
-
-
-def _av() -> ModuleType:
-    try:
-        import av
-    except ImportError:
-        raise MissingExtraError("av", "capture") from None
-    return av

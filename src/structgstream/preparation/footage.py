@@ -24,7 +24,7 @@ from structgstream.data.audio import read_audio
 from structgstream.data.camera_files import NO_CAMERAS, UNREAD, filmed_folder, other_roots
 from structgstream.data.folder_files import check_link, files_of, is_hidden, name_of
 from structgstream.data.images import PICTURE_SUFFIXES, read_picture, significant_bits
-from structgstream.data.picture_size import picture_size
+from structgstream.data.picture_size import check_one_series, picture_size
 from structgstream.data.posed_capture import filmed_roots
 from structgstream.data.prepared import pictures_of
 from structgstream.data.timeline import natural, picture_slots
@@ -227,6 +227,8 @@ def _footage(where: Path, files: Mapping[str, Path], picture_fps: float) -> Foot
     stills = {
         name: pictures_of(file) if file.is_dir() else (file,) for name, file in files.items() if name not in videos
     }
+    for name, own in stills.items():
+        check_one_series(name, own)
     if videos and stills:
         video, still = next(iter(videos)), next(iter(stills))
         raise CaptureError(

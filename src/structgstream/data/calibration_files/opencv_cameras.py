@@ -14,6 +14,7 @@ import numpy as np
 
 from structgstream.data.calibration_files.easymocap import EXTRINSICS, INTRINSICS
 from structgstream.data.calibration_files.opencv_storage import may_be_storage, read_storage
+from structgstream.data.calibration_files.projections import decomposed
 from structgstream.data.calibration_files.reading import LARGEST_BYTES, NoPose, calibration_of
 from structgstream.data.lenses import fisheye_lens, from_integer_centers, opencv_lens
 from structgstream.data.posed import Calibration, PosedCamera, rigid
@@ -31,6 +32,7 @@ SPELLINGS: Mapping[str, tuple[str, ...]] = {
     "translation": ("translation", "trans", "t"),
     "pose": ("extrinsic", "view", "rt", ""),
     "inverse pose": ("camerapose", "c2w", "2world", "toworld"),
+    "projection": ("projection", "proj", "p"),
     "width": ("imagewidth", "imgwidth", "framewidth", "width", "w"),
     "height": ("imageheight", "imgheight", "frameheight", "height", "h"),
     "size": ("imagesize", "imgsize", "size", "resolution"),
@@ -44,7 +46,10 @@ FILLING = re.compile(
 )
 SHAPES = {
     "K": {(3, 3): (3, 3), (9,): (3, 3)},
-    **{key: {(3, 4): (3, 4), (12,): (3, 4), (4, 4): (4, 4), (16,): (4, 4)} for key in ("pose", "inverse pose")},
+    **{
+        key: {(3, 4): (3, 4), (12,): (3, 4), (4, 4): (4, 4), (16,): (4, 4)}
+        for key in ("pose", "inverse pose", "projection")
+    },
 }
 """What a matrix may look like, as a list or as rows, and what it is then."""
 SUFFIXES = (".xml", ".yml", ".yaml", ".json")
@@ -72,7 +77,7 @@ def _files(folder: Path) -> tuple[Path, ...]:
         if file.name in (INTRINSICS, EXTRINSICS) or file.stat().st_size > LARGEST_BYTES or not may_be_storage(file):
             continue
         try:
-            if _tables(file):
+            if (tables := _tables(file)) and (file.suffix.lower() != ".json" or any(map(_own_pose, tables.values()))):
                 holding.append(file)
         except OSError:
             continue
@@ -105,7 +110,7 @@ def read(files: tuple[Path, ...]) -> Calibration:
 
 def _tables(file: Path) -> dict[str, dict[str, Any]]:
     """What a file holds of each camera by its name, which is empty for the one of the whole file."""
-    content = read_storage(file)
+    content = _with_intrinsics(read_storage(file))
     if _value(content, "K") is not None:
         return {"": content}
     named: list[tuple[Any, Any]] = list(content.items())
@@ -114,7 +119,17 @@ def _tables(file: Path) -> dict[str, dict[str, Any]]:
             named += group.items()
         elif isinstance(group, list):
             named += ((_value(one, "name"), one) for one in group if isinstance(one, dict))
-    return {str(key): one for key, one in named if isinstance(one, dict) and _value(one, "K") is not None}
+    split = ((str(key), _with_intrinsics(one)) for key, one in named if isinstance(one, dict))
+    return {key: one for key, one in split if _value(one, "K") is not None}
+
+
+def _with_intrinsics(content: dict[str, Any]) -> dict[str, Any]:
+    """The same with what a projection matrix holds, where it is all there is."""
+    projection = _value(content, "projection")
+    if projection is None or _value(content, "K") is not None:
+        return content
+    K, viewmat = decomposed(projection)
+    return {**content, "K": K, "R": viewmat[:3, :3], "T": viewmat[:3, 3]}
 
 
 def _camera(name: str, content: dict[str, Any]) -> PosedCamera:
@@ -135,6 +150,14 @@ def _camera(name: str, content: dict[str, Any]) -> PosedCamera:
         lens=(fisheye_lens if str(_value(content, "fisheye") or 0) not in ("0", "false") else opencv_lens)(
             [] if coefficients is None else np.ravel(coefficients).tolist()
         ),
+    )
+
+
+def _own_pose(content: dict[str, Any]) -> bool:
+    """Whether a camera's pose is beside its intrinsics, as other tools' JSON has it not, or in other units."""
+    return "distCoef" not in content and (
+        any(_value(content, key) is not None for key in ("pose", "inverse pose"))
+        or all(_value(content, key) is not None for key in ("rotation", "translation"))
     )
 
 

@@ -17,6 +17,8 @@ from structgstream.data.text_files import Unreadable, mapping, number, read_json
 from structgstream.errors import MissingExtraError
 
 MOST_ENTRIES = 1_000_000  # of a matrix
+PLAIN_JSON = re.compile(r'"(camera_?matrix|K|mtx|intrinsics?)"', re.IGNORECASE)
+"""What a program that writes OpenCV's matrices as lists calls the first of them."""
 
 
 def may_be_storage(file: Path) -> bool:
@@ -26,7 +28,7 @@ def may_be_storage(file: Path) -> bool:
     except (OSError, Unreadable):
         return False
     if file.suffix.lower() == ".json":
-        return '"opencv-matrix"' in text
+        return '"opencv-matrix"' in text or PLAIN_JSON.search(text) is not None
     return "<opencv_storage" in text[:400] or (file.suffix.lower() != ".xml" and len(text) > 0)
 
 

@@ -36,19 +36,24 @@ class NoPose(Unreadable):
 
 
 @contextmanager
-def readable(file: Path, expected: str) -> Iterator[None]:
-    """What the body raises for a broken file, as a sentence that says what the file should hold.
+def readable(what: Path | str, expected: str) -> Iterator[None]:
+    """What the body raises for a broken file, as a sentence that says what it should hold.
+
+    Args:
+        what: the file, or what of it is read, for the message.
+        expected: what it should hold.
 
     Raises:
-        CalibrationError: the file is broken.
+        CalibrationError: it is broken.
+        NoPose: the body raised it.
     """
     try:
         with np.errstate(all="ignore"):  # what overflows is not finite, which is refused
             yield
-    except CalibrationError:
+    except (CalibrationError, NoPose):
         raise
     except BROKEN as error:
-        raise CalibrationError(f"{file} cannot be read ({reason(error)}); expected {expected}.") from None
+        raise CalibrationError(f"{what} cannot be read ({reason(error)}); expected {expected}.") from None
 
 
 def calibration_of(
@@ -62,19 +67,13 @@ def calibration_of(
     cameras, unposed = [], []
     for name, entry in entries:
         try:
-            with np.errstate(all="ignore"):  # what overflows is not finite, which is refused
+            with readable(f"Camera {name!r} of {file}", expected):
                 camera = read(name, entry)
-            if not (np.isfinite(camera.viewmat).all() and np.isfinite(camera.K).all()):
-                raise Unreadable("a number that is not finite (NaN or infinity)")
+                if not (np.isfinite(camera.viewmat).all() and np.isfinite(camera.K).all()):
+                    raise Unreadable("a number that is not finite (NaN or infinity)")
             cameras.append(camera)
-        except CalibrationError:
-            raise
         except NoPose:
             unposed.append(name)
-        except BROKEN as error:
-            raise CalibrationError(
-                f"Camera {name!r} of {file} cannot be read ({reason(error)}); expected {expected}."
-            ) from None
     if not cameras:
         found = f"no pose of {listed(unposed)}" if unposed else "no cameras"
         raise CalibrationError(f"{file} holds {found}; expected {expected}.")

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
 from structgstream.data.descriptor_matches import mutual_matches
-from structgstream.data.matching import load_cv2, sift_features
+from structgstream.data.images import opencv
+from structgstream.data.matching import sift_features
 
 KEYPOINTS = 1200
 RATIO = 0.8
@@ -59,7 +60,7 @@ def picture_movement(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Moveme
     apart = np.linalg.norm(end - start, axis=1)
     if (apart < still).mean() > STILL_SHARE:
         return STAYED
-    homography, mask = load_cv2().findHomography(start, end, load_cv2().RANSAC, 2 * still)
+    homography, mask = opencv().findHomography(start, end, opencv().RANSAC, 2 * still)
     follows = np.zeros(len(rows), bool) if mask is None else mask.ravel().astype(bool)
     shift = float(np.median(apart[follows])) if follows.any() else 0.0
     if follows.mean() <= MOVED_SHARE or shift <= still:

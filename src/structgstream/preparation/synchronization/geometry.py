@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
 from structgstream.data.descriptor_matches import mutual_matches
+from structgstream.data.images import opencv
 from structgstream.data.lenses import LensCamera
-from structgstream.data.matching import Features, load_cv2, sift_features
+from structgstream.data.matching import Features, sift_features
 from structgstream.preparation.synchronization.epipolar import PairGeometry
 
 SAME_PLACE = 1e-6  # distance of cameras at one place, as a share of theirs to the origin
@@ -65,10 +66,10 @@ class StaticGeometry:
         matches = mutual_matches(one.descriptors, other.descriptors, ratio=RATIO)
         if len(matches) < LEAST_INLIERS:
             return None
-        F, inliers = load_cv2().findFundamentalMat(
+        F, inliers = opencv().findFundamentalMat(
             one.pixels[matches[:, 0]],
             other.pixels[matches[:, 1]],
-            load_cv2().USAC_MAGSAC,
+            opencv().USAC_MAGSAC,
             max(self.sizes[first] + self.sizes[second]) * INLIER_SHARE,
             0.999,
             5000,
@@ -80,7 +81,7 @@ class StaticGeometry:
 
 def static_features(pictures: list[NDArray[np.uint8]]) -> Features:
     """Features of the median of pictures ``[H, W, 3]`` of one camera, in pixels of these."""
-    cv2 = load_cv2()
+    cv2 = opencv()
     height, width = pictures[0].shape[:2]
     factor = min(LONGER_SIDE / max(width, height), 1.0)
     size = (max(round(width * factor), 1), max(round(height * factor), 1))
