@@ -12,7 +12,7 @@ import select
 import signal
 import subprocess
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -39,16 +39,58 @@ FLAGS = (
 )
 
 
-class Tab:
-    """One page, and what went wrong in it."""
+class Browser:
+    """A running browser; its messages go through two pipes."""
 
     def __init__(self, inlet: int, outlet: int) -> None:
         self._inlet, self._outlet, self._buffer, self._number = inlet, outlet, b"", 0
-        self._session: str | None = None
+
+    @contextmanager
+    def opened_tab(self) -> Iterator["Tab"]:
+        """An empty page with cookies, storage and a cache of its own."""
+        context = self.call("Target.createBrowserContext")["browserContextId"]
+        target = self.call("Target.createTarget", url="about:blank", browserContextId=context)["targetId"]
+        session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        yield Tab(self, session)
+        self.call("Target.disposeBrowserContext", browserContextId=context)
+
+    def call(
+        self,
+        method: str,
+        *,
+        session: str | None = None,
+        on_event: Callable[[str, Mapping[str, Any]], None] | None = None,
+        **parameters: object,
+    ) -> dict[str, Any]:
+        """The result of a method of the browser, or of the page of a session, whose events are told before it."""
+        self._number += 1
+        message: dict[str, object] = {"id": self._number, "method": method, "params": parameters}
+        if session is not None:
+            message["sessionId"] = session
+        os.write(self._inlet, json.dumps(message).encode() + b"\0")
+        while (answer := self._next()).get("id") != self._number:
+            if on_event is not None and answer.get("sessionId") == session:
+                on_event(answer.get("method", ""), answer.get("params", {}))
+        assert "error" not in answer, (method, answer["error"])
+        return answer["result"]
+
+    def _next(self) -> dict[str, Any]:
+        while b"\0" not in self._buffer:
+            assert select.select([self._outlet], [], [], PATIENCE_SECONDS)[0], "the browser does not answer"
+            piece = os.read(self._outlet, 1 << 20)
+            assert piece, "the browser is gone"
+            self._buffer += piece
+        message, _, self._buffer = self._buffer.partition(b"\0")
+        return json.loads(message)
+
+
+class Tab:
+    """One page, and what went wrong in it."""
+
+    def __init__(self, browser: Browser, session: str) -> None:
+        self._browser, self._session = browser, session
         self.complaints: list[str] = []
         self.requests: list[str] = []
-        target = self._call("Target.createTarget", url="about:blank")["targetId"]
-        self._session = self._call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self._call(f"{domain}.enable")
 
@@ -84,24 +126,7 @@ class Tab:
         return decoded_picture(base64.b64decode(self._call("Page.captureScreenshot", format="png")["data"]))
 
     def _call(self, method: str, **parameters: object) -> dict[str, Any]:
-        self._number += 1
-        message: dict[str, object] = {"id": self._number, "method": method, "params": parameters}
-        if self._session is not None:
-            message["sessionId"] = self._session
-        os.write(self._inlet, json.dumps(message).encode() + b"\0")
-        while (answer := self._next()).get("id") != self._number:
-            self._note(answer.get("method", ""), answer.get("params", {}))
-        assert "error" not in answer, (method, answer["error"])
-        return answer["result"]
-
-    def _next(self) -> dict[str, Any]:
-        while b"\0" not in self._buffer:
-            assert select.select([self._outlet], [], [], PATIENCE_SECONDS)[0], "the browser does not answer"
-            piece = os.read(self._outlet, 1 << 20)
-            assert piece, "the browser is gone"
-            self._buffer += piece
-        message, _, self._buffer = self._buffer.partition(b"\0")
-        return json.loads(message)
+        return self._browser.call(method, session=self._session, on_event=self._note, **parameters)
 
     def _note(self, event: str, values: Mapping[str, Any]) -> None:
         if event == "Network.requestWillBeSent":
@@ -114,7 +139,7 @@ class Tab:
             self.complaints.append(str(values["entry"]))
 
 
-def browser() -> str:
+def browser_program() -> str:
     """The browser's program; skips the test, or fails it when ``STRUCTGSTREAM_REQUIRE_BROWSER`` is set."""
     found = subprocess.run([ROOT / "scripts" / "find-browser"], capture_output=True, text=True, check=False)
     if found.returncode == 0:
@@ -124,9 +149,9 @@ def browser() -> str:
 
 
 @contextmanager
-def opened_browser(folder: Path) -> Iterator[Tab]:
-    """A browser with one empty page; ``folder`` holds its profile."""
-    program = browser()
+def opened_browser(folder: Path) -> Iterator[Browser]:
+    """A browser whose profile is in ``folder``."""
+    program = browser_program()
     theirs_in, inlet = map(_moved, os.pipe())
     outlet, theirs_out = map(_moved, os.pipe())
     with (folder / "chromium.log").open("wb") as log:
@@ -141,7 +166,7 @@ def opened_browser(folder: Path) -> Iterator[Tab]:
     os.close(theirs_in)
     os.close(theirs_out)
     try:
-        yield Tab(inlet, outlet)
+        yield Browser(inlet, outlet)
     finally:
         with suppress(ProcessLookupError):
             os.killpg(process, signal.SIGKILL)

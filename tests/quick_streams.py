@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from backends import QUICKEST
+from small_clip import small_clip_path
 from structgstream.cli import main
-from structgstream.data.clip import bundled_clip_path
 
-CLIP = str(bundled_clip_path())
+CLIP = str(small_clip_path())
 SMALL = ["--frames", "3", "--scale", "0.25"]
 QUICK = ["--preset", "tiny", "--device", QUICKEST, "--initial.iterations", "3", "--online.iterations", "2"]
 QUICK += ["--online.patching.iteration", "1"]

@@ -244,7 +244,8 @@ def watched(
         shown = None
         if page:
             (folder / "browser").mkdir()
-            shown = Page(stack.enter_context(chromium().opened_browser(folder / "browser")), address)
+            browser = stack.enter_context(chromium().opened_browser(folder / "browser"))
+            shown = Page(stack.enter_context(browser.opened_tab()), address)
         yield server, trainers, watching, shown
 
 

@@ -155,7 +155,8 @@ def measured(folder: Path, options: argparse.Namespace) -> dict[str, Any]:
         address, server = stack.enter_context(serving(folder / "streams", nice=options.server_nice))
         memory = [stack.enter_context(Watched(process)) for process in (trainer.pid, server)]
         (folder / "browser").mkdir()
-        page = Page(stack.enter_context(chromium().opened_browser(folder / "browser")), address)
+        browser = stack.enter_context(chromium().opened_browser(folder / "browser"))
+        page = Page(stack.enter_context(browser.opened_tab()), address)
         edges = Edges(manifest)
         _watch(edges, page, 60.0 * options.minutes)
         busy = {"trainer": processor_seconds(trainer.pid), "server": processor_seconds(server)}

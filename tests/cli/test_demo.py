@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from quick_streams import CLIP, QUICK, error_of
+from quick_streams import QUICK, error_of
 from structgstream.cli import main, render
 from structgstream.cli.progress import Lines
+from structgstream.data.clip import bundled_clip_path
 from structgstream.session import FrameReport
 
 pytestmark = pytest.mark.usefixtures("quick_presets")
@@ -29,7 +30,7 @@ def test_demo_leaves_everything_to_look_at(
     assert re.search(r"Held-out PSNR [\d.]+ dB \([\d.]+ after frame 0's colour fit\)", text)
     assert all(name.split("/")[-1] in text for name in made - {"clip.log.jsonl"})
     assert (out / "player.html").as_uri() in text
-    assert f"structgstream play {out / 'clip.sgs'} --capture {CLIP}" in text
+    assert f"structgstream play {out / 'clip.sgs'} --capture {bundled_clip_path()}" in text
     assert base64.b64encode((out / "clip.sgs").read_bytes()) in (out / "player.html").read_bytes()
 
 

@@ -89,20 +89,20 @@ def test_every_second_frame_is_resumed_and_scored_against_the_same_frames(
 ) -> None:
     path, whole = tmp_path / "half.sgs", tmp_path / "whole.sgs"
     base = ["reconstruct", CLIP, *QUARTER, "--start", "1", "--every", "2"]
-    assert main([*base, "-o", str(path), "--frames", "2"]) == 0
+    assert main([*base, "-o", str(path), "--frames", "1"]) == 0
     for other in (["--every", "3"], ["--every", "1"]):
-        error = error_of([*base, *other, "-o", str(path), "--frames", "3", "--resume"], capsys, status=1)
+        error = error_of([*base, *other, "-o", str(path), "--frames", "2", "--resume"], capsys, status=1)
         assert "every, fps differ" in error
-    assert main([*base, "-o", str(path), "--frames", "3", "--resume"]) == 0
-    assert main([*base, "-o", str(whole), "--frames", "3"]) == 0
+    assert main([*base, "-o", str(path), "--frames", "2", "--resume"]) == 0
+    assert main([*base, "-o", str(whole), "--frames", "2"]) == 0
     assert path.read_bytes() == whole.read_bytes()
     with open_stream(path) as reader:
         assert reader.header.fps == 15.0
-        assert [info.index for info in reader.packets] == [0, 1, 2]
-        assert [info.pts_seconds for info in reader.packets] == pytest.approx([0, 1 / 15, 2 / 15])
-        found = capture_of(reader.header, CLIP, frames=3)
+        assert [info.index for info in reader.packets] == [0, 1]
+        assert [info.pts_seconds for info in reader.packets] == pytest.approx([0, 1 / 15])
+        found = capture_of(reader.header, CLIP, frames=2)
     filmed = [frame.images["cam00"] for frame in open_capture(CLIP, scale=0.25).frames()]
-    for frame, number in zip(found.frames(), (1, 3, 5), strict=True):
+    for frame, number in zip(found.frames(), (1, 3), strict=True):
         assert (frame.images["cam00"] == filmed[number]).all()
     assert main(["evaluate", str(path), CLIP, "--metrics", "basic", "--device", QUICKEST]) == 0
 

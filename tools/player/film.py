@@ -62,7 +62,11 @@ def main() -> None:
     parser.add_argument("--quality", type=int, default=60)
     options = parser.parse_args()
     width, height = options.size
-    with tempfile.TemporaryDirectory() as folder, opened_browser(Path(folder)) as tab:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        opened_browser(Path(folder)) as browser,
+        browser.opened_tab() as tab,
+    ):
         tab.open(options.page.resolve().as_uri(), width=width, height=height)
         pictures = filmed(
             tab,
