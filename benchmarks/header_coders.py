@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The symbols of a stream's first init record coded by adaptive decisions: what viewer/packages/core/bench/header.mjs decodes.
+"""The symbols of a stream's first init record coded by adaptive decisions.
 
     python -m benchmarks.header_coders FILE OUT
 
-OUT begins with the length of a JSON text, u32, and that text: the bytes of each field, and each array's name, number of
-values and number of contexts. The contexts of each array follow, u8, then the bytes of each field. Contexts are those of
-the init record's frequency tables.
+`viewer/packages/core/bench/header.mjs` decodes OUT. It begins with the length of a JSON text, u32, and that text: the bytes of
+each field, and each array's name, number of values and number of contexts. The contexts of each array follow, u8, then
+the bytes of each field. Contexts are those of the init record's frequency tables.
 """
 
 import json
