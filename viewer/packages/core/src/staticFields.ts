@@ -62,7 +62,9 @@ export function decodedFields(
   const fields = new Map<FieldName, Tensor>();
   for (const [name, { shape, bins }] of found) {
     const step = steps.get(name)!;
-    fields.set(name, { shape, data: Float32Array.from(bins, (bin) => bin * step) });
+    const data = new Float32Array(bins.length);
+    for (let i = 0; i < bins.length; i++) data[i] = bins[i]! * step; // from() with a function takes ten times as long
+    fields.set(name, { shape, data });
   }
   return fields;
 }
@@ -157,7 +159,7 @@ function decodedRows(
   const rows = like.length;
   const columns = bounded(decoder.number(`${name}.columns`), most, `columns of ${name}`);
   budget.take(columns * rows);
-  const shifts = decoder.residuals(`${name}.shift`, Uint8Array.from(like), SHIFTS);
+  const shifts = decoder.residuals(`${name}.shift`, new Uint8Array(like), SHIFTS);
   for (const shift of shifts) {
     if (shift < 0 || shift >= SHIFTS) {
       throw new StreamError(`${WHERE} holds a shift of ${name} beyond ${SHIFTS - 1}; it is damaged.`);
@@ -176,7 +178,7 @@ function decodedRows(
     for (let row = 0, at = column; row < rows; row++, at += columns) {
       const shift = shifts[row]!;
       const shifted = (middle + ((1 << shift) >> 1)) >> shift;
-      bins[at] = checkedBin((values[row]! + shifted) * 2 ** shift);
+      bins[at] = checkedBin((values[row]! + shifted) * (1 << shift));
       before[row] = Math.abs(values[row]!);
     }
     [last, before] = [before, last];
@@ -186,9 +188,10 @@ function decodedRows(
 
 /** Signed numbers: those up to 6 as they are, 7 for all above, and what these have more than 7. */
 function decodedValues(decoder: Decoder, name: FieldName, contexts: Uint8Array): Float64Array {
-  const found = Float64Array.from(decoder.residuals(`${name}.value`, contexts, SHIFTS * SIZES));
+  const found = new Float64Array(decoder.residuals(`${name}.value`, contexts, SHIFTS * SIZES));
   let count = 0;
-  for (const value of found) {
+  for (let i = 0; i < found.length; i++) {
+    const value = found[i]!;
     if (Math.abs(value) > LARGEST_SYMBOL) {
       throw new StreamError(`${WHERE} holds ${name} beyond ${LARGEST_SYMBOL} where the rest follows; it is damaged.`);
     }
