@@ -12,7 +12,7 @@ T = TypeVar("T")
 class Lookahead(Generic[T]):
     """An iterator over ``items`` that prefetches one item.
 
-    With ``ahead=False`` nothing is prefetched: each item is computed when it is asked for, by who asks.
+    With ``ahead=False`` nothing is prefetched: each item is computed in the call that requests it.
 
     An exception raised by ``items`` surfaces from the ``next`` call that would have returned that item. Leaving the
     ``with`` block waits for the item being computed, and calls ``items.close`` if it exists.
@@ -57,7 +57,7 @@ class Lookahead(Generic[T]):
         return found[0]
 
     def _made(self) -> tuple[T] | None:
-        # A future cannot carry StopIteration.
+        # A future cannot raise StopIteration.
         for item in self._items:
             return (item,)
         return None
