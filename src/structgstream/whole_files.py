@@ -24,8 +24,8 @@ _WITHOUT_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EACCES, errno.EPERM, errno.E
 _ADVICE = {
     errno.ENOSPC: "; make room",
     errno.EDQUOT: "; make room",
-    errno.EACCES: "; mend permissions, or choose another place",
-    errno.EPERM: "; mend permissions, or choose another place",
+    errno.EACCES: "; correct its permissions, or choose another place",
+    errno.EPERM: "; correct its permissions, or choose another place",
     errno.EROFS: "; choose another place",
 }
 

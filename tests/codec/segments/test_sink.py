@@ -229,7 +229,7 @@ def test_an_existing_stream_stays_unless_it_may_be_replaced(tmp_path: Path) -> N
     store = folder(tmp_path / "out")
     written(store, SENT)
     (store.folder / "notes.txt").write_text("mine")
-    with pytest.raises(StorageError, match="contains a stream; continue it with --resume, replace it with --overwrite"):
+    with pytest.raises(StorageError, match="holds a stream; continue it with --resume, replace it with --overwrite"):
         SegmentsSink(store).open(header())
     assert archived(store) == as_file(SENT)
     sink = SegmentsSink(store, overwrite=True)
