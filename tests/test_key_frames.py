@@ -62,12 +62,12 @@ def test_frames_before_a_key_frame_are_near_it(apart: float, group: int) -> None
 def test_key_frames_are_foreseen(apart: float, group: int, since: int) -> None:
     keys = KeyFrames(30, 30.0)
     keys.begin(100, 7.0)
-    coming = keys.ahead(100 + since, 7.0 + since * apart, apart=apart)
+    coming = keys.ahead(100 + since, 7.0 + since * apart, spacing=apart)
     assert [*islice(coming, 3)] == [group - since, 2 * group - since, 3 * group - since]
 
 
 def test_a_group_that_has_lasted_too_long_ends_with_the_next_frame() -> None:
     keys = KeyFrames(30, 30.0)
     keys.begin(0, 0.0)
-    assert [*islice(keys.ahead(7, 60.0, apart=0.1), 2)] == [1, 11]
+    assert [*islice(keys.ahead(7, 60.0, spacing=0.1), 2)] == [1, 11]
     assert (keys.interval, keys.least, KeyFrames(3, 30.0).least) == (30, LEAST_FRAMES, 3)

@@ -139,7 +139,7 @@ def test_a_target_that_is_missed_again_is_said_again(caplog: pytest.LogCaptureFi
             for _ in range(30):
                 run.add(size)
     assert [record.getMessage().split(":")[0] for record in caplog.records] == ["Frame 34", "Frame 102"]
-    assert "more is saved from now on" in caplog.records[1].getMessage()
+    assert "bytes are saved from now on" in caplog.records[1].getMessage()
 
 
 def test_what_is_pressed() -> None:

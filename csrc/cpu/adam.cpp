@@ -41,7 +41,7 @@ void adam_step(
         static_cast<float>(1.0 / std::sqrt(1.0 - std::pow(beta2, static_cast<double>(steps)))),
         static_cast<float>(eps)};
     constexpr int64_t kSpan = 1 << 14;
-    constexpr int64_t kWorthThreads = 1 << 22;  // Waking a thread costs more than it saves below.
+    constexpr int64_t kWorthThreads = 1 << 22;  // Below this, waking a thread costs more than it saves.
     const int64_t chunks = (count + kSpan - 1) / kSpan;
 #pragma omp parallel for num_threads(threads) schedule(static) if (threads > 1 && count >= kWorthThreads)
     for (int64_t n = 0; n < chunks; ++n) {

@@ -2,9 +2,9 @@
 // Anchors to drawable Gaussians and back (paper, equations for mu' and Sigma'; Scaffold-GS's three heads).
 //
 // Lanes are anchors: a block of two vectors of anchors passes through the MLPs, whose weights are broadcast. A first
-// pass computes the opacities, which decide how many Gaussians there are; the second gives their attributes to anchors
-// that have one. The backward pass needs one bit for each hidden unit from the forward pass and recomputes the hidden
-// values of the heads that are trained. Weight gradients are sums over anchors: dot products of rows of a chunk, summed
+// pass computes the opacities, which determine the number of Gaussians; a second pass computes the attributes of anchors
+// with at least one Gaussian. The backward pass needs one bit per hidden unit from the forward pass and recomputes the
+// hidden values of the trained heads. Weight gradients are sums over anchors: dot products of rows of a chunk, summed
 // chunk by chunk within a fixed number of groups and then group by group, so the result does not depend on threads.
 
 #include "anchors.h"
@@ -44,7 +44,7 @@ struct Sizes {
 };
 
 // A weight matrix in the order in which `apply` reads it: tiles of kTile outputs, in a tile one input after another.
-// Memory is not a std::vector's: what the compiler does not inline of that would be shared between instruction sets.
+// A std::vector is not used: its functions that are not inlined would be shared between instruction sets.
 class Packed {
   public:
     template <typename Weight>
@@ -100,7 +100,7 @@ Packed second_layer_backwards(const sgs_head& head, const Sizes& s, int h) {
     return Packed(s.hidden, s.outputs[h], nullptr, [&](int o, int i) { return head.w2[i * s.hidden + o]; });
 }
 
-// hidden = max(hidden, 0); bits[word * kBlock + lane] tells which units were positive.
+// hidden = max(hidden, 0); bits[word * kBlock + lane] has a bit for each positive unit.
 void rectify(float* hidden, int count, int32_t* bits, int words) {
     for (int half = 0; half < kBlock; half += kLanes) {
         for (int word = 0; word < words; ++word) {
@@ -128,7 +128,7 @@ void mask(float* gradient, int count, const int32_t* bits) {
     }
 }
 
-// The anchors of a block. Lanes beyond `count` repeat the last anchor; nothing of theirs is written.
+// The anchors of a block. Lanes beyond `count` repeat the last anchor and are not written.
 struct Block {
     int count;
     int64_t anchors[kBlock];
@@ -151,7 +151,7 @@ void read_rows(const float* values, int width, const Block& block, float* rows) 
         for (int l = 0; l < kBlock; ++l) rows[column * kBlock + l] = values[block.anchors[l] * width + column];
 }
 
-// The way back, for `count` anchors.
+// The inverse, for `count` anchors.
 void write_rows(const float* rows, int width, const Block& block, float* values) {
     int column = 0;
     for (; column + kLanes <= width; column += kLanes) {
@@ -209,7 +209,7 @@ struct Inputs {
     }
 };
 
-// Three numbers of each anchor as rows, through the exponential.
+// The exponential of three numbers of each anchor, as rows.
 void read_exponentials(const float* values, const Block& block, float* rows) {
     read_rows(values, 3, block, rows);
     for (int i = 0; i < 3 * kBlock; i += kLanes) store(rows + i, exponential(load(rows + i)));
@@ -219,7 +219,7 @@ constexpr int kAcross = kLanes == 16 ? 4 : 2;
 constexpr int kDown = kLanes / kAcross;
 
 // out[i][j] += sum over the anchors of a chunk of a[i] * b[j], with `out` in tiles of kDown x kAcross (see `in_tiles`).
-// Blocks of a and of b are `stride` floats apart.
+// Consecutive blocks of a and of b have a distance of `stride` floats.
 [[gnu::noinline]] void add_products(
     const float* a, int rows, const float* b, int columns, size_t stride, int blocks, float* out) {
     for (int i = 0; i < rows; i += kDown) {
@@ -247,7 +247,7 @@ constexpr int kDown = kLanes / kAcross;
     }
 }
 
-// Where element (i, j) lies in the output of `add_products`.
+// Position of element (i, j) in the output of `add_products`.
 inline int in_tiles(int i, int j, int columns) {
     return ((i / kDown) * (columns / kAcross) + j / kAcross) * kLanes + (i % kDown) * kAcross + j % kAcross;
 }
@@ -326,7 +326,7 @@ void anchors_select(const sgs_anchors& a, sgs_selection& out, int threads) {
 
 namespace {
 
-// Where the attributes of a block lie while they are made.
+// Buffers of a block's attributes.
 struct AttributeRows {
     Rows rows;
     int inputs, hidden, color, covariance, norms, reach, base, bits;
@@ -336,7 +336,7 @@ struct AttributeRows {
           bits(rows.take(s.words)) {}
 };
 
-// Head outputs to attributes: sigmoid colours, scales times the base scale, unit quaternions.
+// From head outputs to attributes: sigmoid colours, scales times the base scale, unit quaternions.
 void activate(const AttributeRows& at, int k, float* memory) {
     float* color = row_of(memory, at.color);
     const float* base = row_of(memory, at.base);
@@ -423,13 +423,13 @@ void anchors_dress(const sgs_anchors& a, const sgs_selection& selection, const s
 
 namespace {
 
-// Where a block's rows of the backward pass lie. Those of all blocks of a chunk are kept: sums over the chunk follow.
+// Buffers of a block in the backward pass. Those of all blocks of a chunk are retained for the sums over the chunk.
 struct GradientRows {
     Rows rows;
     int inputs, outputs[kHeads], hidden_gradients[kHeads], hidden[kHeads];
     explicit GradientRows(const Sizes& s) : inputs(Inputs::take(rows, s)) {
         for (int h = 0; h < kHeads; ++h) outputs[h] = rows.take(s.outputs_padded[h]);
-        for (int& row : hidden_gradients) row = rows.take(s.hidden_padded);  // together: one product takes them all
+        for (int& row : hidden_gradients) row = rows.take(s.hidden_padded);  // contiguous, for a single product
         for (int& row : hidden) row = rows.take(s.hidden_padded);
     }
 };
@@ -442,8 +442,8 @@ struct ScratchRows {
         : input_gradient(rows.take(s.inputs_padded)), means(rows.take(3)), bits(rows.take(s.words)) {}
 };
 
-// Where the sums of the weights' gradients lie among a group's: of the heads that are trained, one after the other, w1 and
-// w2 in the tiles of `add_products`.
+// Positions of the weight gradients in a group's sums: the trained heads one after the other, w1 and w2 in the tiles of
+// `add_products`.
 struct SumPlaces {
     size_t w1[kHeads], b1[kHeads], w2[kHeads], b2[kHeads], size = 0;
     SumPlaces(const Sizes& s, const bool (&trained)[kHeads]) {
@@ -466,7 +466,7 @@ struct Backward {
     const sgs_anchor_gradients& to;
     Sizes s;
     bool trained[kHeads];
-    bool to_inputs;    // the MLPs' inputs carry a gradient
+    bool to_inputs;    // the MLPs' inputs need a gradient
     int input_first;   // its first row
     GradientRows at;
     ScratchRows scratch;
@@ -491,7 +491,7 @@ struct Backward {
     bool uses(int h) const { return trained[h] || to_inputs; }
 };
 
-// Gradients of a block's Gaussians to gradients of the heads' outputs (before their activations) and of the anchors.
+// From gradients of a block's Gaussians to gradients of the heads' outputs (before activation) and of the anchors.
 [[gnu::noinline]] void gather(
     const Backward& b, int begin, const Block& block, float* const (&outputs)[kHeads], float* to_means) {
     const int k = b.s.k;
@@ -550,7 +550,7 @@ struct Backward {
     if (b.to.log_base_scales != nullptr) write_rows(to_base, 3, block, b.to.log_base_scales);
 }
 
-// Gradients of the MLPs' inputs, and of the means, to features and positions.
+// From gradients of the MLPs' inputs and of the means to gradients of features and positions.
 [[gnu::noinline]] void give(
     const Backward& b, const Inputs& x, const float* inputs, const float* to_means, const Block& block) {
     const int d = b.s.d;
@@ -624,7 +624,7 @@ void add_weights(const Backward& b, const float* rows, int blocks, float* sums) 
     }
 }
 
-// Sums over all groups, without their tiles and padding.
+// Sums over all groups, without tiles and padding.
 void write_weights(const Backward& b, const float* sums) {
     const Sizes& s = b.s;
     for (int h = 0; h < kHeads; ++h) {

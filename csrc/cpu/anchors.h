@@ -12,7 +12,7 @@ struct sgs_head {
     const float* b2;
 };
 
-// Where the gradients of a head go; all null when it is not trained.
+// Output gradients of a head; all null if it is not trained.
 struct sgs_head_gradient {
     float* w1;
     float* b1;
@@ -36,7 +36,7 @@ struct sgs_anchors {
     int32_t distance_input;          // 0 or 1
 };
 
-// Results of the first pass. An anchor is active when one of its opacities is positive.
+// Results of the first pass. An anchor is active if one of its opacities is positive.
 struct sgs_selection {
     float* raw_opacities;    // [m, K]
     int32_t* relu_bits;      // [m, 3, ceil(hidden / 32)]: which hidden units are on
@@ -64,7 +64,7 @@ struct sgs_gaussian_gradients {
     const float* colors;
 };
 
-// Any pointer may be null: that gradient is not computed. Rows of anchors that are not active are left alone.
+// Any pointer may be null: that gradient is not computed. Rows of anchors that are not active are not written.
 struct sgs_anchor_gradients {
     float* positions;
     float* log_offset_scales;

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Depth order and tile lists. One radix sort by depth, then binning in that order: each tile's list is front to back
-// without a sort of its own.
+// Depth order and tile lists: one radix sort by depth, then binning in that order, so each tile's list is front to back
+// without a separate sort.
 
 #include <cstring>
 #include <limits>
@@ -26,7 +26,7 @@ Tiles tiles_of(const Splat& s) {
     return {tile(s.box[0]), tile(s.box[1]), tile(s.box[2] - 1), tile(s.box[3] - 1)};
 }
 
-// The drawn splats front to back. Positive floats order as their bits do; the index breaks ties, so the order is total.
+// The drawn splats front to back. Positive floats have the order of their bits; the index breaks ties.
 std::vector<uint64_t> by_depth(const std::vector<Splat>& splats) {
     constexpr int kDigit = 11, kBuckets = 1 << kDigit, kPasses = 3;
     std::vector<uint64_t> keys, other;
@@ -65,12 +65,12 @@ void bin(Raster& raster) {
                     const int tile = y * raster.tiles_x + x;
                     if (raster.draws(tile)) ++total, ++raster.starts[tile + 1];
                 }
-            if (total > std::numeric_limits<int32_t>::max()) throw std::bad_alloc();  // 80 GB of gradients, anyway
+            if (total > std::numeric_limits<int32_t>::max()) throw std::bad_alloc();  // gradients would need 80 GB
         }
         raster.slots[i + 1] = static_cast<int32_t>(total);
     }
     for (int t = 0; t < tiles; ++t) raster.starts[t + 1] += raster.starts[t];
-    // Once in order of depth, small entries instead of whole splats: what follows is bound by memory.
+    // Small entries in depth order instead of whole splats, because the following steps are bound by memory.
     const std::vector<uint64_t> keys = by_depth(raster.splats);
     std::vector<Entry> order(keys.size());
     for (size_t i = 0; i < keys.size(); ++i) {

@@ -5,8 +5,8 @@
 
 namespace structgstream {
 
-// Fills starts, pairs, slots and pair_slots from the splats. A pair's slot depends on its splat and tile alone, so
-// gradients are summed in one order whatever the threads do. Throws std::bad_alloc where they do not fit in memory.
+// Fills starts, pairs, slots and pair_slots from the splats. A pair's slot depends only on its splat and tile, so
+// gradients are summed in the same order for any number of threads. Throws std::bad_alloc if memory is not sufficient.
 void bin(Raster& raster);
 
 }  // namespace structgstream

@@ -12,7 +12,7 @@ namespace SGS_ISA {
 namespace {
 
 constexpr float kLog2E = 1.44269504f;
-constexpr int kVectors = 64;  // that are summed in single precision
+constexpr int kVectors = 64;  // number of vectors summed in single precision
 
 double sum_of(vf lanes) {
     double total = 0.0;
@@ -20,7 +20,7 @@ double sum_of(vf lanes) {
     return total;
 }
 
-// log2(1 + |values - before| / step); `gradient` by the values.
+// log2(1 + |values - before| / step); `gradient` with respect to the values.
 inline vf bits_of(vf values, vf before, float inverse_step, vf& gradient) {
     const vf difference = values - before;
     const vf ratio = 1.0f + absolute(difference) * inverse_step;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The block of pixels that a vector holds.
+// The block of pixels of a vector.
 #pragma once
 
 #include "splat.h"

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Which pixels changed between two pictures of one camera. Integers throughout: every instruction set and the reference
-// agree to the last pixel.
+// The pixels that changed between two pictures of one camera. Only integers are used, so every instruction set and the
+// reference give the same result.
 
 #include <algorithm>
 #include <cstdint>

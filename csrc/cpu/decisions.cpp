@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// Adaptive yes-or-no decisions (docs/entropy.md, Decisions) and the contexts of rows (docs/bitstream.md, Rows). Reads what
-// may be hostile: decisions are bounded by what is asked for, bytes behind the end count as zeros, and no index comes
-// from what is read without a bound.
+// Adaptive binary decisions (docs/entropy.md, Decisions) and the contexts of rows (docs/bitstream.md, Rows). Input may be
+// hostile: the number of decisions is bounded by the request, bytes after the end count as zeros, and every index from
+// the input is checked.
 
 #include <algorithm>
 #include <cstdint>
@@ -16,11 +16,11 @@ namespace {
 enum Result { kDone = 0, kNoMemory = 1, kDamaged = 2, kRefused = 3 };
 
 constexpr int kResidualInputs = 6;
-constexpr int kLeast = 32, kMost = 65536 - 32;  // of a chance
-constexpr int kFar = 1983;                      // of its logit
+constexpr int kLeast = 32, kMost = 65536 - 32;  // bounds of a probability
+constexpr int kFar = 1983;                      // bound of its logit
 constexpr int kWeightLimit = (1 << 19) - 1;
-constexpr int kNearSizes = 6;    // sizes that have a decision each
-constexpr int kLengthNodes = 9;  // lengths of larger ones that have one
+constexpr int kNearSizes = 6;    // sizes with a decision of their own
+constexpr int kLengthNodes = 9;  // bit lengths of larger sizes with a decision of their own
 constexpr int kLengths = 30;
 constexpr int kNodes = 2 + kNearSizes + kLengthNodes;
 constexpr int64_t kLargestNumber = (int64_t{1} << 31) - 1;
@@ -59,7 +59,7 @@ const Constants& constants() {
     return made;
 }
 
-// The bytes of a field, while they are written or read.
+// The bytes of a field during writing or reading.
 template <bool kEncodes>
 struct Arithmetic {
     explicit Arithmetic(sgs_arithmetic* outer) : outer(outer), low(outer->low), range(outer->range), place(outer->place) {
@@ -117,7 +117,7 @@ struct Arithmetic {
     int64_t place;
 };
 
-// The decisions of one model of so many inputs. A number's contexts are looked up once: `at` takes them.
+// The decisions of one model with a given number of inputs. `at` looks up a number's contexts once.
 template <bool kEncodes, int kInputs>
 struct Coder {
     Coder(sgs_arithmetic* arithmetic, const sgs_model* model)
@@ -151,7 +151,7 @@ struct Coder {
         return yes;
     }
 
-    // A signed number; false where it is damaged.
+    // A signed number; false if it is damaged.
     bool number(int64_t* value) {
         const int64_t given = kEncodes ? *value : 0;
         if (!decide(given != 0, 0)) {
@@ -188,7 +188,7 @@ int bit_length(int64_t value, int most) {
     return length;
 }
 
-// Sizes as classes 0 to 15: each its own below 8, then two an octave.
+// Size classes 0 to 15: one per size below 8, then two per octave.
 int size_class(int32_t size) {
     if (size < 8) return size;
     const int top = 31 - __builtin_clz(static_cast<uint32_t>(size));
@@ -197,7 +197,7 @@ int size_class(int32_t size) {
 
 int32_t limited(int32_t value, int32_t most) { return std::clamp(value, -most, most); }
 
-// The first row and the distance of the rows of a pass; their neighbours are `first` away, in pass 0 there are none.
+// The first row of a pass and the distance of its rows; neighbours are at distance `first`; pass 0 has none.
 struct Pass {
     int64_t first, step;
 };
@@ -209,10 +209,10 @@ Result code_activity(sgs_arithmetic* arithmetic, const sgs_model* block_model, c
                      const uint8_t* history, const int32_t* sizes, uint8_t* active) {
     const size_t rows = static_cast<size_t>(count), block_count = (rows + kBlock - 1) / kBlock;
     const int64_t blocks = static_cast<int64_t>(block_count);
-    // Rows that do not exist are still and were so.
+    // Rows that do not exist count as inactive, now and before.
     std::vector<uint8_t> now(rows + 64, 0), there(block_count, 0);
     std::vector<int32_t> moved(rows + 4, 0);
-    std::vector<int32_t> before(rows + 1, 0);  // how many of the rows before were active
+    std::vector<int32_t> before(rows + 1, 0);  // number of active rows before each row
     std::vector<uint8_t> last(block_count + 2, 0), ever(block_count, 0);
     uint8_t* found = now.data() + 32;
     uint8_t* has = there.data();
@@ -264,7 +264,7 @@ template <bool kEncodes>
 Result code_residuals(sgs_arithmetic* arithmetic, const sgs_model* model, int64_t count, int columns, const int32_t* last,
                       const int32_t* others, int32_t* residuals) {
     Coder<kEncodes, kResidualInputs> coder(arithmetic, model);
-    std::vector<int32_t> told(static_cast<size_t>(count), 0);  // sizes in the columns before
+    std::vector<int32_t> told(static_cast<size_t>(count), 0);  // sizes in earlier columns
     std::vector<uint8_t> moved(static_cast<size_t>(count), 0);
     for (int64_t a = 0; a < count; ++a)
         for (int column = 0; column < columns; ++column) moved[a] |= last[a * columns + column] != 0;
@@ -279,7 +279,7 @@ Result code_residuals(sgs_arithmetic* arithmetic, const sgs_model* model, int64_
                 const int32_t beside = std::abs(above) + std::abs(below);
                 const int32_t first = column ? residuals[at - 1] : 0;
                 const int32_t off = column ? first - last[at - 1] : 0;
-                // Sixteenths of a bin.
+                // Sixteenths of a quantization step.
                 const int32_t led = moved[a] ? (level ? 10 * own + 3 * (above + below) : 16 * own) : 8 * (above + below);
                 const int32_t expected = size_class((std::abs(led) + 4) >> 3);
                 const int32_t contexts[kResidualInputs] = {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The C interface: each entry point goes to the build of its kernel for the instruction set in use.
+// The C interface: each entry point calls the build of its kernel for the instruction set in use.
 
 #include <algorithm>
 #include <atomic>
@@ -200,7 +200,7 @@ int sgs_raster_weights(
         raster.trained = 0;
         raster.splats.resize(count);
         std::vector<float> radii(count);
-        // Without a picture colours play no part; any numbers of the right count will do.
+        // Without a picture colours are not used; any memory of the right size is sufficient.
         project_dispatched(
             {means, quats, scales, opacities, image ? colors : means, nullptr, intervals, count}, raster, radii.data(),
             threads);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// How far offsets times their anchor's scales go beyond a limit, summed, and the gradients: a pass over memory each.
+// Sum of the excess of scaled offsets over a limit, and its gradients; one pass over memory each.
 
 #include <cmath>
 #include <cstdint>

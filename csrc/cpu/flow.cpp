@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Where flow there and back agree, in one pass over the pixels.
+// Forward-backward consistent flow, in one pass over the pixels.
 
 #include <algorithm>
 #include <cstdint>
@@ -18,7 +18,7 @@ extern "C" void sgs_confident_flow(
             const float fx = flow[2 * at], fy = flow[2 * at + 1];
             const float x = fx + static_cast<float>(column), y = fy + static_cast<float>(row);
             float confidence = 0.0f;
-            // Written so that NaN is outside.
+            // NaN counts as outside.
             if (x >= 0.0f && x <= last_x && y >= 0.0f && y <= last_y && (mask == nullptr || mask[at])) {
                 const int x0 = static_cast<int>(x), y0 = static_cast<int>(y);
                 const int x1 = std::min(x0 + 1, width - 1), y1 = std::min(y0 + 1, height - 1);

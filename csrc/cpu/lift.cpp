@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Displacements in space from flow in pictures: robust least squares, re-weighted, for each target on its own.
+// Displacements in space from flow in pictures: iteratively reweighted least squares for each target.
 
 #include "lift.h"
 
@@ -42,7 +42,7 @@ struct Terms {
     }
 };
 
-// Pixels by which the camera sees a point move for a unit of displacement. False before the near plane.
+// Jacobian of a point's projection, pixels per unit. False if the point is in front of the near plane.
 bool jacobian(const FlowLift& lift, int view, const float* center, float* J) {
     const float *V = lift.viewmats + 16 * view, *K = lift.Ks + 9 * view;
     float p[3];
@@ -102,7 +102,7 @@ void solve(const double (&A)[6], const double (&b)[3], float* x) {  // A: xx xy 
     x[1] = static_cast<float>(x1), x[2] = static_cast<float>(x2);
 }
 
-// One round: weights by how well d explains each term (scale 0: all the same), then the best d for these weights.
+// One round: weights from the residual of each term under d (scale 0: equal weights), then the best d for them.
 void refine(const Terms& terms, float scale, float stiffness, const float* prior, float* d) {
     vf sums[10];
     for (vf& s : sums) s = splat(0.0f);

@@ -5,8 +5,8 @@
 
 namespace structgstream {
 
-// Flow in pictures, to be lifted to displacements (kernels/reference_motion.py): `movers` seen by `views`, and `targets`
-// that follow `neighbour_count` movers each.
+// Input and output of the lift from flow to displacements (kernels/reference_motion.py): dynamic primitives (`movers`) in
+// `views`, and `targets` with `neighbour_count` of these each.
 struct FlowLift {
     const float *centers, *weights, *flows;      // [E,3], [V,E], [V,E,2]
     const float *viewmats, *Ks, *near;           // [V,4,4], [V,3,3], [V]
@@ -14,7 +14,7 @@ struct FlowLift {
     const float *affinities, *priors;            // [T,N], [T,3]
     int64_t movers, targets;
     int views, neighbour_count;
-    float share;                                 // of a view's flow that must agree
+    float share;                                 // share of a view's flow that must agree
     float *displacements, *inlier_share;         // [T,3], [T]
     int64_t* agreeing_views;                     // [T]
 };

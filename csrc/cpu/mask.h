@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Comparisons that keep their result in the form the instruction set has for it: a mask register on AVX-512, whole
-// lanes of ones elsewhere.
+// Comparisons with the native result type of the instruction set: a mask register on AVX-512, lanes of ones elsewhere.
 #pragma once
 
 #include <cmath>
@@ -66,7 +65,7 @@ inline vf square_root(vf x) {
 #endif
 }
 
-// 1 / x to about one unit in the last place, for x that is neither tiny nor huge.
+// 1 / x to about one unit in the last place, for x far from underflow and overflow.
 inline vf reciprocal(vf x) {
 #if defined(__AVX512F__)
     const vf guess = (vf)_mm512_maskz_rcp14_ps(0xffff, (__m512)x);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// How much rows differ from their neighbours, and the gradient, in one pass over the pairs.
+// Difference of rows from their neighbours, and its gradient, in one pass over the pairs.
 
 #include <cmath>
 #include <cstdint>

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// How a picture is cut for the loss: bands of rows, one a thread, or the tiles that count as few rectangles. A row's sums
-// do not depend on the bands, and rectangles depend on the tiles alone: so results do not depend on the threads.
+// Division of a picture for the loss: bands of rows, one per thread, or few rectangles that cover the tiles that count.
+// A row's sums do not depend on the bands, and rectangles depend only on the tiles, so results do not depend on threads.
 
 #include "ssim.h"
 
@@ -11,7 +11,7 @@
 namespace structgstream {
 namespace {
 
-constexpr int kLeastRows = 4;  // of a band
+constexpr int kLeastRows = 4;  // smallest height of a band
 
 std::vector<Part> bands(int height, int width, int threads) {
     const int count = std::max(1, std::min(threads, height / kLeastRows));
@@ -24,7 +24,7 @@ std::vector<Part> bands(int height, int width, int threads) {
     return found;
 }
 
-// Runs of tiles, stretched down as far as the same run goes on: every seam costs ten rows or columns twice.
+// Runs of tiles, extended down as far as the run is the same: every seam computes ten rows or columns twice.
 std::vector<Part> rectangles(int height, int width, const uint8_t* tiles) {
     const int tiles_x = (width + kTile - 1) / kTile, tiles_y = (height + kTile - 1) / kTile;
     std::vector<uint8_t> left_over(tiles, tiles + static_cast<size_t>(tiles_x) * tiles_y);

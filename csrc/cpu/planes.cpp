@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Correlation of a picture with its neighbours seen through planes. Lanes are pixels of a row.
+// Correlation of a picture with its neighbours, warped through planes. Lanes are pixels of a row.
 
 #include <algorithm>
 #include <vector>
@@ -34,7 +34,7 @@ struct Size {
     size_t count() const { return static_cast<size_t>(height) * stride; }
 };
 
-// What a window is summed of.
+// The terms of a window's sums.
 enum Sum { kValue, kSquare, kProduct, kSeen, kSums };
 
 struct Scratch {
@@ -47,13 +47,13 @@ struct Scratch {
           scores(neighbours * size.count()) {}
 };
 
-// The row or column that one beside the picture repeats: the edge is repeated, too.
+// The row or column inside the picture that one outside repeats; the edge itself is repeated, too.
 int reflected(int place, int length) {
     while (place < 0 || place >= length) place = place < 0 ? -1 - place : 2 * length - 1 - place;
     return place;
 }
 
-// Bilinear samples of a neighbour, and 1 where all four of its pixels exist and it is in front of the camera, else 0 for both.
+// Bilinear samples of a neighbour, and 1 if all four pixels exist and the point is in front of the camera; else 0 for both.
 void warp(const sgs_neighbour& from, const double* h, const Size& size, float* warped, float* seen) {
     vf lane;
     for (int i = 0; i < kLanes; ++i) lane[i] = static_cast<float>(i);
@@ -62,7 +62,7 @@ void warp(const sgs_neighbour& from, const double* h, const Size& size, float* w
     const vi most_x = vi{} + std::max(0, from.width - 2), most_y = vi{} + std::max(0, from.height - 2);
     for (int row = 0; row < size.height; ++row)
         for (int column = 0; column < size.width; column += kLanes) {
-            // Places at the vector's start in double, so that those of its lanes are right to a thousandth.
+            // The position of the first lane is computed in double, so that those of all lanes are exact to 0.001.
             const double x0 = h[0] * column + h[1] * row + h[2], y0 = h[3] * column + h[4] * row + h[5];
             const double z0 = h[6] * column + h[7] * row + h[8];
             const vf z = static_cast<float>(z0) + lane * static_cast<float>(h[6]);
@@ -116,7 +116,7 @@ inline vf mean_down(const float* across, const Size& size, int window, int row, 
     return sum * (1.0f / static_cast<float>(window * window));
 }
 
-// Of the picture: means over windows, and variances with the noise.
+// Means over windows of the picture, and variances plus noise.
 struct Statistics {
     Buffer grey, mean, variance;
     Statistics(const PlaneSweep& sweep, const Size& size, Scratch& scratch)
@@ -143,7 +143,7 @@ struct Statistics {
     }
 };
 
-// Zero-mean normalised cross-correlation with one neighbour; kUnseen where it does not see the whole window.
+// Zero-mean normalised cross-correlation with one neighbour; kUnseen if it does not see the whole window.
 void correlate(const PlaneSweep& sweep, const Size& size, const Statistics& of, Scratch& scratch, float* scores) {
     const int window = sweep.window;
     float* const line = scratch.line.get();

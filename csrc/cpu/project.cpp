@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Gaussians to splats (EWA: Zwicker et al., 2001) and the gradients back. Lanes are Gaussians.
+// From Gaussians to splats (EWA: Zwicker et al., 2001), and gradients back. Lanes are Gaussians.
 
 #include <algorithm>
 #include <cmath>
@@ -16,7 +16,7 @@ namespace {
 constexpr float kLog2E = 1.44269504f;
 constexpr float kBoxSlack = 0.01f;  // pixels
 constexpr float kBlockSlack = 1e-4f;
-constexpr float kFar = 1e7f;        // pixels: beyond it integers would overflow
+constexpr float kFar = 1e7f;        // pixels: integers would overflow beyond it
 
 // `Width` numbers of each Gaussian of a block as rows of lanes. Lanes beyond the end repeat the last Gaussian.
 template <int Width>
@@ -47,7 +47,7 @@ struct Block {
 
 struct Rotation {
     vf w, x, y, z;   // unit length
-    vf inverse;      // one over the length before
+    vf inverse;      // reciprocal of the length before normalisation
     vf r[9];
     explicit Rotation(const Rows<4>& q) {
         inverse = 1.0f / square_root(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
@@ -60,8 +60,8 @@ struct Rotation {
 
 // The scaled axes of a Gaussian as seen by the linearised camera: rows a (across) and b (down), three axes each.
 struct Footprint {
-    vf point[3];          // in the camera
-    vf inverse;           // one over its depth
+    vf point[3];          // in camera coordinates
+    vf inverse;           // reciprocal of its depth
     vf ux, uy;            // clamped x / z and y / z
     mask free_x, free_y;  // not clamped
     vf axes[9];           // view rotation * rotation * scales
@@ -91,7 +91,7 @@ struct Footprint {
 
 inline vi ceiling(vf x) {
     const vi towards_zero = __builtin_convertvector(x, vi);
-    return towards_zero - (x > __builtin_convertvector(towards_zero, vf));  // a true comparison is minus one
+    return towards_zero - (x > __builtin_convertvector(towards_zero, vf));  // true is minus one
 }
 
 inline vi floored(vf x) {
@@ -139,7 +139,7 @@ void project_block(const GaussianInputs& in, int64_t begin, Raster& raster, floa
         low_pass *= c.fx * c.fy * side * side;
     }
     if (in.intervals) {
-        // The determinant of the projection alone is the square of a cross product, which does not cancel for needles.
+        // The determinant without low-pass is the square of a cross product, which does not cancel for needles.
         vf square = splat(0.0f), size = splat(0.0f);
         for (int j = 0; j < 3; ++j) {
             const int k = (j + 1) % 3, l = (j + 2) % 3;
@@ -159,7 +159,7 @@ void project_block(const GaussianInputs& in, int64_t begin, Raster& raster, floa
         offsets.read(in.screen_offsets, begin, in.count);
         x += offsets[0], y += offsets[1];
     }
-    // The exact box of alpha = 1/255: it shrinks with the opacity.
+    // The exact box of alpha = 1/255, which shrinks with the opacity.
     const vf log2_opacity = log_two(largest(opacity, splat(kMinAlpha)));
     const vf reach = largest(splat(0.0f), log2_opacity - kLog2MinAlpha) * (2.0f / kLog2E);
     const vf half_x = square_root(reach * xx), half_y = square_root(reach * yy);
@@ -177,7 +177,7 @@ void project_block(const GaussianInputs& in, int64_t begin, Raster& raster, floa
         }
         return;
     }
-    // Pixels whose centre is in the box, with slack for roundings. Lanes that are not seen may hold anything.
+    // Pixels whose centre is in the box, with slack for rounding. Lanes that are not visible may have any value.
     const auto tame = [&](vf value) { return keep(seen, value); };
     alignas(kAlignment) int32_t box[4][kLanes];
     store(box[0], at_least_zero(ceiling(tame(x - half_x) - (0.5f + kBoxSlack))));
@@ -187,7 +187,7 @@ void project_block(const GaussianInputs& in, int64_t begin, Raster& raster, floa
     alignas(kAlignment) float out[9][kLanes];
     const vf scale = (0.5f * kLog2E) / determinant;
     const vf to_x = yy * scale, to_xy = -2.0f * xy * scale, to_y = xx * scale;
-    // How far a pixel's centre is from its block's: the triangle inequality.
+    // Distance of a pixel's centre from its block's centre, for the triangle inequality.
     constexpr float kAside = 0.5f * (kBlockX - 1), kBelow = 0.5f * (kBlockY - 1);
     const vf within = square_root(largest(splat(0.0f), log2_opacity - kLog2MinAlpha)) +
                       square_root(kAside * kAside * to_x + kBelow * kBelow * to_y + kAside * kBelow * absolute(to_xy));

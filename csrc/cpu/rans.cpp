@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Interleaved rANS (docs/entropy.md): 32-bit states, 16-bit words, 12-bit frequencies. Reads what may be hostile: every
-// index is checked before it is used.
+// Interleaved rANS (docs/entropy.md): 32-bit states, 16-bit words, 12-bit frequencies. Input may be hostile: every index
+// is checked before it is used.
 
 #include <cstdint>
 #include <cstring>
@@ -20,7 +20,7 @@ constexpr uint32_t kAbsent = 0xffffffffu;
 
 enum Result { kDone = 0, kNoMemory = 1, kDamaged = 2, kRefused = 3 };
 
-// The rows of the table that occur, side by side: a frequency in the high half, what is below it in the low half.
+// The rows of the table that occur, contiguous: a frequency in the high half, its cumulative frequency in the low half.
 struct Rows {
     std::unique_ptr<uint32_t[]> row_of;  // [context_count], or kAbsent
     std::unique_ptr<uint32_t[]> entries;  // [used, alphabet]
@@ -111,7 +111,7 @@ extern "C" int sgs_rans_encode(const uint8_t* symbols, const uint16_t* contexts,
     const Result ready = prepare(contexts, count, frequencies, context_count, alphabet, false, &rows);
     if (ready != kDone) return ready;
     for (int lane = 0; lane < lanes; ++lane) states[lane] = kLow;
-    int64_t free_words = count;  // Written from the end, because the decoder reads forwards.
+    int64_t free_words = count;  // Words are written from the end, because the decoder reads forwards.
     for (int64_t i = count - 1; i >= 0; --i) {
         if (symbols[i] >= alphabet) return kRefused;
         const uint32_t entry = rows.entries[static_cast<int64_t>(rows.row_of[contexts[i]]) * alphabet + symbols[i]];

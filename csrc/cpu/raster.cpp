@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 // Blending splats over tiles, forward and backward.
 //
-// A vector is a small block of pixels (4 x 4, 4 x 2 or 2 x 2). Backward replays forward front to back: it keeps
-// R = the remaining part of the pixel's colour (behind), dotted with the pixel's gradient, so that
-// dL/dalpha = T q - R / (1 - alpha) with q = color . gradient, and needs only the finished image. Splats that less than
-// kMinGradientTransmittance of a pixel's light reaches get neither gradient nor weight from it; they are drawn, as
-// opaque ones would show a hole without what the last light meets.
+// A vector is a small block of pixels (4 x 4, 4 x 2 or 2 x 2). Backward repeats forward front to back. It maintains R, the
+// remaining colour of the pixel behind the splat, dotted with the pixel's gradient. Then
+// dL/dalpha = T q - R / (1 - alpha) with q = color . gradient, so only the finished image is needed. A splat behind a
+// transmittance below kMinGradientTransmittance gets neither gradient nor weight from the pixel. It is drawn
+// nevertheless, because otherwise opaque surfaces would be visibly incomplete.
 
 #include <algorithm>
 #include <cstring>
@@ -22,7 +22,7 @@ namespace {
 constexpr int kAhead = 4;  // splats
 constexpr int kMapsAtOnce = 8;
 
-// The sums over the lanes of each of `Count` vectors, for all of them at once where there are as many lanes.
+// The sums over the lanes of each of `Count` vectors, computed together if there are as many lanes.
 template <int Count>
 inline void store_sums(const vf (&m)[Count], float* out) {
     constexpr int kGroups = (Count + kLanes - 1) / kLanes;
@@ -37,7 +37,7 @@ inline void store_sums(const vf (&m)[Count], float* out) {
     std::memcpy(out, sums, sizeof(float) * Count);
 }
 
-// 2^x for x in [-8, 0.1]: the rounding splits off the integer, a polynomial fitted around zero does the rest.
+// 2^x for x in [-8, 0.1]: integer part by rounding, fraction by a polynomial fitted around zero.
 inline vf power_of_two(vf x) {
     const vf magic = splat(12582912.0f);
     const vf rounded = x + magic;
@@ -69,8 +69,8 @@ struct BlockCentres {
     }
 };
 
-// A bit for each block of a tile that a splat may cover: by its ellipse where few vectors hold all blocks, by its box
-// elsewhere. The quadratic form is rounded in proportion to its two squares, which a part of them allows for.
+// A bit for each block of a tile that a splat may cover: by its ellipse if few vectors contain all blocks, else by its
+// box. The rounding error of the quadratic form is in proportion to its two squares; a share of these is added as slack.
 inline uint64_t near_blocks(const Splat& s, const BlockCentres& centres, int left, int top) {
     uint64_t found = 0;
 #if SGS_LANES > 4
@@ -95,9 +95,9 @@ inline uint64_t near_blocks(const Splat& s, const BlockCentres& centres, int lef
 }
 
 // One splat over one block of pixels whose transmittance is T. T above `least`, zero or more, is live; a pixel that has
-// stopped keeps its transmittance with a minus sign.
+// stopped stores its transmittance with a minus sign.
 struct Coverage {
-    vf dx, dy, alpha, after;  // after: the transmittance behind the splat, stored where none has stopped
+    vf dx, dy, alpha, after;  // after: the transmittance behind the splat, valid for live pixels
     mask used, stopped;
     bool any_stopped;
 
@@ -118,7 +118,7 @@ struct Coverage {
     }
 };
 
-// How much light still passes each pixel of a tile. A block without a live pixel loses its bit in `live`.
+// Transmittance of each pixel of a tile. The bit of a block without a live pixel in `live` is cleared.
 struct Front {
     alignas(kAlignment) float T[kTilePixels];
     uint64_t live = ~uint64_t{0} >> (64 - kBlocks);
@@ -144,8 +144,8 @@ struct Tile {
     }
 };
 
-// Visits the pixels of a tile: their place in the picture, and in the tile's order of blocks. Rows of a block together, so
-// that compilers make vectors of them.
+// Visits the pixels of a tile: their index in the picture and in the tile's order of blocks. Rows of a block are visited
+// together, so that compilers vectorise them.
 template <typename Visit>
 inline void for_pixels(const Tile& t, int width, Visit visit) {
     const int columns = t.right - t.left;
@@ -179,14 +179,14 @@ void scatter(const float (*planes)[kTilePixels], int width, const Tile& t, float
     });
 }
 
-// The splat of pair `n`, of those before `end`. A later one is prefetched: neighbours in depth are far apart in memory.
+// The splat of pair `n` < `end`. A later one is prefetched, because neighbours in depth are distant in memory.
 [[gnu::always_inline]] inline const Splat& splat_of(const Raster& raster, int n, int end) {
     __builtin_prefetch(&raster.splats[raster.pairs[std::min(n + kAhead, end - 1)]]);
     return raster.splats[raster.pairs[n]];
 }
 
-// Visits the blocks of pixels of a tile that a splat covers, and lets it dim the light behind it: visit(place of the block
-// in the tile, transmittance before, coverage).
+// Visits the blocks of pixels of a tile that a splat covers, and updates their transmittance: visit(index of the block in
+// the tile, transmittance before, coverage).
 template <typename Visit>
 [[gnu::always_inline]] inline void for_covered(
     const Splat& s, const Tile& tile, const Lanes& lanes, const BlockCentres& centres, Front& front, Visit visit) {
@@ -240,7 +240,7 @@ void blend_backward(
     gather<1>(alpha, width, tile, coverage);
     if (grad_alpha) gather<1>(grad_alpha, width, tile, grad_coverage);
     for (int i = 0; i < kTilePixels; ++i) {
-        // The background is seen through what coverage leaves: it acts on the coverage's gradient.
+        // The background is visible through the remaining transmittance, so it contributes to the coverage's gradient.
         if (background)
             for (int k = 0; k < 3; ++k) grad_coverage[0][i] -= background[k] * gradient[k][i];
         rest[i] = coverage[0][i] * grad_coverage[0][i];
@@ -250,7 +250,7 @@ void blend_backward(
         }
     }
     int n = raster.starts[index], end = raster.starts[index + 1];
-    while (end > n && raster.pairs[end - 1] >= raster.trained) --end;  // Nothing reads what these would leave.
+    while (end > n && raster.pairs[end - 1] >= raster.trained) --end;  // Their state is not read any more.
     for (; n < end && front.live != 0; ++n) {
         const Splat& s = splat_of(raster, n, end);
         const bool trained = raster.pairs[n] < raster.trained;
@@ -267,7 +267,7 @@ void blend_backward(
             store(rest + at, to_come);
             if (!trained) return;
             const vf slope = before * q - to_come * reciprocal(1.0f - c.alpha);
-            const vf d = keep(above(splat(kMaxAlpha), c.alpha), slope * c.alpha);  // a clamped alpha does not react
+            const vf d = keep(above(splat(kMaxAlpha), c.alpha), slope * c.alpha);  // a clamped alpha has no gradient
             const vf dx = d * c.dx, dy = d * c.dy;
             m[0] += d, m[1] += dx, m[2] += dy;
             m[3] += dx * c.dx, m[4] += dx * c.dy, m[5] += dy * c.dy;
@@ -301,7 +301,7 @@ uint64_t blocks_with_values(const float (&values)[Maps][kTilePixels]) {
 }
 
 // Sums over the pixels of each pair's weight times each of the first Maps maps, of `stride`: sums[stride * slot]. With
-// `image` the tile is drawn, too; without it blocks in which all maps are zero are passed over.
+// `image` the tile is drawn, too; without it blocks in which all maps are zero are skipped.
 template <int Maps, bool kDraws>
 void weigh(const Raster& raster, int index, const float* maps, int stride, float* sums, const float* background,
            float* image) {
@@ -355,7 +355,7 @@ constexpr Weigh* kWeigh[kMapsAtOnce] = {weigh<1, kDraws>, weigh<2, kDraws>, weig
 
 }  // namespace
 
-// maps: `count` numbers for each pixel; sums: as many for each pair, all of which are written. image: drawn, or null.
+// maps: `count` numbers for each pixel; sums: `count` numbers for each pair, all written. image: output, or null.
 void weigh(const Raster& raster, const float* maps, int count, float* sums, const float* background, float* image,
            int threads) {
     const int tiles = raster.tiles_x * raster.tiles_y;
@@ -375,7 +375,7 @@ void rasterize(const Raster& raster, const float* background, float* image, floa
         if (raster.draws(t)) blend(raster, t, background, image, alpha);
 }
 
-// moments: kMomentCount numbers for each pair of a trained splat, all of which are written.
+// moments: kMomentCount numbers for each pair of a trained splat, all written.
 void rasterize_backward(
     const Raster& raster, const float* background, const float* image, const float* alpha, const float* grad_image,
     const float* grad_alpha, float* moments, int threads) {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// How a rendering differs from a picture, reduced to its size: mean absolute difference over channels and 3 x 3 pixels.
+// Residual of a rendering, reduced to a picture's size: mean absolute difference over channels and 3 x 3 pixels.
 
 #include <algorithm>
 #include <cmath>
@@ -14,7 +14,7 @@ namespace {
 
 using structgstream::kTile;
 
-// The pixels of `length` that pixel `i` of `size` covers, as torch's area interpolation has them.
+// The pixels of `length` that pixel `i` of `size` covers, as in torch's area interpolation.
 struct Span {
     int begin, end;
     Span(int i, int length, int size)
@@ -22,7 +22,7 @@ struct Span {
           end(static_cast<int>((static_cast<int64_t>(i + 1) * length + size - 1) / size)) {}
 };
 
-// One row of the rendering as its camera would have recorded it; outside the tiles that of the picture.
+// One row of the rendering as its camera would have recorded it; outside the tiles, the row of the picture.
 void record_row(const sgs_residual& r, int row, const float* gains, const float* biases, float* out) {
     const int numbers = 3 * r.width;
     const float* drawn = r.rendering + static_cast<size_t>(row) * numbers;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Types of the rasteriser's stages: projected splats, tiles, and the state kept by forward for backward.
+// Types of the rasteriser's stages: projected splats, tiles, and the state that forward stores for backward.
 #pragma once
 
 #include <cstddef>
@@ -48,7 +48,7 @@ struct Raster {
     std::vector<int32_t> slots;       // [N + 1] first pair slot of each splat, for the fixed order of sums
     std::vector<int32_t> pair_slots;  // slot of each pair
 
-    // Inlined always: a copy that instruction sets shared could hold instructions that a processor lacks.
+    // Always inlined: a copy shared between instruction sets could contain instructions that a processor lacks.
     [[gnu::always_inline]] bool draws(int tile) const { return drawn_tiles.empty() || drawn_tiles[tile] != 0; }
 };
 

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 // L1 and SSIM (Wang et al., 2004; 11 x 11 Gaussian window, sigma 1.5, zero padding) with the gradient of SSIM.
 //
-// The picture comes in parts (csrc/cpu/parts.cpp), and each part is cut into strips of columns that fit the cache. A strip
-// streams downwards: products of the two pictures are blurred across into a ring of rows, blurred down four rows at a
-// time into the moments, turned into SSIM and its three adjoint maps, and those take the same two blurs back to the
-// picture. Only the sum of the two second moments enters SSIM, so four blurs suffice instead of five. A pixel's value
-// does not depend on the parts, and sums are taken row by row in a fixed order.
+// The picture is divided into parts (csrc/cpu/parts.cpp), and each part into strips of columns that fit the cache. A strip
+// is processed from top to bottom. Products of the two pictures are blurred horizontally into a ring of rows, then
+// vertically, four rows at a time, into the moments. These give SSIM and its three adjoint maps, which pass the same two
+// blurs back to the picture. SSIM needs only the sum of the two second moments, so four blurs are sufficient instead of
+// five. A pixel's value does not depend on the parts, and sums are computed row by row in a fixed order.
 
 #include <algorithm>
 #include <cmath>
@@ -24,7 +24,7 @@ constexpr int kTaps = 2 * kHalf + 1;
 constexpr int kChannels = 3;
 constexpr int kBatch = 4;                           // rows that share the loads of one vertical pass
 constexpr int kReach = kBatch + 2 * kHalf;          // rows that one vertical pass reads
-constexpr int kRing = 16;                           // rows kept; a power of two, at least kReach
+constexpr int kRing = 16;                           // rows in the ring; a power of two, at least kReach
 constexpr int kLead = 12;                           // whole batches between a row's first and last blur
 constexpr int kPad = kChannels * kHalf;             // zeros on both sides of a row
 constexpr int kStripPixels = 256;
@@ -43,8 +43,8 @@ struct Picture : Pictures {
 
 // The buffers of one strip. Rows are `stride` floats, of which the first `kPad` and those after `used` stay zero.
 struct Strip {
-    int first;    // first column held, in pixels
-    int used;     // floats held
+    int first;    // first column in the buffers, pixels
+    int used;     // number of floats in use
     int count;    // the same rounded up to whole vectors
     int stride;
     int skip;     // floats before the first column of the strip itself
@@ -80,7 +80,7 @@ inline void blur_down(const float* weights, const float* const* rows, int at, vf
     }
 }
 
-// Reads picture row `row`, makes its products and blurs them across into the ring. Rows outside count as zero.
+// Reads picture row `row`, computes its products and blurs them horizontally into the ring. Rows outside are zero.
 void take_row(const Picture& p, const Strip& s, int row, bool count_l1) {
     float* out = s.moments + static_cast<size_t>(slot(row)) * kMoments * s.count;
     if (row < 0 || row >= p.height) {
@@ -101,7 +101,7 @@ void take_row(const Picture& p, const Strip& s, int row, bool count_l1) {
         const uint8_t* bytes = p.target_u8 + at;
         for (int i = 0; i < s.used; ++i) y[i] = static_cast<float>(bytes[i]) / 255.0f;
     }
-    for (int i = 0; i < s.count; i += kLanes) {  // what lies behind `used` is zero in x and y
+    for (int i = 0; i < s.count; i += kLanes) {  // x and y are zero from `used` on
         const vf a = load(x + i), b = load(y + i);
         store(squares + i, a * a + b * b);
         store(product + i, a * b);
@@ -134,7 +134,8 @@ double sum_of(const float* values, int count) {
     return total;
 }
 
-// Moments of rows first ... first + 3 to SSIM; with Adjoint also its derivatives, blurred across into their ring.
+// SSIM from the moments of rows first ... first + 3; with Adjoint also its derivatives, blurred horizontally into their
+// ring.
 template <bool Adjoint>
 void take_batch(const Picture& p, const Strip& s, int first, int own_first, int own_end) {
     const float* rows[kMoments][kReach];

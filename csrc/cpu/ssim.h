@@ -30,7 +30,7 @@ class Parts {
     Parts(int height, int width, const uint8_t* tiles, int threads);
     const Part* data() const { return parts_.data(); }
     int count() const { return static_cast<int>(parts_.size()); }
-    // Adds the parts' sums, in the order of the parts, to those of the picture's rows.
+    // Adds the parts' sums, in order of the parts, to the sums of the picture's rows.
     void add_to(double* row_l1, double* row_ssim) const;
 
   private:

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Along each ray the depth at which several views see the same new thing (kernels/reference_motion.py).
+// Plane sweep: along each ray, the depth at which several views show the same new content (kernels/reference_motion.py).
 
 #include <algorithm>
 #include <cmath>
@@ -13,7 +13,7 @@ namespace {
 constexpr float kSupporting = 0.3f, kContradicting = 0.05f, kFrontShare = 1.03f;
 constexpr float kMostDifference = 0.3f, kMissCost = 0.15f, kLonelyCost = 0.05f, kEqualCost = 0.01f;
 
-// Where a ray that is a + z b in the world falls in a view: a and b in its camera.
+// Projection into a view of a ray that is a + z b in the world: a and b in camera coordinates.
 struct Line {
     float from[3], along[3];
 };
@@ -92,7 +92,7 @@ extern "C" void sgs_sweep(
             cost[plane] = votes.cost(least_supports, most_contradictions);
         }
         const int best = static_cast<int>(std::min_element(cost.begin(), cost.end()) - cost.begin());
-        // On a plain surface a stretch of the ray is equally good: take its middle.
+        // On an untextured surface a range of depths has equal costs; its middle is chosen.
         int first = best, last = best;
         while (first > 0 && cost[first - 1] <= cost[best] + kEqualCost) --first;
         while (last + 1 < planes && cost[last + 1] <= cost[best] + kEqualCost) ++last;

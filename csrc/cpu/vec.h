@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Vectors of floats as wide as the instruction set this file is compiled for, and the functions that the loss and the
-// anchors need on them. Plain compiler vectors: no mask types, so one source serves every width.
+// Vectors of floats with the width of the instruction set for which this file is compiled, and functions on them that the
+// loss and the anchors need. They are compiler vectors without mask types, so one source suits every width.
 #pragma once
 
 #include <cstddef>
@@ -42,7 +42,7 @@ inline void store(int32_t* p, vi v) { *reinterpret_cast<unaligned_vi*>(p) = v; }
 inline vf splat(float x) { return x - vf{}; }
 inline vf absolute(vf x) { return (vf)((vi)x & 0x7fffffff); }
 
-// The second one if they are equal or not ordered, on every instruction set.
+// The second argument if they are equal or unordered, on every instruction set.
 #if defined(__AVX512F__)
 inline vf largest(vf a, vf b) { return (vf)_mm512_maskz_max_ps(0xffff, (__m512)a, (__m512)b); }
 inline vf smallest(vf a, vf b) { return (vf)_mm512_maskz_min_ps(0xffff, (__m512)a, (__m512)b); }
@@ -57,7 +57,7 @@ inline vf largest(vf a, vf b) { return a > b ? a : b; }
 inline vf smallest(vf a, vf b) { return a < b ? a : b; }
 #endif
 
-// e^x to about one unit in the last place; saturates instead of overflowing or giving denormal numbers.
+// e^x to about one unit in the last place; saturates instead of overflowing or returning denormal numbers.
 inline vf exponential(vf x) {
     const vf clamped = smallest(largest(x, splat(-87.0f)), splat(88.0f));
     const vf magic = splat(12582912.0f);  // 1.5 * 2^23: adding it rounds to an integer in the low bits
@@ -91,7 +91,7 @@ inline vf log_two(vf x) {
 
 inline vf sigmoid(vf x) { return splat(1.0f) / (1.0f + exponential(-x)); }
 
-// tanh with full relative precision near zero, where the sign of an opacity decides what is drawn.
+// tanh with full relative precision near zero, because the sign of an opacity decides whether a Gaussian is drawn.
 inline vf hyperbolic_tangent(vf x) {
     const vf size = absolute(x), z = x * x;
     vf p = splat(-5.704986e-3f);
@@ -111,7 +111,7 @@ inline vf hyperbolic_tangent(vf x) {
 #define SGS_SHUFFLE(a, b, ...) __builtin_shuffle(a, b, vi{__VA_ARGS__})
 #endif
 
-// Lanes of `a` and `b` in turns, by groups of Step: low takes the groups with an even number, high the odd ones.
+// Interleaves `a` and `b` by groups of Step lanes: `low` has the even groups of both, `high` the odd ones.
 template <int Step, int... Lane>
 inline void interleave(vf a, vf b, vf& low, vf& high, std::integer_sequence<int, Lane...>) {
     low = SGS_SHUFFLE(a, b, (Lane & Step ? kLanes + Lane - Step : Lane)...);

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// Which anchors a camera can see. An anchor counts as a ball that holds all its Gaussians at 3.4 standard deviations; the
-// ball's box on the picture decides. Conservative: it changes the cost of a rendering and never its pixels.
+// The anchors in a camera's view. An anchor is represented by a ball that contains all its Gaussians at 3.4 standard
+// deviations; the ball's box on the picture decides. The test is conservative: it changes the cost of a rendering, never
+// its pixels.
 
 #include "visible.h"
 
@@ -12,7 +13,7 @@
 namespace structgstream {
 namespace SGS_ISA {
 
-// visible: a byte for each anchor. covered: where tiles matter, see csrc/cpu/visible.h.
+// visible: a byte for each anchor. covered: see csrc/cpu/visible.h.
 void anchors_visible(const sgs_anchors& a, int64_t count, const View& view, const int32_t* covered, uint8_t* visible,
                      int threads) {
     const int k = a.offsets_per_anchor;

@@ -11,7 +11,7 @@
 namespace structgstream {
 
 constexpr float kBallDeviations = 3.4f;  // alpha = 1/255 is reached before 3.33 at any opacity
-constexpr float kBoxMargin = 2.0f;       // pixels: the rasteriser's low-pass makes the smallest Gaussian this wide
+constexpr float kBoxMargin = 2.0f;       // pixels: width of the smallest Gaussian after the rasteriser's low-pass
 constexpr float kBallIntervals = 1.86226f;  // kBallDeviations times the root of kLowPass
 
 struct View {
@@ -25,8 +25,8 @@ struct View {
         return !((x + slope * z) / std::sqrt(1.0f + slope * slope) > -1.1f * radius);
     }
 
-    // A ball at (x, y, z) in the camera. covered: null, or sums over the tiles above and left of each corner, so that the
-    // number of tiles in a box takes four reads; [tiles_y + 1][tiles_x + 1].
+    // A ball at (x, y, z) in camera coordinates. covered: null, or a summed-area table of the tiles
+    // [tiles_y + 1][tiles_x + 1], from which the number of tiles in a box needs four reads.
     [[gnu::always_inline]] bool sees(float x, float y, float z, float radius, const int32_t* covered) const {
         if (!(z + radius > near)) return false;
         const float closest = z - radius, furthest = z + radius;
@@ -40,7 +40,7 @@ struct View {
             if (!(box[0] < width && box[1] < height && box[2] > 0.0f && box[3] > 0.0f)) return false;
         } else if (beyond(x, z, radius, fx, cx) || beyond(-x, z, radius, fx, width - cx) ||
                    beyond(y, z, radius, fy, cy) || beyond(-y, z, radius, fy, height - cy)) {
-            return false;  // As near as its radius it has no box, but it may lie beyond a side of the frustum.
+            return false;  // A ball that contains the camera plane has no box, but may be outside the frustum.
         }
         if (covered == nullptr) return true;
         const int x0 = static_cast<int>(std::max(box[0], 0.0f)) / kTile;

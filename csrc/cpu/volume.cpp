@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The product of each Gaussian's three scales, summed, and its gradient: a pass over memory each.
+// Sum of the products of each Gaussian's three scales, and its gradient; one pass over memory each.
 
 #include <cstdint>
 

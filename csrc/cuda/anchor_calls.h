@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The interface of anchors.h, by the elements of anchor_elements.h: anchors.cu compiles it for a GPU, emulate_elements.cpp
-// for a processor.
+// The interface of anchors.h, implemented with the elements of anchor_elements.h. anchors.cu compiles it for a GPU,
+// emulate_elements.cpp for a CPU.
 #pragma once
 
 #include "anchor_elements.h"

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What a thread does for an anchor or for one of its Gaussians: see kernels/reference_anchors.py, whose formulas these are.
+// Work of a thread for an anchor or for one of its Gaussians; the formulas are those of kernels/reference_anchors.py.
 #pragma once
 
 #include <cmath>
@@ -160,7 +160,7 @@ struct Output {
     }
 };
 
-// All Gaussians of an anchor: sums over them need no other thread.
+// All Gaussians of an anchor, in one thread, which also computes the sums over them.
 struct OutputBackward {
     const float *log_offset_scales, *log_base_scales, *offsets;
     int k;

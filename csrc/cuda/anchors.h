@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* The C interface of anchors to Gaussians on a GPU, without the MLPs, which are matrix products: what is before and what is
- * after them. Plain pointers to the GPU's memory; tensors are contiguous, row-major, float32 unless said otherwise;
- * `stream` is a cudaStream_t. Nothing here waits for the GPU or takes memory. All return 0, or CUDA's error number. */
+/* The C interface of the generation of Gaussians on a GPU: the steps before and after the MLPs, which are matrix products.
+ * Plain pointers to the GPU's memory; tensors are contiguous, row-major, float32 unless stated otherwise; `stream` is a
+ * cudaStream_t. No function waits for the GPU or allocates memory. All return 0, or CUDA's error number. */
 #pragma once
 
 #include <stdint.h>
@@ -26,15 +26,15 @@ int sgs_cuda_anchor_inputs_backward(
     const float* positions, int anchors, int feature_size, int distance_input, const float* center,
     const float* v_inputs, float* v_positions, void* stream);
 /* The Gaussians of all anchors. opacity [M,K], color [M,K,3], covariance [M,K,7]: the MLPs' outputs before activation. Out:
- * means, scales, colors [M,K,3], quats [M,K,4], opacities, raw_opacities [M,K], ids [M,K] int64. What is not drawn has
- * opacity and scale 0; raw opacities of anchors that are not seen are -1. */
+ * means, scales, colors [M,K,3], quats [M,K,4], opacities, raw_opacities [M,K], ids [M,K] int64. Gaussians that are not
+ * drawn have opacity and scale 0; raw opacities of anchors that are not visible are -1. */
 int sgs_cuda_anchor_outputs(
     const float* positions, const float* log_offset_scales, const float* log_base_scales, const float* offsets,
     int anchors, int offsets_per_anchor, const float* opacity, const float* color, const float* covariance,
     const uint8_t* seen, float* means, float* quats, float* scales, float* opacities, float* colors,
     float* raw_opacities, int64_t* ids, void* stream);
-/* From the gradients of the Gaussians those of the inputs of sgs_cuda_anchor_outputs, of the same shapes; v_offsets may be
- * null. */
+/* From gradients of the Gaussians to gradients of the inputs of sgs_cuda_anchor_outputs, of the same shapes; v_offsets may
+ * be null. */
 int sgs_cuda_anchor_outputs_backward(
     const float* log_offset_scales, const float* log_base_scales, const float* offsets, int anchors,
     int offsets_per_anchor, const float* color, const float* covariance, const float* raw_opacities,

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Kernels in which every thread makes its own elements and reads none of another's: `for_each` runs them on a GPU, or one
-// after another on a processor, where tests run the same functions without a GPU.
+// Kernels in which every thread computes its own elements and reads none of another thread: `for_each` runs them on a GPU,
+// or one after another on a CPU, where tests run the same functions.
 #pragma once
 
 #include <cstdint>
@@ -26,7 +26,7 @@ __global__ void __launch_bounds__(kElementThreads) element_kernel(const Element 
     if (i < count) element(i);
 }
 
-// Calls `element(i)` for i in 0 ... count - 1; gives CUDA's error number.
+// Calls `element(i)` for i in 0 ... count - 1; returns CUDA's error number.
 template <typename Element>
 int for_each(const Element& element, int64_t count, void* stream) {
     if (count <= 0) return 0;
@@ -37,7 +37,7 @@ int for_each(const Element& element, int64_t count, void* stream) {
 
 #else
 
-// `stream` is not a stream: the elements are made last first when it is not null.
+// `stream` is not a stream: elements are computed in reverse order if it is not null.
 template <typename Element>
 int for_each(const Element& element, int64_t count, void* stream) {
     for (int64_t i = 0; i < count; ++i) element(stream == nullptr ? i : count - 1 - i);

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// The interface of ssim.h on a processor, for tests: the phases of ssim_phases.h, block after block and thread after
-// thread, over memory that is not a number until a phase writes it. `stream` is not a stream: the threads of a phase run
-// last first when it is not null. A phase in which one thread reads what another writes then gives something else.
+// The interface of ssim.h on a CPU, for tests: the phases of ssim_phases.h, block by block and thread by thread, over
+// memory that is NaN until a phase writes it. `stream` is not a stream: the threads of a phase run in reverse order if it
+// is not null, which changes the result of a phase in which one thread reads what another writes.
 
 #include <cstring>
 #include <limits>
@@ -29,7 +29,7 @@ void each_block(const Pictures& p, const Block& block) {
 
 template <typename Shared>
 void forget(Shared& shared) {
-    std::memset(static_cast<void*>(&shared), 0xff, sizeof(Shared));  // every float and every double: not a number
+    std::memset(static_cast<void*>(&shared), 0xff, sizeof(Shared));  // every float and every double is NaN
 }
 
 }  // namespace

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The phases of ssim_phases.h with a GPU's barriers between them.
+// The phases of ssim_phases.h, separated by barriers.
 
 #include "ssim.h"
 #include "ssim_phases.h"
@@ -14,7 +14,7 @@ __device__ Tile tile_of_block() {
             static_cast<int>(gridDim.x)};
 }
 
-// The tests for tiles that do not count are the same for all threads of a block, so barriers are met by all or none.
+// The tests for tiles that do not count are equal for all threads of a block, so all threads or none reach a barrier.
 __global__ void __launch_bounds__(kThreads) forward_kernel(const Forward f) {
     __shared__ ForwardShared shared;
     const Tile tile = tile_of_block();

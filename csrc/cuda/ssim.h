@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* The C interface of the loss on a GPU: plain pointers to the GPU's memory, no torch. Tensors are contiguous, row-major,
- * float32 unless said otherwise; `stream` is a cudaStream_t. Nothing here waits for the GPU or takes memory. */
+ * float32 unless stated otherwise; `stream` is a cudaStream_t. No function waits for the GPU or allocates memory. */
 #pragma once
 
 #include <stdint.h>
@@ -11,7 +11,7 @@ extern "C" {
 
 /* One of target (float) and target_u8 is null. gains and biases [3], applied to the image first, or both null. tiles: a
  * byte for each tile of 16 x 16 pixels, zero where the picture counts as equal, or null. Out: means [2], of the absolute
- * difference and of SSIM; adjoints [3,H,W,3] for backward, or null; sums [2,tiles] is room to work in. All return 0, or
+ * difference and of SSIM; adjoints [3,H,W,3] for backward, or null; sums [2,tiles] is workspace. All return 0, or
  * CUDA's error number. */
 int sgs_cuda_l1_ssim(
     const float* image, const float* target, const uint8_t* target_u8, int height, int width, const float* gains,
@@ -21,7 +21,7 @@ int sgs_cuda_l1_ssim_backward(
     const float* image, const float* target, const uint8_t* target_u8, int height, int width, const float* gains,
     const float* biases, const uint8_t* tiles, const float* adjoints, const float* to_l1, const float* to_ssim,
     float* gradient, void* stream);
-/* What an error number means. */
+/* The meaning of an error number. */
 const char* sgs_cuda_error(int error);
 
 #ifdef __cplusplus

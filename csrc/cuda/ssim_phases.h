@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 // L1 and SSIM (Wang et al., 2004; 11 x 11 Gaussian window, sigma 1.5, zero padding) with their gradient, for a GPU.
 //
-// A block is one tile of 16 x 16 pixels with its three channels, so that the tiles that a caller names are blocks. A row
-// of the picture is a row of 3 W numbers, and a blur across takes every third of them. What a block does is cut at its
-// barriers into phases: functions of one thread that read what earlier phases wrote. ssim.cu runs them on a GPU,
-// emulate_ssim.cpp runs the same functions thread after thread on a processor, which is how they are tested without a GPU.
+// A block is one tile of 16 x 16 pixels with its three channels, so selected tiles are blocks. A row of the picture is a
+// row of 3 W numbers, and a horizontal blur reads every third of them. The work of a block is divided at its barriers into
+// phases: functions of one thread that read what earlier phases wrote. ssim.cu runs them on a GPU. emulate_ssim.cpp runs
+// the same functions thread by thread on a CPU, for tests without a GPU.
 //
-// Only the sum of the two second moments enters SSIM, so four blurs suffice instead of five. Sums are taken in a fixed
-// order without atomics: results repeat bit for bit.
+// SSIM needs only the sum of the two second moments, so four blurs are sufficient instead of five. Sums are computed in a
+// fixed order without atomics, so results repeat bit for bit.
 #pragma once
 
 #include <cstdint>
@@ -70,7 +70,7 @@ SGS_PHASE bool counts(const Pictures& p, const Tile& tile) {
     return p.tiles == nullptr || p.tiles[tile.row * tile.columns + tile.column] != 0;
 }
 
-// Whether a pixel of this or of an adjacent tile counts: then the derivatives here are part of its gradient.
+// Whether a pixel of this or of an adjacent tile counts, whose gradient then needs the derivatives here.
 SGS_PHASE bool counts_nearby(const Pictures& p, const Tile& tile) {
     if (p.tiles == nullptr) return true;
     bool found = false;
@@ -219,7 +219,7 @@ SGS_PHASE void forward_gather(ForwardShared& s, int t) {
     if (t >= kThreads / 16) return;
     float l1 = 0.0f, ssim = 0.0f;
     for (int i = t; i < kThreads; i += kThreads / 16) l1 += s.l1[i], ssim += s.ssim[i];
-    s.l1[t] = l1;  // No other thread reads what lies here: i = t modulo 12.
+    s.l1[t] = l1;  // No other thread reads this element: i = t modulo 12.
     s.ssim[t] = ssim;
 }
 
@@ -232,7 +232,7 @@ SGS_PHASE void forward_give(const Forward& f, const Tile& tile, const ForwardSha
     f.sums[tile.rows * tile.columns + at] = ssim;
 }
 
-// A tile with nothing that counts in it or beside it: equal, by definition, and read by nobody.
+// A tile where neither it nor an adjacent tile counts: equal by definition, and not read.
 SGS_PHASE void forward_skip(const Forward& f, const Tile& tile, int t) {
     if (t != 0) return;
     const int bottom = (tile.row + 1) * kTile, right = (tile.column + 1) * kTile;
@@ -277,7 +277,7 @@ struct BackwardShared {
 struct Backward {
     Pictures pictures;
     const float* adjoints;
-    const float* to_l1;    // one number each, which lies where the pictures lie: no one waits for it
+    const float* to_l1;    // one number each, in the GPU's memory, so that the host does not wait for it
     const float* to_ssim;
     float* gradient;       // [H, W, 3]
 };

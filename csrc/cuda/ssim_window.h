@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The host's side of a launch: the pictures and the window's weights as one value.
+// Host side of a launch: the pictures and the window's weights as one value.
 #pragma once
 
 #include <cmath>

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The interface of sweep.h, by the elements of sweep_elements.h: sweep.cu compiles it for a GPU, emulate_elements.cpp for a
-// processor.
+// The interface of sweep.h, implemented with the elements of sweep_elements.h. sweep.cu compiles it for a GPU,
+// emulate_elements.cpp for a CPU.
 #pragma once
 
 #include "sweep_elements.h"

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What a thread does for a point of a ray in one view, and for a ray: see kernels/reference_motion.py.
+// Work of a thread for a point of a ray in one view, and for a ray; see kernels/reference_motion.py.
 #pragma once
 
 #include <cmath>
@@ -27,7 +27,7 @@ struct Rays {
     }
 };
 
-// What another view says of a point: whether it supports or contradicts it, and how much its colour differs.
+// Vote of another view on a point: whether it supports or contradicts the point, and its colour difference.
 struct SweepVote {
     Rays rays;
     sgs_cuda_sweep_view other;
@@ -64,7 +64,7 @@ struct SweepVote {
     }
 };
 
-// The middle of the cheapest stretch of a ray.
+// The middle of the range of a ray with the least cost.
 struct SweepBest {
     Rays rays;
     int64_t points;

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The interface of tiles.h, by the elements of tile_elements.h: tiles.cu compiles it for a GPU, emulate_elements.cpp for a
-// processor.
+// The interface of tiles.h, implemented with the elements of tile_elements.h. tiles.cu compiles it for a GPU,
+// emulate_elements.cpp for a CPU.
 #pragma once
 
 #include "tile_elements.h"

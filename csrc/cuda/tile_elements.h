@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What a thread does for a Gaussian or for a place of the tile lists: see kernels/cuda_tiles.py, Note [Pairs without
+// Work of a thread for a Gaussian or for an entry of the tile lists; see kernels/cuda_tiles.py, Note [Pairs without
 // waiting].
 #pragma once
 
@@ -64,7 +64,7 @@ struct TileFill {
 
     SGS_ELEMENT void operator()(int64_t place) const {
         if (place >= ends[count - 1]) {
-            // Spread over the tiles below the picture, so that none has a long list.
+            // Unused entries are spread over the tiles below the picture, so that none has a long list.
             tiles[place] = static_cast<int32_t>(boxes.rows * boxes.columns + place % boxes.columns);
             ids[place] = static_cast<int32_t>(order[count - 1]);
             return;
@@ -85,7 +85,7 @@ struct TileFill {
     }
 };
 
-// The places where lists start: each is written by the first place of its tile, or of the next that has one.
+// The starts of the lists: each is written by the first entry of its tile, or of the next tile with an entry.
 struct TileStart {
     const int32_t* sorted_tiles;
     const int64_t* by_tile;

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* The C interface of the CPU kernels: plain pointers, no torch. Tensors are contiguous, row-major, float32 unless said
- * otherwise; `threads` is how many threads a call may use. Results do not depend on it. */
+/* The C interface of the CPU kernels: plain pointers, no torch. Tensors are contiguous, row-major, float32 unless stated
+ * otherwise. `threads` is the number of threads that a call may use; results do not depend on it. */
 #pragma once
 
 #include <stdint.h>
@@ -11,8 +11,8 @@
 extern "C" {
 #endif
 
-/* Which version of this interface the library has. It rises with every change of what stands in this file or in
- * cpu/anchors.h; kernels/native.py expects the same number, so that a library of another version is refused. */
+/* Version of the library's interface. It is incremented with every change of the declarations in this file or in
+ * cpu/anchors.h. kernels/native.py requires the same number, so that a library of another version is refused. */
 #define SGS_ABI_VERSION 8
 int sgs_abi_version(void);
 
@@ -21,27 +21,27 @@ int sgs_isa(void);           /* the one in use */
 int sgs_best_isa(void);      /* the widest that was compiled and that this processor has */
 int sgs_use_isa(int isa);    /* switch, for tests; returns the one in use afterwards */
 
-/* Rasteriser. Forward returns a state for backward, null where memory does not suffice; sgs_raster_free releases it.
+/* Rasteriser. Forward returns a state for backward, null if memory is not sufficient; sgs_raster_free releases it.
  * means [N,3], quats [N,4] wxyz, scales [N,3], opacities [N], colors [N,3], viewmat [4,4] world to camera, K [3,3] pixels;
  * background [3] or null, screen_offsets [N,2] or null; intervals [N], the size of a training pixel at each Gaussian, or null
- * (reference_raster.screen_low_pass). drawn_tiles: one byte for each tile of 16 x 16 pixels, row by row,
- * zero where nothing is to be drawn and the picture is left as it is; or null. Gaussians from `trained` on get no
- * gradient. Out: image [H,W,3], alpha [H,W], radii [N]. */
+ * (reference_raster.screen_low_pass). drawn_tiles: one byte for each tile of 16 x 16 pixels, row by row, zero where nothing
+ * is drawn and the picture does not change; or null. Gaussians from `trained` on get no gradient.
+ * Out: image [H,W,3], alpha [H,W], radii [N]. */
 void* sgs_raster_forward(
     int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
     const float* colors, const float* viewmat, const float* K, int width, int height, float near_plane,
     const float* background, const float* screen_offsets, const float* intervals, const uint8_t* drawn_tiles,
     int64_t trained, float* image, float* alpha, float* radii, int threads);
 /* weights [N,C]: for each Gaussian the sum over the pixels of its blending weight times each of maps [H,W,C], C =
- * channels >= 1. Takes C numbers of memory for each pair of a Gaussian and a tile. image [H,W,3]: the picture of colors
- * [N,3] over background [3] or null, drawn in the same pass; or null, as then is colors. Returns 0, or 1 where memory does
- * not suffice. */
+ * channels >= 1. Needs C numbers of memory for each pair of a Gaussian and a tile. image [H,W,3]: the picture of colors
+ * [N,3] over background [3] or null, drawn in the same pass; or null together with colors. Returns 0, or 1 if memory is
+ * not sufficient. */
 int sgs_raster_weights(
     int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
     const float* colors, const float* viewmat, const float* K, int width, int height, float near_plane,
     const float* background, const float* intervals, const float* maps, int channels, float* weights, float* image,
     int threads);
-/* grad_image [H,W,3]; grad_alpha [H,W] or null. Returns 0, or 1 where memory does not suffice. */
+/* grad_image [H,W,3]; grad_alpha [H,W] or null. Returns 0, or 1 if memory is not sufficient. */
 int sgs_raster_backward(
     const void* state, int64_t count, const float* means, const float* quats, const float* scales,
     const float* opacities, const float* colors, const float* background, const float* image, const float* alpha,
@@ -61,12 +61,12 @@ void sgs_l1_ssim_backward(
     float* gradient, int threads);
 
 /* Pixels whose 3 x 3 mean absolute difference (of pictures [H,W,3]) exceeds `threshold` (in 0 ... 1), and those up to
- * `reach` pixels from them: one byte each. Returns 0, or 1 where memory does not suffice. */
+ * `reach` pixels from them: one byte each. Returns 0, or 1 if memory is not sufficient. */
 int sgs_changed_pixels(
     const uint8_t* before, const uint8_t* now, int height, int width, float threshold, int reach, uint8_t* changed,
     int threads);
 
-/* A rendering [height,width,3] and what it is compared with (kernels/reference_motion.py): picture u8 [reduced_height,
+/* A rendering [height,width,3] and its comparison (kernels/reference_motion.py): picture u8 [reduced_height,
  * reduced_width, 3]; gains and biases [3] or null; tiles, a byte each, and outside u8 [height,width,3], which is shown in those
  * that are zero, or both null; mask, a byte for each pixel of the picture, or null. */
 struct sgs_residual {
@@ -74,10 +74,10 @@ struct sgs_residual {
     const uint8_t *picture, *tiles, *outside, *mask;
     int height, width, reduced_height, reduced_width;
 };
-/* Out: found [reduced_height, reduced_width]. Returns 0, or 1 where memory does not suffice. */
+/* Out: found [reduced_height, reduced_width]. Returns 0, or 1 if memory is not sufficient. */
 int sgs_picture_residual(const struct sgs_residual* residual, float* found);
 
-/* Flow where it agrees with the flow back (kernels/reference_motion.py). flow and back [H,W,2], mask [H,W] one byte each or
+/* Forward-backward consistent flow (kernels/reference_motion.py). flow and back [H,W,2], mask [H,W] one byte each or
  * null. Out: maps [3,H,W]. */
 void sgs_confident_flow(
     const float* flow, const float* back, const uint8_t* mask, int height, int width, float relative, float absolute,
@@ -85,14 +85,14 @@ void sgs_confident_flow(
 
 /* Flow in pictures lifted to displacements (kernels/reference_motion.py). centers [E,3], weights [V,E], flows [V,E,2],
  * viewmats [V,4,4], Ks [V,3,3], near_planes [V], neighbours [T,N] rows of movers, affinities [T,N], priors [T,3]. Out:
- * displacements [T,3], inlier_share [T], agreeing_views [T]. Returns 0, or 1 where memory does not suffice. */
+ * displacements [T,3], inlier_share [T], agreeing_views [T]. Returns 0, or 1 if memory is not sufficient. */
 int sgs_lift_flow(
     const float* centers, const float* weights, const float* flows, const float* viewmats, const float* Ks,
     const float* near_planes, const int64_t* neighbours, const float* affinities, const float* priors, int64_t movers,
     int64_t targets, int views, int neighbour_count, float share, float* displacements, float* inlier_share,
     int64_t* agreeing_views, int threads);
 
-/* A view that rays are swept through (kernels/reference_motion.py). colors [h,w,3], missing [h,w], depths [h,w]. */
+/* A view of the plane sweep (kernels/reference_motion.py). colors [h,w,3], missing [h,w], depths [h,w]. */
 struct sgs_sweep_view {
     const float *colors, *missing, *depths;
     float viewmat[12], K[9], near_plane;
@@ -103,24 +103,25 @@ void sgs_sweep(
     const struct sgs_sweep_view* views, int view_count, int view_index, const int64_t* pixels, const float* farthest,
     int64_t count, int planes, int least_supports, float most_contradictions, float* depths, float* costs, int threads);
 
-/* A grey picture [h,w] beside another (kernels/reference_motion.py). */
+/* A grey neighbour picture [h,w] (kernels/reference_motion.py). */
 struct sgs_neighbour {
     const float* picture;
     int width, height;
 };
-/* How well neighbours correlate with picture [H,W] through planes: homographies double [planes, neighbours, 3, 3] from its pixels to
- * theirs, window odd, noise added to variances. Out: scores [planes, H, W]. Returns 0, or 1 where memory does not suffice. */
+/* Correlation of neighbours with picture [H,W] through planes: homographies double [planes, neighbours, 3, 3] from its pixels to
+ * theirs, window odd, noise added to variances. Out: scores [planes, H, W]. Returns 0, or 1 if memory is not sufficient. */
 int sgs_plane_scores(
     const float* picture, int height, int width, const struct sgs_neighbour* neighbours, int neighbour_count,
     const double* homographies, int64_t planes, int window, float noise, float* scores);
 
-/* Anchors (of `count`) that can put a Gaussian into the picture, or into its tiles that are not zero; ascending. Reads
- * positions, scales and offsets; intervals [count] widens the Gaussians by their low-pass, or null. Returns their number, or -1 where memory does not suffice. */
+/* Anchors (of `count`) that may have a Gaussian in the picture, or in its tiles that are not zero; ascending. Reads
+ * positions, scales and offsets; intervals [count] widens the Gaussians by their low-pass, or null. Returns their number,
+ * or -1 if memory is not sufficient. */
 int64_t sgs_anchors_visible(
     const struct sgs_anchors* anchors, int64_t count, const float* intervals, const float* viewmat, const float* K, int width,
     int height, float near_plane, const uint8_t* tiles, int64_t* visible, int threads);
 
-/* Structured Gaussians: select, then dress into arrays of selection->gaussian_count rows. */
+/* Structured Gaussians: select decodes opacities, dress decodes attributes into arrays of selection->gaussian_count rows. */
 void sgs_anchors_select(const struct sgs_anchors* anchors, struct sgs_selection* selection, int threads);
 void sgs_anchors_dress(
     const struct sgs_anchors* anchors, const struct sgs_selection* selection, const struct sgs_gaussians* out,
@@ -134,20 +135,20 @@ void sgs_anchors_backward(
 double sgs_volume(const float* scales, const float* opacities, int64_t count, int64_t* drawn);
 void sgs_volume_backward(const float* scales, int64_t count, float scale, float* gradient);
 
-/* How far |offsets [M,each,3] * scales [M,3]| go beyond `limit`, summed, returned; gradients of `factor` times the sum by
- * the offsets and by the logarithms of the scales. */
+/* Returns the sum of the excess of |offsets [M,each,3] * scales [M,3]| over `limit`. Gradients are those of `factor` times
+ * the sum with respect to the offsets and to the logarithms of the scales. */
 double sgs_excess(const float* offsets, const float* scales, int64_t anchors, int64_t each, float limit);
 void sgs_excess_backward(
     const float* offsets, const float* scales, int64_t anchors, int64_t each, float limit, float factor,
     float* offset_gradient, float* log_scale_gradient);
 
 /* Sum over pairs of shares [M,each] * (sqrt(|values[j] - values[i]|^2 + slack^2) - slack), where row i of `neighbours`
- * [M,each] holds each j, returned; its gradient by `values` [M,3] is added to `gradient`. */
+ * [M,each] contains each j; returned. Its gradient with respect to `values` [M,3] is added to `gradient`. */
 double sgs_neighbour_difference(
     const float* values, const int64_t* neighbours, const float* shares, int64_t count, int64_t each, float slack,
     float* gradient);
 
-/* Sum of log2(1 + |values - before| / step) over `count` numbers, returned, and its gradient by the values. */
+/* Sum of log2(1 + |values - before| / step) over `count` numbers, returned, and its gradient with respect to the values. */
 double sgs_change_bits(const float* values, const float* before, int64_t count, float step, float* gradient);
 
 /* Adam, in place, on tensors of `count` numbers. */
@@ -156,8 +157,8 @@ void sgs_adam_step(
     double beta2, double eps, int threads);
 
 /* Interleaved rANS (docs/entropy.md). symbols [count], contexts [count] rows of frequencies [context_count, alphabet];
- * lanes is 1, 4 or 32; states [lanes]; words has room for `count` (encode). Return 0; 1 where memory does not suffice;
- * 2 where states and words contradict each other (decode); 3 where symbols, contexts or frequencies do not fit. */
+ * lanes is 1, 4 or 32; states [lanes]; words has room for `count` (encode). Return 0; 1 if memory is not sufficient;
+ * 2 if states and words contradict each other (decode); 3 if symbols, contexts or frequencies are invalid. */
 int sgs_rans_encode(
     const uint8_t* symbols, const uint16_t* contexts, int64_t count, const uint16_t* frequencies, int64_t context_count,
     int alphabet, int lanes, uint32_t* states, uint16_t* words, int64_t* word_count);
@@ -165,9 +166,9 @@ int sgs_rans_decode(
     const uint16_t* words, int64_t word_count, const uint32_t* states, int lanes, const uint16_t* contexts,
     int64_t count, const uint16_t* frequencies, int64_t context_count, int alphabet, uint8_t* symbols);
 
-/* Adaptive decisions (docs/entropy.md). The bytes of a field while they are written or read: `size` is their number for
- * reading, the room for writing; all else is 0 at first. A model has `inputs` cells for each decision: input k the chances and
- * counts from row starts[k] + context on, `nodes` in a row, and weights [nodes, inputs]. */
+/* Adaptive decisions (docs/entropy.md). The bytes of a field during writing or reading: `size` is their number for reading,
+ * the capacity for writing; all other members are 0 at first. A model has `inputs` cells for each decision: the
+ * probabilities and counts of input k start at row starts[k] + context, `nodes` in a row; weights [nodes, inputs]. */
 typedef struct {
     uint8_t* bytes;
     int64_t size, place;
@@ -182,8 +183,8 @@ typedef struct {
     int32_t inputs, nodes;
 } sgs_model;
 
-/* What is coded (encodes: 1) or decoded (0) in place. Contexts are not checked; room for writing must suffice. Return 0; 1 where
- * memory does not suffice; 2 where a number is out of bounds; 3 where the model does not fit.
+/* Encode (encodes: 1) or decode (0) in place. Contexts are not checked; the capacity for writing must be sufficient. Return
+ * 0; 1 if memory is not sufficient; 2 if a number is out of bounds; 3 if the model is invalid.
  * Activity: history u8 [count], sizes [count] of the last residuals, active u8 [count].
  * Residuals of active rows [count, columns], their last ones, and others [count], the sizes in groups before.
  * Numbers [count], or flags with a model of one node; contexts [count, inputs]. */

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Free-viewpoint video streams from synchronised cameras, reconstructed frame by frame.
 
-:func:`prepare` makes a capture from videos and :func:`check` looks at one; :func:`reconstruct` makes a stream from a
+:func:`prepare` makes a capture from videos, and :func:`check` checks one. :func:`reconstruct` makes a stream from a
 capture, :func:`open_stream` opens it for rendering, :func:`evaluate` scores it and :func:`export` writes it in other
 formats. Cameras and points are in the units of the capture, except in a :class:`Scene`, which is normalised
 (``docs/conventions.md``).

@@ -39,7 +39,7 @@ from structgstream.struct_gstream import stream_pipeline
 
 
 def example_clip() -> Path:
-    """The folder of the bundled capture, for a first try: 10 cameras, 12 frames of 320x240.
+    """The folder of the bundled example capture: 10 cameras, 12 frames of 320x240.
 
     Raises:
         CaptureError: the installation lacks the clip.
@@ -54,25 +54,24 @@ def prepare(
     options: PrepareOptions | None = None,
     listener: Listener | None = None,
 ) -> Preparation:
-    """Turns videos of still cameras into a calibrated capture, and checks it.
+    """Turns videos of static cameras into a calibrated capture, and checks it.
 
-    The call can be repeated: steps whose inputs and options are the same are not done again, so that it goes on after
-    an interruption.
+    The call can be repeated: steps with unchanged inputs and options are skipped, so it resumes after an interruption.
 
     Args:
         videos: the folder of the cameras' videos or pictures.
-        capture: the folder to make; nothing that was made by others is written into.
-        options: how; None for the defaults of the command.
-        listener: is told of steps and progress.
+        capture: the folder to make; a folder with other files is refused.
+        options: options of the steps; None for the defaults of the command.
+        listener: receives steps and progress.
 
     Returns:
-        the capture's folder, what the check found, and the page of its report.
+        the capture's folder, the result of the check, and the page of its report.
 
     Raises:
-        CaptureError: the videos cannot be read, synchronised or calibrated, or ``capture`` holds something else.
-        ConfigError: options that these cameras do not allow.
+        CaptureError: the videos cannot be read, synchronised or calibrated, or ``capture`` contains other files.
+        ConfigError: the options are not possible with these cameras.
         StorageError: the capture cannot be written.
-        MissingExtraError: a package is missing that a step needs.
+        MissingExtraError: a package that a step needs is not installed.
     """
     return prepare_capture(Path(videos), Path(capture), options=options, listener=listener)
 
@@ -81,16 +80,16 @@ def check(capture: Path | str, *, report: Path | str | None = None) -> CheckRepo
     """Checks a capture of any layout against its pictures: poses, names, units, overlap, colours, times.
 
     Args:
-        capture: its folder.
+        capture: the folder of the capture.
         report: folder for a page with pictures and numbers; None for none.
 
     Returns:
-        all numbers, and findings: errors, which spoil a stream, first.
+        all measurements, and findings with errors first.
 
     Raises:
         CaptureError: the capture cannot be opened or read.
         StorageError: the report cannot be written.
-        MissingExtraError: a package is missing.
+        MissingExtraError: a package is not installed.
     """
     return check_folder(Path(capture), report=None if report is None else Path(report)).report
 
@@ -118,43 +117,43 @@ def reconstruct(
 ) -> list[FrameReport]:
     """Reconstructs a capture to a stream file, frame by frame; returns after the last frame is stored.
 
-    A frame is on the disk before ``on_frame`` is called. If the call is interrupted, whole frames stay, and the same
-    call with ``resume`` continues after them and gives the same bytes. The log beside the stream, ``OUT.log.jsonl``,
-    has seconds by stage and memory of each frame.
+    A frame is on the disk before ``on_frame`` is called. After an interruption the same call with ``resume`` continues
+    after the last complete frame and gives the same bytes. The log next to the stream, ``OUT.log.jsonl``, has seconds
+    by stage and memory of each frame.
 
     Args:
         capture: the folder of a capture, or an opened one, such as a ``LiveSource``, which is read until it ends.
         path: the stream file to write; the folder, if it is written as segments.
         preset: name of a preset, or a configuration (``dataclasses.replace`` on one of ``PRESETS``).
-        quality: of compact streams, -6 to 6: every quantization step is multiplied by 2^-quality.
-        mbits: of compact streams: target rate in Mbit/s; None for constant quality.
+        quality: for compact streams, -6 to 6: every quantization step is multiplied by 2^-quality.
+        mbits: for compact streams, target rate in Mbit/s; None for constant quality.
         seed: random seed; None for the preset's.
-        held_out: names of the cameras to keep from training; None for those that the capture's layout holds out; "auto"
-            for the one best surrounded by others.
+        held_out: names of the cameras to exclude from training; None for those that the capture's layout holds out;
+            "auto" for the one best surrounded by others.
         scale: size of the pictures relative to the stored ones, in (0, 1].
         start: first frame to use.
         frames: number of frames; None for all.
         near: distance of the near plane, in units of the capture; None for the capture's own.
-        every: step from one frame that is used to the next; the frames a second are divided by it.
+        every: step between used frames; the frame rate is divided by it.
         backend: the compute back-end; ``auto`` takes the first available of cuda, cpu, reference.
-        resume: continue after the last whole frame of ``path``.
+        resume: continue after the last complete frame of ``path``.
         overwrite: replace ``path`` if it exists.
         sink: ``segments`` writes a folder of immutable files and a manifest (docs/segments.md).
-        window_seconds: of segments: how far viewers can go back; None keeps everything.
+        window_seconds: for segments, how far viewers can seek back; None stores everything.
         on_frame: called with the report of each frame.
 
     Returns:
-        a report of each frame that was reconstructed in this call.
+        a report of each frame that this call reconstructed.
 
     Raises:
         CaptureError: the capture cannot be read, or contradicts itself.
-        ConfigError: invalid arguments, or others than those of the stream to resume.
+        ConfigError: arguments are invalid, or differ from those of the stream to resume.
         StorageError: ``path`` exists without ``resume`` or ``overwrite``, or cannot be written.
-        StreamError: the file to resume is no stream.
+        StreamError: the file to resume is not a stream.
         BackendError: the back-end is not available.
     """
     if resume and overwrite:
-        raise ConfigError("resume keeps the file and overwrite replaces it: choose one.")
+        raise ConfigError("resume continues the file and overwrite replaces it: choose one.")
     named = preset if isinstance(preset, str) else None
     config = with_budget(
         preset_named(preset) if isinstance(preset, str) else preset, name=named, quality=quality, mbits=mbits
@@ -175,7 +174,7 @@ def reconstruct(
     else:
         source = capture
     pipeline, chosen = stream_pipeline(config), select_backend(backend)
-    # Last, since it leaves a folder and a lock behind.
+    # Opened last, because it creates a folder and a lock.
     path = Path(path)
     storage = None
     if sink == "segments":
@@ -202,23 +201,23 @@ def evaluate(
     lpips_weights: Path | None = None,
     backend: Backend | BackendName = "auto",
 ) -> Report:
-    """Evaluates a stream file against the capture's pictures; everything is decoded from the file.
+    """Evaluates a stream file against the capture's pictures.
 
     Args:
         path: the stream file.
-        capture: the folder of the capture that it was made from, or that capture, opened with the same arguments.
+        capture: the folder of the stream's capture, or that capture opened with the same arguments.
             Scores at the size of larger stored pictures need the folder.
         cameras: names of the cameras to score; None for the held-out ones.
         metrics: ``basic`` leaves out MS-SSIM, FLIP, LPIPS and the temporal metrics.
-        lpips_weights: folder or file with the weights of LPIPS; None for the default places.
+        lpips_weights: folder or file with the weights of LPIPS; None for the default locations.
         backend: the compute back-end.
 
     Returns:
-        the report, with a mean over all frames and cameras, and scores by frame and by camera.
+        the report: a mean over all frames and cameras, and scores by frame and by camera.
 
     Raises:
-        StreamError: the file is no stream, or damaged.
-        CaptureError: the capture is not the one of the stream.
+        StreamError: the file is not a stream, or is damaged.
+        CaptureError: the capture is not that of the stream.
         ConfigError: there is no camera to score.
         BackendError: the back-end is not available.
     """
@@ -255,21 +254,22 @@ def export(
     Args:
         path: the stream file.
         output: where to write: ``NAME.html`` is one page that plays the stream; ``NAME.ply``, ``NAME.splat`` and
-            ``NAME.spz`` are one frame; any other name is a folder. None for a file or a folder beside the stream.
-        format: of the output; None for the suffix of ``output``, else ``ply``. ``site`` is a folder for a web server.
+            ``NAME.spz`` are one frame; any other name is a folder. None for a file or a folder next to the stream.
+        format: format of the output; None for the suffix of ``output``, else ``ply``. ``site`` is a folder for a web
+            server.
         frame: the only frame to write.
         frames: the first and the last frame to write; None for all.
-        sh_degree: degree of the spherical harmonics, 0 to 2; None for 1, and 0 in a ``.splat``, which has none.
-        low_pass: variance in squared training pixels that plain Gaussians are widened by, for viewers that draw larger
-            pictures than the training pictures or have no low-pass of their own: docs/export.md.
+        sh_degree: degree of the spherical harmonics, 0 to 2; None for 1, or for 0 in a ``.splat``, which has none.
+        low_pass: variance by which plain Gaussians are widened, squared training pixels, for viewers without a low-pass
+            of their own or with larger pictures than the training pictures (docs/export.md).
         backend: evaluates the MLPs.
 
     Returns:
         the file or the folder. Units and axes of plain Gaussians are the capture's own (``.spz``: y up, z back).
 
     Raises:
-        ConfigError: contradictory arguments, or a frame that does not exist.
-        StreamError: the file is no stream, or no frame of it can be decoded.
+        ConfigError: arguments contradict each other, or a frame does not exist.
+        StreamError: the file is not a stream, or none of its frames can be decoded.
         StorageError: a file cannot be written.
         PlayerError: the stream is too long for a page.
         BackendError: the back-end is not available.

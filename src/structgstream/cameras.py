@@ -16,7 +16,7 @@ from structgstream.errors import CalibrationError
 
 
 class Viewport(NamedTuple):
-    """A camera as kernels take it, with the dtype and device of the drawn tensors.
+    """A camera in the form that kernels take, with the dtype and device of the drawn tensors.
 
     Args:
         viewmat: ``[4, 4]`` world to camera.
@@ -36,15 +36,15 @@ class Viewport(NamedTuple):
 
 
 REFERENCE_PIXELS = 640
-"""Longer side, in pixels, of the largest pictures for which lengths in pixels were chosen (320 x 240 to 640 x 360). In
-a larger picture the same content covers more pixels, and lengths are in proportion (:func:`enlargement`)."""
+"""Longer side, in pixels, of the largest pictures for which lengths in pixels were chosen (320 x 240 to 640 x 360).
+Lengths are scaled for larger pictures, in which the same content covers more pixels (:func:`enlargement`)."""
 
 
 def enlargement(width: float, height: float) -> float:
-    """How many pixels of a picture of ``width`` x ``height`` are one of a picture of the reference size, at least 1.
+    """Side of a pixel of the reference size, in pixels of a picture of ``width`` x ``height``; at least 1.
 
-    Lengths in pixels that stand in a configuration are multiplied by it, areas in pixels by its square. Pictures below
-    the reference size take them as they are (docs/scaling.md).
+    Lengths in pixels of a configuration are multiplied by it, areas in pixels by its square. They are not scaled for
+    pictures below the reference size (docs/scaling.md).
     """
     return max(1.0, max(width, height) / REFERENCE_PIXELS)
 
@@ -84,7 +84,7 @@ class Camera:
                 f"got {tuple(self.viewmat.shape)} and {tuple(self.K.shape)}."
             )
         if not (torch.isfinite(self.viewmat).all() and torch.isfinite(self.K).all()):
-            raise CalibrationError("The calibration holds a number that is not finite (NaN or infinity).")
+            raise CalibrationError("The calibration has a number that is not finite (NaN or infinity).")
         rotation = self.viewmat[:3, :3]
         if (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max() > 1e-3 or rotation.det() < 0:
             raise CalibrationError(
@@ -114,7 +114,7 @@ class Camera:
     def resized(self, width: int, height: int) -> "Camera":
         """The same camera with its picture resampled to ``width x height`` pixels; cached, as :meth:`viewport` is.
 
-        The intrinsics scale with the picture; because a pixel's centre sits at +0.5 no half-pixel shift appears.
+        The intrinsics scale with the picture; pixel centres at +0.5 need no half-pixel shift.
         """
         if (width, height) not in self._resized:
             factors = torch.tensor([[width / self.width], [height / self.height], [1.0]], dtype=torch.float64)
@@ -124,7 +124,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class CameraRig:
-    """Named cameras, fixed for the length of a stream, and which of them are held out from training.
+    """Named cameras, constant during a stream, and the names of those that are held out from training.
 
     Everything that is stored per camera follows the order of ``cameras``.
     """

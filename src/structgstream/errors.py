@@ -11,7 +11,7 @@
     |-- BackendError            a compute back-end is not available on this machine
     |-- ConfigError             an option has an invalid value
     |-- OutOfMemoryError        a kernel has not enough memory; also a MemoryError
-    |-- TaskError               tasks of a run failed; what the others made is kept
+    |-- TaskError               tasks of a run failed; results of the others are retained
     |-- PlayerError             the player cannot be served, or does not fit in a page
     `-- MissingExtraError       an optional dependency is not installed
 
@@ -37,7 +37,7 @@ class StreamError(StructGStreamError):
 
 
 class StorageError(StructGStreamError):
-    """The stream cannot be written; packets written before stay readable."""
+    """The stream cannot be written; earlier packets stay readable."""
 
 
 class BackendError(StructGStreamError):
@@ -49,14 +49,14 @@ class ConfigError(StructGStreamError):
 
 
 class OutOfMemoryError(StructGStreamError, MemoryError):
-    """There is not enough memory; the message says for what."""
+    """There is not enough memory; the message states for what."""
 
     def __init__(self, work: str) -> None:
         super().__init__(f"Not enough memory {work}; close other programs, or use smaller pictures (--scale 0.5).")
 
 
 class TaskError(StructGStreamError):
-    """Tasks of a run failed; the message says which, and why the first did. What the others made is kept."""
+    """Tasks of a run failed. The message names them and the first one's reason. Results of the others are retained."""
 
 
 class PlayerError(StructGStreamError):

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colours, distinguishable with all common kinds of colour vision.
+# The colours of Okabe and Ito, distinguishable with all common kinds of colour vision.
 COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#F0E442", "#222222")
 INK, FAINT, OTHER = "#222222", "#dddddd", "#999999"
 
@@ -43,14 +43,14 @@ def without_frame(axis: "Axes") -> None:
 
 
 def save_figure(figure: "Figure", path: Path) -> None:
-    """Writes a picture, whole or not at all, and creates its folder if necessary.
+    """Writes a picture atomically, and creates its folder if necessary.
 
     Raises:
         StorageError: the file cannot be written.
     """
     content = BytesIO()
     with warnings.catch_warnings():
-        # Names of cameras may have letters that the font lacks; a box stands for them then.
+        # The font may lack letters of camera names and then draws boxes.
         warnings.filterwarnings("ignore", message=r"Glyph \d+ .* missing from")
         figure.savefig(content, format=path.suffix.removeprefix(".") or "png")
     write_whole(path, content.getvalue(), called="The picture", new_folder=True, sync=False)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Locks on open files, by which processes keep out of each other's way; each ends with its process, in any way."""
+"""Locks on open files between processes; a lock ends with its process."""
 
 import errno
 import fcntl
@@ -7,17 +7,18 @@ import os
 from pathlib import Path
 from typing import IO, Any, BinaryIO, Literal, cast
 
-_HELD = (errno.EACCES, errno.EAGAIN)  # what POSIX lets a system say of a lock that another has
+_HELD = (errno.EACCES, errno.EAGAIN)  # the errors that POSIX allows for a lock that is held
 
 
 def lock_file(file: IO[Any], *, holder: Literal["file", "process"] = "file") -> bool:
-    """Takes the lock of ``file``, which must be open for writing; False if another has it.
+    """Acquires the lock of ``file``, which must be open for writing; returns False if it is held already.
 
-    A file system without locks, as some networks' are, gives every lock to everyone.
+    On a file system without locks, such as some network file systems, it always succeeds.
 
     Args:
-        file: keeps the lock until it is closed.
-        holder: who has the lock: this open file, so that a second one in the same process is refused, or the process.
+        file: holds the lock until it is closed.
+        holder: the owner of the lock: the open file, so that a second one in the same process is refused, or the
+            process.
     """
     take = fcntl.flock if holder == "file" else fcntl.lockf
     try:
@@ -28,9 +29,9 @@ def lock_file(file: IO[Any], *, holder: Literal["file", "process"] = "file") -> 
 
 
 def open_lockable(path: Path, *, buffering: int = -1) -> BinaryIO:
-    """The file ``path``, made if it is missing, open for writing at its beginning; what is in it stays.
+    """The file ``path``, created if it is missing, open for writing at its beginning and not truncated.
 
-    A link is followed to a device only: a file that it points to is another's.
+    A link is followed only to a device, because a file that it points to may belong to somebody else.
 
     Raises:
         OSError: it cannot be opened, or is a link.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Optical flow between two pictures of one camera, and its forward-backward consistency.
 
-Dense inverse search (:func:`dis_search`) is accurate, but loses what moves farther than its own size: at the levels of
-the pyramid where the motion is short, the thing has vanished. :func:`block_search` looks through all displacements up
-to a bound at a size where that is cheap, and :func:`dis_refinement` makes its answer accurate.
+Dense inverse search (:func:`dis_search`) is accurate, but loses objects that move farther than their own size: they are
+not visible at the levels of the pyramid where their motion is short. :func:`block_search` searches all displacements up
+to a bound on reduced pictures, and :func:`dis_refinement` refines its result.
 """
 
 from collections.abc import Callable
@@ -26,12 +26,12 @@ picture corresponds to ``p + flow[p]`` in the second."""
 
 
 FlowRefinement = Callable[[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]], NDArray[np.float32]]
-"""As :data:`FlowSearch`, with an approximate flow ``[H, W, 2]`` to begin from."""
+"""As :data:`FlowSearch`, with an approximate initial flow ``[H, W, 2]``."""
 
 BLOCK_COST_CLIP = 300.0
-"""Largest difference of two cells, levels of 255 summed over the channels: beyond it they are just different."""
+"""Largest difference of two cells, in levels of 255 summed over channels; larger differences are clamped to it."""
 BLOCK_COST_PER_CELL = 0.6
-"""Cost of a displacement by one cell, in the same levels, which decides where the pictures are plain."""
+"""Cost of a displacement by one cell, in the same levels, which decides in untextured regions."""
 
 
 def dis_search(extra: str, *, refined: bool = True, finest_level: int = 1) -> FlowSearch:
@@ -40,9 +40,9 @@ def dis_search(extra: str, *, refined: bool = True, finest_level: int = 1) -> Fl
     Args:
         extra: the extra of this package that a user should install when OpenCV is missing.
         refined: OpenCV's preset "medium". False: preset "fast", stopped at half resolution and without variational
-            refinement; it takes two fifths of the time and is as accurate at consistent
-            pixels (:func:`consistency_mask`).
-        finest_level: of the pyramid, if not refined: 1 is half resolution, 0 full.
+            refinement; it takes two fifths of the time and is as accurate at consistent pixels
+            (:func:`consistency_mask`).
+        finest_level: finest level of the pyramid, if not refined: 1 is half resolution, 0 full.
 
     Raises:
         MissingExtraError: OpenCV is not installed.
@@ -56,14 +56,14 @@ def dis_search(extra: str, *, refined: bool = True, finest_level: int = 1) -> Fl
 
     def flow(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.float32]:
         one, other = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (first, second))
-        # calc starts from the flow that it is given and overwrites it.
+        # calc starts from its argument and overwrites it.
         return np.asarray(search.calc(one, other, np.zeros((*one.shape, 2), np.float32)), np.float32)
 
     return flow
 
 
 def dis_refinement(*, finest_level: int, coarsest_level: int) -> FlowRefinement:
-    """As :func:`dis_search` with ``refined=False``, but from an approximate flow and the level ``coarsest_level`` on.
+    """As :func:`dis_search` with ``refined=False``, but starts from an approximate flow at level ``coarsest_level``.
 
     Raises:
         MissingExtraError: OpenCV is not installed.
@@ -87,8 +87,9 @@ def block_search(
     """Approximate flow ``[H, W, 2]`` from ``first`` to ``second`` and back: block matching of reduced pictures.
 
     A pixel of a reduced picture is a cell. For each cell p the displacement s of at most ``reach_cells`` cells with the
-    least cost is taken: ``min(sum_c |first(p) - second(p + s)|, 300)``, averaged over 3 x 3 cells, plus ``0.6 |s|``.
-    Then the median over 3 x 3 cells, enlarged. The time is that of ``pi reach_cells^2`` passes over the cells.
+    least cost is chosen. The cost is ``min(sum_c |first(p) - second(p + s)|, 300)``, averaged over 3 x 3 cells, plus
+    ``0.6 |s|``. The result is the median over 3 x 3 cells, enlarged. The time is that of ``pi reach_cells^2`` passes
+    over the cells.
 
     Args:
         first: ``[H, W, 3]``.
@@ -111,7 +112,7 @@ def block_search(
     best = [np.zeros((rows, columns), np.int16) for _ in range(2)]
     total = np.ones((1, 3), np.float32)
     for number, (dx, dy) in enumerate(displacements):
-        # The cells of the first picture that the displacement leads to cells of the second, and these.
+        # The cells of the first picture that stay inside when displaced, and the cells of the second that they map to.
         here = slice(max(0, -dy), rows - max(0, dy)), slice(max(0, -dx), columns - max(0, dx))
         there = slice(max(0, dy), rows + min(0, dy)), slice(max(0, dx), columns + min(0, dx))
         cost = cv2.transform(cv2.absdiff(one[here], other[there]), total)
@@ -152,8 +153,9 @@ def _opencv(extra: str) -> Any:
 
 
 def picture_shift(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[float, float]:
-    """How far ``second`` is shifted as a whole against ``first`` ``[H, W, 3]``, in pixels, and how clearly, 0 to 1:
-    phase correlation (Kuglin and Hines, 1975) of grey pictures under a Hann window.
+    """Global shift of ``second`` relative to ``first``, ``[H, W, 3]`` each, in pixels, and its confidence, 0 to 1.
+
+    Phase correlation (Kuglin and Hines, 1975) of grey pictures under a Hann window.
 
     Raises:
         MissingExtraError: OpenCV is not installed.
@@ -168,8 +170,9 @@ def picture_shift(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[
 
 
 def consistency_mask(flow: NDArray[np.float32], back: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Mask ``[H, W]`` of the pixels whose flow is forward-backward consistent, hence not occluded (Sundaram et al.,
-    2010).
+    """Mask ``[H, W]`` of the pixels whose flow is forward-backward consistent, hence not occluded.
+
+    Source: Sundaram et al., 2010.
 
     With ``f`` the forward and ``b`` the backward flow, ``[H, W, 2]``:
     ``|f(p) + b(p + f(p))|^2 <= 0.01 (|f(p)|^2 + |b(p + f(p))|^2) + 0.5``, and ``p + f(p)`` lies in the picture.
@@ -186,7 +189,7 @@ def _squared_lengths(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def inside(offsets: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Mask ``[H, W]`` of the pixels that their offset moves to a position inside the outermost pixel centres."""
+    """Mask ``[H, W]`` of the pixels whose position plus offset is inside the outermost pixel centres."""
     height, width, _ = offsets.shape
     columns, rows = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)
     x, y = offsets[..., 0] + columns, offsets[..., 1] + rows[:, None]

@@ -32,9 +32,9 @@ class FrameReport:
     0's data for later frames). ``peak_memory_kind`` states whether they are per stage (Note [Peaks]);
     ``peak_device_bytes`` are the GPU's, if any. ``cpu_seconds`` is the CPU time of all threads of the process.
     ``losses`` are the means of the loss terms, without their weights, over the fit's last pass through the cameras.
-    ``absent`` are the cameras without a picture of this frame, held-out ones among them. ``begins`` says why the frame
-    begins another period, and is None if it does not. ``mean_of`` is the number of pictures that a training pixel is
-    the mean of, on average (``data/denoising.py``).
+    ``absent`` are the cameras without a picture of this frame, including held-out ones. ``begins`` states why the frame
+    begins another period, and is None if it does not. ``mean_of`` is the average number of pictures whose mean is a
+    training pixel (``data/denoising.py``).
     """
 
     index: int
@@ -72,7 +72,7 @@ class FrameMeter:
         self._seconds: dict[str, float] = {}
 
     def end(self, stage: str, *, peak: str | None = None) -> None:
-        """Ends a stage of time, and the stage ``peak`` of memory if that is given."""
+        """Ends a stage of time, and the stage ``peak`` of memory if it is given."""
         if peak is not None:
             self._peaks.end(peak)
         now = time.perf_counter()
@@ -86,7 +86,7 @@ class FrameMeter:
         *,
         remarks: FrameRemarks | None = None,
     ) -> FrameReport:
-        """The report of the frame whose packet takes ``size`` bytes, with what its task says of it."""
+        """The report of a frame with a packet of ``size`` bytes, including the remarks of its task."""
         packet, state = encoded.packet, encoded.reconstruction
         read = {name: seconds for name, seconds in self._seconds.items() if name == "read"}
         return FrameReport(
@@ -114,7 +114,7 @@ class FrameMeter:
 
 
 def metered(items: Iterator[T], device: torch.device) -> Iterator[tuple[FrameMeter, T]]:
-    """Each item with the meter of its frame, whose stage ``read`` is the time until the item was there."""
+    """Each item with the meter of its frame, whose stage ``read`` is the time until the item was available."""
     while True:
         meter = FrameMeter(device)
         found = [*islice(items, 1)]

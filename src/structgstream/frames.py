@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 LEAST_CAMERAS = 2
-"""Training cameras that a frame needs: one picture does not say where things are."""
+"""Training cameras that a frame needs, because a single picture does not determine depth."""
 BLANK_LEVELS = 2.0
-"""Standard deviation, in levels of 255, below which a picture shows nothing: a covered lens, a camera that starts."""
+"""Standard deviation, in levels of 255, below which a picture is blank: a covered lens, a camera that starts."""
 MOST_BLANK_SHARE = 0.25
 """Share of frame 0's pictures that may be blank while the others are not; if more are, the scene is dark or plain."""
-_EVERY_PIXELS = 8  # A picture that shows something does so in every eighth row and column.
+_EVERY_PIXELS = 8  # Every eighth row and column is sufficient to detect content.
 
 
 @dataclass(frozen=True)
@@ -23,13 +23,13 @@ class MultiViewFrame:
     Args:
         index: position in the stream, 0 for the first reconstructed frame.
         pts_seconds: presentation time, 0 for the first reconstructed frame.
-        images: camera name to ``[H, W, 3]`` uint8 sRGB, in the rig's order; sizes may differ between cameras. Cameras
-            that have no picture of this instant are missing here. Held-out cameras are included when the source
-            delivers them; training never reads them.
-        masks: camera name to ``[H, W]`` bool, True where the picture counts. A camera that is missing here counts
-            everywhere.
-        captured_unix_seconds: when it was filmed, Unix time, if the cameras are live.
-        mean_of: number of pictures that a training pixel is the mean of, on average (``data/denoising.py``).
+        images: ``[H, W, 3]`` uint8 sRGB by camera name, in the rig's order; sizes may differ between cameras. Cameras
+            without a picture of this frame have no entry. Held-out cameras are included if the source provides them;
+            training never reads them.
+        masks: ``[H, W]`` bool by camera name, True where the picture counts. All pixels count for a camera without an
+            entry.
+        captured_unix_seconds: time of capture, Unix time, for live cameras.
+        mean_of: average number of pictures whose mean is a training pixel (``data/denoising.py``).
     """
 
     index: int
@@ -40,15 +40,15 @@ class MultiViewFrame:
     mean_of: float = 1.0
 
     def present(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Those of the cameras ``names`` whose picture counts somewhere, in their order."""
+        """The cameras among ``names`` that have a pixel that counts, in their order."""
         return tuple(
             name for name in names if name in self.images and (name not in self.masks or self.masks[name].any())
         )
 
     def showing(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Those of :meth:`present` whose picture shows something; in frame 0 all of them if many show nothing.
+        """The cameras of :meth:`present` whose picture is not blank; in frame 0 all of them if many are blank.
 
-        Later many pictures are blank at once where what records them fails, or the light is off.
+        In later frames many pictures are blank at the same time if the recorder fails or the light is off.
         """
         present = self.present(names)
         blank = [name for name in present if self._is_blank(name)]

@@ -8,9 +8,9 @@ from torch import Tensor
 
 
 def row_indices(rows: Tensor) -> Tensor:
-    """Indices ``[n]`` of the rows of a mask ``[N]``; indices as they are.
+    """Indices ``[n]`` of the rows of a mask ``[N]``; indices are returned unchanged.
 
-    Each tensor that is indexed by a mask counts its rows anew, for which the host waits for a GPU.
+    Indexing a tensor by a mask counts its rows each time, for which the host waits for the GPU.
     """
     return rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows
 
@@ -26,14 +26,14 @@ class Gaussians:
         opacities: ``[N]`` in (0, 1).
         colors: ``[N, 3]`` sRGB.
         ids: ``[N]`` int64, identifies a Gaussian of the scene. See Note [Ids].
-        sampling_intervals: ``[N]`` side of a training pixel at the Gaussian, scene units, without gradient, by which
-            it is filtered (``scene/sampling.py``, Note [Drawn as it was trained]); None: by the picture that is drawn.
+        sampling_intervals: ``[N]`` side of a training pixel at the Gaussian, scene units, without gradient, which sets
+            its low-pass (``scene/sampling.py``, Note [Drawn as it was trained]); None: that of the drawn picture.
 
     Note [Ids]
     ~~~~~~~~~~
     Structured Gaussian ``j`` of anchor ``i`` has id ``i * K + j``; free Gaussian in slot ``f`` has ``M * K + f``.
-    The opacity mask and any culling drop rows *together with their ids*, so that statistics, spawning and pruning
-    index by id and need no chain of masks.
+    The opacity mask and culling remove rows *together with their ids*, so that statistics, spawning and pruning can
+    index by id without a chain of masks.
     """
 
     means: Tensor

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Seeds of frames, the pictures that a frame needs, and initial points of frame 0."""
+"""Random seeds of frames, checks of a frame's pictures, and initial points of frame 0."""
 
 import torch
 
@@ -12,20 +12,20 @@ from structgstream.similarity import Similarity
 
 
 def frame_seed(seed: int, index: int) -> int:
-    """The seed of a frame, so that it can be repeated alone."""
+    """The seed of a frame, which depends only on its index, so that a frame can be repeated separately."""
     return (seed * 1_000_003 + index) % 2**63
 
 
 def shows_enough(frame: MultiViewFrame, rig: CameraRig) -> bool:
-    """Whether a later frame can be fitted: the pictures of at least two training cameras show something."""
+    """Whether a later frame can be fitted: at least two training cameras have pictures that are not blank."""
     return len(frame.showing(rig.training)) >= LEAST_CAMERAS
 
 
 def check_enough_pictures(frame: MultiViewFrame, rig: CameraRig, capture: str) -> None:
-    """Check that at least two training cameras have pictures, which in frame 0 show something.
+    """Check that at least two training cameras have pictures, which in frame 0 must not be blank.
 
     Raises:
-        CaptureError: naming them.
+        CaptureError: they do not; the message names the cameras.
     """
     present = frame.present(rig.training) if frame.index else frame.showing(rig.training)
     if len(present) < LEAST_CAMERAS:
@@ -41,7 +41,7 @@ def initial_points_of(
 ) -> torch.Tensor:
     """Normalised points ``[P, 3]`` of the capture, or estimated from ``frame``, after checking the poses.
 
-    A capture's points are those of its beginning: where another period begins they are estimated.
+    A capture's points are those of its first frame; at the beginning of later periods they are estimated.
     """
     from structgstream.pose_check.check import check_poses
 

@@ -3,7 +3,7 @@
 
 Note [Peaks]
 ~~~~~~~~~~~~
-The system keeps one high-water mark of the resident size for the whole process. Linux lets a process reset it
+The system has one high-water mark of the resident size for the whole process. Linux lets a process reset it
 (``/proc/self/clear_refs``, proc_pid_clear_refs(5)), so that the mark at the end of a stage (``VmHWM`` of
 ``/proc/self/status``) is the peak of that stage. Elsewhere the mark only rises, and a stage's value is the peak since
 the process started. It covers all threads: a prefetched frame counts in the stage during which it is decoded. Other
@@ -35,7 +35,7 @@ class PeakMeter:
         device: if it is a CUDA device, torch's allocations on it are measured too.
 
     Attributes:
-        kind: what ``process_bytes`` holds.
+        kind: meaning of ``process_bytes``.
         process_bytes: stage to largest resident size; empty where the system does not report it.
         device_bytes: stage to largest size of allocated tensors; empty without a CUDA device.
     """
@@ -74,7 +74,7 @@ def resident_bytes() -> int | None:
 
 
 def status_bytes(name: str) -> int | None:
-    """The size of that name in ``/proc/self/status``, in bytes; None where there is no such line."""
+    """The size of this name in ``/proc/self/status``, in bytes; None if there is no such line."""
     try:
         lines = _STATUS.read_text().splitlines()
     except OSError:

@@ -55,7 +55,7 @@ class Player(anywidget.AnyWidget):
 
     Args:
         stream: a stream file, read at its present length, or a stream's bytes.
-        height_pixels: of the player; it is as wide as the cell.
+        height_pixels: height of the player; its width is that of the cell.
 
     Attributes:
         stream: the bytes of the shown stream; assigning others replaces it.

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Folders that the program may empty: each has a marker file, and only files that the program names so are removed.
+"""Folders that the program may delete: each has a marker file, and only files with names of the program are removed.
 
 Note [Ownership]
 ~~~~~~~~~~~~~~~~
-A folder is used for side files if it is missing, empty, or has a marker of the same purpose; any other is refused
-before anything in it changes. The marker's identity is random, so that a folder here and one in an object store that
-were made for each other have the same one, and no others have. Removing goes by name as well: what a user has put into
-a marked folder stays there.
+A folder is used for side files if it is missing, empty, or has a marker of the same purpose; any other folder is
+refused before anything in it changes. The marker's identity is random and equal only in folders of the same run, for
+example a local one and one in an object store. Files are removed by name, so files of a user in a marked folder are not
+removed.
 """
 
 import json
@@ -28,9 +28,9 @@ class Owner:
     """The content of a marker.
 
     Args:
-        purpose: what the folder is for, in a few words for messages, such as "parts of a parallel run".
+        purpose: purpose of the folder, in a few words for messages, such as "parts of a parallel run".
         identity: random, equal in all folders of one run.
-        key: hash of what the run was asked for; empty where that does not matter.
+        key: hash of the run's inputs; empty if it does not matter.
     """
 
     purpose: str
@@ -39,17 +39,17 @@ class Owner:
 
     @staticmethod
     def new(purpose: str) -> "Owner":
-        """One that no other folder has."""
+        """An owner with a new random identity."""
         return Owner(purpose, uuid.uuid4().hex)
 
     @property
     def content(self) -> bytes:
-        """As the marker has it."""
+        """The content of the marker file."""
         return f"{json.dumps({'made_by': 'structgstream', **asdict(self)}, indent=1)}\n".encode()
 
 
 def parse_owner(content: bytes) -> Owner | None:
-    """The content of a marker; None if it is another file's."""
+    """The owner in the content of a marker file; None if it is another file."""
     try:
         found = json.loads(content)
         if found["made_by"] != "structgstream":
@@ -70,10 +70,10 @@ def owner_of(folder: Path) -> Owner | None:
 
 
 def check_owned(folder: Path, purpose: str) -> Owner | None:
-    """The owner of a folder that may be used for ``purpose``; None if it has none yet, since it is missing or empty.
+    """The owner of a folder that may be used for ``purpose``; None if it is missing or empty.
 
     Raises:
-        StorageError: it is a file, cannot be read, or holds files and no marker of this purpose.
+        StorageError: it is a file, cannot be read, or contains files without a marker of this purpose.
     """
     found = owner_of(folder)
     if found is not None and found.purpose == purpose:
@@ -88,21 +88,21 @@ def check_owned(folder: Path, purpose: str) -> Owner | None:
         return None
     what = "no marker" if found is None else f"a marker for the {found.purpose}"
     raise StorageError(
-        f"{folder} is needed for the {purpose}, and holds files with {what} of structgstream ({MARKER}), so it may be "
-        "somebody else's; nothing in it was changed. Choose another output, or move the folder to another place."
+        f"{folder} is needed for the {purpose}, and contains files with {what} of structgstream ({MARKER}), so it may "
+        "be somebody else's; nothing in it was changed. Choose another output, or move the folder to another place."
     )
 
 
 def own_folder(folder: Path, purpose: str, *, owner: Owner | None = None) -> Owner:
-    """Makes and marks a folder, unless it is marked already; returns its owner.
+    """Creates and marks a folder unless it is marked already; returns its owner.
 
     Args:
         folder: missing, empty, or of the same purpose.
         purpose: see :class:`Owner`.
-        owner: of a new marker; None for a random identity.
+        owner: owner in a new marker; None for a random identity.
 
     Raises:
-        StorageError: as :func:`check_owned`, or it cannot be made.
+        StorageError: see :func:`check_owned`, or it cannot be created.
     """
     found = check_owned(folder, purpose)
     if found is None:
@@ -114,14 +114,14 @@ def own_folder(folder: Path, purpose: str, *, owner: Owner | None = None) -> Own
 def remove_own(
     folder: Path, purpose: str, names: re.Pattern[str], *, order: Mapping[str, int] | None = None, whole: bool = False
 ) -> None:
-    """Removes the files of a marked folder whose path in it, with slashes, is one of ``names``, and folders so emptied.
+    """Removes the files of a marked folder whose relative path matches ``names``, and folders that are empty then.
 
     Args:
-        folder: nothing happens where it is missing.
+        folder: the folder; a missing one is ignored.
         purpose: see :class:`Owner`.
-        names: matched in full.
-        order: a number by name: smaller ones go first, those that it lacks have 1.
-        whole: whether the marker and the folder go, too, if nothing else is left.
+        names: pattern of relative paths with slashes, matched in full.
+        order: priority by path: smaller ones are removed first; the default is 1.
+        whole: also remove the marker and the folder if nothing else remains.
 
     Raises:
         StorageError: the folder has no marker of this purpose, or a file cannot be removed.

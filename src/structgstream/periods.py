@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decides which frames begin another period, with a header of its own.
+"""Decides which frames begin another period, which has a header of its own.
 
 Note [Periods]
 ~~~~~~~~~~~~~~
-The static fields of a header are those of one frame. When a scene has become another one, anchors and free Gaussians
-have to represent what the header's fields were not made for: pictures get worse and packets larger. A period begins at
-a key frame, after a time, or when the pictures have become worse than those of the period's first frame. Both are
-measured on decoded scenes, so that a resumed run, which has the stream and the pictures, decides the same.
+The static fields of a header are fitted to one frame. After a large change of the scene, anchors and free Gaussians
+have to represent content that these fields do not fit: pictures get worse and packets larger. A period begins at a key
+frame, after a given time or when the residual exceeds that of the period's first frame. Residuals are measured on
+decoded scenes, so that a resumed run, which has the stream and the pictures, makes the same decisions.
 """
 
 import math
@@ -21,20 +21,20 @@ from structgstream.key_frames import LEAST_FRAMES, KeyFrames
 
 @dataclass(frozen=True)
 class PeriodConfig:
-    """When a stream goes on with another header, and how that is made; off by default."""
+    """When a stream continues with another header, and how it is fitted; off by default."""
 
     seconds: float | None = None
-    """A period ends at the first key frame after so many seconds of media time. None: not by time."""
+    """A period ends at the first key frame after so many seconds of media time. None: no limit of time."""
     residual: float | None = None
-    """A period ends at a key frame when the residual of the decoded frames before it exceeded this multiple of that of
-    the period's first frame, such as 1.3. None: not by residual."""
+    """A period ends at a key frame if the residuals of the decoded frames before it exceed this multiple of that of the
+    period's first frame, such as 1.3. None: no limit of the residual."""
     frames: int = 3
-    """As many frames in a row, the last before the key frame, must exceed it."""
+    """Number of consecutive frames before the key frame that must exceed it."""
     start: Literal["points", "scene"] = "points"
     """The first frame of a period is fitted from initial points, as frame 0 is, or from the decoded scene before it,
-    which takes less time and serves a scene that has changed in part."""
+    which takes less time and suits a scene that has changed in part."""
     share: float = 0.35
-    """From the scene, this share of frame 0's iterations is made, the last ones of its schedule."""
+    """Share of frame 0's iterations, from the end of its schedule, for a fit from the decoded scene."""
 
     @property
     def enabled(self) -> bool:
@@ -46,8 +46,8 @@ class PeriodPlan:
     """Finds the frames that begin another period, from times and residuals of the frames before them.
 
     Args:
-        config: when.
-        most: number of periods that a stream may have; the last one goes on.
+        config: conditions of a new period.
+        most: largest number of periods of a stream; the last one does not end.
 
     Raises:
         ConfigError: a value is out of range.
@@ -56,7 +56,7 @@ class PeriodPlan:
     def __init__(self, config: PeriodConfig, *, most: int) -> None:
         for name, value, least in (("seconds", config.seconds, 0.0), ("residual", config.residual, 1.0)):
             if value is not None and not least < value < math.inf:
-                raise ConfigError(f"--period.{name} {value:g} is not above {least:g}; leave it out for none.")
+                raise ConfigError(f"--period.{name} {value:g} is not above {least:g}; leave it out for no limit.")
         if config.frames < 1 or not 0.0 < config.share <= 1.0:
             raise ConfigError(
                 f"--period.frames {config.frames} and --period.share {config.share:g}: frames must be at least 1, and "
@@ -73,7 +73,7 @@ class PeriodPlan:
         if self._first is None or self._number + 1 >= self._most:
             return None
         config, seconds = self._config, pts_seconds - self._first[1]
-        # Times are sums of rounded numbers.
+        # Tolerance for times, which are sums of rounded numbers.
         if config.seconds is not None and seconds >= config.seconds - 1e-6:
             return f"after {seconds:.3g} s"
         measured = dict(self._last)
@@ -84,7 +84,7 @@ class PeriodPlan:
         return None
 
     def begin(self, index: int, pts_seconds: float, *, number: int | None = None) -> None:
-        """Frame ``index`` begins a period: the next one, or that of this number."""
+        """Record that frame ``index`` begins a period: the next one, or that with this number."""
         if number is not None:
             self._number = number
         elif self._first is not None:
@@ -93,10 +93,10 @@ class PeriodPlan:
         self._last.clear()
 
     def measures(self, index: int, pts_seconds: float, keys: KeyFrames) -> bool:
-        """Whether :meth:`add` needs the residual of frame ``index``: it is the first, or soon a key frame follows.
+        """Whether :meth:`add` needs the residual of frame ``index``: it is the first, or a key frame follows soon.
 
-        Where more frames than the shortest group are asked for, that is every frame: of a frame before the last key
-        frame a resumed run could not tell otherwise what the first one had expected.
+        If ``config.frames`` exceeds the shortest group, every frame is needed, because a resumed run cannot reconstruct
+        which key frame was expected in an earlier group.
         """
         if self._config.residual is None or self._first is None:
             return False
@@ -105,18 +105,18 @@ class PeriodPlan:
         return keys.near(index, pts_seconds, within=self._config.frames)
 
     def add(self, index: int, residual: float) -> None:
-        """Take the residual of a decoded frame that :meth:`measures` asks for, in order."""
+        """Add the residual of a decoded frame for which :meth:`measures` is True; in order of frames."""
         if self._first is not None and index == self._first[0]:
             self._floor = residual
         self._last.append((index, residual))
 
     @property
     def remembered(self) -> int:
-        """How many of the last frames :meth:`needed` may name."""
+        """Number of last frames among which those of :meth:`needed` are."""
         return 0 if self._config.residual is None else self._config.frames
 
     def needed(self, pts_seconds: Sequence[float], keys: KeyFrames) -> list[int]:
-        """The frames whose residuals a run that goes on after the frames with these times has to measure again."""
+        """The frames whose residuals must be measured again by a run that resumes after frames at these times."""
         assert self._first is not None, "a period has begun"
         first, count = self._first[0], len(pts_seconds)
         last = range(max(count - self._config.frames, first + 1), count)

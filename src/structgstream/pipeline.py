@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Protocols of a pipeline: a method that fits frames, and a codec that stores them.
 
-Struct-GStream with its two codecs is a pipeline (``struct_gstream.py``); another method would be another.
-``session.py`` runs them all.
+Struct-GStream with its two codecs is a pipeline (``struct_gstream.py``); another method would be another pipeline.
+``session.py`` runs any of them.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -30,10 +30,10 @@ from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.result import FitResult, StepListener
 
 State = TypeVar("State", bound=Drawable)
-"""A decoded frame; it may have a length, its number of Gaussians."""
+"""A decoded frame. Its length, if it has one, is its number of Gaussians."""
 State_co = TypeVar("State_co", bound=Drawable, covariant=True)
 Memory = TypeVar("Memory")
-"""Data of frame 0 that the encoder keeps and a receiver does not have."""
+"""Data of frame 0 that only the encoder stores; a receiver does not have it."""
 
 
 @dataclass(frozen=True)
@@ -41,14 +41,14 @@ class FrameTask:
     """Input of a method for one frame, in normalised units.
 
     Args:
-        frame: its pictures and its time.
-        pictures: of the training cameras, preprocessed by :meth:`Method.observe`.
+        frame: pictures and time of the frame.
+        pictures: pictures of the training cameras, preprocessed by :meth:`Method.observe`.
         rig: all cameras; held-out ones are not used.
-        points: computes initial points ``[P, 3]`` of the frame, which may take a while.
+        points: computes initial points ``[P, 3]`` of the frame, which may take long.
         backend: the compute back-end.
-        seed: of all random numbers, so that a frame can be repeated alone.
+        seed: seed of all random numbers, so that a frame can be repeated separately.
         steps: the codec's quantization steps by name; empty in frame 0.
-        pressure: of the rate control (``rate_control``, Note [Pressure]).
+        pressure: factor of the rate control (``rate_control``, Note [Pressure]).
         begins: why the frame begins another period, in a few words (``periods``); None if it does not.
         on_step: called after every optimisation step.
     """
@@ -66,7 +66,7 @@ class FrameTask:
 
     @property
     def remarks(self) -> "FrameRemarks":
-        """What is told of the frame beside its fit."""
+        """Remarks for the frame's report, in addition to its fit."""
         there = {*self.frame.showing(self.rig.training), *self.frame.present(self.rig.testing)}
         absent = tuple(name for name in self.rig if name not in there)
         return FrameRemarks(absent, self.begins, self.frame.mean_of)
@@ -74,10 +74,10 @@ class FrameTask:
 
 @dataclass(frozen=True)
 class FrameRemarks:
-    """What a frame's report tells of its pictures.
+    """Remarks of a frame's report on its pictures.
 
     Args:
-        absent: the cameras of the rig without a picture that counts, in its order, and blank training ones.
+        absent: the cameras without a picture that counts, and training cameras with a blank one, in the rig's order.
         begins: see :class:`FrameTask`.
         mean_of: see ``MultiViewFrame``.
     """
@@ -88,9 +88,9 @@ class FrameRemarks:
 
 
 EQUAL_INTERVALS = 0.25
-"""Intervals between frames that differ by this share or less count as equal: stamps of a regular stream jitter."""
+"""Intervals between frames that differ by at most this share count as equal, because time stamps jitter."""
 MAX_INTERVALS = 3.0
-"""After a longer gap what moved is expected no farther than after so many intervals."""
+"""Upper bound of the intervals over which motion is extrapolated after a gap."""
 
 
 @dataclass(frozen=True)
@@ -111,9 +111,9 @@ class Past(Generic[State, Memory]):
     seconds: tuple[float, float] | None = None
 
     def intervals(self, pts_seconds: float) -> float:
-        """The time from ``state`` to a frame in times of that from ``older`` to ``state``.
+        """The time from ``state`` to a frame, as a multiple of the time from ``older`` to ``state``.
 
-        Exactly 1 where they are nearly equal, and without ``seconds``; at most :data:`MAX_INTERVALS`.
+        Exactly 1 if they are nearly equal, and without ``seconds``; at most :data:`MAX_INTERVALS`.
         """
         if self.seconds is None or self.seconds[1] <= self.seconds[0]:
             return 1.0
@@ -146,18 +146,17 @@ class Method(Protocol[State, Memory]):
         ...
 
     def prepare(self, state: State, task: Callable[[], FrameTask]) -> Memory:
-        """The data that later frames need of a period's first decoded frame and, if ``task`` is called, of its
-        pictures."""
+        """The data of a period's first decoded frame that later frames need. Calls ``task`` if pictures are used."""
         ...
 
     def next(self, past: Past[State, Memory], task: FrameTask) -> FitResult[State]:
-        """Fit a later frame; one that ``begins`` another period as frame 0 is, with static fields of its own."""
+        """Fit a later frame; one that ``begins`` a period is fitted like frame 0, with static fields of its own."""
         ...
 
 
 @dataclass(frozen=True)
 class StreamFacts:
-    """Facts of a run for the header, which must be equal in a run that continues the stream.
+    """Facts of a run for the header; a run that resumes the stream must have the same ones.
 
     Args:
         codec: name of the codec.
@@ -220,7 +219,7 @@ class FrameCoder(Protocol[State]):
 
 
 class StreamCodec(Protocol[State]):
-    """Stores frames."""
+    """The codec of a stream: its file, header and frame coder."""
 
     @property
     def name(self) -> str:
@@ -232,11 +231,11 @@ class StreamCodec(Protocol[State]):
         ...
 
     def file(self, path: Path, *, frames: int | None, resume: bool) -> tuple[PacketSink, StoredStream[State] | None]:
-        """A sink to the file, which will have ``frames`` frames (None: unknown), and its existing frames if resumed."""
+        """A sink to the file, which will have ``frames`` frames (None: unknown), and the existing frames to resume."""
         ...
 
     def prepare(self, fitted: State, task: FrameTask, facts: StreamFacts) -> tuple[State, StreamHeader]:
-        """A period's first frame as later frames and receivers get it, and the header of the period."""
+        """The reconstruction of a period's first frame, which later frames and receivers use, and its header."""
         ...
 
     def coder(self, header: StreamHeader, device: torch.device) -> FrameCoder[State]:
@@ -252,15 +251,15 @@ class Pipeline(Generic[State, Memory]):
         method: fits frames.
         codec: stores frames.
         config: the resolved configuration as plain JSON values: the header's ``config``.
-        seed: of all random numbers.
+        seed: seed of all random numbers.
         normalised_radius: largest distance of a training camera to their mean after normalisation.
         points: configuration of initial points, for captures without points.
-        rate: rate control.
+        rate: configuration of the rate control.
         metadata: plain JSON values for every header.
-        period: when another period begins.
-        residual: how much a decoded frame differs from its pictures, which ``period.residual`` needs.
-        denoising: of the frames ``denoised``.
-        denoised: numbers of the frames whose pictures are averaged with those after them.
+        period: conditions of a new period.
+        residual: residual of a decoded frame against its pictures, which ``period.residual`` needs.
+        denoising: configuration of the denoising of the frames ``denoised``.
+        denoised: indices of the frames whose pictures are averaged with later ones.
     """
 
     method: Method[State, Memory]

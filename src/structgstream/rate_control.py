@@ -1,29 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rate control: adapts the price of bits so that a stream keeps to a target rate.
+"""Rate control: adapts the weight of the rate term so that a stream meets a target rate.
 
 Note [Pressure]
 ~~~~~~~~~~~~~~~
-The quantization steps of a stream are fixed in its header. Rate control changes the price of a bit in the loss, and the
-gradient threshold for spawning free Gaussians (without effect where ``patching.spawn`` is off), by one factor, the
-pressure; 1 leaves the configuration's values. Gaussians that ``births`` spawns do not follow it: their number and bytes
-are the same at every pressure. It is a function of the sizes of earlier packets only, so that a resumed stream is
-identical.
+The quantization steps of a stream are constant and stored in its header. Rate control changes the weight lambda of the
+rate term in the loss, and the gradient threshold for spawning free Gaussians (without effect if ``patching.spawn`` is
+off). Both are scaled by one factor, the pressure; at 1 they have the configuration's values. Gaussians that ``births``
+spawns are not affected: their number and bytes are the same at every pressure. The pressure is a function of the sizes
+of earlier packets only, so that a resumed stream is identical.
 
 Note [Windows]
 ~~~~~~~~~~~~~~
-The budget of a delta packet is taken from the window that ends a third of its length in the future: the sizes of its
-past packets are known, the size of a key packet in its future part is predicted, and the remainder is shared by the
-delta packets there. So bytes are saved before a key packet comes. A key packet has all changes since frame 0; its size
-is predicted as that of a delta packet times the square root of its frame number (0.98 to 1.13 times that in 3 streams
-of 2 captures, frames 1 to 19).
+The budget of a delta packet is computed from a window that ends a third of its length in the future. The sizes of its
+past packets are known, and the size of a key packet in its future part is predicted. The delta packets of the future
+part share the remainder. So bytes are saved before a key packet comes. A key packet contains all changes since frame 0;
+its predicted size is that of a delta packet times the square root of its frame number (the measured sizes are 0.98 to
+1.13 times that in 3 streams of 2 captures, frames 1 to 19).
 
 Note [Media time]
 ~~~~~~~~~~~~~~~~~
-A rate is one of media time, and a live run may leave out pictures: then a packet has the budget of all frames of the
-media from it to the next, and key packets come sooner (``key_frames``). So packets have places, which are their times
-in frames of the media, and those to come are expected as far apart as those of the window have been. Where packets are
-so far apart that a window would have fewer than the least group has, it is as long as that. Without gaps places are
-frame numbers.
+Rates are per media time, and a live run may skip pictures. The budget of a packet is then that of all frames of the
+media until the next packet, and key packets come sooner (``key_frames``). The place of a packet is its time in frames
+of the media; without gaps it is the frame number. Future packets are expected to have the mean spacing of the packets
+in the window. A window has at least as many packets as the shortest group.
 """
 
 import logging
@@ -51,7 +50,7 @@ _MISSED = 1.1
 
 @dataclass(frozen=True)
 class _Written:
-    """A packet's size in bytes, and its place in frames of the media."""
+    """A packet's size in bytes, and its place (Note [Media time])."""
 
     size: int
     place: int
@@ -65,20 +64,20 @@ class RateConfig:
     """Target rate in megabits per second of media time; None: constant quality without rate control."""
 
     WINDOW_SECONDS: ClassVar[float] = 1.0
-    """Window, in seconds of media time, over which the target holds, without the header; it is at least the interval of
-    key packets and, where frames are left out, a group of five frames."""
+    """Window, in seconds of media time, over which the target is met, without the header; at least the interval of key
+    packets. If frames are skipped it has at least a group of five frames."""
 
 
 class RateController:
     """Computes the pressure of the next frame from the sizes of all packets in order.
 
     The pressure is multiplied by the ratio of the last delta packet's size to the next one's budget. Bytes fall with
-    about the cube root of the price, so each step corrects about a third of the excess.
+    about the cube root of lambda, so each step corrects about a third of the excess.
 
     Args:
         config: the target.
         fps: frames per second of the media.
-        keys: which frames are key frames; it follows the same packets, and is told of each before this is.
+        keys: follows the same packets, and must receive each of them before this object does.
 
     A warning is logged when the target starts to be missed.
 
@@ -89,7 +88,7 @@ class RateController:
     def __init__(self, config: RateConfig, fps: float, *, keys: KeyFrames) -> None:
         self.pressure = 1.0
         """From :data:`LEAST` to :data:`MOST`."""
-        self._budget: float | None = None  # bytes a frame of the media
+        self._budget: float | None = None  # bytes per frame of the media
         if config.target_mbits is None:
             return
         if config.target_mbits <= 0:
@@ -100,13 +99,13 @@ class RateController:
         self._last: deque[_Written] = deque(maxlen=window)
         self._now = 0, 0.0  # number and time of the last packet
         self._origin = 0  # place of the period's first packet
-        self._key: tuple[int, int] | None = None  # the last key packet's size, and how far it is from there
-        self._delta: tuple[int, float] | None = None  # the last delta packet's size, and its pressure
+        self._key: tuple[int, int] | None = None  # size of the last key packet, and its distance from the origin
+        self._delta: tuple[int, float] | None = None  # size of the last delta packet, and its pressure
         self._usual = 0.0  # size of delta packets, a running mean
-        self._said = False
+        self._warned = False
 
     def add(self, size: int, kind: PacketKind, *, index: int, pts_seconds: float, begins: bool = False) -> None:
-        """Record a written packet of ``size`` bytes; ``begins``: with a header of its own, which is not counted."""
+        """Record a written packet of ``size`` bytes. ``begins``: it begins a period, whose header is not counted."""
         if self._budget is None:
             return
         place = round(pts_seconds * self._fps)
@@ -117,17 +116,17 @@ class RateController:
         if kind is PacketKind.DELTA:
             self._usual = size if self._delta is None else 0.8 * self._usual + 0.2 * size
             self._delta = size, self.pressure
-        elif place > self._origin:  # A period's first packet is nearly empty: the header has its fields.
+        elif place > self._origin:  # A period's first packet is nearly empty, because the header contains its fields.
             self._key = size, place - self._origin
         if self._delta is not None:
             last, pressure = self._delta
             factor = min(max(last / self._room(self._budget), _FALL), _RISE)
             self.pressure = min(max(pressure * factor, LEAST), MOST)
-        self._tell(index)
+        self._warn_if_missed(index)
 
-    def _tell(self, index: int) -> None:
-        """Warns when the target begins to be missed."""
-        if self.missed and not self._said:
+    def _warn_if_missed(self, index: int) -> None:
+        """Warns once when the target starts to be missed."""
+        if self.missed and not self._warned:
             remedy = (
                 "nothing more can be saved: take coarser steps (online.rounding.quality), spawn fewer Gaussians "
                 "(online.spawn.most) or take a higher target"
@@ -138,16 +137,16 @@ class RateController:
                 len(self._written()),
                 self.rate_mbits,
                 (self._budget or 0.0) * 8e-6 * self._fps,
-                remedy if self.pressure == MOST else "more is saved from now on",
+                remedy if self.pressure == MOST else "bytes are saved from now on",
             )
-        self._said = self.missed
+        self._warned = self.missed
 
     def _room(self, budget: float) -> float:
         """Budget of the next delta packet in bytes (Note [Windows])."""
-        apart, whole = self._apart, self._packets_of_window
-        each, ahead = budget * apart, max(1, round(_AHEAD * whole))
+        spacing, whole = self._spacing, self._packets_of_window
+        each, ahead = budget * spacing, max(1, round(_AHEAD * whole))
         index, pts_seconds = self._now
-        coming = self._keys.ahead(index, pts_seconds, apart=apart / self._fps)
+        coming = self._keys.ahead(index, pts_seconds, spacing=spacing / self._fps)
         keys = [*takewhile(lambda frames: frames <= ahead, coming)]
         past = [*self._last][max(len(self._last) - (whole - ahead), 0) :]
         left = budget * self._span(past) + each * ahead - sum(one.size for one in past)
@@ -155,25 +154,25 @@ class RateController:
         return min(max(left / max(ahead - len(keys), 1), each / 4.0), 3.0 * each)
 
     def _key_after(self, frames: int) -> float:
-        """Predicted size of a key packet so many frames from now, in bytes (Note [Windows])."""
-        since = self._last[-1].place + frames * self._apart - self._origin
-        size, known = (self._usual, self._apart) if self._key is None else self._key
+        """Predicted size, bytes, of a key packet ``frames`` frames from now (Note [Windows])."""
+        since = self._last[-1].place + frames * self._spacing - self._origin
+        size, known = (self._usual, self._spacing) if self._key is None else self._key
         return size * (since / known) ** 0.5
 
     @property
-    def _apart(self) -> float:
-        """Frames of the media from packet to packet of late (Note [Media time])."""
-        return self._apart_of(self._written())
+    def _spacing(self) -> float:
+        """Mean spacing of the packets of the last window, in frames of the media (Note [Media time])."""
+        return self._spacing_of(self._written())
 
-    def _apart_of(self, packets: Sequence["_Written"]) -> float:
+    def _spacing_of(self, packets: Sequence["_Written"]) -> float:
         if len(packets) < 2:
             return 1.0
         return max(packets[-1].place - packets[0].place, 1) / (len(packets) - 1)
 
     @property
     def _packets_of_window(self) -> int:
-        """How many packets a window has where they come as they did of late."""
-        return min(max(round(self._window / self._apart), self._keys.least, 2), self._window)
+        """Number of packets of a window at the present spacing."""
+        return min(max(round(self._window / self._spacing), self._keys.least, 2), self._window)
 
     def _written(self) -> list["_Written"]:
         """The packets of the last window."""
@@ -184,7 +183,7 @@ class RateController:
 
     def _span(self, packets: Sequence["_Written"]) -> float:
         """Frames of the media from the first of these packets to the one after the last."""
-        return packets[-1].place - packets[0].place + self._apart if packets else 0.0
+        return packets[-1].place - packets[0].place + self._spacing if packets else 0.0
 
     @property
     def rate_mbits(self) -> float | None:
@@ -205,7 +204,7 @@ class RateController:
 
 
 def with_rate_control(config: OnlineConfig, pressure: float) -> OnlineConfig:
-    """``config`` with the price of a bit times ``pressure``, and the spawning threshold times its square root."""
+    """``config`` with lambda times ``pressure``, and the spawning threshold times its square root."""
     if pressure == 1.0:
         return config
     rounding, patching = config.rounding, config.patching

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stream on the disk and the log beside it, written frame by frame: for commands and functions."""
+"""Writes a stream and its log frame by frame; used by commands and the Python API."""
 
 import os
 from collections.abc import Callable, Generator, Mapping
@@ -28,7 +28,7 @@ from structgstream.session import Session
 from structgstream.training.result import StepListener
 
 Storage = Callable[[bool], tuple[PacketSink, StoredStream[State] | None]]
-"""Opens a sink; when called with True, to continue what is there, of which it gives a reader."""
+"""Opens a sink. If called with True, the existing stream is resumed and its reader is returned, too."""
 LogExtras = Callable[[FrameReport], Mapping[str, Any]]
 """Further entries of a frame's line in the log."""
 
@@ -38,8 +38,8 @@ class Run:
     """A reconstruction into a file.
 
     Args:
-        done: number of frames that the file had before.
-        reports: of the further frames; advancing the generator fits, stores and logs a frame.
+        done: number of frames that the file had at the start.
+        reports: reports of the further frames; each step of the generator fits, stores and logs a frame.
     """
 
     done: int
@@ -58,7 +58,7 @@ def record(
     on_step: StepListener | None = None,
     remarks: LogExtras | None = None,
 ) -> Run:
-    """Reconstructs a capture into a file or other storage, with a log beside it.
+    """Reconstructs a capture into a file or other storage, with a log next to it.
 
     The call checks an existing file and starts the log; the file is written as the reports are consumed.
 
@@ -67,7 +67,7 @@ def record(
         source: the capture; frames of a recording are read ahead.
         pipeline: fits and stores frames.
         backend: the compute back-end.
-        resume: continue after the last whole frame of an existing file.
+        resume: continue after the last complete frame of an existing file.
         storage: opens another sink than a file at ``path``, such as :func:`segments_at`.
         metadata: plain JSON values for the header, equal in all runs of a stream.
         on_step: called after every optimisation step.
@@ -75,8 +75,8 @@ def record(
 
     Raises:
         ConfigError: the file to resume was made with another configuration or from another capture.
-        StreamError: the file to resume is no stream, or is damaged so that it cannot be continued.
-        StorageError: the file or the log cannot be written; whole frames stay in the file.
+        StreamError: the file to resume is not a stream, or is damaged so that it cannot be continued.
+        StorageError: the file or the log cannot be written; complete frames in the file are not affected.
     """
     if storage is None:
         sink, resumed = pipeline.codec.file(path, frames=frame_count(source), resume=resume)
@@ -90,12 +90,12 @@ def record(
 def log_reports(
     reports: Generator[FrameReport, None, None], path: Path, *, done: int, remarks: LogExtras | None = None
 ) -> Generator[FrameReport, None, None]:
-    """The reports of a session, each written to the log beside ``path`` before it is yielded.
+    """The reports of a session, each written to the log next to ``path`` before it is yielded.
 
     Args:
-        reports: closed with the result.
+        reports: the reports; closed with the result.
         path: the file that the session writes.
-        done: number of existing frames, whose lines of the log are kept.
+        done: number of existing frames, whose lines of the log are retained.
         remarks: see :data:`LogExtras`.
 
     Raises:
@@ -118,7 +118,7 @@ def _append_reports(
 def segments_at(
     store: Store, *, options: SegmentsOptions | None = None, clocks: Clocks | None = None
 ) -> Storage[Scene]:
-    """Segments in a store, and a preview picture, for :func:`record`; a stream is replaced unless it is resumed."""
+    """Storage for :func:`record`: segments and a preview picture. A stream is replaced unless it is resumed."""
 
     def opened(resume: bool) -> tuple[PacketSink, StoredSegments | None]:
         if resume:
@@ -131,17 +131,17 @@ def segments_at(
 
 
 def segments_folder(path: Path, *, may_exist: bool) -> FolderStore:
-    """The folder of a stream of segments, made if it is not there, checked before frame 0 is fitted for minutes.
+    """Creates and checks the folder of a segmented stream; called before the fit of frame 0, which takes minutes.
 
     Raises:
-        StorageError: it holds a stream, or another program's manifest.json, cannot be made or written, or another
+        StorageError: it contains a stream or another program's manifest.json, cannot be created or written, or another
             process writes to it.
     """
     store = FolderStore(path)
     there = store.names() if path.is_dir() else frozenset()
     if MANIFEST in there and not may_exist:
         raise StorageError(
-            f"{path} holds a stream; continue it with --resume, replace it with --overwrite, or choose another name."
+            f"{path} contains a stream; continue it with --resume, replace it with --overwrite, or choose another name."
         )
     if there == {MANIFEST}:
         try:
@@ -155,11 +155,11 @@ def segments_folder(path: Path, *, may_exist: bool) -> FolderStore:
 
 
 def check_output(path: Path, *, may_exist: bool, resume: bool = True) -> None:
-    """Check that the stream can be written, before frame 0 is fitted for minutes.
+    """Check that the stream can be written; called before the fit of frame 0, which takes minutes.
 
     Args:
         path: the file.
-        may_exist: whether it is replaced, or continued.
+        may_exist: whether an existing file is replaced or continued.
         resume: whether the message names ``--resume``.
 
     Raises:

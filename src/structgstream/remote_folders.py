@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Folders behind a URL, through fsspec and the package of its scheme; and addresses as messages may show them."""
+"""Folders at URLs, through fsspec and the package of a URL's scheme, and addresses without secrets for messages."""
 
 import re
 from typing import Any
@@ -7,7 +7,7 @@ from typing import Any
 from structgstream.errors import MissingExtraError, StorageError
 
 HIDDEN = "***"
-"""What messages show in the place of a secret."""
+"""Replacement of a secret in messages."""
 _SCHEME = re.compile(r"([a-z][a-z0-9+.-]*://)", re.IGNORECASE)
 _ADDRESS = re.compile(rf"{_SCHEME.pattern}[^\s'\"<>]+", re.IGNORECASE)
 _NAMED = re.compile(
@@ -16,19 +16,19 @@ _NAMED = re.compile(
     re.IGNORECASE,
 )
 _PLAIN = {"channel", "subtype", "stream", "resolution", "fps", "transport", "profile", "camera", "unicast", "proto"}
-_LONGEST_REASON = 200  # characters; some services answer with pages
+_LONGEST_REASON = 200  # characters; some services answer with whole pages
 
 
 def open_url(url: str, **options: Any) -> tuple[Any, str]:
     """The file system of a URL, without a cache of listings, and the folder's path in it.
 
     Args:
-        url: as fsspec takes it, such as ``s3://bucket/streams/studio``.
-        options: of the file system, such as ``endpoint_url``.
+        url: URL in the syntax of fsspec, such as ``s3://bucket/streams/studio``.
+        options: options of the file system, such as ``endpoint_url``.
 
     Raises:
         MissingExtraError: fsspec, or the package for this scheme, is not installed.
-        StorageError: the URL is not understood.
+        StorageError: the URL is not supported.
     """
     try:
         from fsspec.core import url_to_fs
@@ -38,21 +38,21 @@ def open_url(url: str, **options: Any) -> tuple[Any, str]:
         return url_to_fs(url, use_listings_cache=False, **options)
     except ImportError as error:
         raise MissingExtraError(str(error.name or "s3fs"), "cloud") from None
-    except Exception as error:  # Each file system has its own; all mean that it cannot be used.
+    except Exception as error:  # Each file system has its own errors; all mean that it cannot be used.
         reason = reason_of(error, url)
         raise StorageError(f"{shown_address(url)} cannot be used as a store ({reason}).") from error
 
 
 def reason_of(error: Exception, *addresses: str) -> str:
-    """What a file system says, on one line, not too long, and without the secrets of these addresses."""
-    said = without_secrets(str(error), *addresses)
-    return " ".join(said.split())[:_LONGEST_REASON] or type(error).__name__
+    """The message of a file system's error on one line, shortened, and without the secrets of these addresses."""
+    message = without_secrets(str(error), *addresses)
+    return " ".join(message.split())[:_LONGEST_REASON] or type(error).__name__
 
 
 def shown_address(address: str) -> str:
-    """An address without user and password, and without values in it that may be secret, for messages.
+    """An address for messages, without user, password and other values that may be secret.
 
-    Also a password that should have been escaped is left out: one with ``@``, ``/``, ``?`` or ``#``.
+    Removes also a password with ``@``, ``/``, ``?`` or ``#`` that should have been escaped.
     """
     scheme, rest = "", address
     if (match := _SCHEME.match(address)) is not None:
@@ -71,11 +71,11 @@ def shown_address(address: str) -> str:
 
 
 def without_secrets(text: str, *addresses: str) -> str:
-    """A text for a message or a log, with all addresses in it as :func:`shown_address` has them.
+    """A text for a message or a log, with :func:`shown_address` applied to all addresses in it.
 
     Args:
-        text: such as what FFmpeg says of an error.
-        addresses: that it may have, whatever characters their passwords have.
+        text: the text, such as an error message of FFmpeg.
+        addresses: addresses that it may contain, with any characters in their passwords.
     """
     for address in sorted(filter(None, addresses), key=len, reverse=True):
         text = text.replace(address, shown_address(address))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks whether a stream can be continued, which needs the same configuration and capture."""
+"""Checks whether a stream can be resumed, which requires the same configuration and capture."""
 
 from collections.abc import Iterator, Mapping
 
@@ -14,7 +14,7 @@ def check_resumable(header: StreamHeader, facts: StreamFacts) -> None:
     """Check that a stream was made with the same method, configuration and capture.
 
     Raises:
-        ConfigError: naming what differs.
+        ConfigError: it was not; the message names the differences.
     """
     if header.codec != facts.codec:
         raise ConfigError(

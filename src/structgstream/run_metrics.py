@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run does now: in a small file beside the stream for programs that watch it, and in the lines of its log.
+"""Metrics of a run: a small file next to the stream for monitoring, and entries in the lines of its log.
 
-``OUT.metrics.json`` is written anew every few seconds and after each frame, whole or not at all. Numbers have their
-units in their names; what is not known is null. ``docs/live.md`` lists the keys.
+``OUT.metrics.json`` is rewritten atomically every few seconds and after each frame. Names of numbers contain their
+units; unknown values are null. ``docs/live.md`` lists the keys.
 """
 
 import json
@@ -28,11 +28,11 @@ from structgstream.whole_files import side_path, write_whole
 FORMAT, VERSION = "structgstream-metrics", 1
 BEAT_SECONDS = 2.0
 RATES = ("frames_in_per_second", "frames_out_per_second", "bits_per_second")
-RECENT = 30  # frames over which rates are taken
+RECENT = 30  # number of frames over which rates are measured
 
 
 class RunState(StrEnum):
-    """Where a run is."""
+    """State of a run."""
 
     WAITING = "waiting"  # for the first frame
     RUNNING = "running"
@@ -46,10 +46,10 @@ def metrics_path(stream: Path) -> Path:
 
 
 class Figures:
-    """What the last frames of a stream, or of all qualities of one, took.
+    """Statistics of the last frames of a stream, or of all its qualities.
 
     Args:
-        fps: frames a second of the media.
+        fps: frames per second of the media.
     """
 
     def __init__(self, fps: float) -> None:
@@ -58,17 +58,17 @@ class Figures:
         self._bytes = 0
 
     def add(self, report: FrameReport) -> None:
-        """Takes a frame's report."""
+        """Add a frame's report."""
         self._recent.append(report)
         self._bytes += report.bytes
 
     @property
     def frames(self) -> int | None:
-        """How many there are up to the newest one; None before the first report."""
+        """Number of frames up to the newest one; None before the first report."""
         return self._recent[-1].index + 1 if self._recent else None
 
     def values(self) -> dict[str, Any]:
-        """Sizes, times and Gaussians, as plain JSON values; what is not known is None."""
+        """Sizes, times and numbers of Gaussians, as plain JSON values; None if unknown."""
         last = self._recent[-1] if self._recent else None
         return {
             "pts_seconds": None if last is None else last.pts_seconds,
@@ -82,18 +82,18 @@ class Figures:
 
 
 class RunMetrics:
-    """Collects what a run does.
+    """Collects and writes the metrics of a run.
 
     Args:
         stream: the file or folder that the run writes.
-        fps: frames a second of the media.
-        total: number of frames, None where it is unknown.
-        done: number of frames that were there before.
-        live: what live cameras do; None for a recording.
-        captured: when a frame was filmed, Unix time, by its number; None where that is not known.
-        qualities: names of those that the run makes of each frame; none where it makes one stream.
-        now: monotonic seconds.
-        unix: Unix time.
+        fps: frames per second of the media.
+        total: number of frames; None if unknown.
+        done: number of frames that existed at the start.
+        live: returns the state of live cameras; None for a recording.
+        captured: returns the time of capture of a frame by its index, Unix time; None if unknown.
+        qualities: names of the qualities of each frame; empty for a single stream.
+        now: returns monotonic seconds.
+        unix: returns Unix time.
     """
 
     def __init__(
@@ -122,12 +122,12 @@ class RunMetrics:
         self._lock, self._writing = threading.Lock(), threading.Lock()
 
     def quality(self, name: str, report: FrameReport) -> None:
-        """Takes a frame's report of one of the qualities, before that of the whole frame."""
+        """Add a frame's report of one of the qualities; called before :meth:`frame`."""
         with self._lock:
             self._qualities[name].add(report)
 
     def frame(self, report: FrameReport) -> dict[str, Any]:
-        """Takes a frame's report, of all qualities; what its line of the log gets besides, if the run is live."""
+        """Add a frame's report of all qualities; returns further entries of its line in the log if the run is live."""
         with self._lock:
             self._state = RunState.RUNNING
             self._figures.add(report)
@@ -144,14 +144,14 @@ class RunMetrics:
         return {"run": {key: taken[key] for key in keys}}
 
     def values(self) -> dict[str, Any]:
-        """Everything, as plain JSON values."""
+        """All metrics, as plain JSON values."""
         live = None if self._live is None else self._live()
         with self._lock:
             now, figures = self._now(), self._figures.values()
             if live is not None:
                 self._arrived.append((now, live.sets))
             several: dict[str, Any] = {}
-            if self._qualities:  # Gaussians and decibels are those of a quality.
+            if self._qualities:  # Numbers of Gaussians and PSNR belong to a single quality.
                 figures |= {"train_psnr": None, "anchors": None, "free": None}
                 each = {name: {"frames": own.frames, **own.values()} for name, own in self._qualities.items()}
                 several["qualities"] = each
@@ -178,14 +178,14 @@ class RunMetrics:
             }
 
     def write(self) -> None:
-        """Writes the file. A full disk is not told here: the stream itself will."""
+        """Writes the file. A full disk is not reported here, because writing the stream will fail and report it."""
         content = f"{json.dumps(self.values(), allow_nan=False)}\n".encode()
         with self._writing, suppress(StorageError):
             write_whole(metrics_path(self._stream), content, sync=False)
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """Writes the file every few seconds, and once more with how the run ended."""
+        """Writes the file every few seconds, and at the end with the final state of the run."""
         stop = threading.Event()
 
         def beat() -> None:
@@ -210,7 +210,7 @@ class RunMetrics:
 
 
 def free_bytes(path: Path) -> int | None:
-    """Room on the disk of a file that may not be there yet; None where that is not known."""
+    """Free space on the disk of a file that may not exist yet; None if unknown."""
     for folder in (path, *path.absolute().parents):
         if folder.exists():
             with suppress(OSError):
@@ -219,14 +219,14 @@ def free_bytes(path: Path) -> int | None:
 
 
 def _rate(counted: list[tuple[float, int]]) -> float | None:
-    """What was counted a second."""
+    """Increase of a counter per second."""
     if len(counted) < 2 or counted[-1][0] <= counted[0][0]:
         return None
     return (counted[-1][1] - counted[0][1]) / (counted[-1][0] - counted[0][0])
 
 
 def _bit_rate(reports: list[FrameReport], fps: float) -> float | None:
-    """Bits a second of media; where frames were skipped a second of media has fewer."""
+    """Bits per second of media time, including the time of skipped frames."""
     if not reports:
         return None
     seconds = reports[-1].pts_seconds - reports[0].pts_seconds + 1 / fps

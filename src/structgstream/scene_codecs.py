@@ -30,8 +30,8 @@ class QuantizationSteps:
     """Quantization steps of a stream, as stored in the header; empty with codec ``raw``.
 
     Args:
-        steps: of packets, by parameter.
-        init_steps: of the init record, by field.
+        steps: steps of packets, by parameter.
+        init_steps: steps of the init record, by field.
     """
 
     steps: Mapping[str, float] = field(default_factory=dict)
@@ -58,7 +58,7 @@ class SceneCodec(ABC):
 
         Raises:
             StorageError: another process writes to the file.
-            StreamError: the file to resume is no stream, or is damaged so that it cannot be continued.
+            StreamError: the file to resume is not a stream, or is damaged so that it cannot be continued.
         """
         sink = FileSink(path, overwrite=True)
         sink.check_unused()
@@ -69,7 +69,7 @@ class SceneCodec(ABC):
         return SceneEncoder(header)
 
     def prepare(self, fitted: Scene, task: FrameTask, facts: StreamFacts) -> tuple[Scene, StreamHeader]:
-        """A period's first frame as later frames and receivers get it, and the header of the period."""
+        """The reconstruction of a period's first frame, which later frames and receivers use, and its header."""
         scene, step_sizes = self._initialize_stream(fitted, task)
         state, dynamic = state_of(scene), self.config.online.dynamic
         reference = dynamic.difference(fields_of("free")) if step_sizes.steps else ()
@@ -92,7 +92,7 @@ class SceneCodec(ABC):
 
     @abstractmethod
     def _initialize_stream(self, scene: Scene, task: FrameTask) -> tuple[Scene, QuantizationSteps]:
-        """The reconstruction of frame 0, as a receiver gets it, and its steps."""
+        """The reconstruction of frame 0, as a receiver decodes it, and its steps."""
 
     def _with_dynamic_fields(self, scene: Scene) -> Scene:
         """``scene`` with all dynamic fields; dynamic appearance gets its basis."""
@@ -104,7 +104,7 @@ class SceneCodec(ABC):
 
 @dataclass(frozen=True)
 class RawCodec(SceneCodec):
-    """Every number as float32."""
+    """Stores every number as float32."""
 
     def _initialize_stream(self, scene: Scene, task: FrameTask) -> tuple[Scene, QuantizationSteps]:
         return self._with_dynamic_fields(scene), QuantizationSteps()

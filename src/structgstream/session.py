@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The frame loop: fit, encode, write; the next frame starts from the decoded one (Note [Closed loop]).
 
-While a frame is fitted, the next one is read and its pictures preprocessed (``lookahead``); a live source that
-hands out its newest frame is asked only when the frame before is stored.
+While a frame is fitted, the next one is read and its pictures are preprocessed (``lookahead``). A live source that
+returns its newest frame is read only after the previous frame is stored.
 """
 
 from collections import deque
@@ -40,17 +40,17 @@ class Session(Generic[State, Memory]):
 
     Args:
         source: the capture, or a live one, which is read until it ends or the loop is stopped.
-        sink: where packets go.
-        pipeline: how frames are fitted and stored, such as ``stream_pipeline(PRESETS["compact"])``.
+        sink: receives the packets.
+        pipeline: fits and stores frames, such as ``stream_pipeline(PRESETS["compact"])``.
         backend: the compute back-end.
-        resumed: a reader of the frames that the sink already has, to continue after them.
-        metadata: plain JSON values for the header; equal in all runs of a stream, because resuming is exact.
+        resumed: a reader of the sink's existing frames, to continue after them; None for a new stream.
+        metadata: plain JSON values for the header; must be equal in all runs of a stream.
         on_step: called after every optimisation step.
 
     Raises:
         CalibrationError: the pictures of a camera are larger than a stream allows.
         ConfigError: the stream to resume was made with another configuration or from another capture, or a target rate
-            cannot be kept.
+            is not possible.
     """
 
     def __init__(
@@ -94,8 +94,8 @@ class Session(Generic[State, Memory]):
     def run(self) -> Generator[FrameReport, None, None]:
         """Fit, encode and write every frame that the sink does not have yet; yields a report for each.
 
-        A complete stream is not changed. Otherwise the sink is closed, with its index, however the loop ends; after a
-        failed write there is no index.
+        A complete stream is not changed. Otherwise the sink is closed, with its index, whenever the loop ends for any
+        reason except a failed write.
         """
         resumed, total = self._resumed, frame_count(self._source)
         if resumed is not None and resumed.complete and total is not None and len(resumed) >= total:
@@ -141,13 +141,13 @@ class Session(Generic[State, Memory]):
                 before = frame
 
     def _showing_from(self, frame: MultiViewFrame) -> MultiViewFrame:
-        """``frame``, or the last one before it whose pictures show something."""
+        """``frame``, or the last one before it with pictures that are not blank."""
         while frame.index > 0 and not shows_enough(frame, self._rig):
             frame = next(self._source.frames(frame.index - 1))
         return frame
 
     def _tasks(self, observed: Iterator[tuple[MultiViewFrame, FramePictures]]) -> Iterator[FrameTask]:
-        """The tasks of frames; each is made after the previous frame is written, on which its pressure depends."""
+        """The tasks of frames; each is created after the previous frame is written, on which its pressure depends."""
         for frame, pictures in observed:
             key = self._keys.kind(frame.index, frame.pts_seconds) is PacketKind.KEY
             begins = self._plan.due(frame.index, frame.pts_seconds) if key and shows_enough(frame, self._rig) else None
@@ -177,7 +177,7 @@ class Session(Generic[State, Memory]):
         )
 
     def _encode(self, fitted: State, task: FrameTask) -> Encoded[State]:
-        """The packet of a frame; for the first of a period the header is written before it."""
+        """The packet of a frame; writes the header before the first packet of a period."""
         if self._coder is None or task.begins is not None:
             fitted, header = self._pipeline.codec.prepare(fitted, task, self._facts)
             self._coder = self._open(header)
@@ -191,14 +191,14 @@ class Session(Generic[State, Memory]):
         return size
 
     def _note(self, packet: Packet | PacketInfo, size: int, *, begins: bool) -> None:
-        """A packet has been written: what follows depends on it."""
+        """Record a written packet for key frames, periods and rate control."""
         index, pts_seconds = packet.index, packet.pts_seconds
         if packet.kind is PacketKind.KEY:
             self._keys.begin(index, pts_seconds)
         self._controller.add(size, packet.kind, index=index, pts_seconds=pts_seconds, begins=begins)
 
     def _open(self, header: StreamHeader) -> FrameCoder[State]:
-        """The coder of a period, whose header the sink gets."""
+        """The coder of the period with this header."""
         self._steps = header.steps
         coder = self._pipeline.codec.coder(header, self._backend.device)
         if self._coder is None:
@@ -240,7 +240,7 @@ class Session(Generic[State, Memory]):
         return (self._shown[0][1], self._shown[1][1]) if len(self._shown) == 2 else None
 
     def _measure(self, state: State, task: FrameTask) -> None:
-        """How well a decoded frame shows its pictures, for the plan of periods, if that asks for it."""
+        """Add the residual of a decoded frame to the plan of periods, if the plan needs it."""
         index = task.frame.index
         if self._pipeline.residual is None or (index > 0 and not shows_enough(task.frame, self._rig)):
             return
@@ -281,14 +281,14 @@ class Session(Generic[State, Memory]):
         return [first, *reversed(found)][-2:]
 
     def _restore_plan(self, resumed: StoredStream[State], period: Period) -> None:
-        """What the plan of periods knew: when the last period began, and residuals measured again."""
+        """Restore the plan of periods: the start of the last period, and residuals, which are measured again."""
         seconds = [info.pts_seconds for info in resumed.packets]
         self._plan.begin(period.first_frame, seconds[period.first_frame], number=period.number)
         for index in self._plan.needed(seconds, self._keys):
             self._measure(resumed.scene(index), self._task_again(index))
 
     def _task_again(self, index: int) -> FrameTask:
-        """The task of an existing frame, whose pictures are read again."""
+        """The task of an existing frame; reads its pictures again."""
         frame = next(self._source.frames(index))
         check_enough_pictures(frame, self._rig, self._source.name)
         return self._task(frame, self._pipeline.method.observe(frame, None, rig=self._rig, backend=self._backend))

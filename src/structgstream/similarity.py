@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The similarity transform between a capture's units and the normalised units of a scene.
 
-Learning rates and voxel sizes are stated for scenes of one size (paper, section Implementations). Training therefore
-runs in normalised units. The stream header stores the transform.
+Learning rates and voxel sizes are defined for scenes of one size (paper, section Implementations), so training runs in
+normalised units. The stream header stores the transform.
 """
 
 from dataclasses import dataclass, replace

@@ -26,11 +26,11 @@ from structgstream.training.result import FitResult
 
 @dataclass(frozen=True)
 class FrameZeroContext:
-    """What later frames need of a period's first frame besides its scene, if they use it.
+    """The data of a period's first frame that later frames need in addition to its scene; None if not used.
 
     Args:
-        floor: its residuals.
-        light: its pictures and F_c.
+        floor: baseline residuals.
+        light: exposure reference: its pictures and F_c.
     """
 
     floor: ResidualFloor | None = None
@@ -42,9 +42,9 @@ class StructGStream:
     """The method. Its memory is :class:`FrameZeroContext`.
 
     Args:
-        config: of the stream.
-        fitted: returns an earlier fit of frame 0 with the same capture, seed and ``config.initial``, which variants
-            that differ in later frames only can share. None: frame 0 is fitted.
+        config: configuration of the stream.
+        fitted: returns an earlier fit of frame 0 with the same capture, seed and ``config.initial``, for configurations
+            that differ only in later frames. None: frame 0 is fitted.
     """
 
     config: StreamConfig
@@ -52,7 +52,7 @@ class StructGStream:
 
     @property
     def needs_before(self) -> bool:
-        """Whether motion segmentation is enabled."""
+        """Whether changed pixels are detected, which needs the previous pictures."""
         return self.config.online.motion.enabled
 
     @property
@@ -93,7 +93,7 @@ class StructGStream:
         return replace(fit, scene=replace(fit.scene, environment=found))
 
     def prepare(self, state: Scene, task: Callable[[], FrameTask]) -> FrameZeroContext:
-        """The residual floor of frame 0, if residuals are used, and its light, if that is followed."""
+        """The baseline residuals of frame 0, if residuals are used, and its exposure reference, if it is needed."""
         motion, light = self.config.online.motion, self.config.online.exposure
         if motion.residual_threshold <= 0.0 and not light.enabled:
             return FrameZeroContext()
@@ -148,7 +148,7 @@ class StructGStream:
         return mean_residual(self._filtered(state, task), task.pictures.views, scale=scale, backend=backend)
 
     def _filtered(self, state: Scene, task: FrameTask) -> Scene:
-        """The decoded ``state`` on the task's device, drawn as online frames draw it."""
+        """The decoded ``state`` on the task's device, with the sampling of online frames."""
         sampling = RigSampling.of(task.rig) if self.config.online.sampling_filter else None
         return replace(on_device(state, task.backend.device), sampling=sampling)
 

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that are written whole or not at all.
+"""Atomic writes of files.
 
 Note [Whole files]
 ~~~~~~~~~~~~~~~~~~
-A file is written as ``PATH.partial`` and renamed, so that whoever reads ``PATH`` reads what was there before or all of
-the new one, whenever the process is killed. The content is synced before the renaming, or the name may be that of an
-empty file after a power cut; the folder after it, or the name may be that of the old one. What a killed process has
-left under the other name is overwritten by the next one that writes the file. Two that write at a time would mix, so
-the file under the other name is locked.
+A file is written as ``PATH.partial`` and renamed, so a reader of ``PATH`` gets the old or the complete new content,
+even if the process is killed. The content is synced before the renaming; otherwise the file may be empty after a power
+cut. The folder is synced after it; otherwise the name may refer to the old file. The next writer overwrites the partial
+file of a killed process. The partial file is locked, because concurrent writers would mix their content.
 """
 
 import errno
@@ -21,12 +20,12 @@ from structgstream.errors import StorageError
 from structgstream.file_locks import lock_file, open_lockable
 
 _WITHOUT_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EACCES, errno.EPERM, errno.EBADF, errno.ENOSYS)
-"""What file systems say that cannot sync a folder, and folders that may be written but not read."""
+"""Errors of file systems that cannot sync a folder, and of folders without read permission."""
 _ADVICE = {
     errno.ENOSPC: "; make room",
     errno.EDQUOT: "; make room",
-    errno.EACCES: "; mend permissions, or choose another place",
-    errno.EPERM: "; mend permissions, or choose another place",
+    errno.EACCES: "; correct its permissions, or choose another place",
+    errno.EPERM: "; correct its permissions, or choose another place",
     errno.EROFS: "; choose another place",
 }
 
@@ -37,7 +36,7 @@ def partial_path(path: Path) -> Path:
 
 
 def side_path(stream: Path, ending: str) -> Path:
-    """The file beside a stream, by its whole name without ``.sgs``: ``a.b.log.jsonl`` for ``a.b`` and ``a.b.sgs``."""
+    """A side file of a stream, by its name without ``.sgs``: ``a.b.log.jsonl`` for ``a.b`` and ``a.b.sgs``."""
     return stream.with_name(f"{stream.name.removesuffix('.sgs')}{ending}")
 
 
@@ -49,19 +48,19 @@ def write_whole(
     new_folder: bool = False,
     sync: bool = True,
 ) -> None:
-    """Writes the file ``path``, or replaces it in one step (Note [Whole files]).
+    """Writes or replaces the file ``path`` atomically (Note [Whole files]).
 
     Args:
         path: the file.
-        content: its bytes, or pieces of them in their order; what their iterator raises, this does, too.
-        called: what messages call the file, before its path: "The picture".
-        new_folder: whether its folder is made when it is missing.
-        sync: whether it is on the disk on return, so that it outlives a power cut.
+        content: its bytes, or an iterable of pieces, whose errors are passed on.
+        called: name of the file in messages, before its path: "The picture".
+        new_folder: create its folder if it is missing.
+        sync: return only when the file is on the disk and survives a power cut.
 
     Raises:
-        StorageError: it cannot be written, or another process writes it; what was there before stays.
+        StorageError: it cannot be written, or another process writes it; an existing file is not affected.
     """
-    with _told(path, called):
+    with _as_storage_error(path, called):
         if new_folder:
             path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path, sync=sync) as file:
@@ -70,17 +69,17 @@ def write_whole(
 
 @contextmanager
 def whole_file(path: Path, *, check: Callable[[Path], object] | None = None) -> Iterator[BinaryIO]:
-    """A file that gets the name ``path`` at the end of the block, if that is reached (Note [Whole files]).
+    """A file that is renamed to ``path`` at the end of the block, unless it raises (Note [Whole files]).
 
     Args:
         path: the file.
-        check: called with the name that the file has until then, when it is written to its end; if it raises, what was
-            there before stays.
+        check: called with the path of the complete partial file before it is renamed; if it raises, an existing file is
+            not affected.
 
     Raises:
-        StorageError: as :func:`write_whole`.
+        StorageError: see :func:`write_whole`.
     """
-    with _told(path, ""), replacing(path) as file:
+    with _as_storage_error(path, ""), replacing(path) as file:
         yield file
         if check is not None:
             file.flush()
@@ -89,26 +88,26 @@ def whole_file(path: Path, *, check: Callable[[Path], object] | None = None) -> 
 
 @contextmanager
 def replacing(path: Path, *, partial: Path | None = None, sync: bool = True) -> Iterator[BinaryIO]:
-    """As :func:`whole_file`, for who has a sentence of its own for what the system refuses.
+    """As :func:`whole_file`, but raises errors of the system unchanged.
 
     Args:
         path: the file.
-        partial: its name while it is written; None for that of :func:`partial_path`.
-        sync: whether it is on the disk after the block.
+        partial: its path while it is written; None for that of :func:`partial_path`.
+        sync: sync the file to the disk before the block ends.
 
     Raises:
-        OSError: it cannot be written; what was there before stays.
+        OSError: it cannot be written; an existing file is not affected.
         StorageError: another process writes it.
     """
     if path.exists() and not path.is_file() and not path.is_dir():
         with path.open("wb") as file:  # a pipe or a device, such as /dev/stdout, which must not become a file
             yield file
         return
-    path = path.resolve() if path.is_symlink() else path  # The link stays.
+    path = path.resolve() if path.is_symlink() else path  # The link is retained.
     partial = partial or partial_path(path)
     file = open_alone(partial, of=path)
     try:
-        file.truncate()  # what a killed process has left
+        file.truncate()  # remains of a killed process
         yield file
         file.flush()
         if sync:
@@ -117,7 +116,7 @@ def replacing(path: Path, *, partial: Path | None = None, sync: bool = True) -> 
     except BaseException:
         with suppress(OSError):
             partial.unlink()
-        with suppress(OSError):  # A file that has met a full disk tells it again.
+        with suppress(OSError):  # Closing raises the error of a full disk again.
             file.close()
         raise
     file.close()
@@ -126,11 +125,11 @@ def replacing(path: Path, *, partial: Path | None = None, sync: bool = True) -> 
 
 
 def open_alone(partial: Path, *, of: Path, buffering: int = -1) -> BinaryIO:
-    """The file ``partial``, with what is in it, at its beginning, open for writing by this process alone.
+    """Opens the file ``partial`` exclusively for writing, at its beginning and without truncation.
 
     Args:
-        partial: made if it is not there.
-        of: the file that it becomes, for the message.
+        partial: the file; created if it is missing.
+        of: final path of the file, for the message.
         buffering: as of :func:`open`.
 
     Raises:
@@ -144,14 +143,14 @@ def open_alone(partial: Path, *, of: Path, buffering: int = -1) -> BinaryIO:
             raise StorageError(f"Another process writes {of}; wait for its end, or choose another name.")
         if _is_at(file, partial):
             return file
-        file.close()  # Who had the lock has renamed or removed it since it was opened here: that is not ours to change.
+        file.close()  # The former lock holder has renamed or removed the file since it was opened here.
 
 
 def give_name(partial: Path, path: Path) -> None:
-    """Syncs the file ``partial`` that is written to its end, renames it, and syncs the folder (Note [Whole files]).
+    """Syncs the complete file ``partial``, renames it, and syncs the folder (Note [Whole files]).
 
     Raises:
-        OSError: one of these has failed.
+        OSError: one of these operations failed.
     """
     _sync(partial)
     partial.replace(path)
@@ -159,7 +158,7 @@ def give_name(partial: Path, path: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Makes names that were given in a folder durable, where the file system can.
+    """Syncs a folder, which makes new names in it durable, if the file system supports it.
 
     Raises:
         OSError: the disk has failed.
@@ -188,8 +187,8 @@ def _is_at(file: BinaryIO, path: Path) -> bool:
 
 
 @contextmanager
-def _told(path: Path, called: str) -> Iterator[None]:
-    """What the system refuses in the block as one sentence."""
+def _as_storage_error(path: Path, called: str) -> Iterator[None]:
+    """Converts errors of the system in the block to StorageError."""
     try:
         yield
     except OSError as error:

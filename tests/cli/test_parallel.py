@@ -91,7 +91,7 @@ def snapshot(folder: Path) -> dict[str, bytes]:
     ("capture", "whose", "status", "said"),
     [
         ("/no/such/capture", "ours", 1, "/no/such/capture"),
-        (CLIP, "parts", 1, "out.sgs.parts is needed for the parts of a parallel run, and holds files"),
+        (CLIP, "parts", 1, "out.sgs.parts is needed for the parts of a parallel run, and contains files"),
         (CLIP, "store", 1, "holds objects and no marker of structgstream"),
         (CLIP, "other run", 1, "holds the parts of another run than"),
     ],

@@ -74,7 +74,7 @@ def test_a_line_is_told_of_each_frame_and_quality(tmp_path: Path, capsys: pytest
     assert lines == [[f"frame {number}/2", name] for number in (1, 2) for name in NAMES]
     assert f"Wrote {out}: low, high" in said.replace("\n", " ")
     error = error_of(asked(out), capsys, status=1)
-    assert "holds a stream; continue it with --resume" in error
+    assert "contains a stream; continue it with --resume" in error
     assert main(asked(out, "--resume")) == 0
     assert [len(open_stream(out / name)) for name in NAMES] == [3, 3]
 

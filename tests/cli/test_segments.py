@@ -67,7 +67,7 @@ def test_a_folder_is_continued_without_saying_what_it_is(
     common = ["reconstruct", CLIP, "-o", str(out), *QUARTER]
     assert main([*common, "--sink", "segments", "--frames", "2"]) == 0
     assert main([*common, "--frames", "3"]) == 1
-    assert "out holds a stream; continue it with --resume" in capsys.readouterr().err
+    assert "out contains a stream; continue it with --resume" in capsys.readouterr().err
     assert main([*common, "--frames", "3", "--resume"]) == 0
     with open_stream(out) as reader:
         assert reader.total_bytes == (made / "file.sgs").stat().st_size

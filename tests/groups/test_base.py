@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What groups share is the beginning of any stream that has the motion start."""
+"""What groups share is the beginning of any stream with scene flow."""
 
 from pathlib import Path
 
@@ -29,5 +29,5 @@ def test_streams_that_cannot_begin_groups_are_refused(tmp_path: Path) -> None:
     with pytest.raises(StreamError, match="no whole frame 0"):
         GroupBase.read(path)
     path.write_bytes(small_stream(1))
-    with pytest.raises(ConfigError, match="codec raw and motion start off"):
+    with pytest.raises(ConfigError, match="codec raw and scene flow off"):
         _ = GroupBase.read(path).config

@@ -85,7 +85,7 @@ def task(index: int) -> Any:
 
 
 def test_frame_0_is_the_headers() -> None:
-    with pytest.raises(ConfigError, match="a header that has frame 0; give one with --init"):
+    with pytest.raises(ConfigError, match="a header with frame 0; give one with --init"):
         group().first(task(0))
 
 

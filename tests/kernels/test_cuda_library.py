@@ -80,7 +80,7 @@ def test_a_failing_compiler_is_quoted_and_leaves_nothing(tmp_path: Path) -> None
 
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:
     nvcc = pretended(tmp_path / "bin", "")
-    with pytest.raises(BackendError, match="No CUDA sources"):
+    with pytest.raises(BackendError, match="There are no CUDA sources"):
         cuda_library.compiled("sm_90", nvcc=nvcc, sources=tmp_path, cache=tmp_path)
     (tmp_path / "file").write_text("")
     with pytest.raises(BackendError, match="set XDG_CACHE_HOME"):

@@ -66,14 +66,14 @@ class GroupBase:
         """The configuration of the stream, which is that of every group.
 
         Raises:
-            ConfigError: it cannot be read, has periods, or lacks the initial scene flow that groups need.
+            ConfigError: it cannot be read, has periods, or was made without scene flow, which groups need.
         """
         config = from_json(self.header.config)
         if config.codec != "compact" or not (config.online.motion.enabled and config.online.scene_flow.enabled):
             raise ConfigError(
-                f"{self.name} was made with codec {config.codec} and motion start "
-                f"{'on' if config.online.scene_flow.enabled else 'off'}; groups need the codec compact and the motion "
-                "start, as the presets compact and fast have them."
+                f"{self.name} was made with codec {config.codec} and scene flow "
+                f"{'on' if config.online.scene_flow.enabled else 'off'}; groups need the codec compact and scene flow, "
+                "as in the presets compact and fast."
             )
         if config.period.enabled:
             raise ConfigError(

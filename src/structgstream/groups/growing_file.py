@@ -47,7 +47,7 @@ class GrowingFile:
 
     def _begin(self, keep: int) -> None:
         if self._file.seek(0, os.SEEK_END) < keep:
-            raise StorageError(f"Another process has changed {self.partial}; give the same command again.")
+            raise StorageError(f"Another process has changed {self.partial}; run the same command again.")
         self._file.truncate(keep)
         self._file.seek(keep)
 
@@ -89,6 +89,6 @@ class GrowingFile:
 
     def _failed(self, error: OSError) -> StorageError:
         return StorageError(
-            f"{self.partial} cannot be written ({error.strerror}); make room or mend permissions, and give the same "
-            "command again."
+            f"{self.partial} cannot be written ({error.strerror}); make room or correct its permissions, and "
+            "run the same command again."
         )

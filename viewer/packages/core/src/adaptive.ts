@@ -10,7 +10,7 @@ const LARGEST_RESIDUAL = 2 ** 23;
 const BLOCK = 32;
 const BLOCK_CONTEXTS = [90, 198];
 const ACTIVITY_CONTEXTS = [255, 108, 360];
-/** First row and step; known neighbours are as far away as the first row is from 0, in pass 0 none are. */
+/** First row and step of a pass; decoded neighbours are at the distance of the first row; pass 0 has none. */
 const PASSES = [
   [0, 16],
   [8, 16],
@@ -18,9 +18,9 @@ const PASSES = [
   [2, 4],
   [1, 2],
 ] as const;
-const PAD = 24; // the farthest that is looked at
+const PAD = 24; // largest distance of a neighbour
 
-/** Decodes one array after another; what a name says before its dot is the field whose bytes it reads. */
+/** Decodes one array after another; the part of a name before the dot is the field whose bytes are read. */
 export class AdaptiveDecoder {
   private readonly codes: ReadonlyMap<string, Arithmetic>;
 
@@ -107,7 +107,7 @@ export class AdaptiveDecoder {
     return found;
   }
 
-  /** Yes (1) or no (0), `[n]`, with contexts below `count`. */
+  /** Flags, 1 or 0, `[n]`, with contexts below `count`. */
   flags(name: string, contexts: ArrayLike<number>, count: number): Uint8Array {
     return Uint8Array.from(
       this.each(name, Int32Array.from(contexts), [count], 1, (code, model) => code.decide(model, 0)),
@@ -119,7 +119,7 @@ export class AdaptiveDecoder {
     return this.each(name, contexts, counts, NUMBER_NODES, (code, model) => code.number(model));
   }
 
-  /** All bytes must have been taken. */
+  /** Check that all bytes were read. */
   end(): void {
     for (const [name, code] of this.codes) {
       if (!code.isWhole)
@@ -163,7 +163,7 @@ export class AdaptiveDecoder {
   }
 }
 
-/** Which blocks of 32 rows have an active one. */
+/** The blocks of 32 rows with an active row. */
 function decodedBlocks(code: Arithmetic, model: Model, history: Uint8Array): Uint8Array {
   const count = Math.ceil(history.length / BLOCK);
   const last = new Uint8Array(count + 2);
@@ -198,7 +198,7 @@ export function bitLength(value: number, most: number): number {
   return Math.min(32 - Math.clz32(value), most);
 }
 
-/** Sizes as classes 0 to 15: each its own below 8, then two an octave. */
+/** Size classes 0 to 15: one per size below 8, then two per octave. */
 function sizeClass(size: number): number {
   if (size < 8) return size;
   const top = 31 - Math.clz32(size);

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 /**
- * A scene's dynamic fields as bins: whole numbers times a step (docs/bitstream.md, section Bins).
+ * A scene's dynamic fields as quantization indices (docs/bitstream.md, section Bins).
  *
- * The value of a bin is the product of two float32 numbers, rounded as IEEE 754 rounds it: the product of doubles is
+ * The value of an index is the product of index and step in float32, rounded as in IEEE 754: the product of doubles is
  * exact, and storing it as float32 rounds it once.
  */
 
@@ -12,7 +12,7 @@ import { type FieldName, type Fields, FREE_COLUMNS, type Tensor } from "./fields
 import { decodedFree, type FreeBins, noFree } from "./freeRows.js";
 import { type Change, decodedChange, noChange } from "./rows.js";
 
-/** Fields of an anchor, which change together: three numbers each, the appearance as many as it has directions. */
+/** Fields of an anchor, which change together: three numbers each, or one per direction of the appearance. */
 const ANCHOR_ROWS: readonly FieldName[] = ["anchor_positions", "offset_scales", "base_scales", "appearance"];
 const WEIGHTS: readonly FieldName[] = ["opacity_mlp", "color_mlp", "covariance_mlp"];
 export const FREE_STEPS = ["free_means", "free_log_scales", "free_quats", "free_logit_opacities", "free_colors"];
@@ -24,7 +24,7 @@ export const CODABLE: ReadonlySet<FieldName> = new Set([...ANCHOR_ROWS, ...WEIGH
 
 export type Steps = ReadonlyMap<string, number>;
 
-/** The dynamic part of a scene, and what the last frame did to it: `anchors` is `[M, columns of the dynamic fields]`. */
+/** The dynamic part of a scene and its last change; `anchors` is `[M, columns of the dynamic fields]`. */
 export interface SceneBins {
   readonly anchors: Int32Array;
   readonly change: Change;
@@ -39,7 +39,7 @@ interface Columns {
   readonly end: number;
 }
 
-/** The columns of each dynamic field of anchors; the appearance has what remains of `total`. */
+/** The columns of each dynamic field of anchors; the appearance has the remaining ones of `total`. */
 function anchorColumns(dynamic: ReadonlySet<FieldName>, total: number): Columns[] {
   return ANCHOR_ROWS.filter((name) => dynamic.has(name)).map((name, number) => ({
     name,
@@ -86,7 +86,7 @@ function nearest(value: Tensor, step: number): Int32Array {
     const quotient = Number(value.data[i]) / step;
     const below = Math.floor(quotient);
     const rest = quotient - below;
-    // Halves go to the even neighbour.
+    // Ties are rounded to even.
     const bin = rest > 0.5 || (rest === 0.5 && below % 2 !== 0) ? below + 1 : below;
     if (!(Math.abs(bin) <= LARGEST)) {
       throw new StreamError(`The reference has a value ${bin} steps from zero; at most ${LARGEST} can be coded.`);
@@ -96,7 +96,7 @@ function nearest(value: Tensor, step: number): Int32Array {
   return bins;
 }
 
-/** The dynamic fields that bins stand for. */
+/** The dynamic fields that the indices represent. */
 export function dequantizeState(
   bins: SceneBins,
   dynamic: ReadonlySet<FieldName>,
@@ -130,7 +130,7 @@ export function dequantizeState(
 /**
  * The bins of the frame after that of `before`.
  *
- * @throws StreamError what is decoded contradicts itself
+ * @throws StreamError the decoded data is inconsistent
  */
 export function decodedScene(
   decoder: AdaptiveDecoder,

@@ -30,7 +30,7 @@ export class BitReader {
     return value;
   }
 
-  /** An Exp-Golomb code of this order with at most `mostZeros` zeros in front. */
+  /** An Exp-Golomb code of this order with at most `mostZeros` leading zeros. */
   golomb(order: number, mostZeros: number): number {
     let zeros = 0;
     while (this.position < this.end_ && !((this.data[this.position >>> 3]! >>> (7 - (this.position & 7))) & 1)) {
@@ -43,13 +43,13 @@ export class BitReader {
     return this.fixed(zeros + order + 1) - (1 << order);
   }
 
-  /** A signed Exp-Golomb code: a place in 0, -1, 1, -2, 2 ... */
+  /** A signed Exp-Golomb code: an index into 0, -1, 1, -2, 2 ... */
   signedGolomb(order: number, mostZeros: number): number {
     const place = this.golomb(order, mostZeros);
     return place % 2 ? -((place + 1) >>> 1) : place >>> 1;
   }
 
-  /** Nothing but the zeros that fill the last byte may be left. */
+  /** Check that only the zeros that fill the last byte remain. */
   end(): void {
     const left = this.end_ - this.position;
     if (left > 7 || this.fixed(left) !== 0) {

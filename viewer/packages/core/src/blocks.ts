@@ -11,7 +11,7 @@ const CODED = 1;
 const MAX_DIMENSIONS = 4;
 const MAX_ELEMENTS = 2 ** 31 - 1;
 
-/** Where one field is in a payload; nothing is copied, and everything stated has been checked against the payload. */
+/** Position of one field in a payload, without a copy; all stated sizes have been checked against the payload. */
 export interface Block {
   readonly name: FieldName;
   readonly coded: boolean;
@@ -31,7 +31,7 @@ function itemBytesOf(coding: number, type: number, dimensions: number): number |
 /**
  * Every block from byte `start` to the end.
  *
- * @throws StreamError an unknown field or coding, a field that comes twice, or a size that does not fit the payload
+ * @throws StreamError an unknown field or coding, a duplicate field, or a size that does not fit the payload
  */
 export function blocksIn(payload: Uint8Array, start: number, where: string): Block[] {
   const view = viewOf(payload);
@@ -51,8 +51,8 @@ export function blocksIn(payload: Uint8Array, start: number, where: string): Blo
     const data = at + HEAD_BYTES + 4 * dimensions!;
     if (data > payload.length) throw new StreamError(`${where} ends within the shape of field ${name}.`);
     const shape = Array.from({ length: dimensions! }, (_, i) => view.getUint32(at + HEAD_BYTES + 4 * i, true));
-    // Products are exact where they are within the bounds, and beyond them also when rounded. An empty tensor has no
-    // bytes to be checked against, so its other sizes get a bound of their own.
+    // Products within the bounds are exact, and those beyond them exceed them even when rounded. An empty tensor has no
+    // bytes to check its sizes against, so they have a bound of their own.
     const bounded = shape.reduce((product, size) => product * Math.max(size, 1), 1) <= MAX_ELEMENTS;
     const end = data + shape.reduce((product, size) => product * size, itemBytes);
     if (!bounded || end > payload.length) {
@@ -65,10 +65,10 @@ export function blocksIn(payload: Uint8Array, start: number, where: string): Blo
 }
 
 /**
- * The tensors of all blocks from byte `start` to the end, copied byte by byte (NaNs keep their bits), which takes a
- * little-endian machine; WebGPU and WebAssembly run on no other.
+ * The tensors of all blocks from byte `start` to the end, copied byte by byte (bits of NaNs do not change). Requires a
+ * little-endian machine, as WebGPU and WebAssembly do.
  *
- * @throws StreamError as {@link blocksIn}, or a block is coded
+ * @throws StreamError see {@link blocksIn}, or a block is coded
  */
 export function unpackedBlocks(payload: Uint8Array, start: number, where: string): Map<FieldName, Tensor> {
   const fields = new Map<FieldName, Tensor>();
@@ -82,8 +82,8 @@ export function unpackedBlocks(payload: Uint8Array, start: number, where: string
 }
 
 /**
- * The tensors of all blocks from byte `start` to the end that are not coded, as {@link unpackedBlocks}, and the bytes
- * of those that are, not copied.
+ * The tensors of all blocks from byte `start` to the end that are not coded, as in {@link unpackedBlocks}, and the bytes
+ * of the coded ones, without a copy.
  *
  * @throws StreamError as {@link blocksIn}
  */

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 
-/** Bytes that arrive in pieces and are taken from the front; memory is at most about twice what has arrived. */
+/** A queue of bytes that arrive in pieces; its memory is at most about twice the bytes in it. */
 export class ByteQueue {
   private buffer = new Uint8Array(0);
   private start = 0;
@@ -23,12 +23,12 @@ export class ByteQueue {
     this.end += bytes.length;
   }
 
-  /** The next bytes, at most `count`, without taking them; valid until the next call. */
+  /** The next bytes, at most `count`, which remain in the queue; valid until the next call. */
   peek(count: number): Uint8Array {
     return this.buffer.subarray(this.start, Math.min(this.start + count, this.end));
   }
 
-  /** A copy of the next `count` bytes, which must be there. */
+  /** Removes the next `count` bytes, which must exist, and returns a copy. */
   take(count: number): Uint8Array {
     const bytes = this.buffer.slice(this.start, this.start + count);
     this.start += count;
@@ -36,7 +36,7 @@ export class ByteQueue {
     return bytes;
   }
 
-  /** Lets the next `count` bytes go, which must be there. */
+  /** Removes the next `count` bytes, which must exist. */
   skip(count: number): void {
     this.start += count;
     if (this.start === this.end) this.clear();

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Arrays of whole numbers from the sections of the init record's fields (docs/bitstream.md, Coded init fields). */
+/** Arrays of integers from the sections of the init record's fields (docs/bitstream.md, Coded init fields). */
 
 import { BitReader } from "./bits.js";
 import { StreamError } from "./errors.js";
@@ -9,9 +9,9 @@ import { RESIDUAL_ALPHABET, residualsOf } from "./residualSymbols.js";
 import { decodedTables, type FrequencyTables, geometric } from "./tables.js";
 
 const CLASSES = 32; // bit lengths of natural numbers below 2^31
-const FLAT = 128; // of the geometric rows: what is expected of a context that has not been seen
+const FLAT = 128; // geometric row of a context that has not occurred
 
-/** The frequency tables that both sides hold, by name; what was not used yet is a geometric guess. */
+/** The frequency tables of encoder and decoder, by name; a table that was not used yet is geometric. */
 export class Tables {
   private readonly sets = new Map<string, FrequencyTables>();
 
@@ -24,7 +24,7 @@ export class Tables {
   }
 }
 
-/** Decodes one section after another; what a name says before its dot is the field whose bytes it reads. */
+/** Decodes one section after another; the part of a name before the dot is the field whose bytes are read. */
 export class Decoder {
   private readonly left: Map<string, Uint8Array>;
 
@@ -70,7 +70,7 @@ export class Decoder {
     throw new StreamError(`${this.where}, ${name}, holds a number beyond 32 bits; it is damaged.`);
   }
 
-  /** Nothing may be left. */
+  /** Check that nothing remains. */
   end(): void {
     for (const [name, data] of this.left) {
       if (data.length) {

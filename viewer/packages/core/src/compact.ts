@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The compact codec: bins after the bins of the frame before, entropy coded (docs/bitstream.md, section Compact). */
+/** The compact codec: quantization indices, predicted from the frame before and entropy coded (docs/bitstream.md). */
 
 import { AdaptiveDecoder } from "./adaptive.js";
 import {
@@ -16,7 +16,7 @@ import { StreamError } from "./errors.js";
 import { type FieldName, mergedFields, type Tensor } from "./fields.js";
 import type { StreamHeader } from "./header.js";
 
-/** What is known after a packet. */
+/** The decoder's state after a packet. */
 interface CompactState {
   readonly index: number;
   readonly bins: SceneBins;
@@ -24,7 +24,7 @@ interface CompactState {
 }
 
 /**
- * Refuses a header whose packets cannot be decoded.
+ * Checks that packets with this header can be decoded.
  *
  * @throws StreamError another codec, dynamic fields that cannot be coded, or no step or reference for one
  */
@@ -58,21 +58,21 @@ function referenceNames(dynamic: ReadonlySet<FieldName>): FieldName[] {
   return [...dynamic].filter((name) => name !== "free" && name !== "free_births");
 }
 
-/** Decodes the frames of one stream, in order, beginning at any key packet. A packet that throws changes nothing. */
+/** Decodes the frames of one stream in order from any key packet. A packet that throws does not change the state. */
 export class CompactDecoder {
   private readonly reference: SceneBins;
   private state: CompactState | undefined;
 
-  /** @throws StreamError the reference has a value that no bin stands for */
+  /** @throws StreamError the reference has a value that no index represents */
   constructor(private readonly header: StreamHeader) {
     const known = mergedFields(header.static, header.reference);
     this.reference = quantizeState(known, new Set(referenceNames(header.dynamic)), header.steps);
   }
 
   /**
-   * Takes a packet in, after which {@link values} are those of its frame.
+   * Decodes a packet; {@link values} then returns its frame.
    *
-   * @throws StreamError the packet is damaged, or does not follow the one before it
+   * @throws StreamError the packet is damaged, or does not follow the last one
    */
   advance(fields: ReadonlyMap<FieldName, Uint8Array>, isKey: boolean, index: number): void {
     const { dynamic } = this.header;
@@ -85,11 +85,11 @@ export class CompactDecoder {
     const decoder = new AdaptiveDecoder(models, fields, where);
     const bins = decodedScene(decoder, start.bins, dynamic, where);
     decoder.end();
-    // What a key packet changes is everything since the reference, and tells nothing of what comes next.
+    // A key packet has all changes since the reference, which do not predict the next frame's.
     this.state = { index, bins: isKey ? withoutChange(bins) : bins, models };
   }
 
-  /** The dynamic fields of the frame that the last packet made; {@link advance} must have been called. */
+  /** The dynamic fields of the last packet's frame; {@link advance} must have been called. */
   values(): Map<FieldName, Tensor> {
     return dequantizeState(this.state!.bins, this.header.dynamic, this.header.steps);
   }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Where a stream goes on after damage (docs/bitstream.md, section Damage). */
+/** Finds where a stream continues after damage (docs/bitstream.md, section Damage). */
 
 import { CHECKSUM_BYTES, HEAD_BYTES, periodAt, RecordType, recordBytes, recordIn, viewOf } from "./records.js";
 
@@ -7,55 +7,55 @@ const FRAME_BYTES = 12;
 const INDEX_ENTRY_BYTES = 13;
 const LEAST_PACKET_BYTES = HEAD_BYTES + FRAME_BYTES + CHECKSUM_BYTES;
 const WORK = 4;
-/** Where the description of an init record is in it, and how it begins: it is a zstd frame. */
+/** Offset of the description in an init record, and its first bytes: it is a zstd frame. */
 const ZSTD = [HEAD_BYTES + 4, 0xfd2fb528] as const;
 
-/** A record that is not whole although others follow it, and the frames from `first` to before `end` that it costs. */
+/** A damaged record that others follow, and the lost frames from `first` to before `end`. */
 export interface Damage {
   readonly offset: number;
   readonly first: number;
   readonly end: number;
 }
 
-/** What is known where the damaged record begins, at byte `offset`: the next frame, and the time of the last one. */
+/** State before the damaged record at byte `offset`: the next frame, and the time of the last one. */
 export interface Standing {
   readonly offset: number;
   readonly expected: number;
   readonly afterSeconds: number;
-  /** Of the last whole init record. */
+  /** Period of the last complete init record. */
   readonly period: number;
-  /** The first byte after the last whole packet that is in no whole record. */
+  /** The first byte after the last complete packet that is in no complete record. */
   readonly since: number;
 }
 
 /**
- * The record that a stream goes on with: where it begins in the bytes that were searched, and its frame; an init record
- * states none.
+ * The record at which a stream continues: its offset in the searched bytes, and its frame, which an init record does not
+ * have.
  */
 export interface Following {
   readonly at: number;
   readonly next: number | undefined;
 }
 
-/** The last frame that a packet at byte `offset` can be: those that were lost took bytes, too. */
+/** Largest possible frame of a packet at byte `offset`, because lost frames took bytes, too. */
 export function lastFrame({ expected, since }: Standing, offset: number): number {
   return expected + Math.floor((offset - since) / LEAST_PACKET_BYTES);
 }
 
 /**
- * Finds what follows damage. One is made for each stream: with all its calls it verifies checksums of no more than four
- * times the stream's bytes, so that a stream made for it cannot make a reader work for long.
+ * Finds the record after damage. Use one object per stream: all its calls together verify checksums of at most four times
+ * the stream's bytes, so that a hostile stream cannot occupy a reader for long.
  */
 export class Search {
   private work = 0;
 
   /**
-   * The first whole packet, init record or index that can come after the damage; otherwise the number of bytes that none
-   * begins in.
+   * The first complete packet, init record or index that can follow the damage; otherwise the number of bytes in which none
+   * begins.
    *
-   * @param bytes of the stream from byte `start` on, which is after the first byte of the damaged record
-   * @param more whether others may come
-   * @returns undefined when too much has been looked at already
+   * @param bytes bytes of the stream from `start` on, which is after the first byte of the damaged record
+   * @param more whether more bytes may come
+   * @returns undefined if the limit of verified bytes is reached
    */
   next(bytes: Uint8Array, start: number, damaged: Standing, more: boolean): Following | number | undefined {
     const view = viewOf(bytes);
@@ -83,7 +83,7 @@ export class Search {
   }
 }
 
-/** Whether a record at `at`, byte `offset` of the stream, can come after the damage by what its beginning says. */
+/** Whether the first bytes of a record at `at`, byte `offset` of the stream, can follow the damage. */
 function canFollow(view: DataView, at: number, size: number, offset: number, damaged: Standing): boolean {
   const kind = view.getUint8(at);
   const length = size - HEAD_BYTES - CHECKSUM_BYTES;
@@ -99,7 +99,7 @@ function isBetween(frame: number, offset: number, damaged: Standing): boolean {
   return damaged.expected <= frame && frame <= lastFrame(damaged, offset);
 }
 
-/** The frame that a packet is, or that would follow an index. */
+/** The frame of a packet, or the one after an index. */
 function nextFrame(kind: number, payload: Uint8Array): number | undefined {
   if (kind === RecordType.init) return undefined;
   if (kind !== RecordType.index) return viewOf(payload).getUint32(0, true);

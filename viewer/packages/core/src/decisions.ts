@@ -1,17 +1,17 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Adaptive decisions: chances that follow what was decoded before (docs/entropy.md, section Decisions). */
+/** Adaptive binary decisions, whose probabilities follow the decoded data (docs/entropy.md, section Decisions). */
 
 const HALF = 1 << 15;
 const LEAST = 32;
 const MOST = 65536 - 32;
 const FAR = 1983;
 const WEIGHT_LIMIT = (1 << 19) - 1;
-const NEAR_SIZES = 6; // sizes that have a decision each
-const LENGTH_NODES = 9; // lengths of larger ones that have one
+const NEAR_SIZES = 6; // sizes with a decision of their own
+const LENGTH_NODES = 9; // bit lengths of larger sizes with a decision of their own
 const LENGTHS = 30;
 const AHEAD = 3;
 
-/** Decisions of a number that have a node. */
+/** Number of nodes of a number's decisions. */
 export const NUMBER_NODES = 2 + NEAR_SIZES + LENGTH_NODES;
 
 /** 65536 / (1 + exp(-j / 4)), rounded. */
@@ -20,7 +20,7 @@ const SQUASHED = [
   64614, 64816, 64974, 65097, 65194, 65269, 65328, 65374, 65410, 65438, 65459, 65476, 65489, 65500, 65508,
 ];
 
-/** The chance in 65536 for a logit in 256, by `logit + FAR`. */
+/** Probability, in 1/65536, of a logit in 1/256, by `logit + FAR`. */
 const CHANCES = Uint16Array.from({ length: 2 * FAR + 1 }, (_, i) => {
   const size = Math.abs(i - FAR);
   const place = size >> 6;
@@ -28,17 +28,17 @@ const CHANCES = Uint16Array.from({ length: 2 * FAR + 1 }, (_, i) => {
   return clamped(i < FAR ? 65536 - chance : chance, LEAST, MOST);
 });
 
-/** The logit for each chance in 4096: the lowest whose chance is not below the middle. */
+/** Logit of each probability in 1/4096: the lowest whose probability is not below the middle. */
 const LOGITS = new Int16Array(4096);
 for (let i = 0, place = 0; i < LOGITS.length; i++) {
   while (place < 2 * FAR && CHANCES[place]! < 16 * i + 8) place++;
   LOGITS[i] = place - FAR;
 }
 
-/** What the `seen`th decision moves its chance by, in 65536. */
+/** Adaptation rate of the `seen`th decision, in 1/65536. */
 const SHARES = Int32Array.from({ length: 256 }, (_, seen) => Math.floor(65536 / (seen + 2)));
 
-/** What is expected of decisions; it changes with each. `counts` are the contexts of each input. */
+/** A model of decisions, updated by each of them. `counts` are the numbers of contexts of each input. */
 export class Model {
   readonly chances: Uint16Array;
   readonly seen: Uint8Array;
@@ -60,7 +60,7 @@ export class Model {
   }
 }
 
-/** The models that are known after a packet, by name. One made of others changes copies of theirs. */
+/** The models after a packet, by name. An object that is created from another changes copies of its models. */
 export class Models {
   private readonly now = new Map<string, Model>();
   private readonly before: ReadonlyMap<string, Model>;
@@ -80,7 +80,7 @@ export class Models {
   }
 }
 
-/** The arithmetic code of one field. Bytes behind the end are zeros. */
+/** The arithmetic code of one field. Bytes after the end are zeros. */
 export class Arithmetic {
   private place = 0;
   private range = 0; // as a signed number of 32 bits; 0 before the first decision
@@ -90,23 +90,23 @@ export class Arithmetic {
 
   constructor(private readonly data: Uint8Array) {}
 
-  /** Whether all bytes have been taken and no more than must be. */
+  /** Whether exactly the bytes of the field were read. */
   get isWhole(): boolean {
     return this.range ? this.place === this.data.length + AHEAD : !this.data.length;
   }
 
-  /** Whether more bytes have been taken than can have been meant. */
+  /** Whether more bytes were read than an encoder can have written. */
   get isOver(): boolean {
     return this.place > this.data.length + AHEAD;
   }
 
-  /** Where the next decisions of `model` are: `contexts` has one for each input from place `from` on. */
+  /** Sets the context of the next decisions of `model`: `contexts` has one per input from index `from` on. */
   at(model: Model, contexts: Int32Array, from: number): void {
     const { starts, nodes } = model;
     for (let k = 0; k < starts.length; k++) this.rows[k] = (starts[k]! + contexts[from + k]!) * nodes;
   }
 
-  /** One decision, and what is learned from it. */
+  /** Decodes one decision and updates the model. */
   decide(model: Model, node: number): number {
     const { chances, seen, weights } = model;
     const { rows, logits } = this;
@@ -134,7 +134,7 @@ export class Arithmetic {
     return yes;
   }
 
-  /** A signed number, which may be beyond 31 bits. */
+  /** A signed number, which may exceed 31 bits. */
   number(model: Model): number {
     if (!this.decide(model, 0)) return 0;
     const negative = this.decide(model, 1);
@@ -155,7 +155,7 @@ export class Arithmetic {
       this.range = -1;
       for (let i = 0; i < 4; i++) this.take();
     }
-    // All are kept as signed numbers of 32 bits; `>>> 0` says which is the larger.
+    // All are stored as signed 32-bit numbers; `>>> 0` makes them comparable.
     let range = this.range;
     const bound = Math.imul(range >>> 16, chance);
     const yes = this.low >>> 0 < bound >>> 0;

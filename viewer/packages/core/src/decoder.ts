@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** A packet to a scene: everything a receiver needs besides a renderer. */
+/** From packets to scenes: everything that a receiver needs except a renderer. */
 
 import { blocksIn, codedFields, unpackedBlocks } from "./blocks.js";
 import { CompactDecoder } from "./compact.js";
@@ -10,7 +10,7 @@ import { viewOf } from "./records.js";
 
 export const FRAME_BYTES = 12;
 
-/** One packet: a key packet stands alone beside the header, a delta packet needs the packet before it. */
+/** One packet: a key packet needs only the header, a delta packet also the packet before it. */
 export interface Packet {
   readonly isKey: boolean;
   readonly index: number;
@@ -18,7 +18,7 @@ export interface Packet {
   readonly payload: Uint8Array;
 }
 
-/** One frame: every field of the scene, in scene units. Fields that do not change are the header's own. */
+/** One frame: every field of the scene, in scene units. Static fields are those of the header. */
 export interface Frame {
   readonly index: number;
   readonly ptsSeconds: number;
@@ -43,12 +43,12 @@ export function packetOf(payload: Uint8Array, isKey: boolean): Packet {
 }
 
 /**
- * Refuses a packet that cannot come next.
+ * Checks that a packet can come next.
  *
  * @param expected the frame that it must be
  * @param begins whether it is the first after an init record
- * @param afterSeconds when the last one is presented
- * @param name what messages call the stream
+ * @param afterSeconds presentation time of the last one
+ * @param name name of the stream in messages
  */
 export function checkFollows(
   facts: Omit<Packet, "payload">,
@@ -69,7 +69,7 @@ export function checkFollows(
   }
 }
 
-/** Decodes the packets of one stream: in order from any key packet on; with codec `raw` in any order. */
+/** Decodes the packets of one stream in order from any key packet; with codec `raw` in any order. */
 export class SceneDecoder {
   private readonly compact: CompactDecoder | undefined;
 
@@ -96,9 +96,9 @@ export class SceneDecoder {
   }
 
   /**
-   * Takes a packet in on the way to a later frame, without making numbers of it.
+   * Decodes a packet on the way to a later frame, without dequantizing it.
    *
-   * @throws StreamError as {@link decode}
+   * @throws StreamError see {@link decode}
    */
   advance({ payload, isKey, index }: Packet): void {
     const where = `Packet ${index}`;
@@ -118,7 +118,7 @@ function checkNames(names: FieldName[], header: StreamHeader, where: string): vo
 }
 
 /**
- * What each field of a packet takes, heads of blocks included.
+ * Bytes of each field of a packet, heads of blocks included.
  *
  * @throws StreamError the payload contradicts the format
  */

@@ -5,7 +5,7 @@ import { StreamError } from "./errors.js";
 
 export const FREE_COLUMNS = 14;
 
-/** By code, from 1 on; a number is a size itself, a letter is the same size wherever it stands. */
+/** By code, from 1 on; a number is a size, a letter denotes the same size in all fields. */
 const FIELD_TABLE = [
   ["anchor_positions", ["M", 3]],
   ["offset_scales", ["M", 3]],
@@ -28,7 +28,7 @@ export type FieldName = (typeof FIELD_TABLE)[number][0];
 /** Every field, in the order of their codes. */
 export const FIELD_NAMES: readonly FieldName[] = FIELD_TABLE.map(([name]) => name);
 
-/** Fields that a scene may do without: of the first two it has both or neither. */
+/** Optional fields; a scene has both of the first two or neither. */
 const OPTIONAL: readonly FieldName[] = ["appearance", "appearance_basis", "environment"];
 
 /** Rows of an environment: spherical harmonics up to degree 0, 1 and 2. */
@@ -66,16 +66,16 @@ export function mergedFields(first: Fields, second: Fields): Map<FieldName, Tens
   return merged;
 }
 
-/** What {@link checkShapes} has to know besides the fields. */
+/** Facts that {@link checkShapes} needs in addition to the fields. */
 export interface ShapeFacts {
   readonly distanceInput: boolean;
   readonly trainingCameras: number;
 }
 
 /**
- * Refuses fields that contradict each other; only those that are there are looked at.
+ * Checks that the existing fields are consistent.
  *
- * @throws StreamError naming the first field that does not fit
+ * @throws StreamError they are not; the message names the first field that does not fit
  */
 export function checkShapes(fields: Fields, facts: ShapeFacts, where: string): void {
   const sizes = new Map<string, number>([["V", facts.trainingCameras]]);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Index and footer: where packets are in a stored file, without reading them (docs/bitstream.md). */
+/** Index and footer: positions of the packets in a stored file, without reading them (docs/bitstream.md). */
 
 import { RecordType, recordIn, viewOf } from "./records.js";
 
@@ -7,7 +7,7 @@ export const FOOTER_BYTES = 16;
 const ENTRY_BYTES = 13;
 const FOOTER_MAGIC = "SGSINDEX";
 
-/** Where one packet is, or the init record before packet `index`. */
+/** Position of one packet, or of the init record before packet `index`. */
 export interface IndexEntry {
   readonly index: number;
   readonly isKey: boolean;
@@ -15,7 +15,7 @@ export interface IndexEntry {
   readonly offset: number;
 }
 
-/** Offset of the index record by the last 16 bytes of a file of `fileBytes`; undefined when it must be scanned. */
+/** Offset of the index record from the last 16 bytes of a file of `fileBytes`; undefined if it must be scanned. */
 export function indexOffset(footer: Uint8Array, fileBytes: number): number | undefined {
   if (footer.length !== FOOTER_BYTES || String.fromCharCode(...footer.subarray(8)) !== FOOTER_MAGIC) return undefined;
   const offset = Number(viewOf(footer).getBigUint64(0, true));
@@ -23,8 +23,8 @@ export function indexOffset(footer: Uint8Array, fileBytes: number): number | und
 }
 
 /**
- * The packets of a file, and the init records after the first, by its index; undefined when it must be scanned. The records they lead to have to be verified
- * when they are read.
+ * The packets of a file, and the init records after the first, from its index; undefined if the file must be scanned. The
+ * records must be verified when they are read.
  *
  * @param bytes the index record: from its offset to the footer
  */

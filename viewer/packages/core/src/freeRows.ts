@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Free Gaussians from frame to frame: some die, some change, some are born (docs/bitstream.md, section Free 3DGs). */
+/** Free Gaussians from frame to frame: some are removed, changed or spawned (docs/bitstream.md, section Free 3DGs). */
 
 import { type AdaptiveDecoder, bitLength } from "./adaptive.js";
 import { StreamError } from "./errors.js";
 import { FREE_COLUMNS } from "./fields.js";
 import { type Change, decodedChange, type Group, noChange, placesOf } from "./rows.js";
 
-/** Free Gaussians that a scene may have: a symbol can take less than a bit, so bytes do not bound their number. */
+/** Largest number of free Gaussians: a symbol can take less than a bit, so bytes do not bound their number. */
 export const MOST_FREE = 2 ** 18;
 
 const GROUPS: readonly Group[] = [
@@ -21,7 +21,7 @@ const MEANS = [6, 7, 8, 9, 10]; // quaternions and opacities
 const LED = [12, 13]; // green and blue
 const BORN_CONTEXTS = [FREE_COLUMNS, FREE_COLUMNS * 39, FREE_COLUMNS * 13];
 
-/** Free Gaussians as bins `[F, 14]`, their ascending births, and what the last frame did to them. */
+/** Free Gaussians as indices `[F, 14]`, their ascending identities, and their last change. */
 export interface FreeBins {
   readonly births: BigInt64Array;
   readonly bins: Int32Array;
@@ -32,7 +32,7 @@ export function noFree(): FreeBins {
   return { births: new BigInt64Array(0), bins: new Int32Array(0), change: noChange(0, FREE_COLUMNS) };
 }
 
-/** What becomes of `before`. */
+/** The free Gaussians of the frame after `before`. */
 export function decodedFree(decoder: AdaptiveDecoder, before: FreeBins, where: string): FreeBins {
   const alive = placesOf(decoder.flags("free_births.alive", before.change.history, 8));
   const kept: Change = {
@@ -56,7 +56,7 @@ export function decodedFree(decoder: AdaptiveDecoder, before: FreeBins, where: s
   const bins = new Int32Array(births.length * FREE_COLUMNS);
   bins.set(stayed);
   bins.set(born.bins, alive.length * FREE_COLUMNS);
-  // What was born did not change.
+  // Spawned Gaussians have no last change.
   const whole = noChange(births.length, FREE_COLUMNS);
   whole.history.set(change.history);
   whole.sizes.set(change.sizes);
@@ -72,7 +72,7 @@ function rowsOf(values: Int32Array, rows: Int32Array): Int32Array {
   return found;
 }
 
-/** What is born, given the bins of what is alive. */
+/** The spawned Gaussians, given the indices of the remaining ones. */
 function decodedBirths(decoder: AdaptiveDecoder, alive: Int32Array, where: string): Pick<FreeBins, "births" | "bins"> {
   const count = decoder.numbers("free_births.count", new Int32Array(1), [1])[0]!;
   if (count < 0 || count > MOST_FREE - alive.length / FREE_COLUMNS) {
@@ -98,12 +98,12 @@ function decodedBirths(decoder: AdaptiveDecoder, alive: Int32Array, where: strin
   return { births, bins: decodedBorn(decoder, alive, count, where) };
 }
 
-/** The bins `[count, 14]` of what is born, column by column. */
+/** The indices `[count, 14]` of spawned Gaussians, column by column. */
 function decodedBorn(decoder: AdaptiveDecoder, alive: Int32Array, count: number, where: string): Int32Array {
   const bins = new Int32Array(count * FREE_COLUMNS);
   const rows = alive.length / FREE_COLUMNS;
   const contexts = new Int32Array(count * BORN_CONTEXTS.length);
-  let one: Int32Array = new Int32Array(count); // errors in the columns before
+  let one: Int32Array = new Int32Array(count); // errors in earlier columns
   let two: Int32Array = new Int32Array(count);
   for (let column = 0; column < FREE_COLUMNS; column++) {
     for (let i = 0, at = 0; i < count; i++) {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** What a receiver knows before the first frame. */
+/** The header of a stream, which a receiver needs before the first frame. */
 
 import type { FieldName, Fields } from "./fields.js";
 
@@ -22,7 +22,7 @@ export interface Similarity {
   readonly scale: number;
 }
 
-/** What the init record says; `reference` is what key packets of the `compact` codec change. */
+/** The content of the init record; `reference` is the state that key packets of the `compact` codec change. */
 export interface StreamHeader {
   readonly cameras: readonly Camera[];
   readonly similarity: Similarity;
@@ -37,7 +37,7 @@ export interface StreamHeader {
   readonly metadata: Readonly<Record<string, unknown>>;
 }
 
-/** A part of a stream that has an init record of its own, at byte `offset`; `first` is its first frame. */
+/** A part of a stream with its own init record, at byte `offset`; `first` is its first frame. */
 export interface Period {
   readonly number: number;
   readonly first: number;
@@ -45,7 +45,7 @@ export interface Period {
   readonly bytes: number;
 }
 
-/** What all periods of a stream have in common differs in these two headers: one sentence, or undefined. */
+/** A sentence on the difference of two headers in what all periods must have in common; undefined if there is none. */
 export function difference(first: StreamHeader, later: StreamHeader): string | undefined {
   const shared = ({ cameras, similarity, fps, codec }: StreamHeader) =>
     JSON.stringify([cameras, similarity, fps, codec]);

@@ -36,7 +36,7 @@ export function unpackedHeader(payload: Uint8Array): StreamHeader {
   return header;
 }
 
-/** With `compact`, all fields but a few are coded; with another codec none is. */
+/** With `compact`, nearly all fields are coded; with another codec none is. */
 function fieldsOf(description: Record<string, unknown>, payload: Uint8Array, start: number): Fields {
   const { values, coded } = mixedBlocks(payload, start, "The init record");
   if (description.codec !== "compact") {

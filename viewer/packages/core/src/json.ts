@@ -9,9 +9,9 @@ const MAX_JSON_BYTES = 2 ** 20;
 const ZSTD_MAGIC = 0xfd2fb528;
 
 /**
- * The value that the frame holds; its stated size is looked at before anything is unpacked.
+ * The value in the frame; its stated size is checked before decompression.
  *
- * @throws StreamError it is no zstd frame, states no size or too large a one, or holds no JSON
+ * @throws StreamError it is not a zstd frame, states no size or too large a one, or contains no JSON
  */
 export function unpackedJson(frame: Uint8Array): unknown {
   const size = contentSize(frame);
@@ -21,7 +21,7 @@ export function unpackedJson(frame: Uint8Array): unknown {
     );
   }
   try {
-    // With a buffer given, the decoder allocates neither the window nor the size that the frame states.
+    // With a given buffer the decoder allocates neither the window nor the size that the frame states.
     const bytes = decompress(frame, new Uint8Array(size));
     return JSON.parse(new TextDecoder("utf-8", { fatal: true, ignoreBOM: true }).decode(bytes));
   } catch (error) {
@@ -30,7 +30,7 @@ export function unpackedJson(frame: Uint8Array): unknown {
   }
 }
 
-/** What a zstd frame (RFC 8878, section 3.1.1.1) states as its content size, if it does. */
+/** The content size that a zstd frame states (RFC 8878, section 3.1.1.1); undefined if it states none. */
 function contentSize(frame: Uint8Array): number | undefined {
   if (frame.length < 5) return undefined;
   const view = viewOf(frame);

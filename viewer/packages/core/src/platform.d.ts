@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What browsers, workers and Node have in common beyond the language itself; the package uses nothing else.
+// The common part of the platforms of browsers, workers and Node; the package uses nothing else.
 
 declare class TextDecoder {
   constructor(label: string, options: { fatal: boolean; ignoreBOM: boolean });

@@ -8,7 +8,7 @@ import { type FrequencyTables, TOTAL } from "./tables.js";
 const LANES = [1, 4, 32];
 const MAX_SYMBOLS = 2 ** 31 - 1;
 
-/** What a section states: `start` is where its states begin, `bytes` how long it is. */
+/** The head of a section: `start` is the offset of its states, `bytes` its length. */
 export interface SectionHead {
   readonly symbols: number;
   readonly words: number;
@@ -18,7 +18,7 @@ export interface SectionHead {
 }
 
 /**
- * The head of the section that begins at `data`, which anything may follow.
+ * The head of the section at the beginning of `data`, which may be longer.
  *
  * @throws StreamError it is damaged, or the section longer than the data
  */
@@ -28,7 +28,7 @@ export function sectionHead(data: Uint8Array, where: string): SectionHead {
   const [value, start] = varintAt(data, next, where);
   const words = Math.floor(value / 4);
   const lanes = LANES[value % 4];
-  // A symbol takes one word at most.
+  // A symbol takes at most one word.
   if (symbols > MAX_SYMBOLS || words > symbols || lanes === undefined) {
     throw new StreamError(`${where} states ${symbols} symbols in ${words} words; it is damaged.`);
   }
@@ -50,10 +50,10 @@ function varintAt(data: Uint8Array, start: number, where: string): [value: numbe
 }
 
 /**
- * The symbols u8 `[n]` of the section that `data` begins with.
+ * The symbols u8 `[n]` of the section at the beginning of `data`.
  *
- * @param contexts `[n]`, each below `tables.contexts`; their number is what the section must state
- * @throws StreamError the section is damaged, or has not this number of symbols
+ * @param contexts `[n]`, each below `tables.contexts`; the section must state this number of symbols
+ * @throws StreamError the section is damaged, or has another number of symbols
  */
 export function decodedSymbols(
   data: Uint8Array,
@@ -70,7 +70,7 @@ export function decodedSymbols(
   if (count === 0) return symbols;
   const { lanes, start } = head;
   const view = viewOf(data);
-  // States are below 2^32 and kept as int32: every operation below gives the same bits as on unsigned numbers.
+  // States are below 2^32 and stored as int32: every operation below gives the same bits as on unsigned numbers.
   const states = new Int32Array(lanes);
   let sound = true;
   for (let lane = 0; lane < lanes; lane++) {
@@ -104,7 +104,7 @@ export function decodedSymbols(
   return symbols;
 }
 
-/** Sums of the frequencies before each symbol and of all, `[contexts, alphabet + 1]`. */
+/** Cumulative frequencies `[contexts, alphabet + 1]`. */
 function startsOf(tables: FrequencyTables): Uint16Array {
   const { contexts, alphabet, rows } = tables;
   const starts = new Uint16Array(contexts * (alphabet + 1));

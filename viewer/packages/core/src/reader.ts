@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 /**
- * Reading a stream as it arrives, or a whole file at once.
+ * Reads a stream as it arrives, or a whole file at once.
  *
- * A reader keeps the payloads of packets, so that any frame can be asked for; `forget` lets go of old ones. Memory never
- * grows by what a record states, only by what has arrived.
+ * A reader stores the payloads of packets, so that any frame can be decoded; `forget` removes old ones. Memory depends
+ * only on the bytes that have arrived, never on sizes that a record states.
  */
 
 import { ByteQueue } from "./byteQueue.js";
@@ -24,7 +24,7 @@ import {
   type StreamRecord,
 } from "./records.js";
 
-/** One packet's place in the stream: `bytes` counts the whole record from byte `offset` on. */
+/** One packet's position in the stream: `bytes` is the length of the record at byte `offset`. */
 export interface PacketInfo {
   readonly isKey: boolean;
   readonly index: number;
@@ -34,12 +34,12 @@ export interface PacketInfo {
 }
 
 /**
- * Where reading stands: more bytes may come; the index has come, so that the run that made the stream had come to its
- * end; or a record was damaged, and nothing after it can be used.
+ * State of reading: more bytes may come; the index has come, so the run that wrote the stream finished; or a record was
+ * damaged, and nothing after it can be used.
  */
 export type ReaderState = "reading" | "complete" | "damaged";
 
-/** A period whose header is there unless it was let go of. */
+/** A period; its header is undefined if it was removed. */
 interface Begun extends Period {
   header: StreamHeader | undefined;
 }
@@ -47,14 +47,14 @@ interface Begun extends Period {
 export class StreamReader {
   private readonly queue = new ByteQueue();
   private readonly search = new Search();
-  // By frame, and so are `infos`: undefined for what is lost, and payloads for what was let go of.
+  // By frame, as `infos` is: undefined for lost packets, and payloads also for removed ones.
   private readonly payloads: (Uint8Array | undefined)[] = [];
   private readonly infos: (PacketInfo | undefined)[] = [];
   private readonly shown: boolean[] = [];
   private readonly whole: PacketInfo[] = [];
   private readonly damaged: Standing[] = [];
   private searching: Standing | undefined;
-  /** Damage since the last whole packet: how many frames it costs is not known before the next one. */
+  /** Damage since the last complete packet; the number of lost frames is not known before the next one. */
   private open: Standing | undefined;
   private readonly begun: Begun[] = [];
   /** The next packet is the first of its period. */
@@ -67,35 +67,35 @@ export class StreamReader {
   private standing: ReaderState = "reading";
   private decoded: number | undefined;
 
-  /** @param name what messages call the stream */
+  /** @param name name of the stream in messages */
   constructor(readonly name = "The stream") {}
 
-  /** What the first init record says, as soon as it is there. */
+  /** The header of the first init record; undefined until it has arrived. */
   get header(): StreamHeader | undefined {
     return this.begun[0]?.header;
   }
 
-  /** Where periods begin; one without a packet yet begins with the next one. */
+  /** The periods; one without a packet yet begins with the next packet. */
   get periods(): readonly Period[] {
     return this.begun;
   }
 
-  /** The header of a period, by its place in {@link periods}; undefined when it was let go of. */
+  /** The header of a period, by its index in {@link periods}; undefined if it was removed. */
   headerOf(place: number): StreamHeader | undefined {
     return this.begun[place]?.header;
   }
 
-  /** Lets go of the headers of all periods but the first and the last. */
+  /** Removes the headers of all periods except the first and the last. */
   forgetHeaders(): void {
     for (const period of this.begun.slice(1, -1)) period.header = undefined;
   }
 
-  /** Every whole packet so far, in order; where others are lost, their indices have gaps. */
+  /** Every complete packet so far, in order; indices have gaps where packets are lost. */
   get packets(): readonly PacketInfo[] {
     return this.whole;
   }
 
-  /** Damaged records that others follow, and the frames that each costs as far as is known. */
+  /** Damaged records that others follow, with their lost frames as far as known. */
   get damage(): readonly Damage[] {
     return this.damaged.map(({ offset, expected }) => {
       const shown = this.shown.indexOf(true, expected);
@@ -108,10 +108,10 @@ export class StreamReader {
   }
 
   /**
-   * Takes the next bytes of the stream, however many.
+   * Adds the next bytes of the stream, any number of them.
    *
-   * @throws StreamError not a stream, another major version, a damaged init record, or records that contradict each
-   *   other; so does every later call
+   * @throws StreamError not a stream, another major version, a damaged init record, or inconsistent records; every later
+   *   call throws, too
    */
   push(bytes: Uint8Array): void {
     if (this.failure) throw this.failure;
@@ -127,7 +127,7 @@ export class StreamReader {
   }
 
   /**
-   * Says that no more bytes will come.
+   * States that no more bytes will come.
    *
    * @throws StreamError nothing of the stream can be shown
    */
@@ -150,9 +150,9 @@ export class StreamReader {
   }
 
   /**
-   * The scene of one frame. The next frame after the last is decoded from it; any other from its key packet on.
+   * The scene of one frame. The frame after the last one is decoded from it; any other from its key packet on.
    *
-   * @throws StreamError there is no such frame, it was forgotten, or it is lost or damaged
+   * @throws StreamError there is no such frame, or it was removed, lost or damaged
    */
   frame(index: number): Frame {
     if (!this.shown[index]) throw this.missing(index);
@@ -172,17 +172,16 @@ export class StreamReader {
     return first;
   }
 
-  /** Lets go of the packets that no frame from `index` on needs. */
+  /** Removes the packets that no frame from `index` on needs. */
   forget(index: number): void {
     const end = this.groupStart(Math.min(index, this.infos.length - 1));
     for (; this.kept < end; this.kept++) this.payloads[this.kept] = undefined;
   }
 
   /**
-   * The packet of one frame, which the reader then lets go of: for who keeps packets himself, in as many bytes as he
-   * wants.
+   * Removes and returns the packet of one frame, for callers that store packets themselves.
    *
-   * @throws StreamError there is no such packet, or it was let go of before
+   * @throws StreamError there is no such packet, or it was removed before
    */
   take(index: number): Packet {
     const packet = this.packet(index);
@@ -229,7 +228,7 @@ export class StreamReader {
       if (size > this.queue.length) break;
       const record = recordIn(this.queue.peek(size), this.offset);
       if (record) {
-        // Its payload is kept, and nothing else of the queue.
+        // The payload is copied, so that the queue's memory can be released.
         this.add({ ...record, payload: record.payload.slice() }, size);
         this.skip(size);
       } else this.stop();
@@ -237,7 +236,7 @@ export class StreamReader {
     if (this.standing !== "reading") this.queue.clear();
   }
 
-  /** What has come is all there is: what follows a record that is not whole is looked for in it. */
+  /** All bytes have arrived; searches them for the record after an incomplete one. */
   private goOn(): void {
     while (this.standing === "reading") {
       const cut = this.searching === undefined;
@@ -245,7 +244,7 @@ export class StreamReader {
       if (cut) this.stop();
       const { searching } = this;
       if (!searching || !this.searched(searching, false)) {
-        // A record that nothing follows has been cut when its end is not there.
+        // An incomplete record that nothing follows is truncated.
         if (!cut && this.standing === "reading") this.standing = "damaged";
         return;
       }
@@ -253,7 +252,7 @@ export class StreamReader {
     }
   }
 
-  /** Whether reading can go on; if not, what need not be looked at again has been let go of. */
+  /** Whether reading can continue; if not, bytes that need not be searched again were removed. */
   private searched(damaged: Standing, more: boolean): boolean {
     const found = this.search.next(this.queue.peek(this.queue.length), this.offset, damaged, more);
     if (found === undefined) this.standing = "damaged";
@@ -280,7 +279,7 @@ export class StreamReader {
     this.offset += count;
   }
 
-  /** The record that begins here is not whole. */
+  /** Handles an incomplete or damaged record. */
   private stop(): void {
     const { begun, offset, afterSeconds } = this;
     if (!begun.length) {
@@ -320,7 +319,7 @@ export class StreamReader {
     const header = unpackedHeader(payload);
     const differing = first && difference(first, header);
     if (differing) throw new StreamError(`Period ${period} of ${this.name} does not belong to it: ${differing}.`);
-    if (this.begins && first) begun.pop(); // a period without a whole packet
+    if (this.begins && first) begun.pop(); // a period without a complete packet
     begun.push({ number: period, first: this.infos.length, offset, bytes, header });
     this.begins = true;
   }
@@ -343,9 +342,9 @@ export class StreamReader {
 }
 
 /**
- * A reader of a whole file, or of one that was cut anywhere.
+ * A reader of a whole file, or of one that was truncated anywhere.
  *
- * @throws StreamError as {@link StreamReader.push} and {@link StreamReader.finish}
+ * @throws StreamError see {@link StreamReader.push} and {@link StreamReader.finish}
  */
 export function readStream(bytes: Uint8Array, name?: string): StreamReader {
   const reader = new StreamReader(name);

@@ -10,7 +10,7 @@ export const HEAD_BYTES = 8;
 export const CHECKSUM_BYTES = 4;
 const MAGIC = [0x89, 0x53, 0x47, 0x53, 0x0d, 0x0a, 0x1a, 0x0a];
 
-/** One record; `offset` is where its first byte is in the stream, `period` the number of its period. */
+/** One record; `offset` is the offset of its first byte in the stream, `period` the number of its period. */
 export interface StreamRecord {
   readonly type: number;
   readonly period: number;
@@ -43,16 +43,16 @@ export function viewOf(bytes: Uint8Array): DataView {
   return new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
 }
 
-/** Whether `bytes` may be the beginning of a stream: as much of the signature as is there is right. */
+/** Whether `bytes` may be the beginning of a stream: the existing part of the signature is correct. */
 export function isSignature(bytes: Uint8Array): boolean {
   return MAGIC.every((byte, i) => i >= bytes.length || bytes[i] === byte);
 }
 
 /**
- * Refuses what is not a stream of this major version.
+ * Checks that a stream has this major version.
  *
- * @param bytes the first 12 bytes, or fewer where the stream is cut
- * @throws StreamError with what was found and what to do
+ * @param bytes the first 12 bytes, or fewer if the stream is truncated
+ * @throws StreamError it does not; the message states what was found and what to do
  */
 export function checkPrefix(bytes: Uint8Array, name: string): void {
   if (!isSignature(bytes)) {
@@ -70,20 +70,20 @@ export function checkPrefix(bytes: Uint8Array, name: string): void {
   }
 }
 
-/** The period that the record states whose head begins at `at`. */
+/** The period that the head of a record at `at` states. */
 export function periodAt(bytes: Uint8Array, at: number): number {
   return bytes[at + 2]! + 256 * bytes[at + 3]!;
 }
 
-/** Bytes of the whole record that `head` (8 bytes) begins: nothing is allocated for it. */
+/** Length of the record with this `head` (8 bytes); nothing is allocated. */
 export function recordBytes(head: Uint8Array): number {
   return HEAD_BYTES + viewOf(head).getUint32(4, true) + CHECKSUM_BYTES;
 }
 
 /**
- * The record that fills `bytes`, or undefined when it is cut or damaged. The payload is not copied.
+ * The record that fills `bytes`, or undefined if it is truncated or damaged. The payload is not copied.
  *
- * @param offset where the bytes are in the stream
+ * @param offset offset of the bytes in the stream
  */
 export function recordIn(bytes: Uint8Array, offset: number): StreamRecord | undefined {
   if (bytes.length < HEAD_BYTES + CHECKSUM_BYTES || recordBytes(bytes) !== bytes.length) return undefined;

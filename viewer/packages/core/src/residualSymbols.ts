@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Signed residuals from symbols of an alphabet of 16, and the rare large ones beside them (docs/entropy.md, Escapes). */
+/** Signed residuals from symbols of an alphabet of 16, and escapes for the rare large ones (docs/entropy.md, Escapes). */
 
 import { BitReader } from "./bits.js";
 import { StreamError } from "./errors.js";
@@ -10,7 +10,7 @@ const ESCAPE = 15;
 const MOST_ZEROS = 28;
 
 /**
- * Residuals int32 `[n]`: symbols 0 to 14 are 0, -1, 1 ... 7, what 15 stands for is in `escapes`.
+ * Residuals int32 `[n]`: symbols 0 to 14 are 0, -1, 1 ... 7; the value of a symbol 15 is in `escapes`.
  *
  * @throws StreamError the escapes are damaged, or not as many as there are symbols 15
  */
@@ -23,7 +23,7 @@ export function residualsOf(symbols: Uint8Array, escapes: Uint8Array, where: str
     values[i] = symbol & 1 ? -size : size;
     if (symbol === ESCAPE) places.push(i);
   }
-  // An escape takes 4 bits at least and 61 at most.
+  // An escape takes 4 to 61 bits.
   if (8 * escapes.length < 4 * places.length || 8 * escapes.length > 61 * places.length + 7) {
     throw new StreamError(`${where} has ${escapes.length} bytes for ${places.length} values; it is damaged.`);
   }

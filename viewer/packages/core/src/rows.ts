@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Rows of bins that mostly stay: which ones change, and by how much (docs/bitstream.md, section Rows). */
+/** Rows of indices of which few change: the active rows and their residuals (docs/bitstream.md, section Rows). */
 
 import type { AdaptiveDecoder } from "./adaptive.js";
 
 const REMEMBERED = 7; // activity of three frames
-const MOST = 255; // of a size that counts
+const MOST = 255; // upper bound of a size
 
 /**
- * What a frame did to rows of bins: `[n, columns]` residuals, zero where a row is not active, and the sizes of each row's
- * together. Bit 0 of `history` says whether the row is active, bits 1 and 2 whether it was in the frames before.
+ * The change of rows in one frame: residuals `[n, columns]`, zero for inactive rows, and the total size of each row's
+ * residuals. Bit 0 of `history` is set if the row is active, bits 1 and 2 if it was active in the two frames before.
  */
 export interface Change {
   readonly history: Uint8Array;
@@ -17,7 +17,7 @@ export interface Change {
   readonly columns: number;
 }
 
-/** Columns from `first` to below `end`, which have models of their own. */
+/** Columns from `first` to below `end`, with models of their own. */
 export interface Group {
   readonly name: string;
   readonly first: number;
@@ -64,7 +64,7 @@ export function decodedChange(decoder: AdaptiveDecoder, before: Change, groups: 
   return { history, sizes, residuals, columns };
 }
 
-/** Where a mask is not zero. */
+/** Indices at which a mask is not zero. */
 export function placesOf(mask: Uint8Array): Int32Array {
   const places = new Int32Array(mask.length);
   let count = 0;

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 /**
- * Frequency tables of the entropy coder and how they are sent (docs/entropy.md, section Table sets).
+ * Frequency tables of the entropy coder and their transmission (docs/entropy.md, section Table sets).
  *
  * No number here reaches 2^53, so the floor of a quotient of doubles is the integer quotient.
  */
@@ -20,7 +20,7 @@ export interface FrequencyTables {
   readonly rows: Uint16Array;
 }
 
-/** Writes the frequencies for `weights` into `row`: what is missing from 4096, the first of the largest gets or gives. */
+/** Writes the frequencies for `weights` into `row`; the first of the largest is adjusted so that the sum is 4096. */
 export function weighed(weights: Float64Array, row: Uint16Array): void {
   let sum = 0;
   let peak = 0;
@@ -63,7 +63,7 @@ export function geometric(number: number, contexts: number, alphabet: number): F
 }
 
 /**
- * The tables that `data` makes of the previous ones.
+ * The tables that result from `data` and the previous ones.
  *
  * @throws StreamError the set is damaged
  */
@@ -72,7 +72,7 @@ export function decodedTables(data: Uint8Array, previous: FrequencyTables, where
   if (data.length > MOST_ROW_BYTES * contexts) {
     throw new StreamError(`${where} has ${data.length} bytes for ${contexts} contexts; it is damaged.`);
   }
-  if (!data.length) return previous; // the rule where there is little to tell
+  if (!data.length) return previous; // usual if little has changed
   const reader = new BitReader(data, where);
   const rows = previous.rows.slice();
   for (let context = 0; context < contexts; context++) {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Cameras as values: out of a header, resized, looking somewhere, on the way from one to another. */
+/** Cameras as values: from a header, resized, directed at a point, or interpolated. */
 
 import type { StreamHeader } from "@structgstream/core";
 import { GlError } from "./errors.js";
@@ -18,7 +18,7 @@ import {
   type Vector,
 } from "./vectors.js";
 
-/** The rows of the rotation: where the camera's x (right), y (down) and z (forward) point to in the scene. */
+/** The rows of the rotation: directions of the camera's x (right), y (down) and z (forward) in the scene. */
 export function axes({ viewmat: v }: Pick<Camera, "viewmat">): Rotation {
   return [
     [v[0]!, v[1]!, v[2]!],
@@ -27,7 +27,7 @@ export function axes({ viewmat: v }: Pick<Camera, "viewmat">): Rotation {
   ];
 }
 
-/** Where the camera stands. */
+/** The camera's position. */
 export function center(camera: Pick<Camera, "viewmat">): Vector {
   const [right, down, forward] = axes(camera);
   const v = camera.viewmat;
@@ -40,7 +40,7 @@ export function viewmatOf(eye: Vector, [right, down, forward]: Rotation): Float6
   return Float64Array.from([...rows, 0, 0, 0, 1]);
 }
 
-/** A camera at `eye` that has `target` in its middle, upright as `up` says. */
+/** A camera at `eye` directed at `target`, upright with respect to `up`. */
 export function lookAt(eye: Vector, target: Vector, up: Vector): Float64Array {
   const ahead = along(target, eye, -1);
   const forward = length(ahead) > 0 ? unit(ahead) : across(up);
@@ -88,7 +88,7 @@ export function resized(camera: Camera, width: number, height: number): Camera {
   return { ...camera, K: { fx: fx * x, fy: fy * y, cx: cx * x, cy: cy * y }, width, height };
 }
 
-/** The same view on a picture of another size: all of it is seen, and more on two sides if the proportion differs. */
+/** The same view on a picture of another size: all of it is visible, and more on two sides if the proportion differs. */
 export function fitted(camera: Camera, width: number, height: number): Camera {
   const { fx, fy, cx, cy } = camera.K;
   const factor = Math.min(width / camera.width, height / camera.height);
@@ -101,7 +101,7 @@ export function fitted(camera: Camera, width: number, height: number): Camera {
   return { ...camera, K, width, height };
 }
 
-/** Pixel (x, y) of a point of the scene, and its depth along z; undefined for what is not in front of the camera. */
+/** Pixel (x, y) of a point of the scene, and its depth along z; undefined for points that are not in front of the camera. */
 export function projected(camera: Camera, point: Vector): { x: number; y: number; depth: number } | undefined {
   const from = along(point, center(camera), -1);
   const [x, y, depth] = axes(camera).map((axis) => dot(axis, from)) as [number, number, number];
@@ -117,7 +117,7 @@ export function unprojected(camera: Camera, x: number, y: number, depth: number)
   return along(along(center(camera), sideways), forward, depth);
 }
 
-/** The corners of what the camera sees at `depth`: top left, top right, bottom right, bottom left. */
+/** The corners of the camera's view at `depth`: top left, top right, bottom right, bottom left. */
 export function frustum(camera: Camera, depth: number): readonly [Vector, Vector, Vector, Vector] {
   const { width, height } = camera;
   return [
@@ -131,7 +131,7 @@ export function frustum(camera: Camera, depth: number): readonly [Vector, Vector
 /**
  * A camera `share` of the way from one to another, with the picture's size of the first.
  *
- * @param around with it the camera goes round this point, at distances between those of the ends; otherwise straight
+ * @param around the path goes around this point, at distances between those of the ends; straight if undefined
  */
 export function between(from: Camera, to: Camera, share: number, around?: Vector): Camera {
   const end = fitted(to, from.width, from.height);
@@ -145,7 +145,7 @@ export function between(from: Camera, to: Camera, share: number, around?: Vector
   return {
     viewmat: viewmatOf(eye, rotationBetween(axes(from), axes(end), share)),
     K: {
-      // A zoom looks even when the logarithm of the focal length is.
+      // A zoom looks uniform if the logarithm of the focal length is linear.
       fx: Math.exp(mixed(Math.log(from.K.fx), Math.log(end.K.fx))),
       fy: Math.exp(mixed(Math.log(from.K.fy), Math.log(end.K.fy))),
       cx: mixed(from.K.cx, end.K.cx),

@@ -23,7 +23,7 @@ import type {
 const MEAN_LOOK: Look = { gain: [1, 1, 1], bias: [0, 0, 0] };
 const BLACK = [0, 0, 0] as const;
 
-/** What is on the canvas. */
+/** The content of the canvas. */
 interface Shown {
   readonly sorted: Sorted | undefined;
   readonly camera: Camera;
@@ -44,13 +44,13 @@ export class SplatRenderer implements Renderer {
   private readonly orders: Orders;
   private readonly pace: Pace;
   private scene: LiveScene | undefined;
-  /** The order that pictures are drawn in, and the scene it belongs to. */
+  /** The order in which splats are drawn, and its scene. */
   private sorted: Sorted | undefined;
   private shown: Shown | undefined;
   private settling: { resolve: () => void; reject: (error: Error) => void }[] = [];
   private destroyed = false;
 
-  /** @throws GlError no WebGL2, or a device that cannot take the path that is asked for */
+  /** @throws GlError there is no WebGL2, or the device does not support the requested path */
   constructor(
     private readonly canvas: HTMLCanvasElement | OffscreenCanvas,
     private readonly options: RendererOptions = {},
@@ -79,7 +79,7 @@ export class SplatRenderer implements Renderer {
     this.alive();
     this.scene = new LiveScene(header);
     this.orders.forget();
-    // The picture of before stays until there is one of the new scene.
+    // The last picture is shown until there is one of the new scene.
     if (goesOn) return;
     this.sorted = undefined;
     this.shown = undefined;
@@ -130,7 +130,7 @@ export class SplatRenderer implements Renderer {
   async screenshot(): Promise<Blob> {
     this.alive();
     if (!this.shown || !this.pipeline) throw new GlError("There is no picture to save yet; call render first.");
-    // The canvas keeps nothing after the browser has shown it: the picture is made again, and taken at once.
+    // The canvas is cleared after the browser has shown it, so the picture is rendered again and saved immediately.
     this.pipeline.show(this.shown.camera, this.shown.look);
     const { canvas } = this;
     if ("convertToBlob" in canvas) return canvas.convertToBlob({ type: "image/png" });
@@ -208,7 +208,7 @@ export class SplatRenderer implements Renderer {
     return sameCamera(shown.camera, camera) && sameLook(shown.look, look);
   }
 
-  /** Held-out cameras have no correction of their own: theirs is the mean. */
+  /** Held-out cameras have no correction of their own and get the mean. */
   private lookNamed(name: string | undefined): Look {
     if (name === undefined || !this.scene) return MEAN_LOOK;
     const { cameras } = this.scene.header;
@@ -223,7 +223,7 @@ export class SplatRenderer implements Renderer {
   }
 
   private readonly lost = (event: Event): void => {
-    event.preventDefault(); // else it would not be restored
+    event.preventDefault(); // otherwise the context would not be restored
     this.pace.stop();
     this.pipeline = undefined;
     this.shown = undefined;

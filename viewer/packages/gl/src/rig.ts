@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** What a rig says about its scene: what it looks at, and which way is up. */
+/** Properties of a scene from its rig: the focus point and the up direction. */
 
 import { axes, center } from "./cameraMath.js";
 import { eigen, outerSum, type Symmetric } from "./symmetric.js";
@@ -7,14 +7,14 @@ import type { Camera } from "./types.js";
 import { along, dot, length, mean, scaled, unit, type Vector } from "./vectors.js";
 
 const LEAST_PARALLAX = 1e-3;
-/** How much of the cameras' right axes must lie in every direction of a plane before that plane is level. */
+/** Smallest share of the cameras' right axes in every direction of a plane for which the plane counts as level. */
 const LEAST_TURN = 0.02;
 
 type View = Pick<Camera, "viewmat">;
 
 /**
- * The point nearest to all optical axes, as Python's camera paths have it. A rig whose cameras look the same way has none;
- * it then lies ahead of their mean, at the size of the rig.
+ * The point nearest to all optical axes, as in Python's camera paths. For nearly parallel axes it is in front of the
+ * cameras' mean, at a distance of the rig's size.
  */
 export function focusPoint(cameras: readonly View[]): Vector {
   const centers = cameras.map(center);
@@ -38,8 +38,8 @@ export function focusPoint(cameras: readonly View[]): Vector {
 }
 
 /**
- * Up, of length 1. Cameras stand upright more often than level: their right axes lie in the ground's plane whatever their
- * pitch. Where they look too much the same way to tell, up is the mean of theirs.
+ * The up direction, of length 1. Cameras are more often upright than level: their right axes are in the ground plane at
+ * any pitch. If their directions are too similar to determine the plane, it is the mean of their up directions.
  */
 export function upAxis(cameras: readonly View[]): Vector {
   const ups = mean(cameras.map((camera) => scaled(axes(camera)[1], -1)));

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Sampling intervals: how large a pixel of the training cameras is at a point of the scene (docs/bitstream.md). */
+/** Sampling intervals: size of a training camera's pixel at a point of the scene (docs/bitstream.md). */
 
 import type { StreamHeader } from "@structgstream/core";
 import { center, rigCamera } from "./cameraMath.js";
@@ -19,7 +19,7 @@ export interface IntervalBound {
 
 export interface TrainingCameras {
   /**
-   * Rows of diag(1 / width, 1 / height, 1) K [R | t] / sqrt(fx fy) of each camera, in scene units: of a point they give
+   * Rows of diag(1 / width, 1 / height, 1) K [R | t] / sqrt(fx fy) of each camera, in scene units. They map a point to
    * (u, v, 1) z / f, with (u, v) in [0, 1] inside the picture and z / f the side of a pixel at that depth.
    */
   readonly rows: Float32Array;
@@ -46,7 +46,7 @@ export function trainingCamerasOf(header: StreamHeader): TrainingCameras {
   return {
     rows: Float32Array.from(rows),
     count: cameras.length,
-    // A weighted mean is at most the largest: the depth is at most the distance, the focal length at least the shortest.
+    // Bound of a weighted mean: the depth is at most the distance, and the focal length at least the shortest.
     bound: {
       middle,
       spread: Math.max(0, ...centers.map((eye) => length(along(eye, middle, -1)))),

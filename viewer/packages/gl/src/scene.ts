@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The scene on this side of the decoder: what it is now, and what it was when an order was asked for. */
+/** The scene in the renderer: its present state, and the state for which an order was requested. */
 
 import { FIELD_NAMES, type FieldName, type Fields, type StreamHeader, type Tensor } from "@structgstream/core";
 import { GlError } from "./errors.js";
 import { type TrainingCameras, trainingCamerasOf } from "./sampling.js";
 import type { SceneUpdate } from "./types.js";
 
-/** A scene at one instant; never changes. */
+/** An immutable state of a scene. */
 export interface Snapshot {
   readonly index: number;
   readonly ptsSeconds: number;
@@ -14,18 +14,18 @@ export interface Snapshot {
   readonly training: TrainingCameras;
 }
 
-/** Numbers that say how much there is. */
+/** Numbers of elements. */
 export interface Sizes {
   readonly anchors: number;
   readonly offsetsPerAnchor: number;
   readonly free: number;
 }
 
-/** Numbers that programs are compiled for. */
+/** Numbers for which programs are compiled. */
 export interface Shape {
   readonly offsetsPerAnchor: number;
   readonly features: number;
-  /** Columns of the anchors' appearance; 0 without. */
+  /** Columns of the anchors' appearance; 0 if there is none. */
   readonly appearance: number;
   readonly hidden: number;
   readonly distanceInput: boolean;
@@ -56,7 +56,7 @@ export function sameShape(a: Shape, b: Shape): boolean {
   return (Object.keys(a) as (keyof Shape)[]).every((key) => a[key] === b[key]);
 }
 
-/** Gathers updates; hands out what the scene is. */
+/** Collects updates and provides the present scene. */
 export class LiveScene {
   private fields: Map<FieldName, Tensor>;
   private found: Snapshot | undefined;
@@ -67,12 +67,12 @@ export class LiveScene {
     this.training = trainingCamerasOf(header);
   }
 
-  /** Undefined until an update has completed the scene. */
+  /** Undefined until updates have completed the scene. */
   get latest(): Snapshot | undefined {
     return this.found;
   }
 
-  /** @throws GlError the update leaves fields out that no update before has brought */
+  /** @throws GlError the update lacks fields that no earlier update contained */
   apply(update: SceneUpdate): void {
     const fields = new Map([...this.fields, ...update.fields]);
     const missing = FIELD_NAMES.filter((name) => !fields.has(name) && !OPTIONAL.includes(name));

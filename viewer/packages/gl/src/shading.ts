@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The MLPs and the low-pass of the training pictures as GLSL and numbers, for those who draw with another program than `SplatRenderer`. */
+/** The MLPs and the low-pass of the training pictures as GLSL and numbers, for other programs than `SplatRenderer`. */
 
 export { TABLE_GLSL, TABLE_WIDTH_BITS } from "./gpu/table.js";
 export { mlpLayout, packedWeights, paddedRows } from "./gpu/weights.js";

@@ -1,17 +1,17 @@
 // SPDX-License-Identifier: Apache-2.0
-/** What goes into the renderer and what comes out: the contract with the player above. */
+/** Inputs and outputs of the renderer: its interface to the player. */
 
 import type { FieldName, StreamHeader, Tensor } from "@structgstream/core";
 
 /**
- * What a decode worker posts for each frame. The arrays were transferred, never shared: the renderer keeps them, because a lost
- * context has to be rebuilt, and nobody else may write to them.
+ * The message of a decode worker for each frame. The arrays are transferred, never shared: the renderer stores them to
+ * restore a lost context, so nobody else may write to them.
  */
 export interface SceneUpdate {
   /** Frame number in the stream. */
   readonly index: number;
   readonly ptsSeconds: number;
-  /** Whole tensors of the fields that changed since the last update given; the header brought the static ones. */
+  /** Complete tensors of the fields that changed since the last update; the header contains the static ones. */
   readonly fields: ReadonlyMap<FieldName, Tensor>;
 }
 
@@ -23,7 +23,7 @@ export interface Intrinsics {
   readonly cy: number;
 }
 
-/** A pinhole camera in SCENE units (`scene = (capture - center) * scale`); `rigCamera` makes one of a header's camera. */
+/** A pinhole camera in SCENE units (`scene = (capture - center) * scale`); `rigCamera` converts a camera of a header. */
 export interface Camera {
   /** 16 numbers, row by row: world to camera, OpenCV axes (x right, y down, z forward), rigid. */
   readonly viewmat: Float64Array;
@@ -36,47 +36,47 @@ export interface Camera {
   readonly near: number;
 }
 
-/** How the MLPs' outputs reach the drawing pass: in fp32 by transform feedback, or in half floats by render targets. */
+/** Transport of the MLPs' outputs to the drawing pass: fp32 by transform feedback, or half floats by render targets. */
 export type MlpPath = "transform-feedback" | "mrt";
 
 export interface RendererOptions {
-  /** The sorting worker (`sorter.worker.ts`), or where its module is; the renderer ends it. By default its own file. */
+  /** The sorting worker (`sorter.worker.ts`), or the URL of its module; the renderer terminates it. By default its own file. */
   readonly sorter?: Worker | URL;
-  /** No more splats are drawn; those left out are of the anchors that look smallest. Unlimited by default. */
+  /** Largest number of drawn splats; those of anchors with the smallest apparent size are left out. Default: no limit. */
   readonly maxSplats?: number;
-  /** Size of what is drawn in pixels of the canvas, e.g. 0.5: a quarter of the pixels. 1 by default. */
+  /** Size of the drawn picture relative to the canvas; 0.5 draws a quarter of the pixels. Default: 1. */
   readonly pixelScale?: number;
-  /** By default the path that this device's limits allow, transform feedback first. */
+  /** Default: the first path that the device supports, transform feedback before render targets. */
   readonly mlpPath?: MlpPath;
-  /** sRGB in [0, 1] behind everything where the scene has no environment. Black by default, as in Python. */
+  /** Background sRGB in [0, 1] of a scene without environment. Default: black, as in Python. */
   readonly background?: readonly [number, number, number];
 }
 
 export interface RenderOptions {
-  /** A training camera of the rig whose exposure and white balance the picture gets; by default the mean of all. */
+  /** A training camera whose exposure and white balance the picture gets. Default: the mean of all. */
   readonly cameraName?: string;
 }
 
-/** What one call of `render` did. */
+/** Result of one call of `render`. */
 export interface RenderStats {
-  /** The frame that the picture shows; undefined until the first order has come. It may lag behind the last update. */
+  /** The frame of the picture; undefined until the first order has come. It may be older than the last update. */
   readonly frameIndex: number | undefined;
   readonly ptsSeconds: number | undefined;
-  /** False when nothing had changed, or the GPU is still at the picture before: the canvas was left as it is. */
+  /** False if nothing has changed or the GPU is busy with the last picture; the canvas was not changed then. */
   readonly drawn: boolean;
-  /** Whether the canvas shows the last update, seen and sorted from this very camera; otherwise `onOrder` will follow. */
+  /** Whether the canvas shows the last update, sorted for exactly this camera; otherwise `onOrder` will be called. */
   readonly settled: boolean;
   /** Anchors whose MLPs were evaluated. */
   readonly anchors: number;
   /** Splats in the order, before those too faint to show are dropped on the GPU. */
   readonly splats: number;
-  /** What the sorting worker took for the order shown. */
+  /** Time of the sorting worker for the present order. */
   readonly sortMilliseconds: number;
-  /** What this call took on the calling thread; the GPU goes on after it. */
+  /** Time of this call on the calling thread; the GPU continues after it. */
   readonly callMilliseconds: number;
 }
 
-/** What the renderer holds on the GPU and beside it; all zero after `destroy`. */
+/** Memory of the renderer on the GPU and on the host; all zero after `destroy`. */
 export interface ResourceCounts {
   readonly textures: number;
   readonly buffers: number;
@@ -85,32 +85,32 @@ export interface ResourceCounts {
   readonly workers: number;
 }
 
-/** What `SplatRenderer` is to a player. */
+/** The interface of `SplatRenderer`. */
 export interface Renderer {
-  /** The next `render` can show something new: an order has come, or the GPU has time again. */
+  /** The next `render` can draw something new: an order has come, or the GPU is free again. */
   onOrder: (() => void) | undefined;
   onContextLost: (() => void) | undefined;
-  /** Everything is on the GPU again: `render` as before. */
+  /** A context was restored; `render` works again. */
   onContextRestored: (() => void) | undefined;
-  /** Something went wrong after a call had returned, in the sorting worker or while a context was restored. */
+  /** An error after a call has returned, in the sorting worker or while a context was restored. */
   onError: ((error: Error) => void) | undefined;
   /** Settable at any time; applies from the next `render` on. */
   maxSplats: number;
   pixelScale: number;
   /**
-   * The static fields; forgets a stream loaded before. Dynamic fields come by `update`. A stream that `goesOn` with another
-   * header keeps its picture until there is one of the new scene. Throws GlError.
+   * Sets the static fields and removes an earlier stream. Dynamic fields follow by `update`. If a stream `goesOn` with
+   * another header, its picture is shown until there is one of the new scene. Throws GlError.
    */
   load(header: StreamHeader, goesOn?: boolean): void;
-  /** The scene as it is now; shown as soon as the order for it has come, the latest winning. Throws GlError. */
+  /** Sets the dynamic fields. The latest scene is shown as soon as its order has come. Throws GlError. */
   update(update: SceneUpdate): void;
   render(camera: Camera, options?: RenderOptions): RenderStats;
-  /** Draws until the picture is settled, for pictures that must be exact. */
+  /** Draws until the picture is exact: of the last update, sorted for its camera. */
   renderSettled(camera: Camera, options?: RenderOptions): Promise<RenderStats>;
-  /** The last picture rendered, as PNG. */
+  /** The last rendered picture as PNG. */
   screenshot(): Promise<Blob>;
   readonly resources: ResourceCounts;
-  /** Sentences about what this device draws worse than others; empty on most. */
+  /** Sentences about limitations of this device; empty on most. */
   readonly limitations: readonly string[];
   destroy(): void;
 }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Three numbers, rotations of three rows of them, and unit quaternions (wxyz). */
+/** Vectors of three numbers, rotations as three rows, and unit quaternions (wxyz). */
 
 export type Vector = readonly [number, number, number];
 export type Rotation = readonly [Vector, Vector, Vector];
@@ -26,7 +26,7 @@ export function length(a: Vector): number {
   return Math.hypot(a[0], a[1], a[2]);
 }
 
-/** Of length 1; a vector without a length stays as it is. */
+/** The vector scaled to length 1; a zero vector is unchanged. */
 export function unit(a: Vector): Vector {
   const size = length(a);
   return size > 0 ? scaled(a, 1 / size) : a;
@@ -37,14 +37,14 @@ export function mean(vectors: readonly Vector[]): Vector {
   return scaled(sum, 1 / Math.max(vectors.length, 1));
 }
 
-/** Some unit vector across `a`. */
+/** A unit vector perpendicular to `a`. */
 export function across(a: Vector): Vector {
   const smallest: Vector = Math.abs(a[0]) < 0.6 * length(a) ? [1, 0, 0] : [0, 1, 0];
   return unit(cross(a, smallest));
 }
 
 export function quaternionOf(r: Rotation): Quaternion {
-  // The largest of the four is found first: dividing by a small one would lose digits.
+  // The largest component is computed first, because dividing by a small one would lose precision.
   const [[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]] = r;
   const squares = [1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz];
   const largest = squares.indexOf(Math.max(...squares));
@@ -66,7 +66,7 @@ export function rotationOf([w, x, y, z]: Quaternion): Rotation {
   ];
 }
 
-/** The rotation that is `share` of the way from one to the other, the shorter way round. */
+/** Interpolated rotation at `share` of the shorter way from one to the other. */
 export function rotationBetween(from: Rotation, to: Rotation, share: number): Rotation {
   const a = quaternionOf(from);
   let b = quaternionOf(to);
@@ -90,7 +90,7 @@ export function directionBetween(from: Vector, to: Vector, share: number): Vecto
   const angle = Math.acos(Math.min(Math.max(dot(a, b), -1), 1));
   if (angle < 1e-6) return a;
   if (Math.PI - angle < 1e-6) {
-    // Opposite: any way round is as short.
+    // Opposite directions: any plane is correct.
     const side = across(a);
     return along(scaled(a, Math.cos(share * angle)), side, Math.sin(share * angle));
   }

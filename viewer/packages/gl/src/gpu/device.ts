@@ -1,23 +1,23 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The context, what this device can do, and sentences about what it cannot. */
+/** The context, the capabilities of this device, and sentences about its limitations. */
 
 import { GlError } from "../errors.js";
 import type { MlpPath } from "../types.js";
 
-/** vec4s that a splat takes of the MLPs' outputs. */
+/** vec4s of the MLPs' outputs per splat. */
 export const SPLAT_VECTORS = 3;
-/** Two splats' outputs as half floats fill so many targets of four 32-bit numbers. */
+/** Number of targets of four 32-bit numbers that two splats' outputs fill as half floats. */
 export const PAIR_TARGETS = 3;
 
 export interface Device {
   readonly gl: WebGL2RenderingContext;
-  /** What splats are blended into. */
+  /** Format of the texture into which splats are blended. */
   readonly accumulation: { readonly format: "RGBA16F" | "RGBA8" };
   readonly maxTextureSize: number;
   readonly maxLayers: number;
-  /** Splats of an anchor that one pass can give, by path; 0 when the device cannot take that path. */
+  /** Splats of an anchor that one pass can compute, by path; 0 if the device does not support the path. */
   readonly splatsPerPass: Readonly<Record<MlpPath, number>>;
-  /** Sentences about what is drawn worse than elsewhere. */
+  /** Sentences about limitations of the rendering on this device. */
   readonly limitations: readonly string[];
 }
 
@@ -38,7 +38,7 @@ export function openDevice(canvas: HTMLCanvasElement | OffscreenCanvas): Device 
   return deviceOf(gl);
 }
 
-/** What a context can do; again after one has been restored, for extensions have to be asked for anew. */
+/** Capabilities of a context; called again after a context was restored, because extensions must be enabled again. */
 export function deviceOf(gl: WebGL2RenderingContext): Device {
   const float = gl.getExtension("EXT_color_buffer_float") ?? gl.getExtension("EXT_color_buffer_half_float");
   const limitations: string[] = [];
@@ -68,9 +68,9 @@ export function deviceOf(gl: WebGL2RenderingContext): Device {
 }
 
 /**
- * The path that is asked for, or the best that the device can take.
+ * The requested path, or the best that the device supports.
  *
- * @throws GlError it cannot take that one
+ * @throws GlError the device does not support the requested path
  */
 export function chosenPath(device: Device, asked: MlpPath | undefined): MlpPath {
   const { splatsPerPass } = device;
@@ -84,6 +84,6 @@ export function chosenPath(device: Device, asked: MlpPath | undefined): MlpPath 
 }
 
 function limit(gl: WebGL2RenderingContext, name: number): number {
-  // A context that is lost at this very moment gives null; it will be asked again.
+  // A context that is lost at this moment returns null and is queried again later.
   return (gl.getParameter(name) as number | null) ?? 0;
 }

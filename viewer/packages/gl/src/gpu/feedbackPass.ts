@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** MLPs by transform feedback: one vertex is one anchor, all in fp32. What a buffer got becomes a texture on the GPU. */
+/** MLPs by transform feedback: one vertex per anchor, in fp32. The buffer is copied to a texture on the GPU. */
 
 import { GlError } from "../errors.js";
 import type { Shape } from "../scene.js";
@@ -66,7 +66,7 @@ export class FeedbackPass implements MlpPass {
     return { textures: { outputs: this.texture }, arrays: {} };
   }
 
-  /** Texels from where one pass writes to where the next one does. */
+  /** Distance, in texels, between the outputs of consecutive passes. */
   get passTexels(): number {
     return this.passRows * WIDTH;
   }
@@ -78,7 +78,7 @@ export class FeedbackPass implements MlpPass {
     if (this.texture) this.resources.deleteTexture(this.texture);
   }
 
-  /** Room for what `count` anchors give, and somewhat more when it has to grow. */
+  /** Allocates memory for the outputs of `count` anchors, with a reserve when it grows. */
   private reserve(count: number): void {
     if (count <= this.room) return;
     const { gl } = this.resources;

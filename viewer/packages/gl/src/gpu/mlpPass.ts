@@ -1,16 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
-/** What both ways of evaluating the MLPs have in common. */
+/** Common interface of both ways to evaluate the MLPs. */
 
 import type { Vector } from "../vectors.js";
 import type { SceneTextures } from "./sceneTextures.js";
 
-/** Evaluates the MLPs of the visible anchors and keeps what they say. */
+/** Evaluates the MLPs of the visible anchors and stores their outputs. */
 export interface MlpPass {
   /** GLSL that reads it (`readingGlsl`). */
   readonly reading: string;
-  /** @throws GlError more visible anchors than this device has room for */
+  /** @throws GlError the device has not enough memory for the visible anchors */
   evaluate(scene: SceneTextures, eye: Vector): void;
-  /** What `reading` reads, for `bindTextures`. */
+  /** The textures that `reading` needs, for `bindTextures`. */
   outputs(): {
     readonly textures: Readonly<Record<string, WebGLTexture | undefined>>;
     readonly arrays: Readonly<Record<string, WebGLTexture | undefined>>;

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 /**
- * No more than one picture ahead of the GPU: a device that takes longer for a picture than its screen does shows fewer,
- * and the page's thread never waits for it.
+ * Submits at most one picture ahead of the GPU: a device that is slower than its screen shows fewer pictures, and the
+ * page's thread never waits for the GPU.
  */
 
 const POLL_MILLISECONDS = 4;
@@ -10,20 +10,20 @@ export class Pace {
   private fence: WebGLSync | null = null;
   private timer: ReturnType<typeof setTimeout> | undefined;
 
-  /** @param onFree the GPU has finished what it was too busy for when `busy` was asked last */
+  /** @param onFree called when the GPU is free after `busy` returned true */
   constructor(
     private readonly gl: WebGL2RenderingContext,
     private readonly onFree: () => void,
   ) {}
 
-  /** A picture has been handed to the GPU. */
+  /** Record that a picture was submitted to the GPU. */
   mark(): void {
     this.release();
     this.fence = this.gl.fenceSync(this.gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     this.gl.flush();
   }
 
-  /** Whether the GPU is still at the last picture; if so, `onFree` follows. */
+  /** Whether the GPU still renders the last picture; if so, `onFree` will be called. */
   busy(): boolean {
     if (!this.working()) return false;
     this.timer ??= setTimeout(this.poll, POLL_MILLISECONDS);

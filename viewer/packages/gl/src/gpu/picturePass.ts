@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The canvas: what was blended, before the environment, as a camera of the rig would take it. */
+/** The canvas: the blended splats in front of the environment, with the exposure of a camera of the rig. */
 
 import { axes } from "../cameraMath.js";
 import { pictureProgram } from "../shaders/picture.js";
@@ -21,7 +21,7 @@ export class PicturePass {
 
   /**
    * @param environment [E, 3], empty without one
-   * @param background behind everything where there is no environment
+   * @param background colour behind everything if there is no environment
    */
   draw(
     blended: WebGLTexture,

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Everything on the GPU, from fields to the canvas; made anew when a context has been restored. */
+/** All GPU stages, from fields to the canvas; created again after a context was restored. */
 
 import type { Fields } from "@structgstream/core";
 import { center, resized } from "../cameraMath.js";
@@ -17,7 +17,7 @@ import { SceneTextures } from "./sceneTextures.js";
 import { SplatPass } from "./splatPass.js";
 import { TargetsPass } from "./targetsPass.js";
 
-/** What depends on the scene's shape: widths of the MLPs, Gaussians of an anchor. */
+/** The stages that depend on the scene's shape: widths of the MLPs, Gaussians per anchor. */
 interface Stage {
   readonly shape: Shape;
   readonly scene: SceneTextures;
@@ -36,7 +36,7 @@ export class Pipeline {
   private stage: Stage | undefined;
   private fields: Fields | undefined;
 
-  /** @throws GlError the device cannot take the path that is asked for, or refuses a shader */
+  /** @throws GlError the device does not support the requested path, or rejects a shader */
   constructor(
     readonly device: Device,
     askedPath: MlpPath | undefined,
@@ -49,7 +49,7 @@ export class Pipeline {
   }
 
   /**
-   * A scene and its order; without one when it throws.
+   * Sets a scene and its order; there is no scene if it throws.
    *
    * @throws GlError the scene is too large for this device
    */
@@ -92,7 +92,7 @@ export class Pipeline {
     this.splats.draw(this.stage?.scene, this.stage?.projection, width, height);
   }
 
-  /** What was drawn last, onto the canvas. */
+  /** Copies the last rendering to the canvas. */
   show(camera: Camera, look: Look): void {
     const environment = this.fields?.get("environment")?.data as Float32Array | undefined;
     if (!this.splats.target) return;

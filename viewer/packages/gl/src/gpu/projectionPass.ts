@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Gaussians to ellipses on the picture, once for each slot and camera. */
+/** Projects Gaussians to ellipses on the picture, once per slot and camera. */
 
 import { axes, center } from "../cameraMath.js";
 import { projectionProgram } from "../shaders/projection.js";
@@ -32,7 +32,7 @@ export class ProjectionPass {
     this.framebuffer = resources.framebuffer();
   }
 
-  /** @throws GlError more splats than this device's textures hold */
+  /** @throws GlError more splats than fit this device's textures */
   project(scene: SceneTextures, camera: Camera): void {
     const { program } = this;
     const { gl } = this.resources;

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Everything that was made on a context, so that all of it can be counted and given back. */
+/** All resources of a context, so that they can be counted and released. */
 
 import { GlError } from "../errors.js";
 import type { ResourceCounts } from "../types.js";
 
-/** What GLSL and the host agree on before the shader's own text. */
+/** The common head of all shaders. */
 const HEAD = `#version 300 es
 ${["float", "int", "sampler2D", "usampler2D", "usampler2DArray"].map((type) => `precision highp ${type};\n`).join("")}`;
 
@@ -15,7 +15,7 @@ export interface ProgramSource {
   readonly feedback?: readonly string[];
 }
 
-/** A linked program and where its uniforms are. */
+/** A linked program and the locations of its uniforms. */
 export class Program {
   private readonly places = new Map<string, WebGLUniformLocation | null>();
 
@@ -24,7 +24,7 @@ export class Program {
     readonly handle: WebGLProgram,
   ) {}
 
-  /** Where a uniform is; null, which WebGL ignores, when the compiler found it unused. */
+  /** Location of a uniform; null, which WebGL ignores, if the compiler removed it as unused. */
   at(name: string): WebGLUniformLocation | null {
     let place = this.places.get(name);
     if (place === undefined) {
@@ -74,7 +74,7 @@ export class Resources {
     return kept(this.arrays, this.gl.createVertexArray());
   }
 
-  /** @throws GlError the driver refuses the program; a lost context gives one that does nothing */
+  /** @throws GlError the driver rejects the program; a lost context returns one that does nothing */
   program(source: ProgramSource): Program {
     const { gl } = this;
     const handle = kept(this.programs, gl.createProgram());
@@ -83,7 +83,7 @@ export class Resources {
       [gl.FRAGMENT_SHADER, source.fragment],
     ] as const) {
       const shader = gl.createShader(type);
-      if (!shader) continue; // only a lost context has none
+      if (!shader) continue; // only a lost context returns none
       gl.shaderSource(shader, HEAD + text);
       gl.compileShader(shader);
       gl.attachShader(handle, shader);
@@ -134,7 +134,7 @@ export class Resources {
   }
 }
 
-/** A lost context may give null, and ignores it wherever it is used. */
+/** A lost context may return null, and ignores it as an argument. */
 function kept<T>(set: Set<T>, made: T | null): T {
   if (made !== null) set.add(made);
   return made as T;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Sampling intervals, once for each state of the scene: the projection of every picture reads them. */
+/** Sampling intervals, computed once per state of the scene and read by the projection of every picture. */
 
 import type { Tensor } from "@structgstream/core";
 import type { TrainingCameras } from "../sampling.js";

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The scene on the GPU: one table for each field that shaders read, written anew only when the field is another one. */
+/** The scene on the GPU: one table per field that shaders read, rewritten only if the field has changed. */
 
 import type { FieldName, Tensor } from "@structgstream/core";
 import { type Shape, type Sizes, type Snapshot, sizesOf } from "../scene.js";
@@ -9,7 +9,7 @@ import type { Resources } from "./resources.js";
 import { Table } from "./table.js";
 import { packedWeights, paddedRows } from "./weights.js";
 
-/** Fields that the weights are made of. */
+/** Fields that contain the weights. */
 const MLP_FIELDS: readonly FieldName[] = ["opacity_mlp", "color_mlp", "covariance_mlp", "appearance_basis"];
 
 export class SceneTextures {
@@ -74,7 +74,7 @@ export class SceneTextures {
     this.splats = order.splats;
   }
 
-  /** Slots that the order may name: those of visible anchors, then all free Gaussians. */
+  /** Number of slots that the order may contain: those of visible anchors, then all free Gaussians. */
   get slotCount(): number {
     return this.anchorCount * this.sizes.offsetsPerAnchor + this.sizes.free;
   }

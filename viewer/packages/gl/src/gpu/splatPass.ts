@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Splats blended from far to near into a texture of their own. */
+/** Blends splats from far to near into a texture. */
 
 import { cornerIndices, INDICES_PER_SPLAT, SPLATS_PER_CALL, splatProgram } from "../shaders/splat.js";
 import { bindTextures } from "./binding.js";
@@ -10,7 +10,7 @@ import type { SceneTextures } from "./sceneTextures.js";
 import { plainTexture } from "./table.js";
 
 export class SplatPass {
-  /** What was blended: colours times coverage, and coverage. */
+  /** The result: colours times coverage, and coverage. */
   target: WebGLTexture | undefined;
   private readonly program: Program;
   private readonly framebuffer: WebGLFramebuffer;
@@ -25,7 +25,7 @@ export class SplatPass {
     const { gl } = resources;
     this.program = resources.program(splatProgram());
     this.framebuffer = resources.framebuffer();
-    // Instances would say the same in less memory, and are several times slower where the GPU is software.
+    // Instancing would need less memory, but is several times slower on software GPUs.
     this.corners = resources.vertexArray();
     gl.bindVertexArray(this.corners);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, resources.buffer());
@@ -70,7 +70,7 @@ export class SplatPass {
     this.target = plainTexture(this.resources);
     [this.width, this.height] = [width, height];
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl[this.device.accumulation.format], width, height);
-    // Seen larger than it is drawn when the resolution is scaled down.
+    // Displayed larger than it is drawn if the resolution is scaled down.
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.LINEAR);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);

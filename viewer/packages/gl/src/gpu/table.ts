@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
-/** A list of texels in a 2D texture, row by row: what shaders read by number. */
+/** A list of texels in a 2D texture, row by row, which shaders read by index. */
 
 import { GlError } from "../errors.js";
 import type { Device } from "./device.js";
 import type { Resources } from "./resources.js";
 
-/** Every WebGL2 device has textures this wide; a power of two, so that shaders shift and mask. */
+/** Width that every WebGL2 device supports; a power of two, so that shaders can shift and mask. */
 export const TABLE_WIDTH_BITS = 11;
 const WIDTH = 1 << TABLE_WIDTH_BITS;
-/** Lists that change their length get so much room more, to be reused for the next ones. */
+/** Reserve of lists that change their length, so that their memory can be reused. */
 const ROOM = 1.25;
 
 export type TexelFormat = "R32UI" | "RG32F" | "RGB32F" | "RGBA32F" | "RGBA32UI";
@@ -20,7 +20,7 @@ export class Table {
   texture: WebGLTexture | undefined;
   private rows = 0;
 
-  /** @param name what messages call it */
+  /** @param name name in messages */
   constructor(
     private readonly resources: Resources,
     private readonly device: Device,
@@ -29,9 +29,9 @@ export class Table {
   ) {}
 
   /**
-   * Room for `texels`; what was there is lost when there was less.
+   * Allocates memory for `texels`; the content is lost if the memory grows.
    *
-   * @throws GlError more than this device's textures hold
+   * @throws GlError more than fit this device's textures
    */
   reserve(texels: number): void {
     const rows = Math.max(Math.ceil(texels / WIDTH), 1);
@@ -50,7 +50,7 @@ export class Table {
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl[this.format], WIDTH, this.rows);
   }
 
-  /** The first texels become `data`, of which `count` numbers are used. */
+  /** Writes the first `count` numbers of `data` to the first texels. */
   write(data: TexelData, count = data.length): void {
     const channels = CHANNELS[this.format];
     const texels = Math.ceil(count / channels);
@@ -79,7 +79,7 @@ export class Table {
   }
 }
 
-/** A new 2D texture, bound, that is read as it is: no filter, no repetition. */
+/** A new 2D texture, bound, without filtering and repetition. */
 export function plainTexture(resources: Resources, target?: number): WebGLTexture {
   const { gl } = resources;
   const where = target ?? gl.TEXTURE_2D;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** MLPs by render targets: one fragment is one anchor, what it says is packed as half floats into layers of a texture. */
+/** MLPs by render targets: one fragment per anchor; outputs are packed as half floats into layers of a texture. */
 
 import { GlError } from "../errors.js";
 import type { Shape } from "../scene.js";

@@ -1,18 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The MLPs' weights in the order in which the shader reads them: four to a texel. */
+/** The MLPs' weights in the order in which the shader reads them, four per texel. */
 
 import type { Fields } from "@structgstream/core";
 import type { Shape } from "../scene.js";
 
-/** Counts of texels that shader and weights agree on. */
+/** Numbers of texels, common to shader and weights. */
 export interface MlpLayout {
-  /** Of an anchor's features, of its appearance, and of all inputs with direction and distance. */
+  /** Texels of an anchor's features, of its appearance, and of all inputs including direction and distance. */
   readonly featureTexels: number;
   readonly appearanceTexels: number;
   readonly inputTexels: number;
-  /** Of the hidden layer's values. */
+  /** Texels of the hidden layer's values. */
   readonly hiddenTexels: number;
-  /** Where the heads begin, and the outputs within a head. */
+  /** First texel of each head, and of the outputs within a head. */
   readonly heads: { readonly opacity: number; readonly color: number; readonly covariance: number };
   readonly outputsAt: number;
   readonly outputTexels: number;
@@ -47,8 +47,8 @@ export function mlpLayout(shape: Shape): MlpLayout {
 }
 
 /**
- * All weights as texels. The appearance `a` of an anchor changes its features by `basis^T a`; as that is linear, it is an
- * input of its own, whose weights are the features' weights times the basis.
+ * All weights as texels. The appearance `a` of an anchor changes its features by `basis^T a`. Because this is linear, the
+ * appearance is a separate input, with the features' weights times the basis as its weights.
  */
 export function packedWeights(fields: Fields, shape: Shape): Float32Array {
   const layout = mlpLayout(shape);

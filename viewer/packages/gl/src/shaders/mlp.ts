@@ -7,13 +7,13 @@ import { TABLE_GLSL } from "../gpu/table.js";
 import type { MlpLayout } from "../gpu/weights.js";
 import type { Shape } from "../scene.js";
 
-/** Gaussians `first` to `first + count - 1` of each anchor: what one pass gives. */
+/** Gaussians `first` to `first + count - 1` of each anchor, which one pass computes. */
 export interface SplatRange {
   readonly first: number;
   readonly count: number;
 }
 
-/** As many ranges of at most `most` as it takes. */
+/** Ranges of at most `most` Gaussians that cover all. */
 export function splatRanges(splats: number, most: number): SplatRange[] {
   const ranges: SplatRange[] = [];
   for (let first = 0; first < splats; first += most) ranges.push({ first, count: Math.min(most, splats - first) });

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Slots to splats: each Gaussian's ellipse on the picture, with the decoder's rules (docs/bitstream.md). */
+/** From slots to splats: each Gaussian's ellipse on the picture, by the rules of docs/bitstream.md. */
 
 import type { ProgramSource } from "../gpu/resources.js";
 import { TABLE_GLSL, TABLE_WIDTH_BITS } from "../gpu/table.js";
@@ -11,12 +11,12 @@ const float MIN_ALPHA = 1.0 / 255.0;
 const float MAX_ALPHA = 0.999;
 `;
 
-/** Square pixels of the picture that is drawn: what is narrower aliases. */
+/** Smallest variance without aliasing, square pixels of the drawn picture. */
 const MIN_LOW_PASS = 0.15;
 
 /**
  * One fragment is one slot. First target: mean x, y, covariance xx, xy; second: covariance yy, opacity, colour in halves.
- * An opacity of 0 says that it is not drawn.
+ * A slot with an opacity of 0 is not drawn.
  *
  * @param reading of `readingGlsl`
  */

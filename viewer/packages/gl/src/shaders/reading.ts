@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-/** GLSL that reads what the MLP passes wrote: `readGaussian(v, k, a, b, c)`, whichever path wrote it. */
+/** GLSL that reads the outputs of the MLP passes of either path: `readGaussian(v, k, a, b, c)`. */
 
 import { PAIR_TARGETS, SPLAT_VECTORS } from "../gpu/device.js";
 import type { MlpPath } from "../types.js";
 import { LAYER_WIDTH_BITS } from "./mlp.js";
 
-/** @param most Gaussians of an anchor that one pass gives */
+/** @param most Gaussians of an anchor that one pass computes */
 export function readingGlsl(path: MlpPath, splats: number, most: number): string {
   return path === "mrt" ? targetsReading(most) : feedbackReading(splats, most);
 }
@@ -24,7 +24,7 @@ void readGaussian(int v, int k, out vec4 a, out vec4 b, out vec4 c) {
 `;
 }
 
-/** Passes have an even number of Gaussians but for the last: pairs lie at the same layers whatever the passes were. */
+/** All passes except the last have an even number of Gaussians, so the layers of a pair do not depend on the passes. */
 function targetsReading(most: number): string {
   if (most % 2) throw new RangeError(`passes of ${most} Gaussians would part a pair`);
   return `

@@ -5,7 +5,7 @@ import type { ProgramSource } from "../gpu/resources.js";
 import { TABLE_GLSL, TABLE_WIDTH_BITS } from "../gpu/table.js";
 import { COVERING_VERTEX } from "./mlp.js";
 
-/** GLSL: `samplingInterval(p)` of a point. Weights fall off around each camera's picture, so that nothing pops. */
+/** GLSL: `samplingInterval(p)` of a point. Weights fall off around each camera's picture, which avoids sudden changes. */
 export const SAMPLING_GLSL = `
 uniform sampler2D cameras; // three rows each (TrainingCameras)
 uniform int cameraCount;
@@ -23,7 +23,7 @@ float samplingInterval(vec3 p) {
 }
 `;
 
-/** One fragment is one point: first the anchors, then the free Gaussians. The target holds the bits of a float. */
+/** One fragment is one point: first the anchors, then the free Gaussians. The target contains the bits of a float. */
 export function samplingProgram(): ProgramSource {
   return {
     vertex: COVERING_VERTEX,

@@ -5,7 +5,7 @@ import type { ProgramSource } from "../gpu/resources.js";
 import { TABLE_GLSL } from "../gpu/table.js";
 import { RULES_GLSL } from "./projection.js";
 
-/** What 16-bit indices reach: the largest of them, 65535, is no vertex but begins a new primitive. */
+/** Number of vertices with 16-bit indices: the largest index, 65535, starts a new primitive. */
 export const SPLATS_PER_CALL = 16383;
 const CORNERS = [0, 1, 2, 2, 1, 3];
 export const INDICES_PER_SPLAT = CORNERS.length;

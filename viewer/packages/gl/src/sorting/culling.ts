@@ -1,21 +1,21 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Which anchors a camera may see. */
+/** The anchors that may be visible to a camera. */
 
 import type { Camera } from "../types.js";
 import type { Placement } from "./placement.js";
 
 /**
- * Share of the picture's size by which the frustum is widened on each side: an order may be shown for the next cameras too,
- * until theirs has come, and what they see at their edges must be in it.
+ * Share of the picture's size by which the frustum is widened on each side. An order may be used for the next cameras until
+ * theirs has come, so it must contain what is visible at their edges.
  */
 const MARGIN = 0.2;
-/** Pixels at least, for tiny pictures: the low-pass reaches 1.3 pixels of what is drawn, which may be a third of the size. */
+/** Smallest margin, pixels, for small pictures: the low-pass reaches 1.3 drawn pixels, which may be three times as large. */
 const MIN_MARGIN_PIXELS = 4;
 const SIZE_BINS = 1024;
-/** Bins of an octave of apparent size. */
+/** Bins per octave of apparent size. */
 const OCTAVE_BINS = 32;
 
-/** Indices, ascending, of the anchors whose ball may reach the picture or its margin, written to `into`; how many. */
+/** Writes the indices, ascending, of the anchors whose ball may reach the picture or its margin to `into`; returns their number. */
 export function seenAnchors(placement: Placement, camera: Camera, into: Uint32Array): number {
   const { positions, radii } = placement;
   const planes = sidePlanes(camera);
@@ -35,7 +35,7 @@ export function seenAnchors(placement: Placement, camera: Camera, into: Uint32Ar
   return count;
 }
 
-/** Four planes in the scene, each a unit normal inwards and a shift: left, right, top, bottom. */
+/** Four planes in the scene, each an inward unit normal and an offset: left, right, top, bottom. */
 function sidePlanes(camera: Camera): Float64Array {
   const { K, width, height, viewmat: v } = camera;
   const [across, down] = [width, height].map((size) => Math.max(MARGIN * size, MIN_MARGIN_PIXELS)) as [number, number];
@@ -54,8 +54,8 @@ function sidePlanes(camera: Camera): Float64Array {
 }
 
 /**
- * Keeps of the first `count` anchors in `seen` about those `keep` that look largest, in their order; how many are left, at
- * most `keep`.
+ * Reduces the first `count` anchors in `seen` to about the `keep` with the largest apparent size, in their order; returns
+ * their number, at most `keep`.
  */
 export function largestAnchors(
   placement: Placement,
@@ -80,7 +80,7 @@ export function largestAnchors(
   let least = SIZE_BINS - 1;
   let larger = 0;
   while (larger + histogram[least]! <= keep && least > 0) larger += histogram[least--]!;
-  // Of the bin that does not fit whole, every so-manieth stays, so that no corner of the picture loses all of them.
+  // The last bin does not fit completely; every n-th of its anchors is selected, so that the loss is evenly distributed.
   const share = (keep - larger) / Math.max(histogram[least]!, 1);
   let [kept, owed] = [0, 0];
   for (let i = 0; i < count; i++) {

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Sorting by depth: a counting sort whose bins are where the depths are, made exact by a last walk. */
+/** Sorting by depth: a counting sort with bins adapted to the depths, and a final insertion sort that makes it exact. */
 
 const COARSE_BINS = 4096;
-/** Past so many places a number stays out of order: it shares a bin with as many others of its own depth but for rounding. */
+/** Largest number of places that the insertion moves a number: beyond it, depths in a bin differ only by rounding. */
 const LONGEST_WALK = 64;
 
-/** Buffers of one size after another, so that sorting makes no garbage. */
+/** Reusable buffers, so that sorting allocates no memory. */
 export class DepthSorter {
   private readonly coarse = new Uint32Array(COARSE_BINS);
   private readonly firsts = new Uint32Array(COARSE_BINS);
@@ -13,8 +13,8 @@ export class DepthSorter {
   private bins = new Uint32Array(0);
 
   /**
-   * Writes the places 0 to `count` - 1 of `depths` to `order`: far ones first, and of equal ones the later first, so that
-   * the order is the reverse of a stable ascending one. Depths must be finite and not negative.
+   * Writes the indices 0 to `count` - 1 of `depths` to `order`: far ones first, and later ones first among equals, which is
+   * the reverse of a stable ascending order. Depths must be finite and not negative.
    */
   sort(depths: Float32Array, count: number, order: Uint32Array): void {
     if (count === 0) return;
@@ -35,8 +35,8 @@ export class DepthSorter {
   }
 
   /**
-   * Every coarse bin has as many fine ones as it holds numbers: `bins`, ascending with the depth. Bits of positive floats
-   * ascend as they do and about as their logarithms, so that a far background leaves bins to what is near.
+   * Every coarse bin has as many fine bins as numbers; `bins` ascend with the depth. Bits of positive floats are about
+   * linear in their logarithms, so that a far background leaves enough bins for near content.
    */
   private assignBins(depths: Float32Array, count: number): void {
     const bits = new Uint32Array(depths.buffer, depths.byteOffset, count);
@@ -59,7 +59,7 @@ export class DepthSorter {
   }
 }
 
-/** Insertion where neighbours stand the wrong way round: bins hold a few numbers each. */
+/** Insertion sort; bins have only a few numbers each. */
 function walk(depths: Float32Array, count: number, order: Uint32Array): void {
   for (let i = count - 2; i >= 0; i--) {
     const moving = order[i]!;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The renderer's side of the sorting worker: one request at a time, the latest wins. */
+/** The renderer's interface to the sorting worker: one request at a time; only the latest waiting request is sent. */
 
 import { sameCamera } from "../cameraMath.js";
 import { GlError } from "../errors.js";
@@ -8,14 +8,14 @@ import type { Camera } from "../types.js";
 import type { Order, OrderAnswer, OrderRequest } from "./messages.js";
 import { PLACING_FIELDS, type PlacingField } from "./placement.js";
 
-/** What an order is for. */
+/** The scene and camera of an order. */
 export interface Wanted {
   readonly snapshot: Snapshot;
   readonly camera: Camera;
   readonly maxSplats: number;
 }
 
-/** An order and what it was made for: a picture is drawn from both or not at all. */
+/** An order with its scene and camera, which must be drawn together. */
 export interface Sorted extends Wanted {
   readonly order: Order;
 }
@@ -25,15 +25,15 @@ export function sameWanted(a: Wanted, b: Wanted): boolean {
 }
 
 export class Orders {
-  /** The newest answer; `take` hands it out. */
+  /** The newest answer, for `take`. */
   private arrived: Sorted | undefined;
   private asked: Wanted | undefined;
   private next: Wanted | undefined;
   private last: Wanted | undefined;
   private id = 0;
-  /** Whose answer nobody waits for. */
+  /** The request whose answer is not needed any more. */
   private stale = 0;
-  /** What the worker has. */
+  /** The state that the worker has. */
   private readonly sent = new Map<PlacingField, Float32Array>();
   private readonly spare: ArrayBuffer[][] = [];
   private returned: ArrayBuffer[] = [];
@@ -41,7 +41,7 @@ export class Orders {
 
   /**
    * @param onOrder an order has come
-   * @param onError the worker failed; no order will come for what was asked
+   * @param onError the worker failed; there will be no answer to the request
    */
   constructor(
     private readonly worker: Worker,
@@ -55,7 +55,7 @@ export class Orders {
     };
   }
 
-  /** Asks for an order, unless it is the one that was asked for last. */
+  /** Requests an order, unless the last request was the same. */
   want(wanted: Wanted): void {
     if (this.last && sameWanted(this.last, wanted)) return;
     this.last = wanted;
@@ -63,19 +63,19 @@ export class Orders {
     this.send();
   }
 
-  /** Whether `take` has something. */
+  /** Whether `take` returns an order. */
   get waiting(): boolean {
     return this.arrived !== undefined;
   }
 
-  /** The newest order that came since the last call. */
+  /** The newest order since the last call. */
   take(): Sorted | undefined {
     const { arrived } = this;
     this.arrived = undefined;
     return arrived;
   }
 
-  /** What was asked for is of a stream that is played no more. */
+  /** Ignores the answer to the last request, because another stream is played. */
   forget(): void {
     this.arrived = undefined;
     this.next = undefined;
@@ -83,7 +83,7 @@ export class Orders {
     this.stale = this.asked ? this.id : 0;
   }
 
-  /** An order that is drawn no more: its memory is used again. */
+  /** Returns the memory of an order that is not drawn any more. */
   release({ order }: Sorted): void {
     if (this.spare.length < 2) this.spare.push([order.anchors.buffer, order.slots.buffer]);
   }
@@ -120,7 +120,7 @@ export class Orders {
     this.worker.postMessage(request, [...buffers, ...[...changed.values()].map(({ buffer }) => buffer)]);
   }
 
-  /** Copied into memory that is used over and over: fresh memory costs a page's thread more than the copy. */
+  /** Copies into reused memory, because new memory costs the page's thread more than the copy. */
   private copied(array: Float32Array): Float32Array<ArrayBuffer> {
     const bytes = array.byteLength;
     const found = this.returned.findIndex(({ byteLength }) => byteLength >= bytes && byteLength <= 2 * bytes);

@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Where everything is: what does not depend on the camera, computed once for each state of the scene. */
+/** Positions and sizes, which do not depend on the camera; computed once per state of the scene. */
 
 import type { FieldName } from "@structgstream/core";
 import { type IntervalBound, TRAINING_LOW_PASS } from "../sampling.js";
 
-/** The fields that say where splats are. */
+/** The fields with the positions of splats. */
 export const PLACING_FIELDS = ["anchor_positions", "offset_scales", "base_scales", "anchor_offsets", "free"] as const;
 export type PlacingField = (typeof PLACING_FIELDS)[number] & FieldName;
 
-/** Their numbers, and what their shapes say. */
+/** Their numbers, and sizes from their shapes. */
 export interface PlacingState {
   readonly arrays: ReadonlyMap<PlacingField, Float32Array>;
   readonly offsetsPerAnchor: number;
@@ -16,10 +16,10 @@ export interface PlacingState {
   readonly interval: IntervalBound;
 }
 
-/** A Gaussian ends within so many standard deviations: alpha = 1/255 is reached before 3.33 at any opacity. */
+/** Radius of a Gaussian, in standard deviations: alpha = 1/255 is reached before 3.33 at any opacity. */
 const BALL_DEVIATIONS = 3.4;
 
-/** Splat `m * K + k` is that of anchor `m`, `M * K + i` is free Gaussian `i`. */
+/** Splat `m * K + k` is Gaussian `k` of anchor `m`; splat `M * K + i` is free Gaussian `i`. */
 export class Placement {
   anchors = 0;
   free = 0;
@@ -28,7 +28,7 @@ export class Placement {
   positions = new Float32Array(0);
   /** [M * K + F, 3] */
   centers = new Float32Array(0);
-  /** [M] of a ball around the anchor that holds all its Gaussians. */
+  /** [M] radius of a ball around the anchor that contains all its Gaussians. */
   radii = new Float32Array(0);
   /** [M] the largest standard deviation that a Gaussian of the anchor can have, without low-pass. */
   extents = new Float32Array(0);
@@ -87,7 +87,7 @@ export class Placement {
 
 function array(state: PlacingState, name: PlacingField): Float32Array<ArrayBuffer> {
   const found = state.arrays.get(name);
-  // A message of this package's own making: that it is whole is not the user's concern.
+  // Only this package creates the state, so this is an internal error.
   if (!found) throw new TypeError(`the sorter was given a state without ${name}`);
   return found as Float32Array<ArrayBuffer>;
 }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Answers requests for orders: what the sorting worker does, without the worker. */
+/** Answers requests for orders; independent of the worker. */
 
 import { largestAnchors, seenAnchors } from "./culling.js";
 import { DepthSorter } from "./depthOrder.js";
@@ -33,7 +33,7 @@ export class Sorter {
     const all = placement.anchors * offsetsPerAnchor + placement.free;
     const order = fitting(second, all);
     const seen = seenAnchors(placement, camera, anchors);
-    // Free Gaussians patch what moves: they are few, and the last that a budget should take.
+    // Free Gaussians represent moving content and are few, so a budget should remove them last.
     const free = Math.min(placement.free, request.maxSplats);
     const keep = Math.floor((request.maxSplats - free) / offsetsPerAnchor);
     const anchorCount = largestAnchors(placement, camera, anchors, seen, keep);
@@ -48,7 +48,7 @@ export class Sorter {
     return { id: request.id, anchors, anchorCount, slots: order, splats, milliseconds, returned };
   }
 
-  /** Fills `depths` and `candidates`, the slots they belong to; how many. */
+  /** Fills `depths` and their slots `candidates`; returns their number. */
   private depthsOf(camera: OrderRequest["camera"], anchors: Uint32Array, anchorCount: number, free: number): number {
     const { depths, candidates, placement } = this;
     const { centers, offsetsPerAnchor: k } = placement;
