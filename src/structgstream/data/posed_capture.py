@@ -323,7 +323,8 @@ def _check(
         unused = [posed.name for posed in calibration.cameras if posed.name not in used]
         missing = [name for name in unused if poses.keys().isdisjoint(_parts(name))]
         idle = list({_parts(name)[:-1] if _is_file(name) else name: name for name in reversed(missing)}.values())[::-1]
-        numbered = {name: posed.name for name, posed in poses.items() if name not in (*_parts(posed.name), posed.name)}
+        others = {name: posed.name for name, posed in poses.items() if name not in (*_parts(posed.name), posed.name)}
+        numbered = {name: own for name, own in others.items() if not (name.isdigit() and own.isdigit())}
         if numbered and not _by_word(list(numbered.values()), list(numbered)):
             pairs = ", ".join(f"{name} is {own!r}" for name, own in sorted(numbered.items())[:3])
             log.warning("%s: no names are the same, so cameras are matched by their numbers alone: %s", root, pairs)

@@ -64,8 +64,8 @@ def _camera(name: str, matrix: ArrayLike) -> PosedCamera:
 
 
 def decomposed(matrix: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Intrinsics ``[3, 3]`` and world to camera ``[4, 4]`` (Hartley and Zisserman, section 6.2.4) of twelve numbers, or
-    of those of a matrix ``[4, 4]`` without its last row.
+    """Intrinsics ``[3, 3]`` and world to camera ``[4, 4]`` of ``[3, 4]`` numbers, or of the first rows of ``[4, 4]``
+    (Hartley and Zisserman, section 6.2.4).
 
     Raises:
         Unreadable: it is of another shape, singular, or a pose without intrinsics.
