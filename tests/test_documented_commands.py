@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 
-from structgstream.cli import app, group_run, options
+from structgstream.cli import app, options
 from structgstream.cli.app import COMMANDS
 
 ROOT = Path(__file__).parents[1]
@@ -70,7 +70,7 @@ def examples() -> list[Any]:
     """The examples in the help of commands, and in that of the program."""
     texts = [("overview", app.overview())]
     for name, home in HOMES.items():
-        texts.append((name, inspect.getsource(importlib.import_module(f"{home}.{name}"))))
+        texts.append((name, inspect.getsource(importlib.import_module(f"{home}.{name.replace('-', '_')}"))))
     pattern = re.compile(r"^\s*(?:Example: )?structgstream (\w.*)$", re.MULTILINE)
     found = [(name, line) for name, text in texts for line in pattern.findall(text)]
     assert {name for name, _ in found} == {"overview", *HOMES}
@@ -95,7 +95,7 @@ def parsed(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         Parsed: it was taken.
     """
     command, *arguments = words
-    module = importlib.import_module(f"{HOMES[command]}.{command}")
+    module = importlib.import_module(f"{HOMES[command]}.{command.replace('-', '_')}")
 
     def known(kind: type[Any], name: str, *, arguments: list[str]) -> None:
         found, rest = options.parse_known_options(kind, name, arguments=arguments)
@@ -107,10 +107,9 @@ def parsed(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         options.parse_options(kind, name, arguments=arguments)
         raise Parsed
 
-    for home in (module, group_run):  # which reads the command line of a group of frames
-        for name, replaced in (("parse_known_options", known), ("parse_options", whole)):
-            if hasattr(home, name):
-                monkeypatch.setattr(home, name, replaced)
+    for name, replaced in (("parse_known_options", known), ("parse_options", whole)):
+        if hasattr(module, name):
+            monkeypatch.setattr(module, name, replaced)
     module.main(arguments)
 
 

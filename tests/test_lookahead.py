@@ -75,7 +75,7 @@ def test_without_looking_ahead_an_item_is_made_when_it_is_asked_for() -> None:
             made.append(number)
             yield number
 
-    with Lookahead(items(), ahead=False) as asked:
+    with Lookahead(items(), depth=0) as asked:
         assert made == []
         assert next(asked) == 0
         assert made == [0]

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prefetching: a background thread computes the next item while the current one is processed."""
+"""Prefetching: a background thread computes the next items while the current one is processed."""
 
+from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
@@ -10,29 +11,29 @@ T = TypeVar("T")
 
 
 class Lookahead(Generic[T]):
-    """An iterator over ``items`` that prefetches one item.
+    """An iterator over ``items`` that prefetches ``depth`` items, in order.
 
-    With ``ahead=False`` nothing is prefetched: each item is computed when it is asked for, by who asks.
+    With a depth of 0 nothing is prefetched: each item is computed in the thread that asks for it.
 
     An exception raised by ``items`` surfaces from the ``next`` call that would have returned that item. Leaving the
     ``with`` block waits for the item being computed, and calls ``items.close`` if it exists.
     """
 
-    def __init__(self, items: Iterator[T], *, ahead: bool = True) -> None:
+    def __init__(self, items: Iterator[T], *, depth: int = 1) -> None:
         self._items = items
-        self._ahead = ahead
-        self._maker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="lookahead")
-        self._next: Future[tuple[T] | None] | None = None
+        self._depth = depth
+        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="lookahead")
+        self._pending: deque[Future[tuple[T] | None]] = deque()
 
     def __enter__(self) -> "Lookahead[T]":
-        if self._ahead:
-            self._next = self._maker.submit(self._made)
+        for _ in range(self._depth):
+            self._pending.append(self._worker.submit(self._compute))
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._maker.shutdown(wait=True, cancel_futures=True)
+        self._worker.shutdown(wait=True, cancel_futures=True)
         if close := getattr(self._items, "close", None):
             close()
 
@@ -40,23 +41,23 @@ class Lookahead(Generic[T]):
         return self
 
     def __next__(self) -> T:
-        """Returns the prefetched item, waiting for it if necessary, and starts the one after it.
+        """Returns the next item, waiting for it if necessary, and starts another one.
 
         Raises:
             StopIteration: there is none.
         """
-        if not self._ahead:
+        if not self._depth:
             return next(self._items)
-        if self._next is None:
+        if not self._pending:
             raise StopIteration
-        ready, self._next = self._next, None
-        found = ready.result()
+        found = self._pending.popleft().result()
         if found is None:
+            self._pending.clear()
             raise StopIteration
-        self._next = self._maker.submit(self._made)
+        self._pending.append(self._worker.submit(self._compute))
         return found[0]
 
-    def _made(self) -> tuple[T] | None:
+    def _compute(self) -> tuple[T] | None:
         # A future cannot carry StopIteration.
         for item in self._items:
             return (item,)

@@ -115,7 +115,7 @@ class Session(Generic[State, Memory]):
 
     def _frames(self, past: Past[State, Memory] | None, start: int) -> Iterator[FrameReport]:
         method = self._pipeline.method
-        with Lookahead(self._observe_frames(start), ahead=may_read_ahead(self._source)) as observed:
+        with Lookahead(self._observe_frames(start), depth=int(may_read_ahead(self._source))) as observed:
             for meter, task in metered(self._tasks(observed), self._backend.device):
                 fit = method.first(task) if past is None else method.next(past, task)
                 meter.end("fit", peak="fit")

@@ -32,7 +32,7 @@ def track(folder: Path) -> list[str]:
 def group(folder: Path, frames: str) -> list[str]:
     given = ["--init", str(folder / "header.sgs"), "--track", str(folder / "track"), "--frames", frames]
     output = str(folder / f"g{frames.split(':')[0]}.sgs")
-    return ["reconstruct", CLIP, *given, "-o", output, "--device", QUICKEST, "--iterations", "4"]
+    return ["fit-group", CLIP, *given, "-o", output, "--device", QUICKEST, "--iterations", "4"]
 
 
 def test_a_shell_loop_makes_an_ordinary_stream(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -82,13 +82,13 @@ def test_every_option_arrives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr("structgstream.preparation.prepare.prepare_capture", note)
     command = f"prepare {tmp_path} -o {tmp_path / 'out'} --calibration board --board 9x6:80mm --board-videos {tmp_path}"
-    command += " --lens fisheye --intrinsics shared --refine --tone --distance a b 3.2m --synchronize audio --near 0.2"
+    command += " --lens fisheye --intrinsics shared --refine --distance a b 3.2m --synchronize audio --near 0.2"
     command += " --field-of-view 90 --size 64x48 --held-out a b --fps 25 --without c --link copy"
     assert main(command.split()) == 130
     assert asked == [
         PrepareOptions(
             calibration="board", board=Board(9, 6, 0.08), board_videos=tmp_path, lens="fisheye", intrinsics="shared",
-            refine=True, tone=True, distance=Distance("a", "b", 3.2), synchronize="audio", near=0.2, field_of_view=90,
+            refine=True, distance=Distance("a", "b", 3.2), synchronize="audio", near=0.2, field_of_view=90,
             size=(64, 48), held_out=("a", "b"), fps=25, without=("c",), link="copy",
         )
     ]  # fmt: skip

@@ -103,7 +103,6 @@ def test_resume_needs_no_word_on_segments(made: Path, tmp_path: Path) -> None:
         (["--preset", "rig"], "got the codec raw; add --preset compact"),
         (["--resume", "--overwrite"], "choose one"),
         (["--policy", "every"], "give --live and a rig file"),
-        (["--init", "x.sgs"], "--qualities"),
     ],
 )
 def test_options_that_make_no_sense(

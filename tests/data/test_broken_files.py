@@ -39,7 +39,6 @@ from structgstream.data.posed_capture import filmed_by
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
 from structgstream.data.rectilinear import rectilinear
 from structgstream.data.timeline import Clock
-from structgstream.data.tone import ToneCurve
 from structgstream.data.video_index import scan_videos
 from structgstream.data.video_pictures import pictures_at
 from structgstream.errors import StructGStreamError
@@ -149,11 +148,10 @@ def write_binary(folder: Path) -> None:
 def write_prepared_folders(path: Path) -> None:
     """A prepared capture of pictures with every kind of value, and masks."""
     rig, cameras = small_rig(3), {}
-    curve = ToneCurve(tuple(tuple(0.1 * step for step in range(1, 9)) for _ in range(3)))
     lenses = (Pinhole(), RadialTangential(k1=-0.1, p1=0.001), Fisheye(k1=0.02))
     for number, (name, lens) in enumerate(zip(rig, lenses, strict=True)):
         filmed = LensCamera(rig[name], lens)
-        cameras[name] = PreparedCamera(f"images/{name}", filmed, rectilinear(filmed), Clock(0.01, 1.0), curve)
+        cameras[name] = PreparedCamera(f"images/{name}", filmed, rectilinear(filmed), Clock(0.01, 1.0))
         for frame in range(2):
             write_picture(path / f"images/{name}/{frame}.png", picture(number, frame))
     write_picture(path / "masks/cam00.png", np.full((HEIGHT, WIDTH, 3), 255, np.uint8))

@@ -17,7 +17,6 @@ from structgstream.data.open import open_capture
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
 from structgstream.data.rectilinear import rectilinear
 from structgstream.data.timeline import Clock
-from structgstream.data.tone import ToneCurve
 from structgstream.data.undistortion import Undistortion, undistort
 from structgstream.data.wrappers import every_nth_frame
 from structgstream.errors import CaptureError
@@ -81,8 +80,7 @@ def test_masks_of_a_prepared_capture_are_named_as_the_cameras_pictures(tmp_path:
     for number, (name, camera) in enumerate(small_rig().cameras.items()):
         filmed = LensCamera(camera, RadialTangential(k1=-0.05))
         clock = Clock(1 / 30 if number == 1 else 0.0)
-        curve = ToneCurve((tuple(np.linspace(0.05, 1, 8)),) * 3)
-        cameras[name] = PreparedCamera(f"pictures/{name}", filmed, rectilinear(filmed), clock, curve)
+        cameras[name] = PreparedCamera(f"pictures/{name}", filmed, rectilinear(filmed), clock)
         for frame in range(1, 5):
             write_picture(tmp_path / "pictures" / name / f"{frame:03d}.png", picture(number, frame))
     write_prepared(tmp_path, PreparedCapture(cameras, 30.0, 0.25))

@@ -44,7 +44,7 @@ class Scripted:
 
 
 def no_thread_is_left() -> bool:
-    return not any(thread.name == "prefetch" for thread in threading.enumerate())
+    return not any(thread.name.startswith("lookahead") for thread in threading.enumerate())
 
 
 @pytest.mark.parametrize("depth", [1, 2, 7])

@@ -23,7 +23,6 @@ from structgstream.data.prepared import (
 )
 from structgstream.data.rectilinear import rectilinear
 from structgstream.data.timeline import Clock
-from structgstream.data.tone import ToneCurve
 from structgstream.data.wrappers import apart_seconds
 from structgstream.errors import CalibrationError, CaptureError, StorageError
 
@@ -49,8 +48,7 @@ def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
 def test_what_is_written_is_read(tmp_path: Path) -> None:
     wanted = content(lenses=LENSES)
     first = wanted.cameras["cam00"]
-    curve = ToneCurve(tuple(tuple(np.linspace(0.02 * k, 1, 8)) for k in range(3)))
-    cameras = {**wanted.cameras, "cam00": replace(first, clock=Clock(-1.25, 1.00001), tone=curve)}
+    cameras = {**wanted.cameras, "cam00": replace(first, clock=Clock(-1.25, 1.00001))}
     wanted = replace(wanted, cameras=cameras, points="points.npy")
     write_prepared(tmp_path, wanted)
     found = read_prepared(tmp_path)
@@ -58,13 +56,24 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert found.points == "points.npy"
     for name, camera in wanted.cameras.items():
         read = found.cameras[name]
-        assert (read.files, read.clock, read.tone, read.filmed.lens) == (
-            camera.files, camera.clock, camera.tone, camera.filmed.lens,
+        assert (read.files, read.clock, read.filmed.lens) == (
+            camera.files, camera.clock, camera.filmed.lens,
         )  # fmt: skip
         for one, other in ((read.filmed.camera, camera.filmed.camera), (read.pinhole, camera.pinhole)):
             assert torch.equal(one.K, other.K)
             assert torch.equal(one.viewmat, other.viewmat)
             assert (one.width, one.height) == (other.width, other.height)
+
+
+def test_tone_curves_of_earlier_versions_are_ignored(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    wanted = content()
+    write_prepared(tmp_path, wanted)
+    stored = json.loads((tmp_path / FILE).read_text())
+    for number, camera in enumerate(stored["cameras"].values()):
+        camera["tone"] = [[0.1 * step for step in range(8)]] * 3 if number == 0 else None
+    (tmp_path / FILE).write_text(json.dumps(stored))
+    assert [*read_prepared(tmp_path).cameras] == [*wanted.cameras]
+    assert "has tone curves, which are not applied any more" in caplog.text
 
 
 def test_videos_are_opened_in_step(tmp_path: Path) -> None:

@@ -202,7 +202,7 @@ def test_notes_that_are_none_are_told(tmp_path: Path, note: bytes, why: str) -> 
 
 
 def test_what_is_no_segment_is_told(tmp_path: Path) -> None:
-    with pytest.raises(StreamError, match="is a stream, not a segment of one; expected what reconstruct --init"):
+    with pytest.raises(StreamError, match="is a stream, not a segment of one; expected what structgstream fit-group"):
         opened(tmp_path, small_stream(2))
     with pytest.raises(StreamError, match=r"g\.sgs is damaged before its first frame: "):
         opened(tmp_path, base().init)

@@ -8,7 +8,7 @@ import pytest
 from measured_runs import finished_run
 from structgstream.errors import ConfigError
 from structgstream.executors.task import Ending
-from structgstream.parallel.measured import measured_in
+from structgstream.parallel.cost import measured_in
 from structgstream.parallel.parts import Parts, group_name
 
 

@@ -3,6 +3,7 @@
 
 import errno
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,11 +15,8 @@ from structgstream.parallel import object_folder, staged
 from structgstream.parallel.exchange import ObjectStore
 from structgstream.parallel.object_folder import ObjectFolder
 from structgstream.parallel.parts import Parts
-from structgstream.parallel.pieces import folder_of, last_pieces, piece_name
 from structgstream.parallel.staged import Staging
 from structgstream.parallel.unit import Unit
-
-ATTEMPT = "000001-0123abcd"
 
 
 @pytest.fixture(autouse=True)
@@ -46,16 +44,11 @@ def run(store: ObjectFolder, script: str, *flags: str) -> int:
         return staged.run(staged.parsed(words))
 
 
-def grown(store: ObjectFolder, name: str, *, have: int = 0) -> bytes:
-    """What the store has of a file."""
-    return last_pieces(store, name).read(store, have=have)
-
-
 def scratch(tmp_path: Path) -> list[Path]:
     return [*(tmp_path / "scratch").iterdir()] if (tmp_path / "scratch").exists() else []
 
 
-def test_needs_are_brought_and_results_taken(store: ObjectFolder, tmp_path: Path) -> None:
+def test_needs_are_fetched_and_results_stored(store: ObjectFolder, tmp_path: Path) -> None:
     store.write("in/a", b"content")
     flags = ("--needs", "in/a", "--needs", "absent", "--gives", "out/b")
     assert run(store, 'mkdir -p "$0/out" && tr a-z A-Z < "$0/in/a" > "$0/out/b" && [ ! -e "$0/absent" ]', *flags) == 0
@@ -94,10 +87,10 @@ def test_a_run_that_was_begun_anew_finds_nothing_of_the_one_before(store: Object
 
 def test_an_earlier_attempt_here_is_not_replaced_by_the_store(staging: Staging) -> None:
     staging.store.write("a", b"store")
-    staging.bring("a")
+    staging.fetch("a")
     assert (staging.folder / "a").read_bytes() == b"store"
     (staging.folder / "a").write_bytes(b"further")
-    staging.bring("a")
+    staging.fetch("a")
     assert (staging.folder / "a").read_bytes() == b"further"
     assert [path.name for path in staging.folder.iterdir()] == ["a"]
 
@@ -107,49 +100,56 @@ def test_a_result_of_before_is_brought_to_be_checked(store: ObjectFolder) -> Non
     assert run(store, 'grep -q before "$0/b"', "--gives", "b") == 0
 
 
-def test_early_files_are_there_before_the_end_and_growing_ones_piece_by_piece(
-    store: ObjectFolder, tmp_path: Path
-) -> None:
-    """The command waits for what the store has of its files, so that it would not end otherwise."""
-    pieces = tmp_path / "store" / folder_of("t")
+def test_growing_files_are_stored_before_the_command_ends(store: ObjectFolder, tmp_path: Path) -> None:
+    """It waits for what the store has of its files, so that it would not end otherwise."""
+    stored = tmp_path / "store"
     script = f"""
 echo groups > "$0/t.groups"; printf abc > "$0/t.partial"
-until [ -e "{tmp_path}/store/t.groups" ] && [ "$(ls "{pieces}" | wc -l)" = 1 ]; do sleep 0.01; done
+until [ -e "{stored}/t.groups" ] && [ "$(cat "{stored}/t.partial")" = abc ]; do sleep 0.01; done
 printf de >> "$0/t.partial"
-until [ "$(ls "{pieces}" | wc -l)" = 2 ]; do sleep 0.01; done
+until [ "$(cat "{stored}/t.partial")" = abcde ]; do sleep 0.01; done
 printf f >> "$0/t.partial"; mv "$0/t.partial" "$0/t"
 """
     store.write("unused", b"")
-    assert run(store, script, "--early", "t.groups", "--grows", "t") == 0
-    assert [*last_pieces(store, "t").names] == [0, 3, 5]
-    assert (grown(store, "t"), grown(store, "t", have=4), store.read("t")) == (b"abcdef", b"ef", b"abcdef")
+    assert run(store, script, "--grows", "t.groups", "--grows", "t.partial", "--gives", "t") == 0
+    assert store.read("t") == b"abcdef"
 
 
 def test_two_files_may_grow(store: ObjectFolder) -> None:
     script = 'printf aaaa > "$0/a.partial"; printf b > "$0/b.partial"; sleep 0.1; printf b >> "$0/b.partial"'
-    assert run(store, script, "--grows", "a", "--grows", "b") == 0
-    assert (grown(store, "a"), grown(store, "b")) == (b"aaaa", b"bb")
+    assert run(store, script, "--grows", "a.partial", "--grows", "b.partial") == 0
+    assert (store.read("a.partial"), store.read("b.partial")) == (b"aaaa", b"bb")
 
 
-def test_on_another_machine_a_growing_file_goes_on(store: ObjectFolder, staging: Staging) -> None:
-    store.write(piece_name("t", ATTEMPT, 0), b"abc")
-    store.write(piece_name("t", ATTEMPT, 3), b"de")
-    staging.bring_growing("t")
-    assert (staging.folder / "t.partial").read_bytes() == b"abcde"
-    (staging.folder / "t.partial").write_bytes(b"abcdef")
-    staging.bring_growing("t")
-    assert (staging.folder / "t.partial").read_bytes() == b"abcdef"
+def test_a_growing_file_goes_on_here_or_on_another_machine(store: ObjectFolder, tmp_path: Path) -> None:
+    flags = ("--grows", "t.partial", "--gives", "t")
+    store.write("t.partial", b"abc")
+    assert run(store, 'printf d >> "$0/t.partial"; exit 137', *flags) == 137
+    store.write("t.partial", b"of another attempt")
+    assert run(store, 'printf e >> "$0/t.partial"; exit 137', *flags) == 137
+    assert store.read("t.partial") == b"abcde"
+    shutil.rmtree(tmp_path / "scratch")
+    store.write("t", b"whole")
+    assert run(store, '[ ! -e "$0/t.partial" ]', *flags) == 0, "a whole file is not one that grows"
 
 
-def test_a_finished_file_is_not_one_that_grows(store: ObjectFolder, staging: Staging) -> None:
-    store.write(piece_name("t", ATTEMPT, 0), b"abc")
-    store.write("t", b"abcdef")
-    staging.bring_growing("t")
-    assert [path.name for path in staging.folder.iterdir()] == ["t"]
+def test_a_growing_file_is_stored_when_it_is_a_tenth_longer(staging: Staging) -> None:
+    path = staging.folder / "t"
+    path.parent.mkdir()
+    for content, ended, stored in (
+        (b"a" * 100, False, 100),
+        (b"a" * 105, False, 100),
+        (b"a" * 120, False, 120),
+        (b"a" * 90, False, 90),
+        (b"a" * 91, True, 91),
+    ):
+        path.write_bytes(content)
+        staging.put_growing("t", ended=ended)
+        assert staging.store.size("t") == stored
 
 
 def test_a_command_that_is_killed_ends_this_process_the_same_way(store: ObjectFolder, tmp_path: Path) -> None:
-    words = ["--name", "task", "--grows", "t", "--", "sh", "-c"]
+    words = ["--name", "task", "--grows", "t.partial", "--", "sh", "-c"]
     script = 'printf abc > "$0/t.partial"; kill -9 $$'
     done = subprocess.run(
         [sys.executable, "-m", "structgstream.parallel.staged", *words, script, staged.HERE],
@@ -157,20 +157,8 @@ def test_a_command_that_is_killed_ends_this_process_the_same_way(store: ObjectFo
         check=False,
     )
     assert done.returncode == -signal.SIGKILL
-    assert grown(store, "t") == b"abc", "what had grown is in the store"
+    assert store.read("t.partial") == b"abc", "what had grown is in the store"
     assert len(scratch(tmp_path)) == 1, "and here, for the next attempt"
-
-
-def test_what_a_killed_command_cut_and_the_next_one_wrote_otherwise_is_in_the_store_as_the_next_one_wrote_it(
-    store: ObjectFolder,
-) -> None:
-    """The next one keeps the whole record ``abc`` and makes ``xyz`` in the place of the cut ``d``."""
-    assert run(store, 'printf abcd > "$0/t.partial"; exit 137', "--grows", "t") == 137
-    assert grown(store, "t") == b"abcd"
-    # It is looked at before the cut record is cut off.
-    script = 'sleep 0.1; printf abcxy > "$0/t.partial"; sleep 0.1; printf z >> "$0/t.partial"; exit 137'
-    assert run(store, script, "--grows", "t") == 137
-    assert grown(store, "t") == b"abcxyz"
 
 
 def test_a_disk_of_this_machine_without_room_is_a_sentence(

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from structgstream.cli.group_run import ReconstructGroup
+from structgstream.cli.fit_group import FitGroup
 from structgstream.cli.join import Join
 from structgstream.cli.options import parse_options
 from structgstream.cli.track import Track
@@ -52,7 +52,7 @@ def test_a_group_is_what_was_asked_for(tmp_path: Path, parts: Parts) -> None:
     task = unit(tmp_path).group_task(parts, 8, 16)
     parts.header.parent.mkdir(parents=True)
     parts.header.touch()
-    found = parse_options(ReconstructGroup, "reconstruct", arguments=after(task.command, "reconstruct"))
+    found = parse_options(FitGroup, "fit-group", arguments=after(task.command, "fit-group"))
     assert (found.scene, found.init, found.track) == (tmp_path / "capture", parts.header, parts.track)
     assert (found.frames, found.output, found.device) == ("8:16", parts.segment(8, 16), "cpu")
     assert task.result == str(parts.segment(8, 16))

@@ -18,7 +18,6 @@ from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibrating import (
     check_complete,
     check_enough,
-    check_tone,
     check_used,
     chosen_method,
     from_other_tool,
@@ -68,18 +67,6 @@ def test_a_calibration_beside_the_videos_is_found_and_another_can_be_named(tmp_p
     assert isinstance(other, Calibration)
     with pytest.raises(CalibrationError, match="nowhere"):
         chosen_method(there, PrepareOptions(calibration=tmp_path / "nowhere"))
-
-
-def test_tone_curves_need_points(tmp_path: Path) -> None:
-    write_room(tmp_path, cameras=3)
-    given = chosen_method(footage(tmp_path, "cam00"), PrepareOptions())
-    toned = PrepareOptions(tone=True)
-    for method in ("board", given):
-        with pytest.raises(ConfigError, match="a board has none" if method == "board" else "cameras.json has none"):
-            check_tone(method, toned)
-        check_tone(method, replace(toned, refine=True))
-        check_tone(method, PrepareOptions())
-    check_tone("sfm", toned)
 
 
 def test_what_would_have_no_effect_is_refused(tmp_path: Path) -> None:

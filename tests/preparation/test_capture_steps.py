@@ -13,15 +13,13 @@ import pytest
 from rooms import write_room
 from structgstream.data.prepared import PreparedCapture, prepared_entries, read_prepared
 from structgstream.data.timeline import Clock
-from structgstream.data.tone import ToneCurve
 from structgstream.errors import ConfigError, StorageError
 from structgstream.preparation.calibrating import chosen_method, from_other_tool
 from structgstream.preparation.calibration.solved import SolvedCalibration
-from structgstream.preparation.capture_steps import POINTS, CaptureSteps, assembled, held_out_of, with_tones
+from structgstream.preparation.capture_steps import POINTS, CaptureSteps, assembled, held_out_of
 from structgstream.preparation.footage import Footage, find_footage
-from structgstream.preparation.job import Job, new_job
 from structgstream.preparation.options import PrepareOptions
-from structgstream.preparation.steps import FOLDER, Silent
+from structgstream.preparation.steps import FOLDER, Job, Silent, new_job
 
 NONE = PrepareOptions(synchronize="none", near=0.25)
 
@@ -65,15 +63,6 @@ def test_who_is_held_out(tmp_path: Path) -> None:
     _, _, content = made(tmp_path / "videos", replace(NONE, held_out=("auto",)))
     assert len(content.held_out) == 1
     assert held_out_of(replace(NONE, held_out=()), None) == frozenset()  # pyright: ignore[reportArgumentType]
-
-
-def test_curves_are_of_those_cameras_that_have_one(tmp_path: Path) -> None:
-    _, _, content = made(tmp_path / "videos")
-    curve = ToneCurve.__new__(ToneCurve)
-    toned = with_tones(content, {"cam02": curve})
-    assert {name: camera.tone is curve for name, camera in toned.cameras.items()} == {
-        "cam00": False, "cam01": False, "cam02": True, "cam03": False,
-    }  # fmt: skip
 
 
 def test_files_are_brought_with_their_masks(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from footage_made import BOARD, FPS, add_sound, centred, write_board_take, write
 from rooms import write_room
 from structgstream.data.prepared import PreparedCapture, read_prepared
 from structgstream.data.timeline import Clock
-from structgstream.errors import CalibrationError, CaptureError, ConfigError
+from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.calibration.comparison import calibration_errors
 from structgstream.preparation.footage import find_footage
 from structgstream.preparation.options import Distance, PrepareOptions
@@ -92,8 +92,6 @@ def test_a_board(tmp_path: Path) -> None:
     for index, (name, filmed) in enumerate(rig.items()):
         write_video(tmp_path / "videos" / f"{name}.mp4", [Film(filmed).picture(room(), noise=1, seed=index)] * 2)
     options = replace(NONE, calibration="board", board=BOARD, board_videos=tmp_path / "board", lens="pinhole")
-    with pytest.raises(ConfigError, match="a calibration by a board has none; add --refine"):
-        prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(options, tone=True))
     made = prepare_capture(tmp_path / "videos", tmp_path / "out", options=options)
     assert not errors(made)
     found = read_prepared(tmp_path / "out")
@@ -103,18 +101,14 @@ def test_a_board(tmp_path: Path) -> None:
         assert error.position_percent < 1
 
 
-def test_refined_toned_and_in_metres(tmp_path: Path) -> None:
+def test_refined_and_in_metres(tmp_path: Path) -> None:
     rig = write_room(tmp_path / "videos")
-    options = replace(NONE, refine=True, tone=True, distance=Distance("cam00", "cam04", 2.0))
-    with pytest.raises(ConfigError, match="add --refine"):
-        prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(options, refine=False))
+    options = replace(NONE, refine=True, distance=Distance("cam00", "cam04", 2.0))
     made = prepare_capture(tmp_path / "videos", tmp_path / "out", options=options)
     assert not errors(made)
     assert "px from their epipolar lines" in made.steps["refine"]
-    assert "after curves" in made.steps["tone"]
     found = read_prepared(tmp_path / "out")
     assert found.unit == "metres"
-    assert any(camera.tone is not None for camera in found.cameras.values())
     centers = {name: camera.pinhole.center for name, camera in found.cameras.items()}
     assert float((centers["cam00"] - centers["cam04"]).norm()) == pytest.approx(2.0)
     scale = 2.0 / float((rig["cam00"].center - rig["cam04"].center).norm())

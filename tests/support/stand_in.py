@@ -3,7 +3,7 @@
 
     python -m tests.support.stand_in reconstruct CAPTURE -o HEADER --frames 1 --resume
     python -m tests.support.stand_in track CAPTURE --init HEADER -o TRACK --groups 4 --frames 40
-    python -m tests.support.stand_in reconstruct CAPTURE --init HEADER --track TRACK --frames 4:8 -o SEGMENT
+    python -m tests.support.stand_in fit-group CAPTURE --init HEADER --track TRACK --frames 4:8 -o SEGMENT
     python -m tests.support.stand_in join SEGMENT... -o OUT
 
 Every frame takes ``STAND_IN_SECONDS`` (0.01) and adds a line to ``NAME.partial``, which is renamed when it is whole.
@@ -106,7 +106,7 @@ def join(options: argparse.Namespace) -> None:
 def parsed() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=("reconstruct", "track", "join"))
+    parser.add_argument("command", choices=("reconstruct", "track", "fit-group", "join"))
     parser.add_argument("words", nargs="+")
     parser.add_argument("-o", dest="output", type=Path, required=True)
     parser.add_argument("--init", type=Path)
@@ -127,7 +127,7 @@ def main() -> None:
     elif options.command == "track":
         options.count = int(options.frames)
         track(options, seconds)
-    elif options.init is None:
+    elif options.command == "reconstruct":
         written(options.output, [line("header", *options.words)], seconds=seconds)
     elif str(options.fail) == options.frames.partition(":")[0]:
         sys.exit("There was no power.")

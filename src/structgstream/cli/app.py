@@ -23,6 +23,7 @@ COMMANDS = {
     "board": "write a calibration board to print",
     "reconstruct": "turn a capture into a stream, frame by frame",
     "track": "follow what moves through a capture, so that groups of frames can be fitted separately",
+    "fit-group": "fit one group of frames, from a header and a track",
     "join": "join groups of frames that were fitted separately to one stream",
     "parallel": "turn a capture into a stream, groups of frames side by side, on one machine or many",
     "plan": "how long a capture would take, on how many machines, and how many bytes it would be",
@@ -171,7 +172,7 @@ def _run(command: str, arguments: list[str]) -> None:
         near = difflib.get_close_matches(command, homes, n=1)
         hint = f" Did you mean {near[0]!r}?" if near else ""
         raise UsageError(f"there is no command {command!r}.{hint} Commands: {', '.join(homes)}.")
-    importlib.import_module(f"{homes[command]}.{command}").main(arguments)
+    importlib.import_module(f"{homes[command]}.{command.replace('-', '_')}").main(arguments)
 
 
 def _packages() -> list[ModuleType]:

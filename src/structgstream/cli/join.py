@@ -31,7 +31,7 @@ class Join:
     segments: Annotated[
         tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SEGMENT [SEGMENT ...]", help_behavior_hint="")
     ]
-    """Segments that reconstruct --init has written, in any order."""
+    """Segments that fit-group has written, in any order."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
     """The stream file to write."""
     check: Flag = False

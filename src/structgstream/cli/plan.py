@@ -27,8 +27,7 @@ from structgstream.cli.tables import compact_table, literal_cells
 
 if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
-    from structgstream.parallel.cost import Estimate, Work
-    from structgstream.parallel.measured import Measured
+    from structgstream.parallel.cost import Estimate, Measured, Work
 
 PROBE_FRAMES = 11
 PROBE_GROUP = 6
@@ -84,8 +83,7 @@ def main(arguments: list[str]) -> None:
         raise UsageError("give either -o FOLDER for a probe, or --run OUT.parts of an existing run.")
     check_ending(options.json, ".json", command="plan", option="--json")
     config, _ = resolve_config(options.preset, rest, command="plan", seed=None)
-    from structgstream.parallel.cost import Work
-    from structgstream.parallel.measured import measured_in
+    from structgstream.parallel.cost import Work, measured_in
 
     source = open_selected_capture(options.scene, options.capture)
     interval = max(1, round(config.key_interval_seconds * source.fps))

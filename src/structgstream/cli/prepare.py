@@ -84,8 +84,6 @@ class Prepare:
     """Frames a second of folders of pictures. Default: 30."""
     without: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAMERA [CAMERA ...]", help_behavior_hint="")] = ()
     """Cameras to leave out."""
-    tone: Flag = False
-    """Estimate a tone curve for each camera, where picture profiles differ strongly; seldom worth it."""
     link: Literal["hard", "symlink", "copy"] = "hard"
     """How videos get into the capture; hard links need no room, and become copies on another file system."""
     report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
@@ -126,7 +124,7 @@ def _prepare(options: Prepare, console: Console) -> "Sequence[Finding]":
 
 def _check(options: Prepare, console: Console) -> "Sequence[Finding]":
     from structgstream.data.folder_files import REPORT
-    from structgstream.preparation.checking.folder import check_folder
+    from structgstream.preparation.prepare import check_folder
 
     folder = options.videos / REPORT if options.report is None else options.report
     with interruptible(), step_display(console) as display:
@@ -155,7 +153,6 @@ def _chosen(options: Prepare) -> "PrepareOptions":
         fps=options.fps,
         without=options.without,
         link=options.link,
-        tone=options.tone,
     )
 
 

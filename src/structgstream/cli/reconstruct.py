@@ -58,11 +58,6 @@ class Reconstruct:
     Example: structgstream reconstruct rig.toml -o now.sgs --live --preset fast --record take1
 
     Example: structgstream reconstruct rig.toml -o now --live --sink segments --qualities low=-1 high=1
-
-    With --init HEADER.sgs it fits one group of frames, which are joined later (reconstruct --init
-    HEADER.sgs --help; docs/cluster.md):
-
-    Example: structgstream reconstruct basketball --init header.sgs --track ball.track --frames 60:120 -o g60.sgs
     """
 
     scene: tyro.conf.Positional[Folder]
@@ -102,10 +97,7 @@ class Reconstruct:
 def main(arguments: list[str]) -> None:
     """Reconstructs with a progress display."""
     if any(argument == "--init" or argument.startswith("--init=") for argument in arguments):
-        from structgstream.cli import group_run
-
-        group_run.main(arguments)
-        return
+        raise UsageError("reconstruct has no --init: a group of frames is fitted by structgstream fit-group.")
     if "--help-config" in arguments:
         _print_config(arguments)
     options, rest = parse_known_options(Reconstruct, "reconstruct", arguments=arguments)

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decodes the next frames in the background while one is trained."""
 
-import queue
-import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -10,6 +8,7 @@ from structgstream.data.source import FrameStream, is_recording
 from structgstream.data.wrappers import SourceWrapper
 from structgstream.errors import ConfigError
 from structgstream.frames import MultiViewFrame
+from structgstream.lookahead import Lookahead
 
 
 @dataclass(frozen=True)
@@ -33,37 +32,8 @@ class Prefetch(SourceWrapper):
         An error of the source is raised in place of the frame that it concerns. Closing the iterator, or an
         exception in its consumer, ends the thread within the decoding of one frame.
         """
-        ready: queue.SimpleQueue[MultiViewFrame | BaseException | None] = queue.SimpleQueue()
-        room = threading.Semaphore(self.depth)
-        stop = threading.Event()
-
-        def decode() -> None:
-            try:
-                room.acquire()
-                for frame in self.source.frames(start):
-                    if stop.is_set():
-                        return
-                    ready.put(frame)
-                    room.acquire()
-                    if stop.is_set():
-                        return
-                ready.put(None)
-            except BaseException as error:  # handed to the consumer, whatever it is
-                ready.put(error)
-
-        # A daemon, so that a consumer that is never closed cannot keep the program from ending.
-        thread = threading.Thread(target=decode, name="prefetch", daemon=True)
-        thread.start()
-        try:
-            while (item := ready.get()) is not None:
-                if isinstance(item, BaseException):
-                    raise item
-                room.release()
-                yield item
-        finally:
-            stop.set()
-            room.release()
-            thread.join()
+        with Lookahead(self.source.frames(start), depth=self.depth) as frames:
+            yield from frames
 
     def frames_behind(self) -> Iterator[MultiViewFrame]:
         return self.source.frames_behind() if isinstance(self.source, SourceWrapper) else iter(())

@@ -6,6 +6,7 @@ calibrated again without touching what was filmed.
 """
 
 import json
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -25,7 +26,6 @@ from structgstream.data.picture_size import picture_size
 from structgstream.data.source import FrameSource
 from structgstream.data.text_files import Unreadable, mapping, number, pixels, read_json
 from structgstream.data.timeline import Clock, common_slots, natural, picture_slots
-from structgstream.data.tone import ToneCurve, toned
 from structgstream.data.undistortion import UndistortedSource
 from structgstream.data.video import synchronised
 from structgstream.data.video_index import scan_videos
@@ -38,6 +38,7 @@ EXPECTED = "a capture that structgstream prepare wrote (docs/captures.md)"
 LENSES: Mapping[str, type[Lens]] = {"pinhole": Pinhole, "opencv": RadialTangential, "fisheye": Fisheye}
 
 Unit = Literal["metres", "arbitrary"]
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -49,14 +50,12 @@ class PreparedCamera:
         filmed: pose, intrinsics, size and lens of the pictures as they are stored.
         pinhole: what they are undistorted to; its pose is that of ``filmed``.
         clock: from the stamps of the file to the time that all cameras share.
-        tone: undoes what makes its colours another camera's; None for nothing.
     """
 
     files: str
     filmed: LensCamera
     pinhole: Camera
     clock: Clock = Clock()
-    tone: ToneCurve | None = None
 
 
 @dataclass(frozen=True)
@@ -126,8 +125,11 @@ def read_prepared(path: Path) -> PreparedCapture:
         entries = mapping(content["cameras"])
         if content["unit"] not in ("metres", "arbitrary"):
             raise Unreadable(f"unit {content['unit']!r}")
+        cameras = {name: _read_camera(name, entry, file) for name, entry in entries.items()}
+        if any(entry.get("tone") for entry in entries.values()):
+            _log.warning("%s has tone curves, which are not applied any more; pictures are read as filmed.", file)
         return PreparedCapture(
-            cameras={name: _read_camera(name, entry, file) for name, entry in entries.items()},
+            cameras=cameras,
             fps=positive(content, "fps"),
             near=positive(content, "near"),
             unit=cast(Unit, content["unit"]),
@@ -156,8 +158,6 @@ def open_prepared(path: Path) -> FrameSource:
     else:
         clocks = {name: camera.clock for name, camera in capture.cameras.items()}
         source = synchronised(scan_videos(files), rig, where=path, fps=capture.fps, points=points, clocks=clocks)
-    curves = {name: camera.tone for name, camera in capture.cameras.items() if camera.tone is not None}
-    source = toned(source, curves)
     pinholes = prepared_rig(path, capture)
     undistorted = UndistortedSource(source, pinholes, filmed)
     return source if all(undistorted.is_unchanged(name) for name in rig) else undistorted
@@ -249,7 +249,6 @@ def _camera_entry(camera: PreparedCamera) -> dict[str, Any]:
         "lens": {"model": lens_model(lens), **asdict(lens)},
         "viewmat": filmed.viewmat.tolist(),
         "clock": asdict(camera.clock),
-        "tone": None if camera.tone is None else camera.tone.controls,
         "pinhole": {"size": [pinhole.width, pinhole.height], "K": pinhole.K.tolist()},
     }
 
@@ -268,5 +267,4 @@ def _read_camera(name: str, entry: dict[str, Any], file: Path) -> PreparedCamera
         except CalibrationError as error:
             raise CalibrationError(f"The pinhole of camera {name!r} of {file}: {error}") from None
         clock = Clock(number(entry["clock"]["offset_seconds"]), positive(entry["clock"], "rate"))
-        tone = None if entry["tone"] is None else ToneCurve(entry["tone"])
-        return PreparedCamera(str(entry["files"]), LensCamera(filmed, lens), pinhole, clock, tone)
+        return PreparedCamera(str(entry["files"]), LensCamera(filmed, lens), pinhole, clock)

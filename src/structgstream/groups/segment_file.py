@@ -160,7 +160,7 @@ def _read(data: ByteSource, name: str) -> Segment:
     if init is None or note is None or init.type != RecordType.INIT:
         raise StreamError(f"{name} is damaged before its first frame: {incomplete_reason(data, PREFIX.size)}.")
     if note.type != NOTE:
-        raise StreamError(f"{name} is a stream, not a segment of one; expected what reconstruct --init has written.")
+        raise StreamError(f"{name} is a stream, not a segment of one; expected what structgstream fit-group writes.")
     identity = _identity(note, name)
     entries: list[tuple[int, int, int]] = []
     end = note.end

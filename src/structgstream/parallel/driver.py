@@ -12,7 +12,7 @@ from structgstream.executors.local import LocalEngine
 from structgstream.executors.places import Place
 from structgstream.executors.task import Ending, Task
 from structgstream.groups.group_list import Groups, groups_path, read_groups
-from structgstream.parallel.exchange import Exchange, SharedFolder
+from structgstream.parallel.exchange import SharedFolder
 from structgstream.parallel.parts import Parts, group_name, key_of, sha256_of
 from structgstream.parallel.unit import HEADER, JOIN, TRACK, Unit
 from structgstream.whole_files import write_whole
@@ -86,7 +86,7 @@ def drive(
     parts: Parts,
     executor: Executor,
     *,
-    exchange: Exchange | None = None,
+    exchange: SharedFolder | None = None,
     listener: Listener | None = None,
 ) -> Groups:
     """Makes what is missing of the parts, and joins them to ``job.output``; returns the groups.
@@ -97,7 +97,7 @@ def drive(
         job: what is to be made.
         parts: the folder of parts, which this process holds (:meth:`Parts.held`).
         executor: runs the tasks, all but the joining, which is done here.
-        exchange: how parts come here; None if all machines see the folder.
+        exchange: how parts come here; by default all machines see the folder.
         listener: told of the state, twice a second and when something ends.
 
     Raises:
@@ -111,7 +111,7 @@ def drive(
 class _Drive:
     """The state of :func:`drive`."""
 
-    def __init__(self, job: Job, parts: Parts, executor: Executor, exchange: Exchange, tell: Listener) -> None:
+    def __init__(self, job: Job, parts: Parts, executor: Executor, exchange: SharedFolder, tell: Listener) -> None:
         self._job, self._unit, self._parts, self._executor, self._tell = job, job.unit, parts, executor, tell
         self._exchange = exchange
         self._status = Status(HEADER)
@@ -152,7 +152,7 @@ class _Drive:
         self._keep_words(endings[0])
         if not endings[0].done:
             raise TaskError(_sentence(endings, self._parts))
-        self._exchange.bring(part)
+        self._exchange.fetch(part)
         self._parts.note(endings[0], key_of(task.command), part, frames=1)
 
     def _submit_groups(self, *, is_tracked: bool) -> None:
@@ -193,15 +193,15 @@ class _Drive:
             self._say(failed=tuple(failed.name for failed in self._failed))
         if ending.name == TRACK:
             if ending.done:
-                self._exchange.bring(self._parts.track)
-                self._exchange.bring(groups_path(self._parts.track))
+                self._exchange.fetch(self._parts.track)
+                self._exchange.fetch(groups_path(self._parts.track))
                 frames = (read_groups(self._parts.track) or [(0, 0)])[-1][1]
                 self._parts.note(ending, key_of(self._header_key), self._parts.track, frames=frames)
             return
         first, end = self._status.groups[self._index[ending.name]]
         if ending.done:
             task = self._unit.group_task(self._parts, first, end)
-            self._exchange.bring(Path(task.result))
+            self._exchange.fetch(Path(task.result))
             self._parts.note(ending, self._key(task), Path(task.result), frames=end - first)
         self._mark({ending.name: State.DONE if ending.done else State.FAILED})
 

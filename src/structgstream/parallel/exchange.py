@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How parts come from the machines that make them to the driver, and the other way: a shared folder, or a store."""
+"""How parts come from the machines that make them to the driver, and back: a shared folder, or a store."""
 
 import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 from structgstream.errors import StorageError
 from structgstream.evaluation.run_log import log_path
@@ -14,7 +13,6 @@ from structgstream.groups.group_list import groups_path
 from structgstream.owned_folders import MARKER, Owner
 from structgstream.parallel.object_folder import ObjectFolder
 from structgstream.parallel.parts import OURS, Parts
-from structgstream.parallel.pieces import last_pieces
 from structgstream.parallel.staged import HERE, STORE
 from structgstream.parallel.unit import CutsTrack
 from structgstream.whole_files import partial_path, write_whole
@@ -23,54 +21,30 @@ STAGED = (PYTHON, "-m", "structgstream.parallel.staged")
 LOOK_SECONDS = 1.0
 
 
-class Exchange(Protocol):
-    """What the driver asks of it."""
+class SharedFolder:
+    """All machines see the parts at the same place, so that nothing is copied."""
 
     def header(self, task: Task) -> Task:
         """The task of frame 0, for where it runs."""
-        ...
+        return task
 
     def track(self, task: Task) -> Task:
         """The task of the tracking pass, for where it runs."""
-        ...
+        return task
 
     def group(self, task: Task, first: int) -> Task:
         """The task of a group that begins at a frame whose start is here, for where it runs."""
-        ...
+        return task
 
-    def bring(self, part: Path) -> None:
-        """Brings a part here that a task has made."""
-        ...
+    def fetch(self, part: Path) -> None:
+        """Copies a part here that a task has made."""
 
     def follow(self) -> None:
-        """Brings here what the tracking pass has written by now."""
-        ...
+        """Copies here what the tracking pass has written by now."""
 
 
-class SharedFolder:
-    """All machines see the parts at the same place."""
-
-    def header(self, task: Task) -> Task:
-        """See ``Exchange.header``."""
-        return task
-
-    def track(self, task: Task) -> Task:
-        """See ``Exchange.track``."""
-        return task
-
-    def group(self, task: Task, first: int) -> Task:
-        """See ``Exchange.group``."""
-        return task
-
-    def bring(self, part: Path) -> None:
-        """See ``Exchange.bring``."""
-
-    def follow(self) -> None:
-        """See ``Exchange.follow``."""
-
-
-class ObjectStore:
-    """Parts meet in an object store; the driver keeps copies.
+class ObjectStore(SharedFolder):
+    """Parts are exchanged through an object store; the driver has copies.
 
     Args:
         store: the folder of the store.
@@ -81,20 +55,21 @@ class ObjectStore:
     def __init__(self, store: ObjectFolder, parts: Parts, *, cut: CutsTrack) -> None:
         self._store, self._parts, self._cut = store, parts, cut
         self._looked = 0.0
-        self._followed = ""  # the attempt at the track that is copied here
+        self._followed: int | None = None  # bytes of the growing track that is copied here
 
     def header(self, task: Task) -> Task:
-        """See ``Exchange.header``."""
+        """See :meth:`SharedFolder.header`."""
         return self._staged(task, ["--gives", self._name(self._parts.header)])
 
     def track(self, task: Task) -> Task:
-        """See ``Exchange.track``."""
-        name = self._name(self._parts.track)
-        files = ["--needs", self._name(self._parts.header), "--grows", name, "--early", f"{name}.groups"]
-        return self._staged(task, files)
+        """See :meth:`SharedFolder.track`."""
+        track = self._parts.track
+        files = ["--needs", self._name(self._parts.header)]
+        files += ["--grows", self._name(groups_path(track)), "--grows", self._name(partial_path(track))]
+        return self._staged(task, [*files, "--gives", self._name(track)])
 
     def group(self, task: Task, first: int) -> Task:
-        """See ``Exchange.group``."""
+        """See :meth:`SharedFolder.group`."""
         track = self._parts.track.with_name(f"start-{first:06d}.sgt")
         command = tuple(word.replace(str(self._parts.track), str(track)) for word in task.command)
         partial = self._name(partial_path(track))
@@ -107,27 +82,25 @@ class ObjectStore:
         files += ["--gives", self._name(log), "--gives", self._name(segment)]
         return self._staged(replace(task, command=command), files)
 
-    def bring(self, part: Path) -> None:
-        """See ``Exchange.bring``."""
+    def fetch(self, part: Path) -> None:
+        """See :meth:`SharedFolder.fetch`."""
         if (data := self._store.read(self._name(part))) is not None:
             write_whole(part, data, new_folder=True)
 
     def follow(self) -> None:
-        """See ``Exchange.follow``; asks the store once a second."""
+        """See :meth:`SharedFolder.follow`; asks the store once a second."""
         if time.monotonic() - self._looked < LOOK_SECONDS:
             return
         self._looked = time.monotonic()
         track = self._parts.track
         groups = groups_path(track)
         if not groups.exists():
-            self.bring(groups)
-        partial, pieces = partial_path(track), last_pieces(self._store, self._name(track))
-        if pieces.attempt != self._followed:
-            write_whole(partial, pieces.read(self._store))
-            self._followed = pieces.attempt
-        elif pieces.attempt:
-            with partial.open("ab") as file:
-                file.write(pieces.read(self._store, have=file.tell()))
+            self.fetch(groups)
+        partial = partial_path(track)
+        size = self._store.size(self._name(partial))
+        if size not in (None, self._followed):
+            self.fetch(partial)
+            self._followed = size
 
     def claim(self, key: str) -> Owner | None:
         """Check that the store may be used for the parts; whose it is, None if it is empty.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files under a URL, such as a folder of an object store, that all machines of a run see."""
 
-import hashlib
+import random
 import re
 import time
 from collections.abc import Callable
@@ -16,13 +16,12 @@ T = TypeVar("T")
 TRIES = 8
 FIRST_DELAY_SECONDS = 0.1
 LONGEST_DELAY_SECONDS = 10.0
-_HASH_BYTES = 32
 
 
 class ObjectFolder:
-    """Objects by name. Each carries the hash of its content, so that one cut short or changed on its way is not taken.
+    """Objects by name, with the bytes of the files that they are copies of.
 
-    A request that fails is made again, :data:`TRIES` times in all, with growing pauses.
+    A request that fails is made again, :data:`TRIES` times in all, with growing, varied pauses.
 
     Args:
         url: of the folder, as fsspec takes it. Addresses and credentials come from the environment, as the scheme's
@@ -45,12 +44,11 @@ class ObjectFolder:
         Raises:
             StorageError: it cannot be written.
         """
-        content = hashlib.sha256(data).digest() + data
 
         def put() -> None:
             if self._files.protocol in ("file", ("file", "local")):
                 self._files.makedirs(str(Path(f"{self._root}/{name}").parent), exist_ok=True)
-            self._files.pipe_file(f"{self._root}/{name}", content)
+            self._files.pipe_file(f"{self._root}/{name}", data)
 
         self._tried(put, f"write {name}")
 
@@ -58,37 +56,31 @@ class ObjectFolder:
         """The content of an object; None if there is none.
 
         Raises:
-            StorageError: it cannot be read, or is not what was written.
+            StorageError: it cannot be read.
         """
 
         def get() -> bytes | None:
             try:
-                content = self._files.cat_file(f"{self._root}/{name}")
+                return self._files.cat_file(f"{self._root}/{name}")
             except FileNotFoundError:
                 return None
-            digest, data = content[:_HASH_BYTES], content[_HASH_BYTES:]
-            if hashlib.sha256(data).digest() != digest:
-                raise ValueError("its hash is another")
-            return data
 
         return self._tried(get, f"read {name}")
 
-    def names(self, folder: str) -> list[str]:
-        """Names of the objects in a folder of this one, in order.
+    def size(self, name: str) -> int | None:
+        """The bytes of an object; None if there is none.
 
         Raises:
-            StorageError: they cannot be listed.
+            StorageError: the store cannot be asked.
         """
 
-        def listed() -> list[str]:
+        def found() -> int | None:
             try:
-                self._files.invalidate_cache()
-                found = self._files.ls(f"{self._root}/{folder}", detail=False)
+                return int(self._files.info(f"{self._root}/{name}")["size"])
             except FileNotFoundError:
-                return []
-            return sorted(f"{folder}/{str(path).rsplit('/', 1)[-1]}" for path in found)
+                return None
 
-        return self._tried(listed, f"list {folder}")
+        return self._tried(found, f"look for {name}")
 
     def owner(self) -> Owner | None:
         """Whose the folder is; None if there is nothing in it.
@@ -143,6 +135,6 @@ class ObjectFolder:
             except Exception as error:  # Each file system has its own.
                 if attempt + 1 == TRIES:
                     raise StorageError(f"Cannot {what} in {self.name} ({reason_of(error, self.url)}).") from error
-            time.sleep(delay)
+            time.sleep(delay * random.uniform(0.5, 1.5))  # so that two processes do not fail in step
             delay = min(2 * delay, LONGEST_DELAY_SECONDS)
         raise AssertionError("unreachable")

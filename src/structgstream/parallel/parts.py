@@ -28,7 +28,7 @@ PURPOSE = "parts of a parallel run"
 OURS = re.compile(
     r"(plan\.json|done\.jsonl|header\.(sgs|log\.jsonl|metrics\.json)|track\.sgt(\.groups)?|start-\d{6,}\.sgt"
     r"|segments/group-\d{6,}-\d{6,}\.(sgs|log\.jsonl|metrics\.json)|logs/(header|track|join|group-\d{6,}-\d{6,})\.txt"
-    r")(\.partial)?|track\.sgt\.pieces/[0-9a-f-]+"
+    r")(\.partial)?"
 )
 """Names that parts have, here and in a store; nothing else is removed."""
 _RUN = "run"  # of the plan: what tells scratch files of one beginning from those of another

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs a command whose files lie in an object store, as a program: ``python -m structgstream.parallel.staged``.
 
-What the command needs is brought into a folder of this machine, and what it makes is taken to the store: a file that
-grows (``--grows``) piece by piece while the command runs, others when it has ended well. The folder stays when the
-command is killed, so that the next attempt of the same run on this machine goes on there; a run that was begun anew
-(``--run``) has another folder, and removes that of before.
+What the command needs is copied into a folder of this machine, and what it makes is copied to the store: a file that
+grows (``--grows``) again and again while the command runs, its results (``--gives``) when it has ended well. The folder
+stays when the command is killed, so that the next attempt of the same run on this machine goes on there; a run that was
+begun anew (``--run``) has another folder, and removes that of before.
 """
 
 import argparse
@@ -15,14 +15,14 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from structgstream.errors import StructGStreamError
 from structgstream.executors.task import words
 from structgstream.owned_folders import MARKER, own_folder, owner_of, remove_own
 from structgstream.parallel.object_folder import ObjectFolder
-from structgstream.parallel.pieces import GrowingCopy, last_pieces
-from structgstream.whole_files import partial_path, write_whole
+from structgstream.whole_files import write_whole
 
 HERE = "{here}"
 """In a word of the command: the folder of this machine."""
@@ -33,6 +33,8 @@ SCRATCH = "STRUCTGSTREAM_SCRATCH"
 PURPOSE = "scratch files of a task"
 ANY = re.compile(f"(?!{re.escape(MARKER)}$).*", re.DOTALL)
 LOOK_SECONDS = 1.0
+GROWTH = 1.1
+"""By which factor a growing file is longer when it is stored again."""
 SIGNALLED = 128
 """Statuses from here on are those of a signal."""
 
@@ -42,55 +44,54 @@ class Staging:
 
     def __init__(self, store: ObjectFolder, folder: Path) -> None:
         self.store, self.folder = store, folder
+        self._sizes: dict[str, int] = {}
 
-    def bring(self, name: str, *, anew: bool = False) -> None:
-        """Takes a file from the store, unless it is not there, or, if not ``anew``, an earlier attempt has left it."""
+    def fetch(self, name: str, *, anew: bool = False) -> None:
+        """Copies a file from the store, unless it is not there, or, if not ``anew``, an earlier attempt has left it."""
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         if (anew or not path.exists()) and (data := self.store.read(name)) is not None:
             write_whole(path, data)
 
-    def bring_growing(self, name: str) -> None:
-        """As :meth:`bring`, of a file that grows."""
-        self.bring(name)
-        whole = self.folder / name
-        partial = partial_path(whole)
-        if not whole.exists() and not partial.exists() and (data := last_pieces(self.store, name).read(self.store)):
-            write_whole(partial, data)
-
-    def take(self, name: str) -> None:
-        """Takes a file to the store, if there is one."""
+    def put(self, name: str) -> None:
+        """Copies a file to the store, if there is one."""
         path = self.folder / name
         if path.exists():
             self.store.write(name, path.read_bytes())
 
+    def put_growing(self, name: str, *, ended: bool) -> None:
+        """Replaces what the store has of a file when it is longer by :data:`GROWTH`, or the command has ended.
+
+        It is stored as a whole, so that the store has a beginning of one attempt, whatever others write at a time. The
+        growth bounds what is sent in all to a multiple of the file.
+        """
+        path = self.folder / name
+        size, known = path.stat().st_size if path.exists() else 0, self._sizes.get(name, 0)
+        if size < known or size > known * (1 if ended else GROWTH):
+            self.put(name)
+            self._sizes[name] = size
+
 
 def run(options: argparse.Namespace) -> int:
-    """Brings, runs, and takes; returns the status of the command."""
+    """Fetches, runs, and stores; returns the status of the command."""
     staging = Staging(ObjectFolder(options.store), scratch_folder(options))
     for name in options.needs:
-        staging.bring(name, anew=True)
+        staging.fetch(name, anew=True)
     for name in options.gives:
-        staging.bring(name)
-    for name in options.grows:
-        staging.bring_growing(name)
-    command = words(tuple(word.replace(HERE, str(staging.folder)) for word in options.command))
-    process = subprocess.Popen(command)
-    growing = [GrowingCopy(staging.store, name, of=staging.folder / name) for name in options.grows]
-    while True:
-        try:
+        staging.fetch(name)
+    if not all((staging.folder / name).exists() for name in options.gives):
+        for name in options.grows:
+            staging.fetch(name)
+    process = subprocess.Popen(words(tuple(word.replace(HERE, str(staging.folder)) for word in options.command)))
+    status = None
+    while status is None:
+        with suppress(subprocess.TimeoutExpired):
             status = process.wait(LOOK_SECONDS)
-        except subprocess.TimeoutExpired:
-            status = None
-        for copy in growing:
-            copy.take()
-        for name in options.early:
-            staging.take(name)
-        if status is not None:
-            break
+        for name in options.grows:
+            staging.put_growing(name, ended=status is not None)
     if status == 0:
-        for name in (*options.grows, *options.gives):
-            staging.take(name)
+        for name in options.gives:
+            staging.put(name)
     if 0 <= status < SIGNALLED:  # What ended by itself would end so again.
         remove_own(staging.folder, PURPOSE, ANY, whole=True)
     if status < 0:  # As the command ended, so that the task counts as killed.
@@ -121,10 +122,9 @@ def parsed(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--name", required=True, help="of the task")
     parser.add_argument("--run", default="", help="what tells one beginning of the run from the next")
     for flag, text in (
-        ("needs", "file to bring"),
-        ("gives", "file to take when the command has ended well, and to bring before if it is there"),
-        ("early", "file to take as soon as it is there"),
-        ("grows", "file to take while it grows"),
+        ("needs", "file to fetch"),
+        ("gives", "file to store when the command has ended well, and to fetch before if it is there"),
+        ("grows", "file to store while it grows, and to fetch before if not all that is given is there"),
     ):
         parser.add_argument(f"--{flag}", action="append", default=[], metavar="NAME", help=text)
     parser.add_argument("command", nargs="+")

@@ -102,7 +102,7 @@ class Unit:
     def group_task(self, parts: Parts, first: int, end: int) -> Task:
         """A segment."""
         name, segment = group_name(first, end), str(parts.segment(first, end))
-        words = (*self.program, "reconstruct", self.capture, "--init", str(parts.header), "--track", str(parts.track))
+        words = (*self.program, "fit-group", self.capture, "--init", str(parts.header), "--track", str(parts.track))
         command = (*words, "--frames", f"{first}:{end}", "-o", segment, *self.device)
         return Task(name, command, segment, parts.log(name))
 

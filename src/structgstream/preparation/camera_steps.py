@@ -7,36 +7,34 @@ from dataclasses import asdict
 from structgstream.data.calibration import listed
 from structgstream.data.posed import Calibration
 from structgstream.data.timeline import Clock
-from structgstream.data.tone import ToneCurve
 from structgstream.errors import ConfigError
 from structgstream.frames import LEAST_CAMERAS
 from structgstream.preparation.calibrating import (
     check_complete,
     check_enough,
     described,
+    focals_told,
     from_other_tool,
     packed,
     scaled,
+    stated_focals,
     summary,
+    turns_told,
     unpacked,
 )
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.claiming import claim
 from structgstream.preparation.footage import Footage, find_footage
-from structgstream.preparation.job import Job
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.solvers import (
     TIMESTAMPS,
     Clocks,
     first_clocks,
-    matched_pictures,
     refined,
     solved_by,
     synchronized,
-    tone_curves,
 )
-from structgstream.preparation.stated import focals_told, stated_focals, turns_told
-from structgstream.preparation.steps import Stored, fingerprint
+from structgstream.preparation.steps import Job, Stored, fingerprint
 
 
 class CameraSteps:
@@ -189,26 +187,6 @@ class CameraSteps:
             after=(after,),
         )
         return found[0]
-
-    def tones(
-        self, footage: Footage, clocks: Clocks, solved: SolvedCalibration, held_out: frozenset[str]
-    ) -> dict[str, ToneCurve]:
-        """Tone curves; ``clocks`` are those of the calibration, whose pictures its observations are of."""
-        curves, _ = self.steps.run(
-            "tone",
-            {"held_out": sorted(held_out)},
-            lambda: tone_curves(solved, matched_pictures(footage, clocks, self.options), held_out=sorted(held_out)),
-            pack=lambda found: Stored(
-                {"curves": {name: curve.controls for name, curve in found[0].items()}, "told": found[1]}
-            ),
-            unpack=lambda stored: (
-                {name: ToneCurve(curve) for name, curve in stored.values["curves"].items()},
-                str(stored.values["told"]),
-            ),
-            summary=lambda found: found[1],
-            after=("scale",),
-        )
-        return curves
 
 
 def _first(

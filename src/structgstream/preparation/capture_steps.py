@@ -25,7 +25,6 @@ from structgstream.data.prepared import (
 from structgstream.data.rectilinear import rectilinear
 from structgstream.data.source import FrameSource
 from structgstream.data.timeline import Clock
-from structgstream.data.tone import ToneCurve
 from structgstream.data.video import measured_fps
 from structgstream.data.wrappers import WithRig
 from structgstream.pose_check.findings import Finding
@@ -33,10 +32,9 @@ from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.checking.check import Examination, check_capture, examine_capture
 from structgstream.preparation.checking.scales import nearest_depth, observed_depths
 from structgstream.preparation.footage import Footage
-from structgstream.preparation.job import Job
 from structgstream.preparation.linking import bring, drop_others, unbring
 from structgstream.preparation.options import PrepareOptions
-from structgstream.preparation.steps import FOLDER, Stored, fingerprint
+from structgstream.preparation.steps import FOLDER, Job, Stored, fingerprint
 from structgstream.similarity import rig_radius
 from structgstream.whole_files import whole_file
 
@@ -189,7 +187,7 @@ def assembled(
     solved: SolvedCalibration,
     options: PrepareOptions,
 ) -> PreparedCapture:
-    """The content of ``capture.json`` with the usual near plane, without points and tone curves.
+    """The content of ``capture.json`` with the usual near plane, without points.
 
     Raises:
         ConfigError: a field of view or size that cannot be.
@@ -206,9 +204,3 @@ def assembled(
     near = options.near or NEAR_IN_RIG_RADII * rig_radius(rig.with_held_out(held_out))
     fps = measured_fps(footage.tracks, clocks) if footage.tracks else None
     return PreparedCapture(cameras, fps or footage.fps, near, "metres" if solved.metres else "arbitrary", held_out)
-
-
-def with_tones(content: PreparedCapture, curves: Mapping[str, ToneCurve]) -> PreparedCapture:
-    """The content with a curve for each camera that has one."""
-    cameras = {name: replace(camera, tone=curves.get(name)) for name, camera in content.cameras.items()}
-    return replace(content, cameras=cameras)

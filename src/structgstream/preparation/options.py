@@ -50,7 +50,6 @@ class PrepareOptions:
         without: names of cameras to leave out.
         link: how files are brought into the capture.
         instants: most instants that structure from motion looks at; it looks at three where these have texture enough.
-        tone: estimate a tone curve per camera.
     """
 
     calibration: str | Path = "auto"
@@ -69,7 +68,6 @@ class PrepareOptions:
     without: tuple[str, ...] = ()
     link: Link = "hard"
     instants: int = 9
-    tone: bool = False
 
     def __post_init__(self) -> None:
         if self.near is not None and not 0 < self.near < math.inf:

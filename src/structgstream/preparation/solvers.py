@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calls synchronisation, calibration and tone curves with the pictures of the footage that they need."""
+"""Calls synchronisation and calibration with the pictures of the footage that they need."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera
 from structgstream.data.timeline import Clock
-from structgstream.data.tone import ToneCurve
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.calibration.board_solving import solve_board
 from structgstream.preparation.calibration.refinement import refine
@@ -24,7 +23,6 @@ from structgstream.preparation.instants import (
 )
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.synchronization import Method, synchronize
-from structgstream.preparation.tone import estimate_tones, sample_colors
 
 TIMESTAMPS = "timestamps.csv"
 BOARD_SECONDS = 0.4
@@ -174,24 +172,6 @@ def refined(
         f"before, {found.after_pixels:.2f} after"
     )
     return found.solved, told if found.changed else f"{told}: the given calibration stays"
-
-
-def tone_curves(
-    solved: SolvedCalibration, pictures: Mapping[str, Sequence[Picture]], *, held_out: Sequence[str]
-) -> tuple[dict[str, ToneCurve], str]:
-    """A tone curve for each camera, and in words what they change.
-
-    Raises:
-        CaptureError: too few points have colours.
-    """
-    names = list(solved.cameras)
-    samples = sample_colors(pictures, solved.observations, cameras=names)
-    found = estimate_tones(samples, cameras=names, held_out=held_out)
-    errors = found.errors
-    return dict(found.curves), (
-        f"colours differ by {errors.as_filmed:.1f} of 255 as filmed, {errors.with_gains:.1f} after gains, "
-        f"{errors.with_curves:.1f} after curves"
-    )
 
 
 def matched_pictures(

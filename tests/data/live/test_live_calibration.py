@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lenses, tone, masks and sizes of a calibration on pictures that arrive."""
+"""Lenses, masks and sizes of a calibration on pictures that arrive."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -14,7 +14,6 @@ from structgstream.data.masks import FOLDER, with_masks
 from structgstream.data.open import open_capture, selected
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, read_prepared, recognizes_prepared
 from structgstream.data.source import FrameSource
-from structgstream.data.tone import toned
 from structgstream.data.undistortion import UndistortedSource
 from structgstream.data.wrappers import SourceWrapper
 from structgstream.frames import MultiViewFrame
@@ -46,7 +45,7 @@ class Arriving:
 
 
 def read_calibration(folder: Path) -> PreparedCapture:
-    """Lenses, pinholes and tone of the cameras of a capture of any layout.
+    """Lenses and pinholes of the cameras of a capture of any layout.
 
     Raises:
         CaptureError: it cannot be opened. A prepared capture needs its ``capture.json`` alone.
@@ -93,7 +92,7 @@ def as_calibrated(
     scale: float,
     near: float | None,
 ) -> FrameSource:
-    """Arriving pictures with tone, lenses and masks applied as those of a prepared capture are.
+    """Arriving pictures with lenses and masks applied as those of a prepared capture are.
 
     Args:
         arriving: pictures of :func:`filmed_rig`.
@@ -107,13 +106,10 @@ def as_calibrated(
         CaptureError: masks that do not fit.
         ConfigError: an invalid option.
     """
-    curves = {name: camera.tone for name, camera in capture.cameras.items() if camera.tone is not None}
-    source = toned(arriving, curves)
     pinholes = _rig({name: camera.pinhole for name, camera in capture.cameras.items()}, capture, folder)
     filmed = {name: camera.filmed for name, camera in capture.cameras.items()}
-    undistorted = UndistortedSource(source, pinholes, filmed)
-    if not all(undistorted.is_unchanged(name) for name in pinholes):
-        source = undistorted
+    undistorted = UndistortedSource(arriving, pinholes, filmed)
+    source = arriving if all(undistorted.is_unchanged(name) for name in pinholes) else undistorted
     return selected(with_masks(source, folder / FOLDER), held_out=held_out, scale=scale, near=near)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``reconstruct --init``: what it asks for, and says when it ends; the fit itself is ``groups/unit``'s."""
+"""``fit-group``: what it asks for, and says when it ends; the fit itself is ``groups/unit``'s."""
 
 import os
 import signal
@@ -12,7 +12,7 @@ import pytest
 
 from quick_streams import CLIP, error_of
 from streams import small_stream
-from structgstream.cli import group_run, main
+from structgstream.cli import fit_group, main
 from structgstream.groups import unit
 from structgstream.groups.first_frame import GroupStartConfig
 
@@ -20,7 +20,7 @@ from structgstream.groups.first_frame import GroupStartConfig
 @pytest.fixture
 def words(tmp_path: Path) -> list[str]:
     (tmp_path / "header.sgs").write_bytes(small_stream(1))
-    return ["reconstruct", CLIP, "--init", str(tmp_path / "header.sgs"), "-o", str(tmp_path / "g.sgs")]
+    return ["fit-group", CLIP, "--init", str(tmp_path / "header.sgs"), "-o", str(tmp_path / "g.sgs")]
 
 
 class Shown:
@@ -49,7 +49,7 @@ class Shown:
 @pytest.fixture
 def shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
     made = Shown()
-    monkeypatch.setattr(group_run, "display", made)
+    monkeypatch.setattr(fit_group, "display", made)
     return made
 
 
@@ -116,7 +116,7 @@ def test_ranges_and_numbers_that_mean_nothing_are_refused(
 ) -> None:
     asked = fits(monkeypatch, done=0)
     for given, said in (
-        (["--frames", "4"], "--frames 4 with --init; a group is A:B, such as --frames 60:120."),
+        (["--frames", "4"], "--frames 4: a group is A:B, such as --frames 60:120."),
         (["--frames", "4:x"], "a group is A:B"),
         (["--frames", "-1:4"], ""),
         (["--frames", "4:4"], "--frames 4:4 is empty; B is the frame after the last one."),
@@ -126,6 +126,11 @@ def test_ranges_and_numbers_that_mean_nothing_are_refused(
     ):
         assert said in error_of([*words, *given], capsys, status=2)
     assert not asked
+
+
+def test_the_former_spelling_names_the_command(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    error = error_of(["reconstruct", *words[1:], "--frames", "0:4"], capsys, status=2)
+    assert "reconstruct has no --init: a group of frames is fitted by structgstream fit-group." in error
 
 
 def test_a_group_without_a_track_and_a_header_that_is_none_are_told(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``structgstream reconstruct --init``: one group of frames."""
+"""``structgstream fit-group``."""
 
 import logging
 import re
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ReconstructGroup:
+class FitGroup:
     """Fits one group of frames from a header and a track into a segment (docs/cluster.md).
 
     Configuration, picture size, first frame and held-out cameras are the header's. The same command may be given at any
     time: it goes on where it was interrupted, repairs what is damaged, and leaves a finished segment as it is.
 
-    Example: structgstream reconstruct basketball --init header.sgs --track ball.track --frames 60:120 -o g60.sgs
+    Example: structgstream fit-group basketball --init header.sgs --track ball.track --frames 60:120 -o g60.sgs
     """
 
     scene: tyro.conf.Positional[Folder]
@@ -44,7 +44,7 @@ class ReconstructGroup:
     iterations: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Optimisation steps of the group's first frame. Default: eleven times those of an online frame."""
     rounds: int = 3
-    """Rounds of flow, births and iterations of the group's first frame."""
+    """Rounds of scene flow, spawning and iterations of the group's first frame."""
     device: Device = "auto"
     """Compute back-end."""
     overwrite: Flag = False
@@ -52,12 +52,12 @@ class ReconstructGroup:
 
 
 def main(arguments: list[str]) -> None:
-    """Reconstructs with a progress display."""
-    options = parse_options(ReconstructGroup, "reconstruct", arguments=arguments)
-    check_ending(options.output, ".sgs", command="reconstruct --init")
+    """Fits with a progress display."""
+    options = parse_options(FitGroup, "fit-group", arguments=arguments)
+    check_ending(options.output, ".sgs", command="fit-group")
     matched = re.fullmatch(r"(\d+):(\d+)", options.frames)
     if matched is None:
-        raise UsageError(f"--frames {options.frames} with --init; a group is A:B, such as --frames 60:120.")
+        raise UsageError(f"--frames {options.frames}: a group is A:B, such as --frames 60:120.")
     if (options.iterations is not None and options.iterations < 1) or options.rounds < 1:
         raise UsageError("--iterations and --rounds must be at least 1.")
     first, end = int(matched[1]), int(matched[2])
@@ -74,7 +74,7 @@ def main(arguments: list[str]) -> None:
     say(Console(), text)
 
 
-def _fit(options: ReconstructGroup, task: "SegmentTask") -> bool:
+def _fit(options: FitGroup, task: "SegmentTask") -> bool:
     """Fits what is missing of the segment; whether anything was."""
     from structgstream.groups.unit import fit_segment
     from structgstream.kernels.backend import select_backend
