@@ -211,11 +211,36 @@ def guided_matches(
     _, depths = triangulate(*cameras, first.pixels[row], second.pixels[column])
     kept = ((depths > depth_range[0]) & (depths < depth_range[1])).all(1)
     row, column = row[kept], column[kept]
+    return mutually_best(first, second, row, column, ratio=ratio, distinct_pixels=distinct_pixels)
+
+
+def mutually_best(
+    first: Features,
+    second: Features,
+    row: NDArray[np.intp],
+    column: NDArray[np.intp],
+    *,
+    ratio: float,
+    distinct_pixels: float,
+    distance: float = np.inf,
+) -> NDArray[np.intp]:
+    """Matches ``[S, 2]`` among candidates that are each other's best and pass the ratio test both ways.
+
+    Args:
+        first: keypoints of one picture.
+        second: those of the other.
+        row: ``[C]``, of each candidate the index into ``first``.
+        column: ``[C]``, the index into ``second``.
+        ratio: see :func:`distinct_best`.
+        distinct_pixels: see :func:`distinct_best`.
+        distance: descriptor distance below which a match must be.
+    """
     similarity = np.einsum("sd,sd->s", first.descriptors[row], second.descriptors[column])
     cost = np.sqrt(np.maximum(2 - 2 * similarity, 1e-12))
     forward = distinct_best(row, column, cost, second.pixels, ratio=ratio, distinct_pixels=distinct_pixels)
     backward = distinct_best(column, row, cost, first.pixels, ratio=ratio, distinct_pixels=distinct_pixels)
     mutual = np.intersect1d(forward, backward)
+    mutual = mutual[cost[mutual] < distance]
     return np.stack([row[mutual], column[mutual]], 1)
 
 

@@ -25,8 +25,7 @@ from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.evidence import ALL_PAIRS, Evidence, gather, pair_errors
 from structgstream.pose_check.explanations import explain, readings_of
 from structgstream.pose_check.findings import Finding
-from structgstream.pose_check.suspects import find_suspects
-from structgstream.pose_check.verdicts import Verdict, judge
+from structgstream.pose_check.verdicts import Verdict, find_suspects, judge
 
 MIN_MATCHES = 100  # of a rig, for a verdict
 CONTRADICTED_SHARE = 0.5  # of the matches, above which poses are refused if most cameras are off

@@ -11,8 +11,7 @@ from structgstream.cameras import Camera
 from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.evidence import gather
 from structgstream.pose_check.findings import Finding
-from structgstream.preparation.checking.bumps import bump_findings
-from structgstream.preparation.checking.stillness import picture_movement
+from structgstream.preparation.checking.bumps import bump_findings, picture_movement
 
 Pictures = dict[str, NDArray[np.uint8]]
 

@@ -14,9 +14,8 @@ from structgstream.pose_check.check import examine_poses
 from structgstream.pose_check.evidence import Evidence, pair_errors
 from structgstream.pose_check.explanations import explain
 from structgstream.pose_check.findings import worst_first
-from structgstream.pose_check.suspects import Suspects
 from structgstream.pose_check.tracks import LEAST_VIEWS, Tracks
-from structgstream.pose_check.verdicts import Verdict
+from structgstream.pose_check.verdicts import Suspects, Verdict
 from structgstream.preparation.checking.bumps import bump_findings
 from structgstream.preparation.checking.colors import Color, color_findings, compare_colors
 from structgstream.preparation.checking.findings import (
