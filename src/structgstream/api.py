@@ -28,9 +28,8 @@ from structgstream.exporters.request import check_degree, check_low_pass, check_
 from structgstream.frame_report import FrameReport
 from structgstream.kernels.backend import Backend, BackendName, select_backend
 from structgstream.preparation.checking.findings import CheckReport
-from structgstream.preparation.checking.folder import check_folder
 from structgstream.preparation.options import PrepareOptions
-from structgstream.preparation.prepare import Preparation, prepare_capture
+from structgstream.preparation.prepare import Preparation, check_folder, prepare_capture
 from structgstream.preparation.steps import Listener
 from structgstream.presets import DEFAULT_PRESET, StreamConfig, preset_named, with_budget
 from structgstream.recorder import check_output, record, segments_at, segments_folder

@@ -121,6 +121,10 @@ class Camera:
             self._resized[width, height] = replace(self, K=self.K * factors, width=width, height=height)
         return self._resized[width, height]
 
+    def scaled(self, scale: float) -> "Camera":
+        """:meth:`resized` to ``scale`` times the size, rounded to whole pixels, at least one."""
+        return self.resized(max(1, round(self.width * scale)), max(1, round(self.height * scale)))
+
 
 @dataclass(frozen=True)
 class CameraRig:

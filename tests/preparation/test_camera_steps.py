@@ -17,10 +17,9 @@ from structgstream.preparation.calibrating import chosen_method
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.camera_steps import CameraSteps
 from structgstream.preparation.claiming import SOURCE
-from structgstream.preparation.job import Job, new_job
 from structgstream.preparation.options import Distance, PrepareOptions
 from structgstream.preparation.solvers import TIMESTAMPS, Clocks
-from structgstream.preparation.steps import FOLDER, Silent
+from structgstream.preparation.steps import FOLDER, Job, Silent, new_job
 
 NONE = PrepareOptions(synchronize="none")
 

@@ -18,9 +18,8 @@ from structgstream.preparation.calibrating import chosen_method, from_other_tool
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.capture_steps import POINTS, CaptureSteps, assembled, held_out_of
 from structgstream.preparation.footage import Footage, find_footage
-from structgstream.preparation.job import Job, new_job
 from structgstream.preparation.options import PrepareOptions
-from structgstream.preparation.steps import FOLDER, Silent
+from structgstream.preparation.steps import FOLDER, Job, Silent, new_job
 
 NONE = PrepareOptions(synchronize="none", near=0.25)
 

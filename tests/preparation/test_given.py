@@ -14,7 +14,7 @@ from structgstream.data.lenses import LensCamera, Pinhole, RadialTangential
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
 from structgstream.data.rectilinear import rectilinear
 from structgstream.errors import CalibrationError
-from structgstream.preparation.given import demand_calibration, find_calibration
+from structgstream.preparation.calibrating import demand_calibration, find_calibration
 
 RIG = small_rig(3)
 

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 from pathlib import Path
 
-from structgstream.preparation.job import new_job
 from structgstream.preparation.options import PrepareOptions
-from structgstream.preparation.steps import Stored
+from structgstream.preparation.steps import Stored, new_job
 
 
 class Heard:

@@ -16,7 +16,7 @@ import numpy as np
 
 from structgstream.data.clip import bundled_clip_path
 from structgstream.data.posed import rotation_matrix
-from structgstream.preparation.checking.folder import check_folder
+from structgstream.preparation.prepare import check_folder
 
 TURNED, DEGREES = "cam04", 0.6
 QUALITY, WIDEST = 82, 1000

@@ -124,7 +124,7 @@ def _prepare(options: Prepare, console: Console) -> "Sequence[Finding]":
 
 def _check(options: Prepare, console: Console) -> "Sequence[Finding]":
     from structgstream.data.folder_files import REPORT
-    from structgstream.preparation.checking.folder import check_folder
+    from structgstream.preparation.prepare import check_folder
 
     folder = options.videos / REPORT if options.report is None else options.report
     with interruptible(), step_display(console) as display:

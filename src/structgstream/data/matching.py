@@ -8,14 +8,13 @@ pixel's centre at (0.5, 0.5).
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
-from structgstream.errors import MissingExtraError
+from structgstream.data.images import opencv
 
 Pair = tuple[str, str]
 """Names of two cameras."""
@@ -44,7 +43,7 @@ def sift_features(
     Raises:
         MissingExtraError: cv2 is not installed.
     """
-    cv2 = load_cv2()
+    cv2 = opencv()
     # Without the precise upscale every keypoint would be off by a quarter of a pixel.
     sift = cv2.SIFT.create(
         nfeatures=count,
@@ -61,19 +60,6 @@ def sift_features(
     pixels = np.array([keypoint.pt for keypoint in keypoints], np.float64) + 0.5
     rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9), dtype=np.float32)
     return Features(pixels, rooted)
-
-
-def load_cv2() -> ModuleType:
-    """OpenCV, which only capturing needs.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
-    try:
-        import cv2
-    except ImportError:
-        raise MissingExtraError("cv2", "capture") from None
-    return cv2
 
 
 def project(camera: Camera, points: Floats) -> tuple[Floats, Floats]:
@@ -225,11 +211,36 @@ def guided_matches(
     _, depths = triangulate(*cameras, first.pixels[row], second.pixels[column])
     kept = ((depths > depth_range[0]) & (depths < depth_range[1])).all(1)
     row, column = row[kept], column[kept]
+    return mutually_best(first, second, row, column, ratio=ratio, distinct_pixels=distinct_pixels)
+
+
+def mutually_best(
+    first: Features,
+    second: Features,
+    row: NDArray[np.intp],
+    column: NDArray[np.intp],
+    *,
+    ratio: float,
+    distinct_pixels: float,
+    distance: float = np.inf,
+) -> NDArray[np.intp]:
+    """Matches ``[S, 2]`` among candidates that are each other's best and pass the ratio test both ways.
+
+    Args:
+        first: keypoints of one picture.
+        second: those of the other.
+        row: ``[C]``, of each candidate the index into ``first``.
+        column: ``[C]``, the index into ``second``.
+        ratio: see :func:`distinct_best`.
+        distinct_pixels: see :func:`distinct_best`.
+        distance: descriptor distance below which a match must be.
+    """
     similarity = np.einsum("sd,sd->s", first.descriptors[row], second.descriptors[column])
     cost = np.sqrt(np.maximum(2 - 2 * similarity, 1e-12))
     forward = distinct_best(row, column, cost, second.pixels, ratio=ratio, distinct_pixels=distinct_pixels)
     backward = distinct_best(column, row, cost, first.pixels, ratio=ratio, distinct_pixels=distinct_pixels)
     mutual = np.intersect1d(forward, backward)
+    mutual = mutual[cost[mutual] < distance]
     return np.stack([row[mutual], column[mutual]], 1)
 
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from structgstream.cameras import enlargement
 from structgstream.data.arrays import Floats
 from structgstream.data.descriptor_matches import mutual_matches
-from structgstream.data.matching import Features, Pair, load_cv2, sift_features
+from structgstream.data.images import opencv
+from structgstream.data.matching import Features, Pair, sift_features
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ class PairMatcher:
         rows, columns = mutual_matches(first.descriptors, second.descriptors, ratio=config.ratio).T
         if len(rows) < config.min_inliers:
             return empty
-        cv2 = load_cv2()
+        cv2 = opencv()
         pixels1, pixels2 = first.pixels[rows], second.pixels[columns]
         height, width = np.maximum(*(self._images[name].shape[:2] for name in pair))
         most = config.inlier_pixels * enlargement(width, height)

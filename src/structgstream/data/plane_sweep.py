@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
-from structgstream.data.images import reduced_mask
-from structgstream.data.matching import back_project, inside, load_cv2, project
+from structgstream.data.images import opencv, reduced_mask
+from structgstream.data.matching import back_project, inside, project
 from structgstream.data.plane_homographies import plane_homographies
 from structgstream.kernels.backend import processor_backend
 
@@ -110,7 +110,7 @@ def sweep_view(
     camera: Camera, image: NDArray[np.uint8], *, width: int, mask: NDArray[np.bool_] | None = None
 ) -> SweepView:
     """The picture averaged down to at most ``width`` pixels, with its camera and its mask."""
-    cv2 = load_cv2()
+    cv2 = opencv()
     width = min(width, camera.width)
     height = max(1, round(camera.height * width / camera.width))
     colors = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
@@ -188,7 +188,7 @@ def sweep_points(
     Raises:
         MissingExtraError: cv2 is not installed.
     """
-    cv2 = load_cv2()
+    cv2 = opencv()
     names = [name for name in cameras if neighbours[name]]
     positions: list[Floats] = [np.empty((0, 3))]
     colors: list[NDArray[np.uint8]] = [np.empty((0, 3), np.uint8)]

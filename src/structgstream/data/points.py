@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig, enlargement
 from structgstream.data.arrays import Floats
-from structgstream.data.images import reduced_mask
+from structgstream.data.images import opencv, reduced_mask
 from structgstream.data.matching import (
     Features,
     Pair,
@@ -24,7 +24,6 @@ from structgstream.data.matching import (
     guided_matches,
     inside,
     level_normal,
-    load_cv2,
     neighbor_views,
     project,
     sift_features,
@@ -158,7 +157,7 @@ def _at_reference(
     small, pictures, counting = dict(cameras), dict(images), dict(masks)
     for name, camera in cameras.items():
         if (by := enlargement(camera.width, camera.height)) > 1.0:
-            cv2, size = load_cv2(), (max(1, round(camera.width / by)), max(1, round(camera.height / by)))
+            cv2, size = opencv(), (max(1, round(camera.width / by)), max(1, round(camera.height / by)))
             small[name] = camera.resized(*size)
             pictures[name] = np.asarray(cv2.resize(images[name], size, interpolation=cv2.INTER_AREA), np.uint8)
             if name in masks:

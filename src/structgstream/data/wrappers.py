@@ -158,13 +158,7 @@ def resized(source: FrameSource, scale: float) -> FrameSource:
         raise ConfigError(f"The scale of a capture must lie in (0, 1], got {scale:g}.")
     if scale == 1:
         return source
-    cameras = source.rig.cameras
-    rig = source.rig.mapped(
-        {
-            name: camera.resized(max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
-            for name, camera in cameras.items()
-        }
-    )
+    rig = source.rig.mapped({name: camera.scaled(scale) for name, camera in source.rig.cameras.items()})
     return resized_to(source, rig)
 
 

@@ -42,8 +42,7 @@ def visible_mixtures(mixed: Scene, pictures: BorderPictures, rig: CameraRig, bac
     with torch.no_grad():
         for name in pictures.first:
             camera = rig[name]
-            scale = _SCALE / enlargement(camera.width, camera.height)
-            small = camera.resized(*(max(1, round(size * scale)) for size in (camera.width, camera.height)))
+            small = camera.scaled(_SCALE / enlargement(camera.width, camera.height))
             shown = render(mixed, camera, backend).image
             excess = _excess(shown, pictures.before[name], pictures.first[name])
             excess = area_mean(excess[None, None], (small.height, small.width))

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The step that finds the cameras: structure from motion, a board, or the calibration of another tool."""
+"""The step that finds the cameras: structure from motion, a board, or a calibration that is there already."""
 
 import shlex
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -9,15 +10,19 @@ from typing import Any
 import numpy as np
 
 from structgstream.data.calibration import listed
-from structgstream.data.lenses import LensCamera
-from structgstream.data.posed import Calibration
+from structgstream.data.exif import read_exif
+from structgstream.data.found_calibrations import calibration_below, read_calibration
+from structgstream.data.immersive import MODELS, read_models
+from structgstream.data.json_videos import FILE as CAMERAS
+from structgstream.data.json_videos import read_cameras
+from structgstream.data.lenses import LensCamera, Pinhole
+from structgstream.data.posed import Calibration, PosedCamera
 from structgstream.data.posed_capture import filmed_by, orientations
-from structgstream.data.prepared import LENSES, camera_of, lens_model
+from structgstream.data.prepared import FILE as PREPARED
+from structgstream.data.prepared import LENSES, camera_of, lens_model, read_prepared
 from structgstream.errors import CalibrationError, ConfigError
-from structgstream.preparation.calibration.coordinates import with_distance
-from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
+from structgstream.preparation.calibration.solved import Observations, SolvedCalibration, with_distance
 from structgstream.preparation.footage import Footage
-from structgstream.preparation.given import demand_calibration, find_calibration
 from structgstream.preparation.options import METHODS, PrepareOptions
 from structgstream.preparation.steps import Stored
 
@@ -185,3 +190,103 @@ def scaled(solved: SolvedCalibration, options: PrepareOptions) -> SolvedCalibrat
     if distance is None:
         return solved
     return with_distance(solved, distance.first, distance.second, metres=distance.metres)
+
+
+def find_calibration(where: Path) -> Calibration | None:
+    """The calibration in a folder or one folder below, or that a file holds; None when there is none that is known.
+
+    Raises:
+        CalibrationError: it is broken, or a pickle.
+    """
+    folder, file = (where, None) if where.is_dir() else (where.parent, where)
+
+    def meant(name: str) -> bool:
+        return (folder / name).is_file() and file in (None, folder / name)
+
+    if meant(PREPARED):
+        return _of_prepared(folder)
+    if meant(CAMERAS):
+        return _of_cameras(folder / CAMERAS)
+    if meant(MODELS):
+        return read_models(folder / MODELS)
+    if (found := read_calibration(folder, file)) is not None or file is not None:
+        return found
+    below = calibration_below(folder)
+    return None if below is None else read_calibration(below)
+
+
+def demand_calibration(where: Path) -> Calibration:
+    """As :func:`find_calibration`.
+
+    Raises:
+        CalibrationError: there is none, or it is broken.
+    """
+    if not where.exists():
+        raise CalibrationError(f"The calibration {where} does not exist; give a file or a folder of docs/captures.md.")
+    found = find_calibration(where)
+    if found is None:
+        raise CalibrationError(
+            f"{where} is no calibration that is known; expected a file of docs/captures.md (aniposelib, EasyMocap, "
+            "multical, Kalibr, CMU Panoptic, Qualisys, ZJU-MoCap, OpenCV, transforms.json, models.json, COLMAP)."
+        )
+    return found
+
+
+def _of_prepared(folder: Path) -> Calibration:
+    capture = read_prepared(folder)
+    cameras = []
+    for name, camera in capture.cameras.items():
+        filmed = camera.filmed.camera
+        size = (filmed.width, filmed.height)
+        cameras.append(PosedCamera(name, filmed.viewmat.numpy(), filmed.K.numpy(), size, camera.filmed.lens))
+    return Calibration(folder / PREPARED, tuple(cameras), held_out=sorted(capture.held_out), turned_by_exif=False)
+
+
+def _of_cameras(file: Path) -> Calibration:
+    rig, _, _ = read_cameras(file)
+    cameras = tuple(
+        PosedCamera(name, camera.viewmat.numpy(), camera.K.numpy(), (camera.width, camera.height), Pinhole())
+        for name, camera in rig.cameras.items()
+    )
+    return Calibration(file, cameras, held_out=rig.testing)
+
+
+def stated_focals(footage: Footage) -> dict[str, float]:
+    """Focal lengths in pixels of those cameras whose first picture states one (Exif); videos do not.
+
+    Raises:
+        CaptureError: a picture cannot be read.
+        MissingExtraError: Pillow is not installed.
+    """
+    stated = {name: read_exif(files[0]).focal_pixels for name, files in footage.stills.items()}
+    return {name: focal for name, focal in stated.items() if focal is not None}
+
+
+def focals_told(focals: Mapping[str, float], footage: Footage) -> str:
+    """What was stated, in words; empty for nothing."""
+    if not focals:
+        return ""
+    shares = sorted(focal / max(footage.size(name)) for name, focal in focals.items())
+    span = f"{shares[0]:.3f}" + (f" to {shares[-1]:.3f}" if shares[-1] - shares[0] > 5e-4 else "")
+    return (
+        f"began with the focal lengths that the pictures of {len(focals)} of {len(footage.cameras)} cameras state "
+        f"({span} of the longer side)"
+    )
+
+
+def turns_told(footage: Footage) -> str:
+    """Which cameras' pictures are to be turned to be seen upright (Exif), in words; empty for none.
+
+    A prepared capture has pixels as they are stored, so pictures are never turned: that is said, not done.
+
+    Raises:
+        CaptureError: a picture cannot be read.
+        MissingExtraError: Pillow is not installed.
+    """
+    turned = [name for name, files in footage.stills.items() if read_exif(files[0]).orientation != 1]
+    if not turned:
+        return ""
+    return (
+        f"the files of {listed(turned)} say that pictures are to be turned (Exif orientation), and they are taken as "
+        "they are stored: turn them without loss (exiftran -a, jpegtran) to have them upright"
+    )

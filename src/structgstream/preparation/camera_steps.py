@@ -13,16 +13,18 @@ from structgstream.preparation.calibrating import (
     check_complete,
     check_enough,
     described,
+    focals_told,
     from_other_tool,
     packed,
     scaled,
+    stated_focals,
     summary,
+    turns_told,
     unpacked,
 )
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.claiming import claim
 from structgstream.preparation.footage import Footage, find_footage
-from structgstream.preparation.job import Job
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.solvers import (
     TIMESTAMPS,
@@ -32,8 +34,7 @@ from structgstream.preparation.solvers import (
     solved_by,
     synchronized,
 )
-from structgstream.preparation.stated import focals_told, stated_focals, turns_told
-from structgstream.preparation.steps import Stored, fingerprint
+from structgstream.preparation.steps import Job, Stored, fingerprint
 
 
 class CameraSteps:

@@ -32,10 +32,9 @@ from structgstream.preparation.checking.check import Examination, check_capture,
 from structgstream.preparation.checking.findings import Finding
 from structgstream.preparation.checking.scales import nearest_depth, observed_depths
 from structgstream.preparation.footage import Footage
-from structgstream.preparation.job import Job
 from structgstream.preparation.linking import bring, drop_others, unbring
 from structgstream.preparation.options import PrepareOptions
-from structgstream.preparation.steps import FOLDER, Stored, fingerprint
+from structgstream.preparation.steps import FOLDER, Job, Stored, fingerprint
 from structgstream.similarity import rig_radius
 from structgstream.whole_files import whole_file
 

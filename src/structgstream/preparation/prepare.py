@@ -1,21 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From videos of still cameras to a calibrated capture, step by step; steps that were done are not done again."""
+"""From videos of still cameras to a calibrated capture, step by step; steps that were done are not done again.
+
+:func:`check_folder` is the last step for a capture of any layout.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from structgstream.data.folder_files import REPORT
+from structgstream.data.open import open_capture
 from structgstream.data.posed import Calibration
+from structgstream.data.prepared import read_prepared, recognizes_prepared
 from structgstream.preparation.calibrating import check_board, check_used, chosen_method
 from structgstream.preparation.camera_steps import CameraSteps
 from structgstream.preparation.capture_steps import CaptureSteps, assembled
+from structgstream.preparation.checking.check import Checked, check_capture
 from structgstream.preparation.checking.findings import Finding
 from structgstream.preparation.claiming import alone
 from structgstream.preparation.footage import Footage
-from structgstream.preparation.job import Job, new_job
 from structgstream.preparation.options import PrepareOptions
-from structgstream.preparation.steps import Listener, Silent
+from structgstream.preparation.report.write import write_report
+from structgstream.preparation.steps import Job, Listener, Silent, new_job
 
 
 @dataclass(frozen=True)
@@ -77,3 +83,26 @@ def _made(job: Job, find: CameraSteps, footage: Footage, method: str | Calibrati
     content = make.points(make.near(content))
     findings = make.check(content)
     return Preparation(job.capture, findings, job.told, tuple(job.steps.skipped), job.capture / REPORT / "index.html")
+
+
+def check_folder(path: Path, *, report: Path | None, listener: Listener | None = None) -> Checked:
+    """The check of a capture.
+
+    Args:
+        path: its folder.
+        report: folder for the report; None writes none.
+        listener: is told of the progress.
+
+    Raises:
+        CaptureError: the capture cannot be opened or read.
+        MissingExtraError: a package is missing that the check or the report needs.
+        StorageError: the report cannot be written.
+    """
+    listener = listener or Silent()
+    listener.begin("check", skipped=False)
+    unit = read_prepared(path).unit if recognizes_prepared(path) else None
+    checked = check_capture(open_capture(path), unit=unit, listener=listener)
+    if report is not None:
+        write_report(report, checked, listener=listener)
+    listener.end("check", f"{len(checked.report.findings)} findings")
+    return checked

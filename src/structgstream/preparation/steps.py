@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results of steps on the disk: a step whose inputs and options are the same is not done again.
+"""A preparation and the results of its steps on the disk: a step with the same inputs and options is not done again.
 
 A result is ``work/STEP.json`` (numbers, and the key) and ``work/STEP.npz`` (arrays). The key is a hash of the step's
 inputs and of the keys of the steps before it; the JSON is written last, so what an interruption leaves is done again.
@@ -18,10 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.errors import StorageError
+from structgstream.preparation.options import PrepareOptions
 from structgstream.whole_files import replacing
 
 FOLDER = "work"
 VERSION = 4  # of the steps' results; a new one does all steps again
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
@@ -59,9 +61,6 @@ class Silent:
 
     def end(self, step: str, summary: str) -> None:
         """Says nothing."""
-
-
-Value = TypeVar("Value")
 
 
 class Steps:
@@ -159,3 +158,48 @@ def fingerprint(files: Mapping[str, Path]) -> list[tuple[str, str, int, int]]:
             inner = file.relative_to(path).as_posix() if path.is_dir() else file.name
             found.append((name, inner, status.st_size, status.st_mtime_ns))
     return found
+
+
+@dataclass(frozen=True)
+class Job:
+    """One preparation.
+
+    Args:
+        videos: the folder of what was filmed.
+        capture: the folder to make.
+        options: what is asked for.
+        listener: is told of steps.
+        steps: runs them, or takes their results from the disk.
+        told: what each step found, in words.
+    """
+
+    videos: Path
+    capture: Path
+    options: PrepareOptions
+    listener: Listener
+    steps: Steps
+    told: dict[str, str] = field(default_factory=dict)
+
+
+def new_job(videos: Path, capture: Path, *, options: PrepareOptions, listener: Listener) -> Job:
+    """A preparation that has not begun."""
+    told: dict[str, str] = {}
+    noting = _Noting(listener, told)
+    return Job(videos, capture, options, noting, Steps(capture, noting), told)
+
+
+class _Noting:
+    """Passes everything on, and notes what steps found."""
+
+    def __init__(self, listener: Listener, told: dict[str, str]) -> None:
+        self._listener, self._told = listener, told
+
+    def begin(self, step: str, *, skipped: bool) -> None:
+        self._listener.begin(step, skipped=skipped)
+
+    def progress(self, done: int, total: int, what: str) -> None:
+        self._listener.progress(done, total, what)
+
+    def end(self, step: str, summary: str) -> None:
+        self._told[step] = summary
+        self._listener.end(step, summary)

@@ -97,9 +97,9 @@ def mean_of_counting(values: Tensor, mask: Tensor | None) -> Tensor:
 
 def reduced(view: View, scale: float) -> View:
     """The view with its picture reduced by ``scale`` (area average) and its camera resized."""
-    width, height = (max(1, round(size * scale)) for size in (view.camera.width, view.camera.height))
+    camera = view.camera.scaled(scale)
+    height, width = camera.height, camera.width
     image = _reduced_picture(view.image, (height, width))
-    camera = view.camera.resized(width, height)
     if view.mask is None:
         return View(view.index, camera, image)
     mask = area_mean(view.mask[None, None].float(), (height, width))[0, 0] > 1.0 - 1e-4

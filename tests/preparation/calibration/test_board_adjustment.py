@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from filmed import ring, turned
 from structgstream.data.lenses import LensCamera, RadialTangential
 from structgstream.preparation.calibration.board import Board
-from structgstream.preparation.calibration.board_adjustment import adjust_board
 from structgstream.preparation.calibration.board_model import Sightings
 from structgstream.preparation.calibration.board_sightings import Sighting
+from structgstream.preparation.calibration.board_solving import adjust_board
 from structgstream.preparation.calibration.comparison import calibration_errors
 
 BOARD = Board(7, 5, 0.12)

@@ -6,8 +6,13 @@ from filmed import ring
 from structgstream.data.alignment import Alignment
 from structgstream.data.posed import rotation_matrix
 from structgstream.errors import CalibrationError
-from structgstream.preparation.calibration.coordinates import normalized, upright, with_distance
-from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
+from structgstream.preparation.calibration.solved import (
+    Observations,
+    SolvedCalibration,
+    normalized,
+    upright,
+    with_distance,
+)
 
 POINTS = np.random.default_rng(0).uniform(-0.4, 0.4, (12, 3))
 TURN = Alignment(0.7, rotation_matrix(np.array([0.5, 1.0, -2.0])), np.array([4.0, 5.0, 6.0]))

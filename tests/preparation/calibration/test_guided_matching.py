@@ -4,8 +4,7 @@ from dataclasses import replace
 import numpy as np
 
 from repetitive import POINTS, keypoints_of, ring
-from structgstream.preparation.calibration.guided_matching import GuidedMatchConfig, guided_matches
-from structgstream.preparation.calibration.keypoint_matches import all_matches
+from structgstream.preparation.calibration.matching import GuidedMatchConfig, all_matches, guided_matches
 
 
 def test_what_looks_alike_is_told_apart_by_epipolar_lines() -> None:

@@ -2,8 +2,13 @@
 import numpy as np
 import pytest
 
-from structgstream.preparation.calibration.colmap import LensModel, filmed_camera, pycolmap_module
-from structgstream.preparation.calibration.intrinsics import field_of_view, guessed_camera
+from structgstream.preparation.calibration.colmap import (
+    LensModel,
+    field_of_view,
+    filmed_camera,
+    guessed_camera,
+    pycolmap_module,
+)
 
 
 @pytest.mark.parametrize(("lens", "degrees"), [("pinhole", 60), ("radial", 85), ("opencv", 40), ("fisheye", 150)])

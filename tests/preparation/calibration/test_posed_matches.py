@@ -5,7 +5,7 @@ import torch
 
 from filmed import ring
 from structgstream.data.lenses import Fisheye, LensCamera, RadialTangential
-from structgstream.preparation.calibration.posed_matches import (
+from structgstream.preparation.calibration.matching import (
     agreeing_matches,
     camera_rays,
     epipolar_angles,

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 from filmed import Film, Plane, noise_texture, ring, room, turned
 from structgstream.cameras import Camera
 from structgstream.frames import MultiViewFrame
-from structgstream.preparation.checking.bumps import bump_findings
+from structgstream.preparation.checking.bumps import bump_findings, picture_movement
 from structgstream.preparation.checking.evidence import gather
 from structgstream.preparation.checking.findings import Finding
-from structgstream.preparation.checking.stillness import picture_movement
 
 Pictures = dict[str, NDArray[np.uint8]]
 

@@ -7,7 +7,7 @@ import pytest
 
 from rooms import write_room
 from structgstream.errors import CaptureError
-from structgstream.preparation.checking.folder import check_folder
+from structgstream.preparation.prepare import check_folder
 
 
 class Noted:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filmed import noise_texture
-from structgstream.preparation.checking.stillness import picture_movement
+from structgstream.preparation.checking.bumps import picture_movement
 
 SCENE = noise_texture(4, size=320)
 SIZE = 240

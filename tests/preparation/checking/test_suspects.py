@@ -9,8 +9,8 @@ import numpy as np
 from evidence_made import wide_ring
 from structgstream.data.matching import Pair
 from structgstream.preparation.checking.evidence import PairError
-from structgstream.preparation.checking.suspects import Suspects, accused, find_suspects
 from structgstream.preparation.checking.tracks import Tracks
+from structgstream.preparation.checking.verdicts import Suspects, accused, find_suspects
 
 GOOD, WRONG = PairError(0.3, 0.02, 80), PairError(6.0, 0.3, 80)
 

@@ -8,6 +8,7 @@ from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.audio import (
     SPEED_OF_SOUND,
+    PairLag,
     Sound,
     audio_lags,
     connected_by,
@@ -15,7 +16,6 @@ from structgstream.preparation.synchronization.audio import (
     solve_by_audio,
     sound_of,
 )
-from structgstream.preparation.synchronization.loops import PairLag
 from structgstream.preparation.synchronization.solving import Solution
 from takes import heard, lenses, ring
 

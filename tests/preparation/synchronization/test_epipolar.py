@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from structgstream.preparation.synchronization.changes import Changes
-from structgstream.preparation.synchronization.epipolar import BUNDLES, PairGeometry, line_signals
-from structgstream.preparation.synchronization.geometry import CalibratedGeometry
+from structgstream.preparation.synchronization.epipolar import BUNDLES, CalibratedGeometry, PairGeometry, line_signals
 from takes import HEIGHT, WIDTH, lenses, ring
 
 CAMERAS = lenses(ring(3))

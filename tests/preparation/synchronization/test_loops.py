@@ -3,7 +3,7 @@
 
 import pytest
 
-from structgstream.preparation.synchronization.loops import PairLag, doubts
+from structgstream.preparation.synchronization.audio import PairLag, doubts
 
 STARTS = {"a": 0.0, "b": 1.2, "c": -0.4, "d": 2.5}
 

@@ -12,7 +12,7 @@ from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.changes import Changes, picture_changes
 from structgstream.preparation.synchronization.correlation import Signal
-from structgstream.preparation.synchronization.geometry import CalibratedGeometry
+from structgstream.preparation.synchronization.epipolar import CalibratedGeometry
 from structgstream.preparation.synchronization.motion import (
     PairSignals,
     agreeing_cameras,

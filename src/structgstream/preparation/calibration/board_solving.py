@@ -12,8 +12,8 @@ from structgstream.data.arrays import Floats
 from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera
 from structgstream.errors import CalibrationError
+from structgstream.preparation.calibration.adjustment import cameras_in, estimated, posed_problem
 from structgstream.preparation.calibration.board import Board
-from structgstream.preparation.calibration.board_adjustment import adjust_board
 from structgstream.preparation.calibration.board_model import (
     Sightings,
     board_model,
@@ -22,8 +22,15 @@ from structgstream.preparation.calibration.board_model import (
     sensor_poses,
 )
 from structgstream.preparation.calibration.board_sightings import Sighting, board_sightings
-from structgstream.preparation.calibration.colmap import LensModel, colmap_camera, filmed_camera, pycolmap_module
-from structgstream.preparation.calibration.intrinsics import guessed_camera
+from structgstream.preparation.calibration.bundle import Scene, Sights
+from structgstream.preparation.calibration.colmap import (
+    LensModel,
+    colmap_camera,
+    filmed_camera,
+    guessed_camera,
+    pycolmap_module,
+)
+from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL
 from structgstream.preparation.calibration.mapping import Freedom, adjust
 from structgstream.preparation.calibration.pictures import checked_pictures
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
@@ -250,3 +257,63 @@ def _without_outliers(sightings: Sightings, solved: SolvedCalibration) -> Sighti
             if inside.sum() >= 4:
                 kept[name].append(replace(sight, corners=sight.corners[inside], pixels=sight.pixels[inside]))
     return kept
+
+
+def adjust_board(
+    board: Board,
+    sightings: Sightings,
+    cameras: Mapping[str, LensCamera],
+    poses: Mapping[int, Floats],
+    *,
+    lens: LensModel,
+    known: frozenset[str],
+) -> tuple[dict[str, LensCamera], dict[int, Floats]]:
+    """Cameras and board-to-world poses ``[4, 4]`` by instant, adjusted together; the first camera is the world.
+
+    Args:
+        lens: which distortion is estimated.
+        known: cameras whose intrinsics and lens stay.
+    """
+    number = {instant: index for index, instant in enumerate(poses)}
+    seen = [(index, sight) for index, name in enumerate(cameras) for sight in sightings[name]]
+    counts = [len(sight.corners) for _, sight in seen]
+    sights = Sights(
+        np.repeat([index for index, _ in seen], counts).astype(np.intp),
+        np.repeat([number[sight.instant] for _, sight in seen], counts).astype(np.intp),
+        np.concatenate([board.corners[sight.corners] for _, sight in seen]),
+        np.concatenate([sight.pixels for _, sight in seen]),
+    )
+    stack = np.stack(list(poses.values()))
+    bundle, scene = posed_problem(
+        list(cameras.values()),
+        sights,
+        (stack[:, :3, :3], stack[:, :3, 3]),
+        lens=np.arange(len(cameras)),
+        free=(FOCAL, ASPECT, ACROSS, DOWN, *DISTORTION[lens]),
+        held=np.array([name in known for name in cameras]),
+        turning=True,
+    )
+    bundle, scene = estimated(bundle, scene)
+    scene = _from_first(scene)
+    return cameras_in(scene, cameras, bundle.lens), dict(zip(poses, _matrices(scene.turns, scene.places), strict=True))
+
+
+def _from_first(scene: Scene) -> Scene:
+    """In the axes of the first camera."""
+    turn, move = scene.rotations[0], scene.translations[0]
+    rotations = scene.rotations @ turn.T
+    translations = scene.translations - rotations @ move
+    rotations[0], translations[0] = np.eye(3), 0.0  # exactly
+    return replace(
+        scene,
+        rotations=rotations,
+        translations=translations,
+        turns=turn @ scene.turns,
+        places=scene.places @ turn.T + move,
+    )
+
+
+def _matrices(turns: Floats, places: Floats) -> Floats:
+    found = np.tile(np.eye(4), (len(turns), 1, 1))
+    found[:, :3, :3], found[:, :3, 3] = turns, places
+    return found

@@ -5,6 +5,7 @@ Both count pixels from the picture's corner, with the centre of the top-left pix
 camera poses with OpenCV axes, so nothing is converted but names and orders of parameters.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import astuple
 from types import ModuleType
@@ -103,3 +104,18 @@ def _lens(name: str, terms: Sequence[float]) -> Lens:
     if name == "OPENCV_FISHEYE":
         return Fisheye(*terms)
     return RadialTangential(*terms) if any(terms) else Pinhole()
+
+
+def guessed_camera(lens: LensModel, number: int, size: tuple[int, int], degrees: float) -> Any:
+    """A camera of pycolmap without distortion whose picture spans ``degrees`` across its longer side."""
+    half = math.radians(degrees) / 2
+    focal = max(size) / 2 / (half if lens == "fisheye" else math.tan(half))
+    camera = pycolmap_module().Camera.create_from_model_name(number, MODELS[lens], focal, *size)
+    camera.has_prior_focal_length = True
+    return camera
+
+
+def field_of_view(lens: LensModel, focal: float, size: tuple[int, int]) -> float:
+    """Degrees that the longer side spans of a picture without distortion of this focal length in pixels."""
+    half = max(size) / 2 / focal
+    return 2 * math.degrees(half if lens == "fisheye" else math.atan(half))

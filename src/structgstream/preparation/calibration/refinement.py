@@ -15,11 +15,10 @@ from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.adjustment import Limits, adjust_together
 from structgstream.preparation.calibration.colmap import MODELS, LensModel, holding
 from structgstream.preparation.calibration.comparison import rig_alignment
-from structgstream.preparation.calibration.coordinates import normalized
 from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL
 from structgstream.preparation.calibration.mapping import Freedom, adjust, cameras_of, filtered, observed
-from structgstream.preparation.calibration.posed_matches import epipolar_pixels
-from structgstream.preparation.calibration.solved import SolvedCalibration
+from structgstream.preparation.calibration.matching import epipolar_pixels
+from structgstream.preparation.calibration.solved import SolvedCalibration, normalized
 from structgstream.preparation.calibration.triangulation import (
     PosedGraph,
     TriangulationConfig,

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from structgstream.data.matching import Pair
 from structgstream.preparation.calibration.adjustment import Limits, chosen
 from structgstream.preparation.calibration.colmap import pycolmap_module
-from structgstream.preparation.calibration.guided_matching import GuidedMatchConfig, guided_matches
 from structgstream.preparation.calibration.keypoints import Keypoints
 from structgstream.preparation.calibration.mapping import filtered, observed
+from structgstream.preparation.calibration.matching import GuidedMatchConfig, guided_matches
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
 from structgstream.preparation.calibration.triangulation import PosedGraph, posed_model
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a calibration gives: cameras, points, and what was observed of them."""
+"""What a calibration gives: cameras, points, and what was observed of them; its unit and axes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from structgstream.data.alignment import Alignment
 from structgstream.data.arrays import Floats
 from structgstream.data.lenses import LensCamera
-from structgstream.data.matching import Pair
+from structgstream.data.matching import Pair, level_normal
+from structgstream.errors import CalibrationError
 
 Indices = NDArray[np.intp]
 
@@ -119,3 +120,55 @@ class SolvedCalibration:
 
 def _median(values: Floats) -> float:
     return float(np.median(values)) if len(values) else float("nan")
+
+
+def normalized(solved: SolvedCalibration) -> SolvedCalibration:
+    """With the axes of the first camera, the mean camera at the origin and the farthest one unit away from it."""
+    rotation = next(iter(solved.cameras.values())).camera.viewmat[:3, :3].numpy()
+    centers = _centers(solved)
+    scale = 1 / max(float(np.linalg.norm(centers - centers.mean(0), axis=1).max()), 1e-300)
+    return solved.aligned(Alignment(scale, rotation, -scale * rotation @ centers.mean(0)))
+
+
+def with_distance(solved: SolvedCalibration, first: str, second: str, *, metres: float) -> SolvedCalibration:
+    """In metres, from the measured distance between the lenses of two cameras.
+
+    Raises:
+        CalibrationError: a camera that was not placed, or a distance that is not positive.
+    """
+    for name in (first, second):
+        if name not in solved.cameras:
+            raise CalibrationError(
+                f"The distance is said from camera {name!r}, which is not among the placed ones "
+                f"({', '.join(solved.cameras)})."
+            )
+    apart = float(np.linalg.norm(np.diff([_center(solved, first), _center(solved, second)], axis=0)))
+    if not metres > 0 or first == second or apart == 0:
+        raise CalibrationError(f"A distance of {metres:g} m between {first!r} and {second!r} gives no scale.")
+    return solved.aligned(Alignment(metres / apart, np.eye(3), np.zeros(3)), metres=True)
+
+
+def upright(solved: SolvedCalibration) -> SolvedCalibration:
+    """Turned so that up is -y, as estimated from the cameras' horizontal axes; the origin stays."""
+    up = level_normal({name: filmed.camera for name, filmed in solved.cameras.items()})
+    if np.linalg.norm(up) < 0.5:
+        return solved
+    return solved.aligned(Alignment(1.0, _turn(up, np.array([0.0, -1.0, 0.0])), np.zeros(3)))
+
+
+def _turn(start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The smallest rotation that turns one unit vector to another."""
+    axis, cosine = np.cross(start, end), float(start @ end)
+    if cosine < -1 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + cross + cross @ cross / (1 + cosine)
+
+
+def _centers(solved: SolvedCalibration) -> NDArray[np.float64]:
+    return np.stack([filmed.camera.center.numpy() for filmed in solved.cameras.values()])
+
+
+def _center(solved: SolvedCalibration, name: str) -> NDArray[np.float64]:
+    return solved.cameras[name].camera.center.numpy()

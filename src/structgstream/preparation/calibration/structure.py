@@ -23,10 +23,13 @@ from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Pair
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.adjustment import Limits, adjust_together
-from structgstream.preparation.calibration.colmap import LensModel, colmap_camera, pycolmap_module
-from structgstream.preparation.calibration.coordinates import normalized
-from structgstream.preparation.calibration.intrinsics import field_of_view, guessed_camera
-from structgstream.preparation.calibration.keypoint_matches import KeypointMatchConfig, all_matches
+from structgstream.preparation.calibration.colmap import (
+    LensModel,
+    colmap_camera,
+    field_of_view,
+    guessed_camera,
+    pycolmap_module,
+)
 from structgstream.preparation.calibration.keypoints import KeypointConfig, Keypoints, all_keypoints
 from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL
 from structgstream.preparation.calibration.mapping import (
@@ -38,9 +41,10 @@ from structgstream.preparation.calibration.mapping import (
     observed,
     size_of,
 )
+from structgstream.preparation.calibration.matching import KeypointMatchConfig, all_matches
 from structgstream.preparation.calibration.pictures import checked_pictures
 from structgstream.preparation.calibration.rematching import RematchConfig, rematched
-from structgstream.preparation.calibration.solved import SolvedCalibration
+from structgstream.preparation.calibration.solved import SolvedCalibration, normalized
 from structgstream.preparation.calibration.view_graph import (
     Matches,
     PairConfig,

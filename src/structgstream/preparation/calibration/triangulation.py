@@ -15,11 +15,10 @@ from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Pair
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.colmap import colmap_camera, colmap_pose, pycolmap_module
-from structgstream.preparation.calibration.keypoint_matches import KeypointMatchConfig, all_matches
 from structgstream.preparation.calibration.keypoints import KeypointConfig, Keypoints, all_keypoints
 from structgstream.preparation.calibration.mapping import filtered, observed
+from structgstream.preparation.calibration.matching import KeypointMatchConfig, agreeing_matches, all_matches
 from structgstream.preparation.calibration.pictures import checked_pictures
-from structgstream.preparation.calibration.posed_matches import agreeing_matches
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.calibration.view_graph import PairConfig, verified_pairs, write_database
 

@@ -31,10 +31,9 @@ from structgstream.preparation.checking.presence import (
     whole_frame,
 )
 from structgstream.preparation.checking.scales import nearest_depth, observed_depths, scale_findings
-from structgstream.preparation.checking.suspects import Suspects
 from structgstream.preparation.checking.times import measure_times, time_findings
 from structgstream.preparation.checking.tracks import LEAST_VIEWS, Tracks
-from structgstream.preparation.checking.verdicts import Verdict, judge
+from structgstream.preparation.checking.verdicts import Suspects, Verdict, judge
 from structgstream.preparation.steps import Listener, Silent
 from structgstream.preparation.synchronization import SynchronizationCheck
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
-from structgstream.data.matching import load_cv2
+from structgstream.data.images import opencv
 from structgstream.preparation.checking.evidence import Evidence
 from structgstream.preparation.checking.findings import Finding
 
@@ -39,7 +39,7 @@ def compare_colors(evidence: Evidence) -> dict[str, Color]:
 
     Least absolute deviations over all matches, as highlights and occlusions make outliers.
     """
-    cv2 = load_cv2()
+    cv2 = opencv()
     smooth = {name: cv2.blur(image, (PATCH, PATCH)) for name, image in evidence.images.items()}
     names = list(evidence.keypoints)
     first, second, ratios = [], [], []

@@ -13,7 +13,8 @@ import numpy as np
 
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
-from structgstream.data.matching import load_cv2, project
+from structgstream.data.images import opencv
+from structgstream.data.matching import project
 from structgstream.preparation.checking.tracks import AGREE_PIXELS, Tracks
 
 LEAST_SEEN = 8
@@ -96,7 +97,7 @@ class _View:
     skew: float
 
     def pixels(self, change: Floats, points: Floats) -> Floats:
-        cv2 = load_cv2()
+        cv2 = opencv()
         turn = cv2.Rodrigues(np.asarray(change[TURN], np.float64))[0]
         seen = (points - self.center - change[MOVE]) @ (turn @ self.rotation).T
         depth = np.where(np.abs(seen[:, 2:]) < 1e-12, 1e-12, seen[:, 2:])
@@ -166,7 +167,7 @@ def _view(camera: Camera) -> _View:
 
 def _by_points(camera: Camera, points: Floats, pixels: Floats, limit: float) -> Floats | None:
     """The change to a pose from scratch, so that a camera may be off by any amount."""
-    cv2 = load_cv2()
+    cv2 = opencv()
     found, turn, shift, inliers = cv2.solvePnPRansac(
         points, pixels, camera.K.numpy(), None, reprojectionError=limit, iterationsCount=500
     )

@@ -1,17 +1,123 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which cameras are off, and by how much: what pairs say, held against points of several cameras."""
+"""Which cameras are off, and by how much.
 
-from collections.abc import Mapping
+Those that disagree with others which agree with each other, held against points of several cameras.
+"""
+
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from structgstream.cameras import Camera
 from structgstream.data.matching import Pair
 from structgstream.preparation.checking.evidence import Evidence, PairError, pair_errors
 from structgstream.preparation.checking.resection import Resection, resected
-from structgstream.preparation.checking.suspects import Suspects, accused, find_suspects
-from structgstream.preparation.checking.tracks import Tracks, build_tracks
+from structgstream.preparation.checking.tracks import LEAST_VIEWS, Tracks, build_tracks
 
+TIMES_TYPICAL = 4.0
+FLOOR_PIXELS = 0.75  # of pictures up to 1000 pixels wide, in proportion above
+MOST_WEIGHT = 100  # matches above which a pair is not trusted more
+OFF_SHARE = 0.5
+VIOLATING_SHARE = 0.5
+LEAST_ACCUSING, LEAST_CAMERAS, ACCUSING_TIMES = 15, 4, 2.5
 LEAST_MATCHES = 60  # of a camera's pairs, from which on they tell something without points; chance makes 20 to 25
+
+
+@dataclass(frozen=True)
+class Suspects:
+    """The verdict on a rig.
+
+    Args:
+        off: cameras that disagree with the others, the worst first.
+        bad: pairs that the poses do not explain.
+        limit_pixels: error above which a pair counts as such.
+        everything: whether so much disagrees that no camera can be singled out.
+    """
+
+    off: tuple[str, ...]
+    bad: tuple[Pair, ...]
+    limit_pixels: float
+    everything: bool
+
+    @property
+    def stray(self) -> tuple[Pair, ...]:
+        """Bad pairs of cameras that fit others: most likely what is wrong there are the matches."""
+        if self.everything:
+            return ()
+        return tuple(pair for pair in self.bad if not set(pair) & set(self.off))
+
+
+def find_suspects(errors: Mapping[Pair, PairError], cameras: Mapping[str, Camera]) -> Suspects:
+    """Names the cameras without which the poses explain the matches.
+
+    A bumped camera has a large error with all cameras that see the same, while these agree with each other. So the
+    camera whose matches are explained worst is taken away, until no camera has most of its matches unexplained. If
+    fewer than half of the cameras remain, the mistake is not one of single cameras.
+    """
+    limit = _limit(errors, cameras)
+    bad = {pair for pair, error in errors.items() if error.pixels > limit or error.share > VIOLATING_SHARE}
+    weights = {pair: min(error.matches, MOST_WEIGHT) for pair, error in errors.items()}
+    off: list[str] = []
+    remaining = [name for name in cameras if any(name in pair for pair in errors)]
+    while remaining:
+        shares = {name: _share(name, bad, weights, off) for name in remaining}
+        worst = max(remaining, key=lambda name: (shares[name], _amount(name, errors, off)))
+        if shares[worst] < OFF_SHARE:
+            break
+        off.append(worst)
+        remaining.remove(worst)
+    seen = len(off) + len(remaining)
+    everything = bool(off) and len(remaining) < max(2, (seen + 1) // 2)
+    return Suspects(tuple(off), tuple(pair for pair in errors if pair in bad), limit, everything)
+
+
+def accused(tracks: Tracks, suspects: Suspects, *, cleared: Collection[str] = ()) -> str | None:
+    """The camera, if any, that sees points farther from where the others say than these do, although its pairs look
+    well.
+
+    Along an epipolar line a match may lie anywhere: in a row of cameras, no pair reveals one that was turned along it.
+    Points of several cameras do.
+
+    Args:
+        tracks: points of the cameras that are not off.
+        suspects: the verdict so far.
+        cleared: cameras that are not to be named.
+    """
+    medians = {}
+    for name in tracks.names:
+        seen = tracks.residuals[tracks.of(name) & (tracks.views[tracks.point] >= LEAST_VIEWS)]
+        if name not in suspects.off and len(seen) >= LEAST_ACCUSING:
+            medians[name] = float(np.median(seen))
+    if len(medians) < LEAST_CAMERAS:
+        return None
+    named = [name for name in medians if name not in cleared]
+    if not named:
+        return None
+    worst = max(named, key=lambda name: medians[name])
+    others = float(np.median([median for name, median in medians.items() if name != worst]))
+    return worst if medians[worst] > ACCUSING_TIMES * others else None
+
+
+def _limit(errors: Mapping[Pair, PairError], cameras: Mapping[str, Camera]) -> float:
+    """Pixels; relative to the better pairs, because soft pictures have large errors in any calibration."""
+    width = max((camera.width for camera in cameras.values()), default=0)
+    typical = float(np.percentile([error.pixels for error in errors.values()], 25)) if errors else 0.0
+    floor = FLOOR_PIXELS * max(width / 1000, 1)
+    return max(floor, min(TIMES_TYPICAL * typical, 4 * floor))
+
+
+def _share(name: str, bad: Collection[Pair], weights: Mapping[Pair, int], off: Collection[str]) -> float:
+    """Share of a camera's matches, with cameras that are not off, that lie in bad pairs."""
+    own = {pair: weight for pair, weight in weights.items() if name in pair and not set(pair) & set(off)}
+    total = sum(own.values())
+    return sum(weight for pair, weight in own.items() if pair in bad) / total if total else 0.0
+
+
+def _amount(name: str, errors: Mapping[Pair, PairError], off: Collection[str]) -> float:
+    """Median error of a camera's pairs, to tell the culprit among cameras of equal shares."""
+    own = [error.pixels for pair, error in errors.items() if name in pair and not set(pair) & set(off)]
+    return float(np.median(own)) if own else 0.0
 
 
 @dataclass(frozen=True)

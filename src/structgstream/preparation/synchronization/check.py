@@ -14,7 +14,7 @@ from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import apart_seconds
 from structgstream.preparation.synchronization.changes import Changes, reduced_changes, reduced_picture
 from structgstream.preparation.synchronization.correlation import demand_scipy
-from structgstream.preparation.synchronization.geometry import CalibratedGeometry
+from structgstream.preparation.synchronization.epipolar import CalibratedGeometry
 from structgstream.preparation.synchronization.motion import (
     agreeing_cameras,
     pair_signals,

@@ -23,8 +23,7 @@ from structgstream.preparation.synchronization.correlation import (
     lag_changes,
     resampled,
 )
-from structgstream.preparation.synchronization.epipolar import line_signals
-from structgstream.preparation.synchronization.geometry import Geometry
+from structgstream.preparation.synchronization.epipolar import Geometry, line_signals
 from structgstream.preparation.synchronization.lines import Line, fitted_line
 from structgstream.preparation.synchronization.solving import Solution, Tie, connected, solve_clocks
 from structgstream.preparation.synchronization.streams import period_seconds

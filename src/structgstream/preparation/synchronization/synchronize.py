@@ -22,7 +22,7 @@ from structgstream.preparation.synchronization.audio import (
 )
 from structgstream.preparation.synchronization.changes import Changes, picture_changes
 from structgstream.preparation.synchronization.correlation import demand_scipy
-from structgstream.preparation.synchronization.geometry import (
+from structgstream.preparation.synchronization.epipolar import (
     CalibratedGeometry,
     Geometry,
     StaticGeometry,

@@ -149,7 +149,7 @@ def depth_distortion(gaussians: Gaussians, camera: Camera, *, scale: float, back
     The standard deviation of depth, weighted by blending weights, relative to the mean depth, averaged over the pixels
     with coverage above :data:`COVERED`. It takes one more rendering, with "colours" z, z^2 and 1.
     """
-    small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    small = camera.scaled(scale)
     viewport = small.viewport(gaussians.means)
     depths = gaussians.means @ viewport.viewmat[2, :3] + viewport.viewmat[2, 3]
     moments = torch.stack([depths, depths.square(), torch.ones_like(depths)], dim=1)
@@ -191,7 +191,7 @@ def in_free_space(scene: Scene, cameras: Sequence[Camera], *, config: FreeSpaceC
     drawn = torch.zeros_like(in_front)
     with torch.no_grad():
         for camera in cameras:
-            small = camera.resized(*(max(1, round(side * config.scale)) for side in (camera.width, camera.height)))
+            small = camera.scaled(config.scale)
             structured = scene.structured(small, backend)
             rows = structured.anchors
             before = _before_surfaces(scene.anchors.positions[rows], scene, small, config.depth_share, backend)

@@ -427,8 +427,7 @@ class Sweep:
 
 
 def _reduced(camera: Camera) -> Camera:
-    scale = min(1.0, DEPTH_WIDTH / camera.width)
-    return camera.resized(*(max(1, round(pixels * scale)) for pixels in (camera.width, camera.height)))
+    return camera.scaled(min(1.0, DEPTH_WIDTH / camera.width))
 
 
 @dataclass(frozen=True)

@@ -116,7 +116,7 @@ def _focus(
 ) -> ActiveTiles | None:
     in_motion = dynamic.gaussians(camera, backend)
     # Extents of Gaussians are measured on a reduced picture, which costs a sixteenth.
-    small = camera.resized(*(max(1, round(size * REACH_SCALE)) for size in (camera.width, camera.height)))
+    small = camera.scaled(REACH_SCALE)
     reach = draw(in_motion, small, backend)
     reach = replace(reach, radii=reach.radii * (camera.width / small.width))
     enlarged = enlargement(camera.width, camera.height)

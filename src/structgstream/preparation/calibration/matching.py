@@ -1,26 +1,117 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Matches of keypoints near each other's epipolar lines, once poses are known roughly.
+"""Which keypoints of cameras match: without poses, with rough ones, and which matches agree with poses.
 
 Among all keypoints of a picture many look alike; among those of one epipolar plane few do. So a camera whose scene has
-little texture gets several times the matches that it has without poses.
+little texture gets several times the matches once poses are known roughly.
 """
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
+from structgstream.data.descriptor_matches import mutual_matches
 from structgstream.data.lenses import LensCamera
-from structgstream.data.matching import Pair, distinct_best
+from structgstream.data.matching import Features, Pair, mutually_best
 from structgstream.preparation.calibration.keypoints import Keypoints
-from structgstream.preparation.calibration.posed_matches import camera_rays, epipolar_angles
 
 Indices = NDArray[np.intp]
-
 LEAST_SINE = 0.02  # rays along the baseline belong to every epipolar plane
+
+
+@dataclass(frozen=True)
+class KeypointMatchConfig:
+    """How keypoints of two cameras are matched.
+
+    Args:
+        ratio: largest ratio of the best to the second-best descriptor distance.
+        distance: largest descriptor distance of a match; unit descriptors are at most sqrt(2) apart.
+    """
+
+    ratio: float = 0.85
+    distance: float = 0.8
+
+
+def keypoint_matches(
+    first: Keypoints, second: Keypoints, *, config: KeypointMatchConfig = KeypointMatchConfig()
+) -> NDArray[np.uint32]:
+    """Mutually best matches ``[S, 2]``, indices into the two lists, of keypoints that share an instant."""
+    seen = None if first.seen.shape[1] == 1 else (first.seen, second.seen)
+    found = mutual_matches(
+        first.descriptors, second.descriptors, ratio=config.ratio, distance=config.distance, seen=seen
+    )
+    return found.astype(np.uint32)
+
+
+def all_matches(
+    keypoints: Mapping[str, Keypoints], *, workers: int, config: KeypointMatchConfig = KeypointMatchConfig()
+) -> dict[Pair, NDArray[np.uint32]]:
+    """:func:`keypoint_matches` of every pair of cameras."""
+    pairs = list(combinations(keypoints, 2))
+    with ThreadPoolExecutor(workers) as pool:
+        found = pool.map(lambda pair: keypoint_matches(keypoints[pair[0]], keypoints[pair[1]], config=config), pairs)
+        return dict(zip(pairs, found, strict=True))
+
+
+def camera_rays(filmed: LensCamera, pixels: Floats) -> Floats:
+    """Unit directions ``[S, 3]`` in the world of pixels as filmed; NaN where the lens shows nothing."""
+    flat = filmed.to_normalized(pixels)
+    rays = np.concatenate([flat, np.ones((len(flat), 1))], 1) @ filmed.camera.viewmat[:3, :3].numpy()
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def epipolar_angles(cameras: tuple[LensCamera, LensCamera], rays: tuple[Floats, Floats]) -> Floats:
+    """Angle ``[S]`` in radians of each pair of rays to their epipolar plane, the larger one of the two cameras.
+
+    Rays that meet behind the cameras count as being a right angle off.
+    """
+    base = (cameras[1].camera.center - cameras[0].camera.center).numpy()
+    length = np.linalg.norm(base)
+    if length == 0:
+        return np.arccos(np.clip((rays[0] * rays[1]).sum(1), -1, 1))
+    base = base / length
+    volume = np.abs((np.cross(base, rays[0]) * rays[1]).sum(1))
+    widest = [np.linalg.norm(np.cross(base, ray), axis=1) for ray in rays]
+    angles = np.arcsin(np.clip(volume / np.maximum(np.minimum(*widest), 1e-12), 0, 1))
+    # In the epipolar plane the two rays turn towards each other, unless they meet behind.
+    ahead = (rays[0] @ base) - (rays[1] @ base) > -1e-3
+    return np.where(ahead, angles, np.pi / 2)
+
+
+def agreeing_matches(
+    keypoints: Mapping[str, Keypoints],
+    matches: Mapping[Pair, NDArray[np.uint32]],
+    cameras: Mapping[str, LensCamera],
+    *,
+    degrees: float,
+) -> dict[Pair, NDArray[np.uint32]]:
+    """The matches whose rays pass within ``degrees`` of their epipolar plane."""
+    rays = {name: camera_rays(cameras[name], keypoints[name].pixels) for name in cameras}
+    found = {}
+    for (one, two), pairs in matches.items():
+        angles = epipolar_angles((cameras[one], cameras[two]), (rays[one][pairs[:, 0]], rays[two][pairs[:, 1]]))
+        found[one, two] = pairs[angles < np.radians(degrees)]
+    return found
+
+
+def epipolar_pixels(
+    keypoints: Mapping[str, Keypoints],
+    matches: Mapping[Pair, NDArray[np.uint32]],
+    cameras: Mapping[str, LensCamera],
+) -> dict[Pair, Floats]:
+    """Distance of each match to its epipolar plane, in pixels of the longer of the two focal lengths."""
+    rays = {name: camera_rays(cameras[name], keypoints[name].pixels) for name in cameras}
+    found = {}
+    for (one, two), pairs in matches.items():
+        focal = max(float(cameras[name].camera.K[0, 0]) for name in (one, two))
+        found[one, two] = focal * epipolar_angles(
+            (cameras[one], cameras[two]), (rays[one][pairs[:, 0]], rays[two][pairs[:, 1]])
+        )
+    return found
 
 
 @dataclass(frozen=True)
@@ -121,12 +212,13 @@ def _best(
     first, second = keypoints
     together = (first.seen[row] & second.seen[column]).any(1)
     row, column = row[together], column[together]
-    alike = np.einsum("sd,sd->s", first.descriptors[row], second.descriptors[column])
-    cost = np.sqrt(np.maximum(2 - 2 * alike, 1e-12))
-    there = distinct_best(
-        row, column, cost, second.pixels, ratio=config.ratio, distinct_pixels=config.distinct_pixels
-    )  # fmt: skip
-    back = distinct_best(column, row, cost, first.pixels, ratio=config.ratio, distinct_pixels=config.distinct_pixels)
-    kept = np.intersect1d(there, back)
-    kept = kept[cost[kept] < config.distance]
-    return np.stack([row[kept], column[kept]], 1).astype(np.uint32)
+    found = mutually_best(
+        Features(first.pixels, first.descriptors),
+        Features(second.pixels, second.descriptors),
+        row,
+        column,
+        ratio=config.ratio,
+        distinct_pixels=config.distinct_pixels,
+        distance=config.distance,
+    )
+    return found.astype(np.uint32)
