@@ -7,13 +7,12 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from filmed import Film, noise_texture, ring, room
+from filmed import Film, ring, room
 from structgstream.data.lenses import LensCamera, RadialTangential
 from structgstream.data.posed import rotation_matrix
-from structgstream.errors import CalibrationError, CaptureError, ConfigError
+from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.comparison import calibration_errors
 from structgstream.preparation.calibration.refinement import refine
-from structgstream.preparation.calibration.triangulation import triangulated
 
 LENS = RadialTangential(k1=-0.12, k2=0.02)
 Pictures = dict[str, list[NDArray[np.uint8]]]
@@ -124,29 +123,3 @@ def test_a_lens_that_cannot_be_refined_is_refused() -> None:
     rig, pictures = filmed()
     with pytest.raises(ConfigError, match="model brown cannot be refined; take opencv"):
         refine(pictures, rig, free="lens", lens="brown")
-
-
-def test_points_lie_on_the_room_and_cameras_stay() -> None:
-    rig, pictures = filmed()
-    found = triangulated(pictures, rig, metres=True)
-    assert len(found.points) > 300
-    assert np.median(found.errors()) < 0.3
-    depths = []
-    for plane in room():
-        local = (found.points - plane.pose[:3, 3]) @ plane.pose[:3, :3]
-        beside = (np.maximum(0, np.maximum(-local[:, :2], local[:, :2] - plane.size))).max(1)
-        depths.append(np.hypot(local[:, 2], beside))
-    assert np.median(np.min(depths, axis=0)) < 0.01  # of a room four units wide
-    assert found.metres
-    assert all(found.cameras[name] is rig[name] for name in rig)
-
-
-def test_a_calibration_of_other_pictures_is_refused() -> None:
-    rig, pictures = filmed()
-    others = {name: [noise_texture(index, size=320)[:240]] for index, name in enumerate(rig)}
-    with pytest.raises(CalibrationError, match="No point agrees with the poses of the 5 cameras"):
-        triangulated(others, rig)
-    with pytest.raises(CaptureError, match="no pictures of camera 'more'"):
-        triangulated(pictures, rig | {"more": rig["cam00"]})
-    with pytest.raises(CalibrationError, match="have 160x240 pixels, its calibration is for 320x240"):
-        triangulated(pictures | {"cam01": [pictures["cam01"][0][:, :160]]}, rig)

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of made observations; those of pairs and in other coordinates are tried in ``test_coordinates``."""
+"""Errors of made observations; those in other coordinates are in ``test_coordinates``."""
 
 import numpy as np
-import pytest
 
 from filmed import ring
 from structgstream.data.lenses import LensCamera, RadialTangential
@@ -22,20 +21,13 @@ def test_errors_follow_the_lens() -> None:
     rig = ring(2, radius=2.6, arc_degrees=40, lens=RadialTangential(k1=-0.12))
     found = solved(rig, cloud(3), [(0, 0, (3.0, -4.0)), (0, 1, (0.0, 0.0)), (2, 1, (0.0, 1.0))])
     np.testing.assert_allclose(found.residuals(), [[-3, 4], [0, 0], [0, -1]], atol=1e-9)
-    assert found.camera_errors() == pytest.approx({"cam00": 5.0, "cam01": 0.5})
+    np.testing.assert_allclose(found.errors(), [5, 0, 1], atol=1e-9)
     assert found.track_lengths().tolist() == [2, 0, 1]
-    np.testing.assert_allclose(found.point_errors(), [2.5, np.nan, 1.0])
-    (pair,) = found.pair_errors().values()
-    assert (pair.points, pair.median_pixels) == (1, pytest.approx(5.0))
 
 
 def test_what_a_camera_cannot_see_has_no_error() -> None:
-    """A point behind it, and a camera without observations."""
+    """A point behind it."""
     rig = ring(2, radius=2.6, arc_degrees=40)
     behind = 3 * next(iter(rig.values())).camera.center.numpy()[None]
     found = solved(rig, behind, [(0, 0, (1.0, 1.0))])
     assert np.isnan(found.errors()).all()
-    assert np.isnan(found.camera_errors()["cam01"])
-    (pair,) = found.pair_errors().values()
-    assert pair.points == 0
-    assert np.isnan(pair.median_pixels)

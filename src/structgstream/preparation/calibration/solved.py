@@ -3,7 +3,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from structgstream.data.alignment import Alignment
 from structgstream.data.arrays import Floats
 from structgstream.data.lenses import LensCamera
-from structgstream.data.matching import Pair, level_normal
+from structgstream.data.matching import level_normal
 from structgstream.errors import CalibrationError
 
 Indices = NDArray[np.intp]
@@ -35,19 +34,6 @@ class Observations:
 
     def __len__(self) -> int:
         return len(self.point)
-
-
-@dataclass(frozen=True)
-class PairError:
-    """How well two cameras agree.
-
-    Args:
-        points: number of points that both see.
-        median_pixels: median over them of the larger of the two reprojection errors; nan without points.
-    """
-
-    points: int
-    median_pixels: float
 
 
 @dataclass(frozen=True)
@@ -81,32 +67,9 @@ class SolvedCalibration:
         """Length ``[M]`` of :meth:`residuals`, pixels."""
         return np.linalg.norm(self.residuals(), axis=1)
 
-    def camera_errors(self) -> dict[str, float]:
-        """Median reprojection error of each camera, pixels; nan for one without observations."""
-        errors = self.errors()
-        return {name: _median(errors[self.observations.camera == index]) for index, name in enumerate(self.cameras)}
-
-    def pair_errors(self) -> dict[Pair, PairError]:
-        """Agreement of each pair of cameras."""
-        errors = np.full((len(self.points), len(self.cameras)), np.nan)
-        errors[self.observations.point, self.observations.camera] = self.errors()
-        names = list(self.cameras)
-        found = {}
-        for one, two in combinations(range(len(names)), 2):
-            larger = np.maximum(errors[:, one], errors[:, two])
-            larger = larger[np.isfinite(larger)]
-            found[names[one], names[two]] = PairError(len(larger), _median(larger))
-        return found
-
     def track_lengths(self) -> Indices:
         """Number of observations ``[P]`` of each point."""
         return np.bincount(self.observations.point, minlength=len(self.points))
-
-    def point_errors(self) -> Floats:
-        """Mean reprojection error ``[P]`` of each point, pixels; nan without observations."""
-        total = np.bincount(self.observations.point, self.errors(), len(self.points))
-        with np.errstate(invalid="ignore"):
-            return total / self.track_lengths()
 
     def aligned(self, alignment: Alignment, *, metres: bool | None = None) -> "SolvedCalibration":
         """The same calibration in other coordinates; pictures and errors stay what they are."""
@@ -116,10 +79,6 @@ class SolvedCalibration:
             points=alignment.points(self.points),
             metres=self.metres if metres is None else metres,
         )
-
-
-def _median(values: Floats) -> float:
-    return float(np.median(values)) if len(values) else float("nan")
 
 
 def normalized(solved: SolvedCalibration) -> SolvedCalibration:

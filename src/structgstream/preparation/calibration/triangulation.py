@@ -13,13 +13,10 @@ from numpy.typing import NDArray
 
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Pair
-from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.colmap import colmap_camera, colmap_pose, pycolmap_module
 from structgstream.preparation.calibration.keypoints import KeypointConfig, Keypoints, all_keypoints
-from structgstream.preparation.calibration.mapping import filtered, observed
 from structgstream.preparation.calibration.matching import KeypointMatchConfig, agreeing_matches, all_matches
 from structgstream.preparation.calibration.pictures import checked_pictures
-from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.calibration.view_graph import PairConfig, verified_pairs, write_database
 
 
@@ -51,35 +48,6 @@ class PosedGraph:
     keypoints: Mapping[str, Keypoints]
     matches: Mapping[Pair, NDArray[np.uint32]]
     geometries: Mapping[Pair, Any]
-
-
-def triangulated(
-    pictures: Mapping[str, Sequence[NDArray[np.uint8]]],
-    cameras: Mapping[str, LensCamera],
-    *,
-    masks: Mapping[str, Sequence[NDArray[np.bool_]]] | None = None,
-    metres: bool = False,
-    seed: int = 0,
-    config: TriangulationConfig = TriangulationConfig(),
-) -> SolvedCalibration:
-    """The given ``cameras`` as they are, with points from pictures of the same instants.
-
-    Raises:
-        CalibrationError: no point agrees with the poses, or pictures that do not belong to the cameras.
-        MissingExtraError: pycolmap or cv2 is not installed.
-    """
-    graph = posed_graph(pictures, cameras, masks=masks, seed=seed, config=config)
-    longest = max(max(filmed.camera.width, filmed.camera.height) for filmed in cameras.values())
-    limit = max(1.0, config.pixels * longest / 1000)
-    model = posed_model(graph, cameras, pixels=limit, slack_degrees=config.slack_degrees)
-    filtered(model, pixels=limit, degrees=config.degrees)
-    points, observations = observed(model, graph.keypoints, {name: index for index, name in enumerate(cameras)})
-    if not len(points):
-        raise CalibrationError(
-            f"No point agrees with the poses of the {len(cameras)} cameras: the calibration does not belong to these "
-            "pictures, or the cameras see too little in common."
-        )
-    return SolvedCalibration(dict(cameras), points, observations, metres=metres)
 
 
 def posed_graph(
