@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 
 from structgstream.data.plane_sweep import SweepConfig
+from structgstream.data.points import PointsConfig
 from structgstream.presets import PRESETS, RIG, TINY
-from tests.varied import varied
 
 TINY_RIG = replace(
     RIG,
@@ -26,7 +26,14 @@ TINY_RIG = replace(
 )
 """Paper mode as small as the preset tiny: float32, everything fitted in every frame, births by gradients."""
 
-FEW_POINTS = varied(replace(TINY.points, max_points=1_500), SWEEP_LEVELS=(SweepConfig(width=60, planes=(8, 12)),))
+
+class FewSweeps(PointsConfig):
+    """One coarse plane sweep. A class of this module, so that configurations can be sent to another process."""
+
+    SWEEP_LEVELS = (SweepConfig(width=60, planes=(8, 12)),)
+
+
+FEW_POINTS = FewSweeps(max_points=1_500)
 """Initial points for pictures of 80x60 pixels, in a tenth of the time that the usual sweeps and their points take."""
 
 QUICK = replace(

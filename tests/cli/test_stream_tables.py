@@ -61,7 +61,7 @@ def test_what_a_stream_is_in_a_line_for_each_fact() -> None:
         "size 5.0 kB, header 1.0 kB",
         "rate 0.02 Mbit/s without the header",
         "came, went anchors (+5 -2), free Gaussians (+4 -0), says the log",
-        "acts lifted 7, jumps 0",
+        "acts displaced 7, scene cuts 0",
         "state complete: its run ended or was stopped in order",
     ):
         assert line in lines
