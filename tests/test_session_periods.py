@@ -85,8 +85,9 @@ def test_stopped_after_any_frame_it_goes_on_to_the_same_bytes(case: str, tmp_pat
     ends = {record.end for record in records}
     (second,) = (record for record in records[1:] if record.type == RecordType.INIT)
     path = tmp_path / "a.sgs"
-    for cut in sorted({*ends, second.offset + 100, second.end + 40}):
-        if cut <= records[0].end or (case == "points" and cut < second.offset):
+    near = [end for end in ends if second.offset <= end] if case == "points" else sorted(ends)[1::2]
+    for cut in sorted({*near, second.offset, second.offset + 100, second.end, second.end + 40}):
+        if cut <= records[0].end:
             continue
         path.write_bytes(data[:cut])
         sink, resumed = FileSink.resume(path)
@@ -95,15 +96,16 @@ def test_stopped_after_any_frame_it_goes_on_to_the_same_bytes(case: str, tmp_pat
 
 
 def test_a_killed_writer_of_segments_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
-    """Killed around the operations with which the second period begins, and at the end."""
+    """Killed before each of the operations with which the second period begins."""
     data, _ = whole("residual")
     counted = KilledStore(folder(tmp_path / "counted"), at=10**6, done=True)
     run(resume_segments(counted)[0], BY_RESIDUAL)
     begins = next(at for at, what in enumerate(counted.operations) if "init-0001" in what)
-    for at in range(begins - 1, begins + 5):
+    # After an operation is before the next one.
+    for at in range(begins, begins + 3):
         store = folder(tmp_path / f"{at}")
         with pytest.raises(Killed):
-            run(resume_segments(KilledStore(store, at=at, done=bool(at % 2)), clocks=Hands().clocks())[0], BY_RESIDUAL)
+            run(resume_segments(KilledStore(store, at=at, done=False), clocks=Hands().clocks())[0], BY_RESIDUAL)
         sink, resumed = resume_segments(store)
         run(sink, BY_RESIDUAL, resumed=resumed)
         write_archive(store, tmp_path / "out.sgs")

@@ -82,11 +82,11 @@ def counts_of(fields: Fields, decode: Callable[[Fields], object]) -> list[Count]
 
 
 def enlarged(fields: Fields, counts: list[Count]) -> Iterator[tuple[Count, int, Fields]]:
-    all_values = {*thinned(counts)}
+    more = {*thinned(counts)}
     for count in counts:
         data = fields[count.field]
-        # The least of them is the one for which most memory would be there.
-        for value in (*HUGE, 2**35 - 1) if count in all_values else HUGE[:1]:
+        # More than 32 bits are refused where any number is read.
+        for value in (*HUGE, 2**35 - 1) if count in more else HUGE:
             yield count, value, {**fields, count.field: data[: count.start] + varint(value) + data[count.end :]}
 
 

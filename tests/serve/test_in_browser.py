@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from chromium import Tab, opened_browser
+from chromium import Browser, Tab, opened_browser
 from pictures import decoded_picture
 from rigs import random_scene
 from serving import served
@@ -56,9 +56,15 @@ def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with opened_browser(tmp_path_factory.mktemp("browser")) as opened:
+        yield opened
+
+
 @pytest.fixture
-def tab(tmp_path: Path) -> Iterator[Tab]:
-    with opened_browser(tmp_path) as opened:
+def tab(browser: Browser) -> Iterator[Tab]:
+    with browser.opened_tab() as opened:
         yield opened
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chromium import Tab, opened_browser
+from chromium import Browser, Tab, opened_browser
 from rigs import random_scene
 from segment_folders import GrowingFolder
 from serving import hosted
@@ -30,9 +30,15 @@ def answered(metrics: str, kind: str, stream: str) -> bool:
     return re.search(sample, metrics) is not None
 
 
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with opened_browser(tmp_path_factory.mktemp("browser")) as opened:
+        yield opened
+
+
 @pytest.fixture
-def tab(tmp_path: Path) -> Iterator[Tab]:
-    with opened_browser(tmp_path) as opened:
+def tab(browser: Browser) -> Iterator[Tab]:
+    with browser.opened_tab() as opened:
         yield opened
 
 
@@ -101,7 +107,7 @@ def test_a_page_switches_between_the_qualities_of_a_stream(tab: Tab, tmp_path: P
         return server.ask("/metrics", Authorization=f"Bearer {all_streams}").body.decode()
 
     with hosted(ServerSettings(folder, keys=KEYS)) as server:
-        tab.open(f"{server.address}streams/show/?token={token}", width=900, height=600)
+        tab.open(f"{server.address}streams/show/?token={token}", width=360, height=240)
         tab.wait_for(SHOWN)
         low = shown(2)
         assert answered(numbers(), "segment", "show/low")
