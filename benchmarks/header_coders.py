@@ -3,9 +3,9 @@
 
     python -m benchmarks.header_coders FILE OUT
 
-`viewer/packages/core/bench/header.mjs` decodes OUT. It begins with the length of a JSON text, u32, and that text: the bytes of
-each field, and each array's name, number of values and number of contexts. The contexts of each array follow, u8, then
-the bytes of each field. Contexts are those of the init record's frequency tables.
+`viewer/packages/core/bench/header.mjs` decodes OUT. It begins with the length of a JSON text, u32, and that text: the
+bytes of each field, and each array's name, number of values and number of contexts. The contexts of each array follow,
+u8, then the bytes of each field. Contexts are those of the init record's frequency tables.
 """
 
 import json
@@ -17,12 +17,12 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.arrays import Bins, Contexts, Naturals
 from structgstream.codec.entropy.adaptive import AdaptiveEncoder
+from structgstream.codec.entropy.bits import Bins, Contexts, Naturals
 from structgstream.codec.entropy.models import Models
 from structgstream.codec.entropy.section_coder import SectionEncoder, Tables
+from structgstream.codec.fields import static_fields
 from structgstream.codec.reader import open_stream
-from structgstream.codec.scene import static_fields
 
 
 class Both(SectionEncoder):
