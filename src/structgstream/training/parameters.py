@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import Camera, enlargement
-from structgstream.codec.fields.quantization import round_all_straight_through, trainable
+from structgstream.codec.fields.quantization import round_all_straight_through
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
@@ -21,6 +21,7 @@ from structgstream.scene.state import (
     scene_of,
     state_of,
     tensor_of,
+    trainable,
 )
 
 # The quality multiplies a field of RoundingConfig by 2^(-quality * share); the share is 1 unless stated. For frame 0 it

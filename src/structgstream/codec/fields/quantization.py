@@ -22,7 +22,7 @@ from torch import Tensor
 from structgstream.codec.entropy.bits import Bins
 from structgstream.errors import StreamError
 from structgstream.kernels.backend import Backend
-from structgstream.scene.state import FieldName, Granularity, ParameterName, fields_of, parameters_of
+from structgstream.scene.state import FieldName, ParameterName, trainable
 
 # torch's operations on lists of tensors have a leading underscore; its own optimisers are built on them.
 # pyright: reportPrivateImportUsage=false
@@ -98,11 +98,6 @@ def round_straight_through(value: Tensor, step: float) -> Tensor:
 def round_all_straight_through(values: Sequence[Tensor], steps: Sequence[float]) -> tuple[Tensor, ...]:
     """Each of ``values`` on the grid of its step; the gradients are those of ``values``."""
     return _RoundStraightThrough.apply([*steps], *values) if values else ()  # type: ignore[return-value]
-
-
-def trainable(*granularities: Granularity) -> tuple[ParameterName, ...]:
-    """The trainable parameters of the fields of ``granularities``, in the order of the state table."""
-    return tuple(p.name for p in parameters_of(fields_of(*granularities)) if p.trainable)
 
 
 _BITS_PER_KB: Final = 8000
