@@ -54,7 +54,7 @@ _HOMES = {
     "MultiViewFrame": "frames",
     "PRESETS": "presets",
     "Packet": "codec.packets",
-    "PacketInfo": "codec.packet_table",
+    "PacketInfo": "codec.contents",
     "PacketKind": "codec.packets",
     "PeakKind": "memory",
     "Pipeline": "pipeline",
