@@ -11,9 +11,10 @@ from benchmarks.benchmark import Benchmark, Growth, Target, Variant
 from benchmarks.contest import Contestant, Quantity, Results
 from structgstream.cameras import Camera, CameraRig
 from structgstream.codec.container.blocks import pack_raw_block, unpack_raw_blocks
+from structgstream.codec.decoder import CompactDecoder, CompactState
+from structgstream.codec.encoder import CompactEncoder
+from structgstream.codec.fields.packet_fields import dequantize_state, quantize_state
 from structgstream.codec.packets import PacketKind, StreamHeader
-from structgstream.codec.scene.bins import dequantize_state, quantize_state
-from structgstream.codec.scene.compact import CompactDecoder, CompactEncoder, CompactState
 from structgstream.scene.order import morton_order
 from structgstream.scene.state import FieldName
 from structgstream.similarity import Similarity

@@ -12,10 +12,9 @@ import zstandard
 from benchmarks.benchmark import Benchmark, Growth, Target, Variant
 from benchmarks.contest import Contestant, Quantity, Results
 from structgstream.codec.entropy import rans
-from structgstream.codec.entropy.residual_symbols import ALPHABET, residuals_to_symbols
+from structgstream.codec.entropy.bits import ALPHABET, residuals_to_symbols
 from structgstream.codec.entropy.table_choice import choose_tables
-from structgstream.codec.entropy.table_sets import decode_tables
-from structgstream.codec.entropy.tables import FrequencyTables, geometric
+from structgstream.codec.entropy.tables import FrequencyTables, decode_tables, geometric
 
 CONTEXTS = 50
 Symbols = tuple[np.ndarray, np.ndarray, np.ndarray]

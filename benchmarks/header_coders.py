@@ -17,12 +17,12 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.arrays import Bins, Contexts, Naturals
 from structgstream.codec.entropy.adaptive import AdaptiveEncoder
+from structgstream.codec.entropy.bits import Bins, Contexts, Naturals
 from structgstream.codec.entropy.models import Models
 from structgstream.codec.entropy.section_coder import SectionEncoder, Tables
+from structgstream.codec.fields import static_fields
 from structgstream.codec.reader import open_stream
-from structgstream.codec.scene import static_fields
 
 
 class Both(SectionEncoder):

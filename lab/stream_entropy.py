@@ -11,8 +11,8 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.arrays import Contexts
 from structgstream.codec.entropy.adaptive import AdaptiveDecoder
+from structgstream.codec.entropy.bits import Contexts
 from structgstream.codec.entropy.section_coder import SectionDecoder
 from structgstream.codec.reader import open_stream
 

@@ -4,10 +4,8 @@
 from dataclasses import replace
 from pathlib import Path
 
-from structgstream.codec.container.payload import parse_packet
 from structgstream.codec.container.records import PREFIX, RecordType, read_record, scan_records
-from structgstream.codec.packets import PacketKind
-from structgstream.codec.segments.group import part_of, segment_of
+from structgstream.codec.packets import PacketKind, parse_packet
 from structgstream.codec.segments.manifest import (
     MANIFEST,
     Edge,
@@ -17,9 +15,10 @@ from structgstream.codec.segments.manifest import (
     SegmentEntry,
     Window,
     init_name,
+    manifest_to_json,
     sha256_of,
 )
-from structgstream.codec.segments.manifest_json import manifest_to_json
+from structgstream.codec.segments.next_manifest import part_of, segment_of
 from structgstream.codec.segments.store import FolderStore
 
 _KINDS = {RecordType.KEY: PacketKind.KEY, RecordType.DELTA: PacketKind.DELTA}

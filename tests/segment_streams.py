@@ -11,8 +11,7 @@ from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.sink import Clocks, SegmentsSink
 from structgstream.codec.segments.store import FolderStore, Store
-from structgstream.codec.sinks import MemorySink
-from structgstream.codec.stored_segments import StoredSegments, resume_segments
+from structgstream.codec.sinks import MemorySink, StoredSegments, resume_segments
 
 
 class Killed(BaseException):

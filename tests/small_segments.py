@@ -7,11 +7,10 @@ from functools import cache
 from pathlib import Path
 
 from streams import header_for, moved, small_scene, small_stream
-from structgstream.codec.container.payload import parse_packet
 from structgstream.codec.container.records import PREFIX, read_record
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.header import unpack_header
-from structgstream.codec.packets import Packet, PacketKind
+from structgstream.codec.packets import Packet, PacketKind, parse_packet
 from structgstream.groups.base import GroupBase
 from structgstream.groups.segment_file import SegmentIdentity
 from structgstream.groups.segment_sink import SegmentSink

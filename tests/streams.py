@@ -8,10 +8,10 @@ import torch
 
 from rigs import arc_rig, random_scene
 from structgstream.codec.encoder import SceneEncoder
+from structgstream.codec.fields.packet_fields import FREE_FIELDS, dequantize_state, quantize_state
+from structgstream.codec.fields.quantization import round_to_bins
+from structgstream.codec.fields.static_fields import UNCODED_FIELDS
 from structgstream.codec.packets import PacketKind, PacketSink, StreamHeader
-from structgstream.codec.scene.bins import dequantize_state, quantize_state, round_to_bins
-from structgstream.codec.scene.compact import FREE_FIELDS
-from structgstream.codec.scene.static_fields import UNCODED_FIELDS
 from structgstream.codec.sinks import MemorySink
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, parameters_of, scene_of, state_of

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.codec.segments.cloud_store import CloudStore
+from structgstream.codec.segments.store import CloudStore
 from structgstream.data.live.rig_file import read_rig
 from structgstream.errors import CaptureError, MissingExtraError, StorageError
 from structgstream.parallel.object_folder import ObjectFolder

@@ -15,9 +15,8 @@ from segment_streams import Hands, Killed, KilledStore, folder
 from streams import same
 from structgstream.codec.container.records import RecordType, scan_records
 from structgstream.codec.reader import StreamReader
-from structgstream.codec.segments.archive import write_archive
-from structgstream.codec.sinks import FileSink, MemorySink
-from structgstream.codec.stored_segments import resume_segments
+from structgstream.codec.segments.stored_bytes import write_archive
+from structgstream.codec.sinks import FileSink, MemorySink, resume_segments
 from structgstream.frames import MultiViewFrame
 from structgstream.periods import PeriodConfig
 from structgstream.presets import StreamConfig, to_json

@@ -8,11 +8,10 @@ import pytest
 
 from segment_streams import Hands, folder
 from small_presets import TINY_RIG
-from structgstream.codec.segments.archive import write_archive
 from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
-from structgstream.codec.segments.stored_bytes import read_manifest
-from structgstream.codec.stored_segments import resume_segments
+from structgstream.codec.segments.stored_bytes import read_manifest, write_archive
+from structgstream.codec.sinks import resume_segments
 from structgstream.kernels.backend import reference_backend
 from structgstream.session import Session
 from structgstream.struct_gstream import stream_pipeline

@@ -29,8 +29,7 @@ from lab.robustness.stream_writers import Sent, content, edge_of
 from structgstream.codec.packets import PacketSink
 from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
-from structgstream.codec.sinks import MemorySink
-from structgstream.codec.stored_segments import resume_segments
+from structgstream.codec.sinks import MemorySink, resume_segments
 
 PACE_SECONDS = 0.1
 NAME = "live"

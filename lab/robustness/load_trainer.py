@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from structgstream.codec.container.packet_head import FRAME
+from structgstream.codec.container.records import FRAME
 from structgstream.codec.packets import Packet
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.segments.sink import SegmentsSink

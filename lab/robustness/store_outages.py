@@ -28,14 +28,11 @@ from benchmarks.machine import load_average, machine
 from lab.robustness.stream_writers import OPTIONS, Sent, content, real_writer, repeated
 from structgstream.codec.container.records import footer_offset
 from structgstream.codec.reader import open_stream
-from structgstream.codec.segments.archive import write_archive
-from structgstream.codec.segments.cloud_store import CloudStore
-from structgstream.codec.segments.manifest import MANIFEST
-from structgstream.codec.segments.manifest_json import manifest_from_json
+from structgstream.codec.segments.manifest import MANIFEST, manifest_from_json
 from structgstream.codec.segments.mirror import MirroredStore, MirrorOptions
-from structgstream.codec.segments.store import FolderStore
-from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest
-from structgstream.codec.stored_segments import resume_segments
+from structgstream.codec.segments.store import CloudStore, FolderStore
+from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest, write_archive
+from structgstream.codec.sinks import resume_segments
 from structgstream.errors import StreamError
 
 FRAMES = 100

@@ -13,7 +13,7 @@ from pathlib import Path
 from lab.robustness.stream_writers import OPTIONS, Row, Sent, content, edge_of, readable, send
 from structgstream.codec.segments.mirror import MirroredStore
 from structgstream.codec.segments.store import FolderStore, Store
-from structgstream.codec.stored_segments import resume_segments
+from structgstream.codec.sinks import resume_segments
 from structgstream.errors import StorageError
 
 DISK_BYTES = 3_000_000

@@ -7,17 +7,14 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from structgstream.codec.container.packet_head import FRAME
-from structgstream.codec.container.records import footer_offset
+from structgstream.codec.container.records import FRAME, footer_offset
 from structgstream.codec.packets import Packet, PacketSink, StreamHeader
 from structgstream.codec.reader import StreamReader, open_stream
-from structgstream.codec.segments.archive import write_archive
 from structgstream.codec.segments.recovery import find
 from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
-from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest
-from structgstream.codec.sinks import FileSink, MemorySink
-from structgstream.codec.stored_segments import resume_segments
+from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest, write_archive
+from structgstream.codec.sinks import FileSink, MemorySink, resume_segments
 from structgstream.errors import StreamError
 
 PACE_SECONDS = 0.004

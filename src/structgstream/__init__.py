@@ -17,7 +17,7 @@ from structgstream.version import __version__ as __version__
 if TYPE_CHECKING:
     from structgstream.api import check, evaluate, example_clip, export, prepare, reconstruct
     from structgstream.cameras import Camera, CameraRig
-    from structgstream.codec.packet_table import PacketInfo
+    from structgstream.codec.contents import PacketInfo
     from structgstream.codec.packets import Packet, PacketKind, StreamHeader
     from structgstream.codec.reader import StreamReader, open_stream
     from structgstream.codec.sinks import FileSink, MemorySink
@@ -54,7 +54,7 @@ _HOMES = {
     "MultiViewFrame": "frames",
     "PRESETS": "presets",
     "Packet": "codec.packets",
-    "PacketInfo": "codec.packet_table",
+    "PacketInfo": "codec.contents",
     "PacketKind": "codec.packets",
     "PeakKind": "memory",
     "Pipeline": "pipeline",

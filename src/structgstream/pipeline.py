@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import CameraRig
-from structgstream.codec.container.periods import Period
+from structgstream.codec.container.index import Period
+from structgstream.codec.contents import PacketInfo
 from structgstream.codec.encoder import Encoded
-from structgstream.codec.packet_table import PacketInfo
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
 from structgstream.data.denoising import DenoisingConfig
 from structgstream.data.points import PointsConfig

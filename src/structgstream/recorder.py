@@ -14,7 +14,7 @@ from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.sink import Clocks, SegmentsSink
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.codec.segments.stored_bytes import read_manifest
-from structgstream.codec.stored_segments import StoredSegments, resume_segments
+from structgstream.codec.sinks import StoredSegments, resume_segments
 from structgstream.data.prefetch import read_ahead
 from structgstream.data.source import FrameStream, frame_count
 from structgstream.errors import StorageError, StreamError

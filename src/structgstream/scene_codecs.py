@@ -6,13 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from structgstream.codec.encoder import SceneEncoder
+from structgstream.codec.fields.quantization import float32, round_to_bins
 from structgstream.codec.packets import StreamHeader
 from structgstream.codec.reader import StreamReader
-from structgstream.codec.scene.bins import round_to_bins
 from structgstream.codec.sinks import FileSink
 from structgstream.errors import CalibrationError
 from structgstream.pipeline import FrameTask, StreamFacts
@@ -21,7 +20,7 @@ from structgstream.scene.appearance import with_appearance
 from structgstream.scene.order import in_morton_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, fields_of, parameters_of, scene_of, state_of, with_dynamic_fields
-from structgstream.training.frame0.quantization import estimate_sensitivity, float32, quantize_first_frame, regauge
+from structgstream.training.frame0.quantization import estimate_sensitivity, quantize_first_frame, regauge
 from structgstream.training.parameters import pixel_size
 
 
@@ -112,7 +111,7 @@ class RawCodec(SceneCodec):
 
 @dataclass(frozen=True)
 class CompactCodec(SceneCodec):
-    """All values are quantized (``training/parameters.py``, Note [Bins]); anchors are in Z-order."""
+    """All values are quantized (``codec/fields/quantization.py``, Note [Bins]); anchors are in Z-order."""
 
     def _initialize_stream(self, scene: Scene, task: FrameTask) -> tuple[Scene, QuantizationSteps]:
         dynamic, rounding = self.config.online.dynamic, self.config.online.rounding
@@ -126,7 +125,7 @@ class CompactCodec(SceneCodec):
             )
         known = rounding.steps(pixel)
         used = {parameter.name for parameter in parameters_of(dynamic)}
-        steps = {name: float(np.float32(step)) for name, step in known.items() if name in used}
+        steps = {name: float32(step) for name, step in known.items() if name in used}
         voxel_size = self.config.initial.voxel_size
         scene, init_steps = quantize_first_frame(
             scene, sensitivity, config=rounding, voxel_size=voxel_size, steps=steps

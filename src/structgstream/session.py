@@ -11,11 +11,11 @@ from contextlib import suppress
 from functools import partial
 from typing import Generic
 
-from structgstream.codec.container.periods import Period
+from structgstream.codec.container.index import Period
 from structgstream.codec.container.records import MAX_PERIODS
+from structgstream.codec.contents import PacketInfo
 from structgstream.codec.encoder import Encoded
 from structgstream.codec.header import check_picture_sizes
-from structgstream.codec.packet_table import PacketInfo
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
 from structgstream.data.denoising import denoised
 from structgstream.data.source import FrameStream, frame_count, keep_frames, may_read_ahead

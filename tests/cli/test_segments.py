@@ -11,11 +11,9 @@ from quick_streams import CLIP, QUARTER, stopped_by_sigterm
 from s3_emulator import BUCKET, emulator
 from structgstream.cli import main, segment_options
 from structgstream.codec.reader import open_stream
-from structgstream.codec.segments.archive import write_archive
-from structgstream.codec.segments.cloud_store import CloudStore
 from structgstream.codec.segments.recovery import stale_files
-from structgstream.codec.segments.store import FolderStore
-from structgstream.codec.segments.stored_bytes import read_manifest
+from structgstream.codec.segments.store import CloudStore, FolderStore
+from structgstream.codec.segments.stored_bytes import read_manifest, write_archive
 
 pytestmark = pytest.mark.usefixtures("quick_tiny")
 

@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 from properties import examples
 from streams import header_for, same, small_scene
 from structgstream.codec.container.blocks import pack_raw_block
-from structgstream.codec.container.payload import parse_packet
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.encoder import SceneEncoder
-from structgstream.codec.packets import Packet, PacketKind
+from structgstream.codec.packets import Packet, PacketKind, parse_packet
 from structgstream.errors import StreamError
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, state_of
 

@@ -9,11 +9,10 @@ from hypothesis import strategies as st
 from properties import examples
 from rigs import random_scene
 from streams import header_for, moved, same, small_scene
-from structgstream.codec.container.payload import parse_packet
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.header import pack_header, unpack_header
-from structgstream.codec.packets import PacketKind
+from structgstream.codec.packets import PacketKind, parse_packet
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, state_of

@@ -7,7 +7,7 @@ import numpy as np
 
 from rigs import arc_rig
 from streams import moved, small_scene
-from structgstream.codec.frame_renderer import FrameRenderer
+from structgstream.codec.reader import FrameRenderer
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.render import render, to_8bit_image
 from structgstream.scene.scene import Scene

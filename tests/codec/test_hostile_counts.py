@@ -14,14 +14,15 @@ import torch
 
 from properties import thinned
 from streams import compact_header, small_scene
-from structgstream.codec.container.blocks import BLOCK, iterate_blocks, unpack_blocks
-from structgstream.codec.container.init_record import LENGTH
+from structgstream.codec.container.blocks import BLOCK, LENGTH, iterate_blocks, unpack_blocks
+from structgstream.codec.decoder import CompactDecoder
+from structgstream.codec.encoder import CompactEncoder
 from structgstream.codec.entropy import rans, section_coder
 from structgstream.codec.entropy.section_coder import SectionDecoder, varint
+from structgstream.codec.fields.packet_fields import CODABLE
+from structgstream.codec.fields.static_fields import decode_fields
 from structgstream.codec.header import pack_header, unpack_header
 from structgstream.codec.packets import PacketKind, StreamHeader
-from structgstream.codec.scene.compact import CODABLE, CompactDecoder, CompactEncoder
-from structgstream.codec.scene.static_fields import decode_fields
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import FieldName, state_of

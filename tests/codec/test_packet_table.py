@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from properties import examples
 from streams import small_stream
 from structgstream.codec.container.records import Record, RecordType, packed, scan_records
-from structgstream.codec.packet_table import LOST, Packets
+from structgstream.codec.contents import LOST, Packets
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import StreamError
 

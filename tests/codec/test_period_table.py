@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from period_streams import FIRSTS, FRAMES, LENGTHS, period_header, period_of, period_stream
 from properties import examples
 from rigs import arc_rig
-from structgstream.codec.container.periods import Period
+from structgstream.codec.container.index import Period
 from structgstream.codec.container.records import Record, RecordType, packed, scan_records
+from structgstream.codec.contents import PeriodTable, differences
 from structgstream.codec.header import pack_header
 from structgstream.codec.packets import StreamHeader
-from structgstream.codec.period_table import PeriodTable, differences
 from structgstream.errors import StreamError
 from structgstream.similarity import Similarity
 

@@ -8,7 +8,7 @@ import pytest
 
 from properties import THOROUGH
 from streams import header_for, moved, same, small_scene, small_stream, write_stream
-from structgstream.codec.container.continuation import readable_part
+from structgstream.codec.container.damage import readable_part
 from structgstream.codec.container.records import PREFIX, RecordType, packed, prefix, scan_records
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.header import pack_header

@@ -11,7 +11,7 @@ import pytest
 
 from killed import folders_of_the_killed
 from streams import header_for, moved, same, small_scene, small_stream, write_stream
-from structgstream.codec.container import disk_room
+from structgstream.codec.container import byte_source
 from structgstream.codec.container.records import RecordType, scan_records
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, PacketKind
@@ -210,7 +210,7 @@ def test_a_disk_that_is_nearly_full_is_told_of_and_the_stream_gets_its_index(
 ) -> None:
     """Three packets and the header are kept free."""
     free = {"bytes": 10**9}
-    monkeypatch.setattr(disk_room.shutil, "disk_usage", lambda path: SimpleNamespace(free=free["bytes"]))
+    monkeypatch.setattr(byte_source.shutil, "disk_usage", lambda path: SimpleNamespace(free=free["bytes"]))
     sink = FileSink(tmp_path / "a.sgs")
     header_bytes = sink.open(header_for(SCENES[0]))
     size = sink.write(packets()[0])

@@ -9,11 +9,11 @@ import pytest
 
 from segment_streams import as_file, folder, header, packets, written
 from streams import same
-from structgstream.codec.packet_table import LOST
+from structgstream.codec.contents import LOST
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.segments.retention import SegmentsOptions
-from structgstream.codec.stored_segments import StoredSegments, resume_segments
+from structgstream.codec.sinks import StoredSegments, resume_segments
 
 SENT = packets(9)
 

@@ -17,7 +17,7 @@ import zstandard
 
 from structgstream.codec.container.records import scan_records
 from structgstream.codec.reader import StreamReader, open_stream
-from structgstream.codec.segments.manifest_json import manifest_from_json, manifest_to_json
+from structgstream.codec.segments.manifest import manifest_from_json, manifest_to_json
 from structgstream.codec.segments.stored_bytes import open_segments
 from structgstream.scene.state import state_of
 from vectors.generate import (

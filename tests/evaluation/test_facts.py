@@ -11,7 +11,7 @@ import pytest
 from rigs import arc_rig
 from streams import header_for, small_scene
 from structgstream.cameras import CameraRig
-from structgstream.codec.packet_table import PacketInfo
+from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.data.wrappers import section
 from structgstream.errors import CaptureError, ConfigError

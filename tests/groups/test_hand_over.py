@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from streams import STEPS, small_scene
-from structgstream.codec.scene.bins import dequantize, quantize
+from structgstream.codec.fields.quantization import dequantize, quantize
 from structgstream.groups.seam_blend import FADE_FRAMES, NEIGHBOURS, SeamBlend
 from structgstream.kernels.values import HeadWeights
 from structgstream.scene.scene import Scene

@@ -12,7 +12,7 @@ from killed import folders_of_the_killed
 from properties import examples
 from small_segments import END, FIRST, FROM_FRAME_0, IDENTITY, base, encoded, write
 from streams import same
-from structgstream.codec.container import disk_room
+from structgstream.codec.container import byte_source
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError, StorageError
 from structgstream.groups import segment_sink
@@ -164,7 +164,7 @@ def test_a_nearly_full_disk_keeps_the_packets_before(tmp_path: Path, monkeypatch
     sink = SegmentSink(path, base(), IDENTITY, None)
     sink.write(encoded()[0][0])
     monkeypatch.setattr(segment_sink, "free_bytes", lambda where: 10)
-    assert disk_room.check_room is segment_sink.check_room
+    assert byte_source.check_room is segment_sink.check_room
     with pytest.raises(StorageError, match=r"g\.sgs\.partial"):
         sink.write(encoded()[0][1])
     sink.close()

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from splats import splats_of, viewport_of
-from structgstream.codec.entropy import decisions, rans
+from structgstream.codec.entropy import adaptive, rans
 from structgstream.errors import OutOfMemoryError
 from structgstream.kernels import cpu_anchors, cpu_motion, cpu_raster
 from structgstream.kernels.native import native_reason
@@ -115,4 +115,4 @@ def test_no_memory_for_gradients() -> None:
 
 def test_no_memory_for_decisions() -> None:
     with pytest.raises(OutOfMemoryError, match="decisions"):
-        decisions._check(decisions._NO_MEMORY)
+        adaptive._check(adaptive._NO_MEMORY)

@@ -20,10 +20,9 @@ from small_presets import QUICK
 from structgstream import session, struct_gstream
 from structgstream.cameras import CameraRig
 from structgstream.codec.reader import open_stream
-from structgstream.codec.segments.archive import write_archive
 from structgstream.codec.segments.quality_list import read_list
 from structgstream.codec.segments.store import FolderStore
-from structgstream.codec.segments.stored_bytes import read_manifest
+from structgstream.codec.segments.stored_bytes import read_manifest, write_archive
 from structgstream.data.live.kept import KeptFrames, kept_folder
 from structgstream.errors import ConfigError, StorageError
 from structgstream.evaluation.run_log import read_log

@@ -13,7 +13,7 @@ import pytest
 from segment_folders import GrowingFolder
 from serving import Served, hosted
 from streams import small_stream
-from structgstream.codec.segments.manifest_json import manifest_from_json
+from structgstream.codec.segments.manifest import manifest_from_json
 from structgstream.codec.segments.quality_list import ListedQuality, list_from_json, write_list
 from structgstream.serve.app import ServerSettings
 from structgstream.serve.pages import bundle

@@ -29,8 +29,7 @@ from serving import served
 from streams import compact_header, moved, write_stream
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.store import FolderStore
-from structgstream.codec.sinks import FileSink
-from structgstream.codec.stored_segments import resume_segments
+from structgstream.codec.sinks import FileSink, resume_segments
 from structgstream.data.clip import bundled_clip_path
 from structgstream.data.open import open_capture
 from structgstream.evaluation.evaluate import rendered

@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from rigs import random_scene
+from structgstream.codec.fields.quantization import RateTerm
 from structgstream.kernels.backend import reference_backend
-from structgstream.training.parameters import Parameters, RateTerm, parameters_of_fields
+from structgstream.training.parameters import Parameters, parameters_of_fields
 
 BACKEND = reference_backend()
 
@@ -14,7 +15,7 @@ BACKEND = reference_backend()
 def test_leaving_a_bin_has_a_price() -> None:
     parameters = Parameters.of(random_scene(10), trained=parameters_of_fields({"anchor_positions", "offset_scales"}))
     steps = {"anchor_positions": 0.5, "offset_scales": 0.25, "covariance_mlp": 0.1}
-    rate_term = RateTerm.of(parameters, steps, weight=0.5, free=False)  # type: ignore[arg-type]
+    rate_term = RateTerm.of(parameters.values, steps, weight=0.5, free=False)  # type: ignore[arg-type]
     assert rate_term is not None
     assert rate_term.value(parameters.values, BACKEND).item() == 0.0
     values = dict(parameters.values)
@@ -34,8 +35,8 @@ def test_what_was_there_is_charged_and_what_is_born_is_not() -> None:
     scene = random_scene(10, free=6)
     parameters = Parameters.of(scene, trained=parameters_of_fields({"free"}))
     steps: dict = {"free_means": 0.5, "free_colors": 0.1}
-    assert RateTerm.of(parameters, steps, weight=1.0, free=False) is None
-    rate_term = RateTerm.of(parameters, steps, weight=1.0, free=True)
+    assert RateTerm.of(parameters.values, steps, weight=1.0, free=False) is None
+    rate_term = RateTerm.of(parameters.values, steps, weight=1.0, free=True)
     assert rate_term is not None
     keep = torch.tensor([True, False, True, True, False, True])
     rate_term, old = rate_term.after_pruning(keep), parameters.values["free_means"]
@@ -65,4 +66,4 @@ def test_the_gradient_of_the_price_is_that_of_its_formula() -> None:
 @pytest.mark.parametrize(("steps", "weight"), [({}, 1.0), ({"covariance_mlp": 0.1}, 1.0), ({"base_scales": 0.1}, 0.0)])
 def test_no_price_where_nothing_is_paid(steps: dict, weight: float) -> None:
     parameters = Parameters.of(random_scene(3), trained=parameters_of_fields({"anchor_positions"}))
-    assert RateTerm.of(parameters, steps, weight=weight, free=True) is None
+    assert RateTerm.of(parameters.values, steps, weight=weight, free=True) is None

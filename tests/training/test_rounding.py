@@ -7,17 +7,11 @@ import torch
 
 from rigs import arc_rig, random_scene
 from structgstream.cameras import Camera, CameraRig
-from structgstream.codec.scene.bins import LARGEST, dequantize_state, quantize_state
-from structgstream.codec.scene.compact import CODABLE
+from structgstream.codec.fields.packet_fields import CODABLE, dequantize_state, quantize_state
+from structgstream.codec.fields.quantization import LARGEST, round_straight_through
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import FieldName, ParameterName, parameters_of, state_of
-from structgstream.training.parameters import (
-    Parameters,
-    RoundingConfig,
-    parameters_of_fields,
-    pixel_size,
-    round_straight_through,
-)
+from structgstream.training.parameters import Parameters, RoundingConfig, parameters_of_fields, pixel_size
 from tests.varied import varied
 
 

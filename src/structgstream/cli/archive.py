@@ -38,8 +38,8 @@ def main(arguments: list[str]) -> None:
     check_ending(output, ".sgs", command="archive")
     if output.exists() and not options.overwrite:
         raise UsageError(f"{output} exists; replace it with --overwrite, or choose another name.")
-    from structgstream.codec.segments.archive import write_archive
     from structgstream.codec.segments.store import FolderStore
+    from structgstream.codec.segments.stored_bytes import write_archive
 
     frames = write_archive(FolderStore(options.segments), output)
     what = "1 frame" if frames == 1 else f"{frames} frames"

@@ -129,8 +129,8 @@ class SegmentOptions:
         elif self.publish is None:
             yield partial(_storage, segments_folder(output, may_exist=may_exist), options)
         else:
-            from structgstream.codec.segments.cloud_store import CloudStore
             from structgstream.codec.segments.mirror import AnotherStreamError, MirroredStore, MirrorOptions
+            from structgstream.codec.segments.store import CloudStore
             from structgstream.errors import StorageError, StreamError
 
             remote = CloudStore(self.publish)

@@ -1,21 +1,220 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a stream holds: found by reading every record, or by its index."""
+"""What a stream holds: packets and periods, found by reading every record, or by its index."""
 
 import math
+from abc import abstractmethod
+from array import array
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import overload
 
-from structgstream.codec.container.byte_source import ByteSource
+from structgstream.codec.container.blocks import field_sizes, iterate_blocks
+from structgstream.codec.container.byte_source import ByteSlice, ByteSource
 from structgstream.codec.container.damage import Damage, PacketSearch, Standing
-from structgstream.codec.container.index import Index, indexed_frames
-from structgstream.codec.container.payload import parse_packet
-from structgstream.codec.container.periods import Period
-from structgstream.codec.container.records import Record, RecordType, scan_records
-from structgstream.codec.packet_table import KINDS, LOST, Packets
-from structgstream.codec.packets import Packet, PacketKind
-from structgstream.codec.period_table import PeriodTable
+from structgstream.codec.container.index import Index, Period, indexed_frames, period_at
+from structgstream.codec.container.records import (
+    FRAME,
+    PACKET_KINDS,
+    RECORD,
+    Record,
+    RecordType,
+    read_head,
+    read_record,
+    scan_records,
+)
+from structgstream.codec.header import unpack_header
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet
 from structgstream.errors import StreamError
+from structgstream.similarity import Similarity
+
+LOST = 2**64 - 1
+"""Offset of a packet that is lost."""
+
+
+@dataclass(frozen=True)
+class PacketInfo:
+    """Facts of one packet: ``bytes`` is the length of its record, ``field_bytes`` that of each field's part."""
+
+    kind: PacketKind
+    index: int
+    pts_seconds: float
+    offset: int
+    bytes: int
+    field_bytes: Mapping[str, int]
+
+
+class PacketInfos(Sequence[PacketInfo]):
+    """Facts of packets, each found when it is asked for."""
+
+    @abstractmethod
+    def at(self, index: int) -> PacketInfo:
+        """Facts of the packet of a frame."""
+
+    @overload
+    def __getitem__(self, index: int) -> PacketInfo: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[PacketInfo]: ...
+
+    def __getitem__(self, index: int | slice) -> PacketInfo | list[PacketInfo]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        return self.at(range(len(self))[index])
+
+
+class Packets(PacketInfos):
+    """The packets of a stream in order, up to the first lost one. Only offsets are in memory; indexing reads the heads
+    of the packet's record and fields.
+
+    Attributes:
+        offsets: of all packets, including those after a lost one; :data:`LOST` for lost ones.
+        whole: number of packets before the first lost one.
+
+    Raises:
+        StreamError: on indexing a packet that was damaged after the stream was opened.
+    """
+
+    def __init__(self, data: ByteSource, name: str) -> None:
+        self._data = data
+        self._name = name
+        self.offsets: array[int] = array("Q")
+        self.whole = 0
+
+    def __len__(self) -> int:
+        return self.whole
+
+    def at(self, index: int) -> PacketInfo:
+        """Facts of the packet of a frame that is not lost."""
+        offset = self.offsets[index]
+        head = read_head(self._data, offset)
+        if head is None or head.type not in PACKET_KINDS or head.length < FRAME.size:
+            raise self.damaged(index)
+        start = offset + RECORD.size
+        payload = ByteSlice(self._data, start, start + head.length)
+        number, pts_seconds = FRAME.unpack(payload[: FRAME.size])
+        if number != index:
+            raise self.damaged(index)
+        try:
+            blocks = [*iterate_blocks(payload, FRAME.size, where=f"Packet {index}")]
+        except StreamError as error:
+            if read_record(self._data, offset) is None:  # The record was damaged after opening.
+                raise self.damaged(index) from error
+            raise
+        field_bytes: dict[str, int] = {block.name: block.end - block.start for block in blocks}
+        return PacketInfo(PACKET_KINDS[head.type], index, pts_seconds, offset, head.bytes, field_bytes)
+
+    def packet(self, index: int) -> Packet:
+        """The packet of a frame that is not lost; its checksum is verified."""
+        record = read_record(self._data, self.offsets[index])
+        if record is None or record.type not in PACKET_KINDS:
+            raise self.damaged(index)
+        packet = parse_packet(record.payload, PACKET_KINDS[record.type])
+        if packet.index != index:
+            raise self.damaged(index)
+        return packet
+
+    def damaged(self, index: int) -> StreamError:
+        """The error for a packet that was damaged after opening."""
+        return StreamError(f"Packet {index} of {self._name}, at byte {self.offsets[index]}, is damaged.")
+
+
+class PeriodTable:
+    """The periods of one stream, the first of which is always there. One header besides the first is in memory.
+
+    Args:
+        data: the stream.
+        name: of the stream, for messages.
+        init: its first init record.
+
+    Attributes:
+        first: the header of the first period.
+        periods: those of which a packet has been found, in order; always the first.
+
+    Raises:
+        StreamError: the init record is not valid.
+    """
+
+    def __init__(self, data: ByteSource, name: str, init: Record) -> None:
+        self._data = data
+        self._name = name
+        self.first = unpack_header(init.payload)
+        self.periods: list[Period] = [Period(init.period, 0, init.offset, init.end - init.offset)]
+        self._last: tuple[Period, StreamHeader] = self.periods[0], self.first
+
+    def place(self, frame: int) -> int:
+        """The place in :attr:`periods` of the period of a frame."""
+        return period_at(self.periods, frame)
+
+    def header(self, place: int) -> StreamHeader:
+        """The header of the period at ``place``.
+
+        Raises:
+            StreamError: its init record has been damaged, or does not belong to this stream.
+        """
+        period = self.periods[place]
+        if place == 0:
+            return self.first
+        if self._last[0] != period:
+            self._last = period, self.check(self._record(period))
+        return self._last[1]
+
+    def check(self, init: Record) -> StreamHeader:
+        """The header of a later init record.
+
+        Raises:
+            StreamError: it is not valid, or is of another stream.
+        """
+        header = unpack_header(init.payload)
+        if differing := list(differences(self.first, header)):
+            raise StreamError(
+                f"The init record of period {init.period} of {self._name}, at byte {init.offset}, has other "
+                f"{differing[0]} than the first; a stream keeps them. Write it as a stream of its own."
+            )
+        return header
+
+    def field_bytes(self, place: int) -> dict[str, int]:
+        """Bytes of each field in the init record of the period at ``place``."""
+        return field_sizes(self._record(self.periods[place]).payload)
+
+    def _record(self, period: Period) -> Record:
+        record = read_record(self._data, period.offset)
+        if record is None or record.type != RecordType.INIT or record.period != period.number:
+            raise StreamError(
+                f"The init record of period {period.number} of {self._name}, at byte {period.offset}, is damaged."
+            )
+        return record
+
+
+def differences(first: StreamHeader, later: StreamHeader) -> Sequence[str]:
+    """What may not change from period to period and differs."""
+    found = {
+        "cameras": _cameras(first) != _cameras(later),
+        "similarity": _plain(first.similarity) != _plain(later.similarity),
+        "frames a second": first.fps != later.fps,
+        "codec": first.codec != later.codec,
+    }
+    return [name for name, differs in found.items() if differs]
+
+
+def _plain(similarity: Similarity) -> tuple[float, ...]:
+    return (*similarity.center, similarity.scale)
+
+
+def _cameras(header: StreamHeader) -> list[tuple[object, ...]]:
+    rig = header.rig
+    return [
+        (
+            name,
+            rig[name].viewmat.tolist(),
+            rig[name].K.tolist(),
+            rig[name].width,
+            rig[name].height,
+            rig[name].near,
+            name in rig.held_out,
+        )
+        for name in rig
+    ]
 
 
 @dataclass(frozen=True)
@@ -117,8 +316,8 @@ class Scan:
     def _add(self, record: Record) -> None:
         if record.type == RecordType.INIT:
             self._add_init(record)
-        elif record.type in KINDS:
-            packet = parse_packet(record.payload, KINDS[RecordType(record.type)])
+        elif record.type in PACKET_KINDS:
+            packet = parse_packet(record.payload, PACKET_KINDS[record.type])
             self._check(packet, record)
             self._add_packet(packet, record)
 

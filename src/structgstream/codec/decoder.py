@@ -1,19 +1,107 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decodes packets to scenes."""
+"""Decodes packets to scenes (docs/bitstream.md, sections Packets and Compact).
 
-from collections.abc import Set
+With the codec ``compact`` bins are predicted from the previous frame's. A key packet is predicted from the header's
+reference state and starts with fresh models, so each group of packets (a key packet and the delta packets up to the
+next one) can be decoded by itself.
+"""
+
+from collections.abc import Mapping, Set
+from dataclasses import dataclass
 
 from torch import Tensor
 
 from structgstream.codec.container.blocks import coded_payloads, unpack_raw_blocks
-from structgstream.codec.container.packet_head import FRAME
-from structgstream.codec.packets import Packet, StreamHeader
-from structgstream.codec.scene.compact import CompactDecoder, CompactState
-from structgstream.codec.scene.shapes import check_shapes
+from structgstream.codec.container.records import FRAME
+from structgstream.codec.entropy.adaptive import AdaptiveCoder, AdaptiveDecoder
+from structgstream.codec.entropy.models import Models
+from structgstream.codec.fields.packet_fields import (
+    CODABLE,
+    FREE_FIELDS,
+    SceneBins,
+    code_scene,
+    dequantize_state,
+    quantize_state,
+)
+from structgstream.codec.header import check_shapes
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.errors import StreamError
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import FieldName, scene_of
+from structgstream.scene.state import FieldName, parameters_of, scene_of
+
+
+@dataclass(frozen=True)
+class CompactState:
+    """The state that encoder and decoder share after a packet."""
+
+    index: int
+    bins: SceneBins
+    models: Models
+
+
+class CompactCoder:
+    """State that encoder and decoder share: the prediction of each packet.
+
+    Raises:
+        StreamError: the header has another codec, dynamic fields that cannot be coded, or no step or reference for one.
+    """
+
+    def __init__(self, header: StreamHeader) -> None:
+        if header.codec != "compact":
+            raise StreamError(
+                f"The stream is coded with {header.codec!r}; this version knows 'raw' and 'compact'. "
+                "Install a newer structgstream."
+            )
+        if beyond := header.dynamic - CODABLE:
+            raise StreamError(f"The compact codec has no coding for {', '.join(sorted(beyond))}; keep it static.")
+        if header.dynamic & FREE_FIELDS not in (frozenset(), FREE_FIELDS):
+            raise StreamError("The header announces free Gaussians without their births, or births without them.")
+        rows = header.dynamic - FREE_FIELDS
+        needed = {parameter.name for parameter in parameters_of(header.dynamic) if parameter.step}
+        if missing := needed - header.steps.keys():
+            raise StreamError(f"The header states no step for {', '.join(sorted(missing))}.")
+        if header.reference.keys() != rows:
+            raise StreamError("The header's reference state does not hold the dynamic fields of anchors and MLPs.")
+        self._header = header
+        known: dict[FieldName, Tensor] = {**header.static, **header.reference}
+        # Static fields are not read; a key packet starts without free Gaussians.
+        self._reference = quantize_state(known, rows, header.steps)
+        self.state: CompactState | None = None
+
+    def _start(self, kind: PacketKind, index: int) -> tuple[SceneBins, Models]:
+        if kind is PacketKind.KEY:
+            return self._reference, Models()
+        if self.state is None or self.state.index != index - 1:
+            raise StreamError(f"Packet {index} needs packet {index - 1}, which was not decoded before it.")
+        return self.state.bins, Models(self.state.models)
+
+    def _code(self, coder: AdaptiveCoder, after: SceneBins | None, before: SceneBins, index: int) -> SceneBins:
+        has_free = not FREE_FIELDS.isdisjoint(self._header.dynamic)
+        return code_scene(coder, after, before, has_free=has_free, where=f"Packet {index}")
+
+    def _keep(self, kind: PacketKind, index: int, bins: SceneBins, models: Models) -> None:
+        # Residuals of a key packet are relative to the reference, so they do not predict those of the next packet.
+        self.state = CompactState(index, bins.without_change() if kind is PacketKind.KEY else bins, models)
+
+
+class CompactDecoder(CompactCoder):
+    """Decodes the frames of one stream in order, starting at any key packet."""
+
+    def decode(
+        self, fields: Mapping[FieldName, bytes | memoryview], *, kind: PacketKind, index: int
+    ) -> dict[FieldName, Tensor]:
+        """The dynamic fields of a frame.
+
+        Raises:
+            StreamError: the packet is damaged, or does not follow the one before it.
+        """
+        before, models = self._start(kind, index)
+        decoder = AdaptiveDecoder(models, fields, where=f"Packet {index}")
+        bins = self._code(decoder, None, before, index)
+        decoder.end()
+        self._keep(kind, index, bins, models)
+        return dequantize_state(bins, self._header.dynamic, self._header.steps)
 
 
 class SceneDecoder:

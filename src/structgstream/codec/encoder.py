@@ -9,14 +9,17 @@ trainer and viewers would drift apart.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
+from torch import Tensor
+
 from structgstream.codec.container.blocks import pack_coded_block, pack_raw_block
-from structgstream.codec.container.payload import packet_from_blocks
-from structgstream.codec.decoder import SceneDecoder
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader
-from structgstream.codec.scene.compact import CompactEncoder
+from structgstream.codec.decoder import CompactCoder, CompactState, SceneDecoder
+from structgstream.codec.entropy.adaptive import AdaptiveEncoder
+from structgstream.codec.fields.packet_fields import quantize_state
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader, packet_from_blocks
 from structgstream.errors import StreamError
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import STATE_TABLE, FieldName, state_of
@@ -30,6 +33,32 @@ class Encoded(Generic[SceneT]):
 
     packet: Packet
     reconstruction: SceneT
+
+
+class CompactEncoder(CompactCoder):
+    """Encodes the frames of one stream, in order."""
+
+    def replay(self, state: CompactState | None) -> None:
+        """Continue from a decoder's state."""
+        self.state = state
+
+    def encode(self, state: Mapping[FieldName, Tensor], *, kind: PacketKind, index: int) -> dict[FieldName, bytes]:
+        """The bytes of each dynamic field.
+
+        Raises:
+            StreamError: a value is out of range, or a delta packet does not follow the packet before it.
+        """
+        before, models = self._start(kind, index)
+        after = quantize_state(state, self._header.dynamic, self._header.steps)
+        if after.anchors.shape != before.anchors.shape:
+            raise StreamError(f"Frame {index} has {len(after.anchors)} anchors, the header {len(before.anchors)}.")
+        for name, bins in after.weights.items():
+            if bins.shape != before.weights[name].shape:
+                raise StreamError(f"Frame {index} has {name} of another size than the header.")
+        encoder = AdaptiveEncoder(models, where=f"Frame {index}")
+        self._keep(kind, index, self._code(encoder, after, before, index), models)
+        fields = encoder.fields()
+        return {name: fields.get(name, b"") for name in self._header.dynamic}
 
 
 class SceneEncoder:

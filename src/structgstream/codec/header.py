@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Packing and unpacking of the init record (docs/bitstream.md, section Init record)."""
+"""The init record: packed, unpacked, and which shapes fit together (docs/bitstream.md, Init record, Fields)."""
 
 import math
 from collections.abc import Mapping, Set
@@ -10,14 +10,70 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig
-from structgstream.codec.container.blocks import pack_coded_block, pack_raw_block, unpack_blocks
-from structgstream.codec.container.init_record import first_block, pack_init, read_description
+from structgstream.codec.container.blocks import (
+    first_block,
+    pack_coded_block,
+    pack_init,
+    pack_raw_block,
+    read_description,
+    unpack_blocks,
+)
+from structgstream.codec.fields.static_fields import UNCODED_FIELDS, decode_fields, encode_fields
 from structgstream.codec.packets import StreamHeader
-from structgstream.codec.scene.shapes import check_shapes
-from structgstream.codec.scene.static_fields import UNCODED_FIELDS, decode_fields, encode_fields
 from structgstream.errors import CalibrationError, StreamError
-from structgstream.scene.state import STATE_TABLE, FieldName
+from structgstream.scene.state import FIELDS, STATE_TABLE, FieldName
 from structgstream.similarity import Similarity
+
+ENVIRONMENT_ROWS = (1, 4, 9)
+"""Numbers of spherical harmonics up to degree 0, 1 and 2."""
+
+
+def check_shapes(
+    fields: Mapping[FieldName, Tensor], *, distance_input: bool, training_cameras: int, where: str
+) -> None:
+    """Check that the shapes of the fields present are consistent.
+
+    Raises:
+        StreamError: naming the first field of another shape, its shape and the expected one.
+    """
+    sizes: dict[str, int] = {"V": training_cameras}
+    for name, value in fields.items():
+        _match(name, value, sizes, where)
+    if sizes.get("E", 1) not in ENVIRONMENT_ROWS:
+        raise StreamError(f"{where} has an environment of {sizes['E']} rows; expected 1, 4 or 9.")
+    if not {"K", "D"} <= set(sizes):
+        return
+    if sizes["K"] < 1 or sizes["D"] < 1:
+        raise StreamError(
+            f"{where} has {sizes['K']} Gaussians and {sizes['D']} features an anchor; expected at least 1."
+        )
+    inputs = sizes["D"] + 3 + int(distance_input)
+    hidden: int | None = None
+    for name, row in FIELDS.items():
+        if not row.outputs or name not in fields:
+            continue
+        weights, outputs = len(fields[name]), row.outputs * sizes["K"]
+        units, rest = divmod(weights - outputs, inputs + 1 + outputs)
+        if rest or units < 1 or units != (hidden or units):
+            raise StreamError(
+                f"{where} has an MLP of {weights} weights, which fits no hidden layer between {inputs} inputs and "
+                f"{outputs} outputs, or not the size of the other MLPs' hidden layer."
+            )
+        hidden = units
+
+
+def _match(name: FieldName, value: Tensor, sizes: dict[str, int], where: str) -> None:
+    shape = FIELDS[name].shape
+    fits = value.dim() == len(shape) and (value.dtype == torch.int64) == FIELDS[name].integers
+    for size, expected in zip(value.shape, shape):
+        fits = fits and size == (sizes.setdefault(expected, size) if isinstance(expected, str) else expected)
+    if not fits:
+        wanted = [str(sizes.get(e, e)) if isinstance(e, str) else str(e) for e in shape]
+        raise StreamError(
+            f"{where} has field {name} as {tuple(value.shape)} {value.dtype}, which does not fit the others; expected "
+            f"({', '.join(wanted)})."
+        )
+
 
 MAX_IMAGE_SIDE = 65_535
 MAX_IMAGE_PIXELS = 2**26

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parts of a stream: header, packets, and the protocol of packet sinks."""
+"""The parts of a stream: header, packets and their payload, and the protocol of packet sinks."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -8,12 +9,13 @@ from typing import Any, Protocol
 from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig
-from structgstream.codec.packet_kind import PacketKind
-from structgstream.errors import ConfigError
+from structgstream.codec.container.blocks import iterate_blocks
+from structgstream.codec.container.records import FRAME, PacketKind
+from structgstream.errors import ConfigError, StreamError
 from structgstream.scene.state import FieldName
 from structgstream.similarity import Similarity
 
-__all__ = ["Packet", "PacketKind", "PacketSink", "StreamHeader"]
+__all__ = ["Packet", "PacketKind", "PacketSink", "StreamHeader", "packet_from_blocks", "parse_packet"]
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class StreamHeader:
         distance_input: whether the distance to the camera is an input of the MLPs.
         config: the resolved configuration of the run, as plain JSON values.
         metadata: capture name, creator, start frame and the like, as plain JSON values.
-        steps: ``compact`` only: quantization steps by parameter (``bins.py``), each a float32 number.
+        steps: ``compact`` only: quantization steps by parameter (``fields``), each a float32 number.
         reference: ``compact`` only: the dynamic fields of anchors and MLPs from which key packets are predicted.
         init_steps: ``compact`` only: quantization steps by field of ``static`` and ``reference``
             (``static_fields.py``), each a float32 number.
@@ -101,3 +103,37 @@ class PacketSink(Protocol):
     def write(self, packet: Packet) -> int: ...
 
     def close(self) -> None: ...
+
+
+MAX_FRAMES = 2**31
+"""Frames of a stream."""
+
+
+def packet_from_blocks(
+    blocks: Mapping[FieldName, bytes], *, index: int, pts_seconds: float, kind: PacketKind
+) -> Packet:
+    """The packet of a frame with these field blocks, in this order.
+
+    Raises:
+        StreamError: the stream is as long as it can be.
+    """
+    # The identity of a birth is frame * 2^32 + number, of 63 bits. 2^31 frames are 2.27 years at 30 frames a second.
+    if index >= MAX_FRAMES:
+        raise StreamError(f"A stream has at most {MAX_FRAMES} frames; begin another one.")
+    payload = FRAME.pack(index, pts_seconds) + b"".join(blocks.values())
+    return Packet(kind, index, pts_seconds, payload, {name: len(block) for name, block in blocks.items()})
+
+
+def parse_packet(payload: bytes, kind: PacketKind) -> Packet:
+    """The packet in a key or delta record.
+
+    Raises:
+        StreamError: the payload violates the format.
+    """
+    if len(payload) < FRAME.size:
+        raise StreamError("A packet is too short to hold its index and time.")
+    index, pts_seconds = FRAME.unpack_from(payload)
+    if not math.isfinite(pts_seconds):
+        raise StreamError(f"Packet {index} has the presentation time {pts_seconds}; it is damaged.")
+    blocks = iterate_blocks(payload, FRAME.size, where=f"Packet {index}")
+    return Packet(kind, index, pts_seconds, payload, {block.name: block.end - block.start for block in blocks})

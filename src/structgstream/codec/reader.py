@@ -9,7 +9,7 @@ checksum is verified then. With the ``raw`` codec packets are independent, so ra
 """
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 
@@ -19,19 +19,48 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera
 from structgstream.codec.container.byte_source import ByteSource, FileBytes
 from structgstream.codec.container.damage import Damage
-from structgstream.codec.container.index import read_index
-from structgstream.codec.container.periods import Period
+from structgstream.codec.container.index import Period, read_index
 from structgstream.codec.container.records import PREFIX, RecordType, check_prefix, incomplete_reason, read_record
-from structgstream.codec.contents import Scan, contents_by_index, first_run
+from structgstream.codec.contents import PacketInfo, Packets, PeriodTable, Scan, contents_by_index, first_run
 from structgstream.codec.decoder import SceneDecoder
-from structgstream.codec.frame_renderer import FrameRenderer
-from structgstream.codec.packet_table import PacketInfo, Packets
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
-from structgstream.codec.period_table import PeriodTable
 from structgstream.codec.segments.stored_bytes import is_segments, open_segments
 from structgstream.errors import StreamError
-from structgstream.kernels.backend import Backend, BackendName
+from structgstream.kernels.backend import Backend, BackendName, select_backend
+from structgstream.scene.render import render, to_8bit_image
 from structgstream.scene.scene import Scene
+from structgstream.scene.state import on_device
+
+
+class FrameRenderer:
+    """Renders frames of one stream; keeps the last scene and back-end between calls."""
+
+    def __init__(self) -> None:
+        self._asked: BackendName | Backend | None = None
+        self._backend: Backend | None = None
+        self._last: tuple[int, Scene] | None = None
+
+    def picture(
+        self, index: int, view: Camera, *, decode: Callable[[int], Scene], backend: BackendName | Backend
+    ) -> NDArray[np.uint8]:
+        """The 8-bit sRGB picture ``[H, W, 3]`` of a frame.
+
+        Args:
+            index: the frame.
+            view: the camera, in the scene's units.
+            decode: returns the scene of a frame.
+            backend: the compute back-end.
+
+        Raises:
+            BackendError: the back-end is not available.
+        """
+        if self._backend is None or backend != self._asked:
+            self._backend, self._asked, self._last = select_backend(backend), backend, None
+        if self._last is None or self._last[0] != index:
+            self._last = None  # So that two scenes are not in memory at once.
+            self._last = index, on_device(decode(index), self._backend.device)
+        return to_8bit_image(render(self._last[1], view, self._backend).image)
+
 
 NOTHING = -2  # index of the last decoded frame if there is none: no frame follows it
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from structgstream.cameras import Camera
-from structgstream.codec.packet_table import PacketInfo
+from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import PacketKind
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import select_cameras

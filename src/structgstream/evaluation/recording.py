@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 
 import torch
 
-from structgstream.codec.packet_table import PacketInfo
+from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import StreamHeader
 from structgstream.errors import BackendError
 from structgstream.scene.render import Drawable

@@ -7,11 +7,10 @@ from functools import cached_property
 from pathlib import Path
 
 from structgstream.codec.container.byte_source import FileBytes
-from structgstream.codec.container.payload import parse_packet
 from structgstream.codec.container.records import PREFIX, RecordType, check_prefix, read_record
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.header import unpack_header
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet
 from structgstream.errors import ConfigError, StreamError
 from structgstream.presets import StreamConfig, from_json
 from structgstream.scene.scene import Scene

@@ -6,11 +6,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain
 
-from structgstream.codec.container.payload import parse_packet
 from structgstream.codec.container.records import RecordType, packed, read_record
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.encoder import SceneEncoder
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet
 from structgstream.groups.border import draw_border, moving_at_border
 from structgstream.groups.mixture import visible_mixtures
 from structgstream.groups.seam_blend import SeamBlend

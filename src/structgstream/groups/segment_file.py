@@ -17,8 +17,8 @@ from pathlib import Path
 
 from structgstream.codec.container.byte_source import ByteSource, FileBytes
 from structgstream.codec.container.index import pack_index
-from structgstream.codec.container.packet_head import FRAME
 from structgstream.codec.container.records import (
+    FRAME,
     PREFIX,
     Record,
     RecordType,

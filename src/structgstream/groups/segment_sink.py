@@ -5,13 +5,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from structgstream.codec.container.disk_room import check_room, free_bytes
-from structgstream.codec.container.index import INDEX_ENTRY, pack_index
-from structgstream.codec.container.payload import parse_packet
-from structgstream.codec.container.periods import Period
+from structgstream.codec.container.byte_source import check_room, free_bytes
+from structgstream.codec.container.index import INDEX_ENTRY, Period, pack_index
 from structgstream.codec.container.records import PREFIX, RecordType, packed, read_record
 from structgstream.codec.decoder import SceneDecoder
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet
 from structgstream.codec.reader import PacketInfo
 from structgstream.errors import ConfigError, StreamError
 from structgstream.groups.base import GroupBase

@@ -4,9 +4,9 @@
 Note [State table]
 ~~~~~~~~~~~~~~~~~~
 This is the only list of fields. The optimiser reads the parameters of the dynamic fields and their learning rates from
-it, and the quantiser their steps. The init record contains the static fields and packets the dynamic ones, in the
-coding stated here. Half of the paper's ablations are edits of the dynamic set. The order of rows is the order of fields
-in a stream.
+it; ``codec/fields`` rounds them, estimates the rate of their changes and codes them, by their rows alone. The init
+record contains the static fields and packets the dynamic ones, in the coding stated here. Half of the paper's ablations
+are edits of the dynamic set. The order of rows is the order of fields in a stream.
 """
 
 from collections.abc import Iterable, Mapping
@@ -231,6 +231,11 @@ def fields_of(*granularities: Granularity) -> tuple[FieldName, ...]:
 def parameters_of(names: Iterable[FieldName]) -> tuple[Parameter, ...]:
     """The parameters of the fields ``names``, in that order."""
     return tuple(parameter for name in names for parameter in FIELDS[name].parameters)
+
+
+def trainable(*granularities: Granularity) -> tuple[ParameterName, ...]:
+    """The trainable parameters of the fields of ``granularities``, in the table's order."""
+    return tuple(p.name for p in parameters_of(fields_of(*granularities)) if p.trainable)
 
 
 def flatten_head(head: HeadWeights) -> Tensor:

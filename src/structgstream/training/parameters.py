@@ -1,65 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scene as the tensors that are trained, their quantization while they are, and the rate term.
+"""A scene as the tensors that are trained, and the quantization steps that are configured."""
 
-Note [Bins]
-~~~~~~~~~~~
-A dynamic value is sent as an integer bin times a step. Leaves are continuous, renderings use the quantized values, and
-gradients pass the rounding unchanged (straight-through). Bins are absolute, so differences between frames are exact
-integers and errors do not accumulate. The rate term is what changes of bins since the previous frame cost.
-"""
-
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Final
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from structgstream.cameras import Camera, enlargement
-from structgstream.kernels.backend import Backend
+from structgstream.codec.fields.quantization import round_all_straight_through
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import (
     PARAMETERS,
     FieldName,
-    Granularity,
     ParameterName,
-    fields_of,
     parameters_of,
     scene_from,
     scene_of,
     state_of,
     tensor_of,
+    trainable,
 )
-
-# torch's operations on lists of tensors have a leading underscore; its own optimisers are built on them.
-# pyright: reportPrivateImportUsage=false
-
-
-class _RoundStraightThrough(torch.autograd.Function):
-    """Operations are on lists of tensors, which on a GPU is one launch for all of them."""
-
-    @staticmethod
-    def forward(ctx: Any, steps: list[float], *values: Tensor) -> tuple[Tensor, ...]:
-        found = torch._foreach_div(values, steps)
-        torch._foreach_round_(found)
-        torch._foreach_mul_(found, steps)
-        return tuple(found)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        return None, *grads
-
-
-def round_straight_through(value: Tensor, step: float) -> Tensor:
-    """``value`` on the grid of ``step``; the gradient is that of ``value``."""
-    return round_all_straight_through([value], [step])[0]
-
-
-def round_all_straight_through(values: Sequence[Tensor], steps: Sequence[float]) -> tuple[Tensor, ...]:
-    """Each of ``values`` on the grid of its step; the gradients are those of ``values``."""
-    return _RoundStraightThrough.apply([*steps], *values) if values else ()  # type: ignore[return-value]
 
 
 @dataclass(frozen=True)
@@ -139,11 +103,6 @@ def pixel_size(positions: Tensor, cameras: Iterable[Camera]) -> float | None:
     return float(torch.tensor(sizes).median()) if sizes else None
 
 
-def trainable(*granularities: Granularity) -> tuple[ParameterName, ...]:
-    """The trainable parameters of the fields of ``granularities``, in the order of the state table."""
-    return tuple(p.name for p in parameters_of(fields_of(*granularities)) if p.trainable)
-
-
 ANCHOR_ROWS, FREE_ROWS, CAMERA_ROWS = trainable("anchor"), trainable("free"), trainable("camera")
 
 
@@ -203,56 +162,3 @@ def detached(scene: Scene) -> Scene:
     """The same scene without a gradient graph."""
     state: dict[FieldName, Tensor] = {name: value.detach().contiguous() for name, value in state_of(scene).items()}
     return scene_of(state, distance_input=scene.distance_input, sampling=scene.sampling)
-
-
-_BITS_PER_KB: Final = 8000
-
-
-@dataclass(frozen=True)
-class RateTerm:
-    """An estimate of the bits of changes, as a loss term.
-
-    A bit has the same price in every frame, however much moves: that gives the best pictures for the bytes of all.
-
-    Args:
-        weight: what a kilobyte adds to the loss.
-        before: the last frame's values by name.
-        steps: the quantization steps by name.
-    """
-
-    weight: float
-    before: Mapping[ParameterName, Tensor]
-    steps: Mapping[ParameterName, float]
-
-    @classmethod
-    def of(
-        cls, parameters: Parameters, steps: Mapping[ParameterName, float], *, weight: float, free: bool
-    ) -> "RateTerm | None":
-        """The price of changing ``parameters`` from their present values; None for none.
-
-        With ``free``, bits of free Gaussians are priced like those of anchors, else not at all.
-        """
-        names = (*ANCHOR_ROWS, *FREE_ROWS) if free else ANCHOR_ROWS
-        paid: dict[ParameterName, float] = {
-            name: steps[name] for name in names if name in steps and name in parameters.values
-        }
-        if not paid or weight <= 0.0:
-            return None
-        return cls(weight, {name: parameters.values[name].detach().clone() for name in paid}, paid)
-
-    def after_pruning(self, keep: Tensor) -> "RateTerm":
-        """The term after free Gaussians outside the mask ``keep`` were pruned; ones spawned since have none."""
-        before = {
-            name: value[keep[: len(value)]] if name in FREE_ROWS else value for name, value in self.before.items()
-        }
-        return replace(self, before=before)
-
-    def value(self, values: Mapping[ParameterName, Tensor], backend: Backend) -> Tensor:
-        """Weighted sum of log2(1 + distance in bins), in kilobytes."""
-        priced = [_first_rows(values[name], len(self.before[name])) for name in self.steps]
-        before = [self.before[name] for name in self.steps]
-        return self.weight / _BITS_PER_KB * backend.change_bits(priced, before, [*self.steps.values()])
-
-
-def _first_rows(value: Tensor, count: int) -> Tensor:
-    return value if len(value) == count else value[:count]

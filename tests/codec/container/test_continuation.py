@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from properties import examples
 from streams import small_stream
-from structgstream.codec.container.continuation import readable_part
+from structgstream.codec.container.damage import readable_part
 from structgstream.codec.container.records import PREFIX, RECORD, prefix, read_record
 from structgstream.codec.reader import StreamReader
 from structgstream.errors import StreamError

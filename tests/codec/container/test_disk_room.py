@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.codec.container.disk_room import MARGIN_PACKETS, check_room, free_bytes
+from structgstream.codec.container.byte_source import MARGIN_PACKETS, check_room, free_bytes
 from structgstream.errors import StorageError
 
 

@@ -5,12 +5,12 @@ import pytest
 import torch
 import zstandard
 
-from structgstream.codec.container.blocks import pack_raw_block
-from structgstream.codec.container.init_record import (
+from structgstream.codec.container.blocks import (
     MAX_JSON_BYTES,
     field_sizes,
     first_block,
     pack_init,
+    pack_raw_block,
     read_description,
 )
 from structgstream.errors import StreamError

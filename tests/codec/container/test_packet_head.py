@@ -6,7 +6,7 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.codec.container.packet_head import FRAME
+from structgstream.codec.container.records import FRAME
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(allow_nan=False))

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from structgstream.codec.container.blocks import pack_raw_block
-from structgstream.codec.container.payload import packet_from_blocks, parse_packet
-from structgstream.codec.packets import PacketKind
+from structgstream.codec.packets import PacketKind, packet_from_blocks, parse_packet
 from structgstream.errors import StreamError
 from structgstream.scene.state import FieldName
 

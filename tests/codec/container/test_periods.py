@@ -4,7 +4,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.codec.container.periods import Period, period_at
+from structgstream.codec.container.index import Period, period_at
 
 
 def periods(firsts: list[int]) -> list[Period]:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from properties import examples
 from structgstream.codec.entropy import reference_decisions as reference
-from structgstream.codec.entropy.decisions import code_activity, code_numbers, code_residuals
+from structgstream.codec.entropy.adaptive import code_activity, code_numbers, code_residuals
 from structgstream.codec.entropy.models import (
     ACTIVITY_CONTEXTS,
     BLOCK_CONTEXTS,

@@ -6,8 +6,7 @@ import struct
 import numpy as np
 import pytest
 
-from structgstream.codec.entropy.rans import decode, encode, has_native
-from structgstream.codec.entropy.reference_rans import LOW, decode_lanes, encode_lanes
+from structgstream.codec.entropy.rans import LOW, decode, decode_lanes, encode, encode_lanes, has_native
 from structgstream.codec.entropy.tables import FrequencyTables
 
 # Symbol 0 three times as often as symbol 1: frequencies 3072 and 1024 of 4096, starts 0 and 3072.

@@ -6,8 +6,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.codec.entropy.bits import BitReader, fixed, golomb, pack_bits, signed_golomb
-from structgstream.codec.entropy.residual_symbols import residuals_to_symbols, symbols_to_residuals
+from structgstream.codec.entropy.bits import (
+    BitReader,
+    fixed,
+    golomb,
+    pack_bits,
+    residuals_to_symbols,
+    signed_golomb,
+    symbols_to_residuals,
+)
 from structgstream.errors import StreamError
 
 INT32 = st.one_of(st.integers(-9, 9), st.integers(-(2**31), 2**31 - 1), st.sampled_from([-(2**31), 2**31 - 1]))

@@ -5,8 +5,15 @@ import numpy as np
 import pytest
 
 from structgstream.codec.entropy.bits import fixed, pack_bits
-from structgstream.codec.entropy.table_sets import decode_tables, levels_of, top_level, weights_of
-from structgstream.codec.entropy.tables import TOTAL, FrequencyTables, geometric
+from structgstream.codec.entropy.tables import (
+    TOTAL,
+    FrequencyTables,
+    decode_tables,
+    geometric,
+    levels_of,
+    top_level,
+    weights_of,
+)
 from structgstream.errors import StreamError
 
 EVEN = FrequencyTables(np.full((2, 4), TOTAL // 4, np.uint16))

@@ -11,8 +11,18 @@ from properties import examples
 from structgstream.codec.entropy.bits import fixed, pack_bits, signed_golomb
 from structgstream.codec.entropy.rans import encode
 from structgstream.codec.entropy.table_choice import choose_tables
-from structgstream.codec.entropy.table_sets import decode_tables, levels_of, top_level, weights_of
-from structgstream.codec.entropy.tables import TOTAL, FrequencyTables, code_costs, geometric, logs, normalize_counts
+from structgstream.codec.entropy.tables import (
+    TOTAL,
+    FrequencyTables,
+    code_costs,
+    decode_tables,
+    geometric,
+    levels_of,
+    logs,
+    normalize_counts,
+    top_level,
+    weights_of,
+)
 from structgstream.errors import StreamError
 
 COUNTS = st.lists(st.one_of(st.integers(0, 3), st.integers(0, 2**31)), min_size=1, max_size=32)

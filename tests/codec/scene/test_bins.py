@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from properties import examples
 from rigs import random_scene
 from streams import STEPS
-from structgstream.codec.scene.bins import LARGEST, dequantize_state, quantize_state, quantized_fields
-from structgstream.codec.scene.compact import CODABLE
+from structgstream.codec.fields.packet_fields import CODABLE, dequantize_state, quantize_state, quantized_fields
+from structgstream.codec.fields.quantization import LARGEST
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, state_of

@@ -17,16 +17,13 @@ from properties import examples, thinned
 from rigs import random_scene
 from streams import STATIC_STEP, STEPS, compact_header, same, small_scene
 from structgstream.codec.container.blocks import coded_payloads
-from structgstream.codec.container.packet_head import FRAME
-from structgstream.codec.container.payload import parse_packet
-from structgstream.codec.container.records import RECORD, RecordType, scan_records
-from structgstream.codec.decoder import SceneDecoder
-from structgstream.codec.encoder import SceneEncoder
-from structgstream.codec.header import pack_header, unpack_header
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.codec.container.records import FRAME, RECORD, RecordType, scan_records
+from structgstream.codec.decoder import CompactDecoder, SceneDecoder
+from structgstream.codec.encoder import CompactEncoder, SceneEncoder
+from structgstream.codec.fields.packet_fields import CODABLE
+from structgstream.codec.header import check_shapes, pack_header, unpack_header
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet
 from structgstream.codec.reader import StreamReader
-from structgstream.codec.scene.compact import CODABLE, CompactDecoder, CompactEncoder
-from structgstream.codec.scene.shapes import check_shapes
 from structgstream.codec.sinks import MemorySink
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance

@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from properties import examples
 from structgstream.codec.entropy.adaptive import AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.entropy.models import Models
-from structgstream.codec.scene import free_rows
-from structgstream.codec.scene.bins import FreeBins
-from structgstream.codec.scene.change import Change
-from structgstream.codec.scene.free_rows import MOST_FREE, code_free
+from structgstream.codec.fields import free_rows
+from structgstream.codec.fields.free_rows import MOST_FREE, FreeBins, code_free
+from structgstream.codec.fields.rows import Change
 from structgstream.errors import StreamError
 
 

@@ -10,8 +10,7 @@ import documented
 from properties import examples
 from structgstream.codec.entropy.adaptive import AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.entropy.models import Models
-from structgstream.codec.scene.change import Change
-from structgstream.codec.scene.rows import code_change
+from structgstream.codec.fields.rows import Change, code_change
 from structgstream.errors import StreamError
 
 GROUPS = (("anchor_positions", 0, 2), ("offset_scales", 2, 3))

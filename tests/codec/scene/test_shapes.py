@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from streams import small_scene
-from structgstream.codec.scene.shapes import check_shapes
+from structgstream.codec.header import check_shapes
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import STATE_TABLE, FieldName, state_of

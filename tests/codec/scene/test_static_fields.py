@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 
 from properties import examples
 from streams import small_scene
-from structgstream.codec.entropy.section_coder import SectionEncoder, Tables, varint
-from structgstream.codec.scene.bins import round_to_bins
-from structgstream.codec.scene.static_fields import (
+from structgstream.codec.entropy.bits import varint
+from structgstream.codec.entropy.section_coder import SectionEncoder, Tables
+from structgstream.codec.fields.quantization import round_to_bins
+from structgstream.codec.fields.static_fields import (
     FREE_NUMBERS,
     MOST_ANCHORS,
     MOST_WEIGHTS,

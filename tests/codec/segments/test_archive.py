@@ -9,10 +9,9 @@ import pytest
 from segment_folders import GrowingFolder
 from segment_streams import as_file, folder, packets, written
 from streams import small_stream
-from structgstream.codec.segments.archive import write_archive
 from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
-from structgstream.codec.segments.stored_bytes import read_manifest
+from structgstream.codec.segments.stored_bytes import read_manifest, write_archive
 from structgstream.errors import StorageError, StreamError
 
 SENT = packets(7)

@@ -8,10 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from properties import examples
-from structgstream.codec.container.packet_head import FRAME
-from structgstream.codec.container.records import RecordType, packed
-from structgstream.codec.packet_kind import PacketKind
-from structgstream.codec.segments.group import part_of, records_of, segment_of
+from structgstream.codec.container.records import FRAME, PacketKind, RecordType, packed
+from structgstream.codec.segments.next_manifest import part_of, records_of, segment_of
 from structgstream.errors import StreamError
 
 

@@ -14,11 +14,12 @@ from structgstream.codec.segments.manifest import (
     SegmentEntry,
     Window,
     init_name,
+    manifest_from_json,
+    manifest_to_json,
     part_name,
     segment_name,
     sha256_of,
 )
-from structgstream.codec.segments.manifest_json import manifest_from_json, manifest_to_json
 from structgstream.errors import StreamError
 
 SHA = sha256_of(b"")

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.segments.manifest import (
+    MOST_MANIFEST_BYTES,
     Edge,
     HistoryEntry,
     Manifest,
@@ -22,16 +23,13 @@ from structgstream.codec.segments.manifest import (
     Window,
     history_name,
     init_name,
-    part_name,
-    segment_name,
-    sha256_of,
-)
-from structgstream.codec.segments.manifest_json import (
-    MOST_MANIFEST_BYTES,
     manifest_from_json,
     manifest_to_json,
     page_from_json,
     page_to_json,
+    part_name,
+    segment_name,
+    sha256_of,
 )
 from structgstream.errors import StreamError
 

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from segment_streams import Hands, as_file, folder, header, packets, written
-from structgstream.codec.segments.manifest import MANIFEST
-from structgstream.codec.segments.manifest_json import manifest_from_json
+from structgstream.codec.segments.manifest import MANIFEST, manifest_from_json
 from structgstream.codec.segments.mirror import AnotherStreamError, MirroredStore, MirrorOptions
 from structgstream.codec.segments.recovery import stale_files
 from structgstream.codec.segments.retention import SegmentsOptions

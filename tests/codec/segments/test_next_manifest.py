@@ -10,15 +10,13 @@ from hypothesis import strategies as st
 
 from properties import examples
 from segment_streams import folder, header
-from structgstream.codec.container.packet_head import FRAME
-from structgstream.codec.container.records import RecordType, packed
-from structgstream.codec.segments.group import part_of
-from structgstream.codec.segments.manifest import Edge, PeriodEntry, Window
-from structgstream.codec.segments.manifest_json import manifest_from_json, manifest_to_json
+from structgstream.codec.container.records import FRAME, RecordType, packed
+from structgstream.codec.segments.manifest import Edge, PeriodEntry, Window, manifest_from_json, manifest_to_json
 from structgstream.codec.segments.next_manifest import (
     Draft,
     empty_manifest,
     next_segment,
+    part_of,
     periods_in,
     reopened,
     with_frame,

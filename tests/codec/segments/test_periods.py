@@ -13,11 +13,10 @@ from segment_streams import Hands, Killed, KilledStore, folder
 from streams import same
 from structgstream.codec.container.records import MINOR_WITH_PERIODS, PREFIX
 from structgstream.codec.reader import StreamReader, open_stream
-from structgstream.codec.segments.archive import write_archive
 from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore, Store
-from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest
-from structgstream.codec.stored_segments import resume_segments
+from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest, write_archive
+from structgstream.codec.sinks import resume_segments
 
 
 def write(

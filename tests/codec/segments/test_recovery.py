@@ -9,8 +9,7 @@ import pytest
 
 from segment_folders import GrowingFolder
 from streams import small_stream
-from structgstream.codec.segments.manifest import MANIFEST, Manifest, Window
-from structgstream.codec.segments.manifest_json import manifest_to_json
+from structgstream.codec.segments.manifest import MANIFEST, Manifest, Window, manifest_to_json
 from structgstream.codec.segments.recovery import find, stale_files
 from structgstream.codec.segments.store import FolderStore
 from structgstream.errors import StreamError

@@ -14,14 +14,13 @@ from segment_streams import Hands, Killed, KilledStore, as_file, folder, header,
 from structgstream.codec.container.records import prefix
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import open_stream
-from structgstream.codec.segments.archive import write_archive
 from structgstream.codec.segments.manifest import MANIFEST, Manifest
 from structgstream.codec.segments.recovery import find
 from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.sink import SegmentsSink
 from structgstream.codec.segments.store import FolderStore
-from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest
-from structgstream.codec.stored_segments import resume_segments
+from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest, write_archive
+from structgstream.codec.sinks import resume_segments
 from structgstream.errors import StorageError, StreamError
 
 SENT = packets(8)

@@ -12,9 +12,8 @@ from properties import examples
 from segment_folders import GrowingFolder
 from segment_streams import folder, packets, written
 from streams import small_stream
-from structgstream.codec.packet_kind import PacketKind
-from structgstream.codec.segments.manifest import MANIFEST
-from structgstream.codec.segments.manifest_json import manifest_to_json
+from structgstream.codec.container.records import PacketKind
+from structgstream.codec.segments.manifest import MANIFEST, manifest_to_json
 from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import StoredBytes, is_segments, open_segments, read_manifest

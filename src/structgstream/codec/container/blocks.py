@@ -1,18 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Field blocks: one tensor of the scene as bytes (docs/bitstream.md, section Field blocks).
+"""Field blocks, a tensor each, and the payload of an init record (docs/bitstream.md, section Field blocks).
 
 Coding 0 (``raw``) stores little-endian numbers: float32, or int64 for identities. Coding 1 (``coded``) stores bytes
 that are defined by the stream's codec.
 """
 
+import json
 import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
 from torch import Tensor
+from zstandard import ZstdCompressor, ZstdDecompressor, ZstdError, frame_content_size
 
 from structgstream.codec.container.byte_source import ByteSource
 from structgstream.errors import StreamError
@@ -141,3 +144,71 @@ def coded_payloads(payload: bytes, start: int, *, where: str) -> dict[FieldName,
 def _numbers(payload: bytes, block: Block) -> Tensor:
     array = np.frombuffer(payload, dtype=block.dtype, count=math.prod(block.shape), offset=block.data)
     return torch.from_numpy(array.reshape(block.shape).astype(block.dtype.newbyteorder("=")))
+
+
+MAX_JSON_BYTES = 2**20
+LENGTH = struct.Struct("<I")
+_ZSTD_LEVEL = 19
+
+
+def pack_init(description: Mapping[str, Any], blocks: Iterable[bytes]) -> bytes:
+    """The payload of a description, which is plain JSON values, and blocks.
+
+    Raises:
+        StreamError: the description is too long.
+    """
+    text = json.dumps(description, sort_keys=True, allow_nan=False, separators=(",", ":")).encode()
+    if len(text) > MAX_JSON_BYTES:
+        raise StreamError(
+            f"The header's description has {len(text)} bytes, at most {MAX_JSON_BYTES} are allowed; "
+            "leave out metadata or cameras."
+        )
+    packed = ZstdCompressor(level=_ZSTD_LEVEL).compress(text)
+    return LENGTH.pack(len(packed)) + packed + b"".join(blocks)
+
+
+def first_block(payload: bytes) -> int:
+    """The byte where the description ends and field blocks begin.
+
+    Raises:
+        StreamError: the payload is too short for it.
+    """
+    if len(payload) < LENGTH.size:
+        raise StreamError("The init record is too short.")
+    (length,) = LENGTH.unpack_from(payload)
+    if LENGTH.size + length > len(payload):
+        raise StreamError("The init record states a longer description than it holds.")
+    return LENGTH.size + length
+
+
+def read_description(payload: bytes) -> dict[str, Any]:
+    """The description; its stated size is checked before anything is unpacked.
+
+    Raises:
+        StreamError: as :func:`first_block`.
+        ValueError: it is too long, or not JSON.
+    """
+    packed = payload[LENGTH.size : first_block(payload)]
+    try:
+        size = frame_content_size(packed)
+        if not 0 <= size <= MAX_JSON_BYTES:
+            raise ValueError(f"its description unpacks to {size} bytes, at most {MAX_JSON_BYTES} are allowed")
+        return json.loads(
+            ZstdDecompressor().decompress(packed, max_output_size=MAX_JSON_BYTES), parse_constant=_refuse_constant
+        )
+    except ZstdError as error:
+        raise ValueError(str(error)) from error
+
+
+def field_sizes(payload: bytes) -> dict[str, int]:
+    """Bytes of each field in the payload.
+
+    Raises:
+        StreamError: the payload violates the format.
+    """
+    blocks = iterate_blocks(payload, first_block(payload), where="The init record")
+    return {block.name: block.end - block.start for block in blocks}
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no number of JSON")

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random-access bytes: in memory, in a file that is read on demand, or a part of either."""
+"""Random-access bytes, in memory or in a file that is read on demand; and the room that a disk has left."""
 
+import shutil
 import threading
 import weakref
 from io import FileIO
 from pathlib import Path
 from typing import Protocol
 
-from structgstream.errors import StreamError
+from structgstream.errors import StorageError, StreamError
 
 
 class ByteSource(Protocol):
@@ -90,3 +91,36 @@ class ByteSlice:
     def __getitem__(self, key: slice, /) -> bytes | memoryview:
         start, stop, _ = key.indices(self._size)
         return self._data[self._start + start : self._start + max(stop, start)]
+
+
+MARGIN_PACKETS = 3
+"""A packet is written only while this many of the largest one so far fit, besides what closing the stream takes."""
+
+
+def free_bytes(path: Path) -> int | None:
+    """What an ordinary user may still write beside ``path``; None if that is not known."""
+    try:
+        return shutil.disk_usage(path).free
+    except OSError:
+        return None
+
+
+def check_room(free: int | None, *, largest: int, closing: int, where: str, frames: int) -> None:
+    """Check that the next packet and the end of the stream fit.
+
+    Args:
+        free: bytes that are left; None if that is not known.
+        largest: bytes of the largest packet so far, the next one included.
+        closing: bytes that closing the stream takes.
+        where: the stream, for the message.
+        frames: number of frames that it has.
+
+    Raises:
+        StorageError: they may not fit.
+    """
+    needed = MARGIN_PACKETS * largest + closing
+    if free is not None and free < needed:
+        raise StorageError(
+            f"The disk of {where} is nearly full: {free} bytes are left, and {needed} are kept to finish the stream. "
+            f"It was closed after {frames} frames, all of which are safe; make room and continue with --resume."
+        )

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Index and footer: offsets of records for random access (docs/bitstream.md, section Index record and footer)."""
+"""Periods, index and footer: offsets for random access (docs/bitstream.md, Periods, Index record and footer)."""
 
 import struct
 from array import array
-from collections.abc import Iterable
+from bisect import bisect_right
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from structgstream.codec.container.byte_source import ByteSource
-from structgstream.codec.container.packet_head import FRAME
-from structgstream.codec.container.periods import Period
 from structgstream.codec.container.records import (
     FOOTER,
     FOOTER_MAGIC,
+    FRAME,
     RECORD,
     Head,
     RecordType,
@@ -20,6 +20,29 @@ from structgstream.codec.container.records import (
     read_head,
     read_record,
 )
+
+
+@dataclass(frozen=True)
+class Period:
+    """Where a period begins.
+
+    Args:
+        number: as stated by its records; 0 for the first of a stream.
+        first_frame: its first whole packet's.
+        offset: of its init record.
+        bytes: of its init record.
+    """
+
+    number: int
+    first_frame: int
+    offset: int
+    bytes: int
+
+
+def period_at(periods: Sequence[Period], frame: int) -> int:
+    """The place in ``periods`` of the one that a frame belongs to."""
+    return max(bisect_right(periods, frame, key=lambda period: period.first_frame) - 1, 0)
+
 
 INDEX_ENTRY = struct.Struct("<IBQ")  # frame index, record type, offset
 

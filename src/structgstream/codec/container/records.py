@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records, the containers of all data in a stream file (docs/bitstream.md, section Records).
+"""Records, which hold all data of a stream file, and a packet's head (docs/bitstream.md, section Records).
 
 A file is the magic, the version, and a sequence of records. Records before a truncated or damaged one stay readable.
 """
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -33,6 +33,19 @@ class RecordType(IntEnum):
     KEY = 2
     DELTA = 3
     INDEX = 4
+
+
+class PacketKind(IntEnum):
+    """A key packet needs only the header; a delta packet also needs the packet before it."""
+
+    KEY = 1
+    DELTA = 2
+
+
+PACKET_KINDS: Mapping[int, PacketKind] = {RecordType.KEY: PacketKind.KEY, RecordType.DELTA: PacketKind.DELTA}
+"""The kind of packet that a record of a type holds."""
+RECORD_TYPES: Mapping[PacketKind, RecordType] = {kind: RecordType(type) for type, kind in PACKET_KINDS.items()}
+"""The type of the record that holds a kind of packet."""
 
 
 @dataclass(frozen=True)
@@ -168,3 +181,6 @@ def scan_records(data: ByteSource, offset: int = PREFIX.size) -> Iterator[Record
     while (record := read_record(data, offset)) is not None:
         yield record
         offset = record.end
+
+
+FRAME = struct.Struct("<Id")  # index, presentation time in seconds

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers as bits, highest first, and Exp-Golomb codes (docs/entropy.md, section Bits)."""
+"""Integers as bits, and residuals as symbols with escapes (docs/entropy.md, sections Bits and Escapes)."""
 
 from collections.abc import Iterable
 from typing import TypeVar
@@ -9,6 +9,10 @@ from numpy.typing import NDArray
 
 from structgstream.errors import StreamError
 
+Bins = NDArray[np.int32]
+Naturals = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+Contexts = NDArray[np.uint16]
 Whole = TypeVar("Whole", int, NDArray[np.int64])
 
 
@@ -33,6 +37,15 @@ def golomb(value: int, *, order: int) -> str:
 def signed_golomb(value: int, *, order: int) -> str:
     """Exp-Golomb of the index of ``value`` in 0, -1, 1, -2, 2 ..."""
     return golomb(zigzag(value), order=order)
+
+
+def varint(value: int) -> bytes:
+    """LEB128 of a number from 0 to 2^32 - 1: seven bits per byte, lowest first; the high bit marks that more follow."""
+    out = bytearray()
+    while value >= 128:
+        out.append(value & 127 | 128)
+        value >>= 7
+    return bytes([*out, value])
 
 
 def zigzag(values: Whole) -> Whole:
@@ -123,3 +136,55 @@ class BitReader:
         rest = self._text[self._position :]
         if len(rest) > 7 or "1" in rest:
             raise StreamError(f"{self._where} goes on after its last number; it is damaged.")
+
+
+ALPHABET = 16
+LARGEST_SYMBOL = 7
+ESCAPE = 15
+_ORDER = 2
+_MOST_ZEROS = 28
+
+
+def residuals_to_symbols(residuals: NDArray[np.integer]) -> tuple[NDArray[np.uint8], bytes]:
+    """Symbols u8 ``[n]`` (0, -1, 1, -2, 2 ... 7 are 0 to 14; 15 is any other) and the others' values.
+
+    Args:
+        residuals: integers ``[n]`` that int32 can hold.
+
+    Raises:
+        StreamError: one is out of int32's range.
+    """
+    values = residuals.astype(np.int64)
+    if len(values) and (int(values.min()) < -(2**31) or int(values.max()) >= 2**31):
+        raise StreamError("A residual is beyond 32 bits; take a larger quantization step.")
+    size = np.abs(values)
+    symbols = np.where(size > LARGEST_SYMBOL, ESCAPE, zigzag(values)).astype(np.uint8)
+    large = values[size > LARGEST_SYMBOL].tolist()
+    return symbols, pack_bits(golomb(abs(v) - LARGEST_SYMBOL - 1, order=_ORDER) + fixed(v < 0, 1) for v in large)
+
+
+def symbols_to_residuals(
+    symbols: NDArray[np.uint8], escapes: bytes | memoryview, *, where: str = "A section of escapes"
+) -> NDArray[np.int32]:
+    """Inverse of :func:`residuals_to_symbols`: residuals int32 ``[n]``.
+
+    Raises:
+        StreamError: a symbol is above 15, the number of values differs from that of escapes, or a value is beyond 32
+            bits.
+    """
+    if (symbols > ESCAPE).any():
+        raise StreamError(f"{where} belongs to symbols above {ESCAPE}; they are damaged.")
+    values = unzigzag(symbols.astype(np.int64))
+    places = np.flatnonzero(symbols == ESCAPE)
+    # An escape takes 4 to 61 bits.
+    if not 4 * len(places) <= 8 * len(escapes) <= 61 * len(places) + 7:
+        raise StreamError(f"{where} has {len(escapes)} bytes for {len(places)} values; it is damaged.")
+    reader = BitReader(escapes, where=where)
+    for place in places:
+        magnitude = reader.golomb(order=_ORDER, most_zeros=_MOST_ZEROS) + LARGEST_SYMBOL + 1
+        negative = reader.fixed(1)
+        if magnitude > 2**31 - 1 + negative:
+            raise StreamError(f"{where} holds a value beyond 32 bits; it is damaged.")
+        values[place] = -magnitude if negative else magnitude
+    reader.end()
+    return values.astype(np.int32)

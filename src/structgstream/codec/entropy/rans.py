@@ -1,15 +1,66 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sections of entropy-coded symbols: framing, bounds, and the choice between C++ and NumPy (docs/entropy.md)."""
+"""Sections of symbols: interleaved rANS in C++ or NumPy, framing and bounds (docs/entropy.md, Symbols)."""
 
 import ctypes
 
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.entropy.reference_rans import decode_lanes, encode_lanes
-from structgstream.codec.entropy.tables import COST_BITS, TOTAL, FrequencyTables, code_costs
+from structgstream.codec.entropy.bits import varint
+from structgstream.codec.entropy.tables import COST_BITS, FREQUENCY_BITS, TOTAL, FrequencyTables, code_costs
 from structgstream.errors import OutOfMemoryError, StreamError
 from structgstream.kernels.native import native_library, native_reason
+
+LOW = 1 << 16
+"""Lowest state, and the state before the first encoded symbol."""
+
+
+def encode_lanes(
+    symbols: NDArray[np.uint8], contexts: NDArray[np.uint16], tables: FrequencyTables, *, lanes: int
+) -> tuple[NDArray[np.uint32], NDArray[np.uint16]]:
+    """Final states u32 ``[lanes]`` and words u16 in the order of reading. Inputs have been checked."""
+    frequencies = tables.rows[contexts, symbols].astype(np.uint64)
+    starts = tables.starts[contexts, symbols].astype(np.uint64)
+    states = np.full(lanes, LOW, np.uint64)
+    pieces: list[NDArray[np.uint16]] = []
+    for first in range((len(symbols) - 1) // lanes * lanes, -1, -lanes):
+        f, c = frequencies[first : first + lanes], starts[first : first + lanes]
+        x = states[: len(f)]
+        full = x >= f << np.uint64(20)
+        pieces.append((x[full] & np.uint64(0xFFFF)).astype(np.uint16))
+        x = np.where(full, x >> np.uint64(16), x)
+        states[: len(f)] = (x // f << np.uint64(FREQUENCY_BITS)) + x % f + c
+    words = np.concatenate([*pieces[::-1], np.empty(0, np.uint16)])
+    return states.astype(np.uint32), words
+
+
+def decode_lanes(
+    words: NDArray[np.uint16], states: NDArray[np.uint32], contexts: NDArray[np.uint16], tables: FrequencyTables
+) -> NDArray[np.uint8] | None:
+    """The symbols u8 ``[n]``, or None if states and words are inconsistent. Contexts have been checked."""
+    lanes = len(states)
+    used, rows = np.unique(contexts, return_inverse=True)
+    slots = np.repeat(np.tile(np.arange(tables.alphabet, dtype=np.uint8), len(used)), tables.rows[used].reshape(-1))
+    frequencies, starts = tables.rows[used].astype(np.uint64), tables.starts[used].astype(np.uint64)
+    symbols = np.empty(len(contexts), np.uint8)
+    x, position = states.astype(np.uint64), 0
+    if (x < LOW).any():
+        return None
+    for first in range(0, len(contexts), lanes):
+        row = rows[first : first + lanes]
+        now = x[: len(row)]
+        slot = now & np.uint64(TOTAL - 1)
+        found = slots[row * TOTAL + slot.astype(np.int64)]
+        symbols[first : first + lanes] = found
+        now = frequencies[row, found] * (now >> np.uint64(FREQUENCY_BITS)) + slot - starts[row, found]
+        low = np.flatnonzero(now < LOW)
+        if position + len(low) > len(words):
+            return None
+        now[low] = now[low] << np.uint64(16) | words[position : position + len(low)]
+        position += len(low)
+        x[: len(row)] = now
+    return symbols if position == len(words) and (x == LOW).all() else None
+
 
 MAX_SYMBOLS = 2**31 - 1
 LANES = (1, 4, 32)
@@ -61,11 +112,11 @@ def encode(
     if lanes is not None and lanes not in LANES:
         raise StreamError(f"Sections have 1, 4 or 32 lanes, not {lanes}.")
     if not len(symbols):
-        return _varint(0)
+        return varint(0)
     lanes = lanes_for(symbols, contexts, tables) if lanes is None else lanes
     code = _native_encode if uses_native(native) else encode_lanes
     states, words = code(symbols, contexts, tables, lanes=lanes)
-    head = _varint(len(symbols)) + _varint(len(words) << 2 | LANES.index(lanes))
+    head = varint(len(symbols)) + varint(len(words) << 2 | LANES.index(lanes))
     return head + states.astype("<u4").tobytes() + words.astype("<u2").tobytes()
 
 
@@ -129,16 +180,6 @@ def _head(data: bytes | memoryview, *, where: str) -> tuple[int, int, int, int]:
     if count > MAX_SYMBOLS or word_count > count or lane_code >= len(LANES):
         raise StreamError(f"{where} states {count} symbols in {word_count} words; it is damaged.")
     return count, word_count, LANES[lane_code], start
-
-
-def _varint(value: int) -> bytes:
-    """LEB128: seven bits per byte, lowest first; the high bit marks that more follow."""
-    out = bytearray()
-    while value > 0x7F:
-        out.append(value & 0x7F | 0x80)
-        value >>= 7
-    out.append(value)
-    return bytes(out)
 
 
 def _read_varint(data: bytes | memoryview, start: int, *, where: str) -> tuple[int, int]:

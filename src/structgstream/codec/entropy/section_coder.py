@@ -14,13 +14,22 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.arrays import Bins, Contexts, Naturals
-from structgstream.codec.entropy.bits import bit_lengths, fixed, pack_bits, unpack_numbers
+from structgstream.codec.entropy.bits import (
+    ALPHABET,
+    Bins,
+    Contexts,
+    Naturals,
+    bit_lengths,
+    fixed,
+    pack_bits,
+    residuals_to_symbols,
+    symbols_to_residuals,
+    unpack_numbers,
+    varint,
+)
 from structgstream.codec.entropy.rans import decode, encode, section_bytes
-from structgstream.codec.entropy.residual_symbols import ALPHABET, residuals_to_symbols, symbols_to_residuals
 from structgstream.codec.entropy.table_choice import choose_tables
-from structgstream.codec.entropy.table_sets import decode_tables
-from structgstream.codec.entropy.tables import FrequencyTables, geometric_family
+from structgstream.codec.entropy.tables import FrequencyTables, decode_tables, geometric_family
 from structgstream.errors import StreamError
 from structgstream.scene.state import FieldName
 
@@ -167,12 +176,3 @@ class SectionDecoder:
             raise StreamError(f"{self._where} ends {size - len(data)} bytes too early in {field}; it is damaged.")
         self._left[field] = data[size:]
         return data[:size]
-
-
-def varint(value: int) -> bytes:
-    """LEB128 of a number from 0 to 2^32 - 1: seven bits per byte, lowest first; the high bit marks that more follow."""
-    out = bytearray()
-    while value >= 128:
-        out.append(value & 127 | 128)
-        value >>= 7
-    return bytes([*out, value])

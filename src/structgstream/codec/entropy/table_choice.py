@@ -12,22 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.codec.entropy.bits import fixed, golomb, pack_bits, signed_golomb, zigzag
-from structgstream.codec.entropy.table_sets import (
+from structgstream.codec.entropy.tables import (
+    COST_BITS,
     COUNT_BITS,
     NUMBER_BITS,
     PRECISION_BITS,
-    levels_of,
-    top_level,
-    weights_of,
-)
-from structgstream.codec.entropy.tables import (
-    COST_BITS,
     FrequencyTables,
     code_costs,
     geometric_family,
+    levels_of,
     logs,
     normalize_counts,
+    top_level,
     weighed,
+    weights_of,
 )
 from structgstream.errors import StreamError
 

@@ -12,9 +12,10 @@ from structgstream.codec.segments.manifest import (
     SegmentEntry,
     StoredFile,
     history_name,
+    page_from_json,
+    page_to_json,
     sha256_of,
 )
-from structgstream.codec.segments.manifest_json import page_from_json, page_to_json
 from structgstream.codec.segments.store import Store
 from structgstream.errors import StreamError
 

@@ -1,11 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The manifest of a segments folder as values (docs/segments.md)."""
+"""The manifest of a segments folder: values, JSON, and the checks of what a host sends (docs/segments.md).
+
+Equal values are equal bytes: keys are sorted, there is no white space, and numbers come back exactly.
+"""
 
 import hashlib
-from dataclasses import dataclass
-from typing import Protocol
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from typing import Any, Protocol
 
-from structgstream.codec.packet_kind import PacketKind
+from structgstream.codec.container.records import PacketKind
+from structgstream.codec.segments.strict_json import Fields, parse_object
+from structgstream.errors import StreamError
 
 FORMAT = "structgstream-segments"
 VERSION = 1
@@ -201,3 +209,203 @@ def segment_name(segment: int, sha256: str) -> str:
 def history_name(first_segment: int, sha256: str) -> str:
     """The name of a page whose first segment has this number."""
     return f"history-{first_segment:08d}-{sha256[:16]}.json"
+
+
+MOST_MANIFEST_BYTES = 4 * 2**20
+MOST_PAGE_BYTES = 4 * 2**20
+MOST_ENTRIES = 4096
+MOST_GROUP_FRAMES = 65_536
+MOST_SEGMENT_BYTES = 2**40
+MOST_LEVEL = 8
+MIN_FPS = 1e-9
+
+
+def manifest_to_json(manifest: Manifest) -> bytes:
+    """The content of ``manifest.json``."""
+    parts = [{**asdict(part), "kind": part.kind.name.lower()} for part in manifest.parts]
+    return _dumped({**asdict(manifest), "parts": parts, "format": FORMAT, "version": VERSION})
+
+
+def manifest_from_json(data: bytes, *, name: str) -> Manifest:
+    """The manifest in ``data``; ``name`` is for messages.
+
+    Raises:
+        StreamError: it is no manifest, of a newer version, or contradicts itself or the format's bounds.
+    """
+    top = parse_object(data, name, most_bytes=MOST_MANIFEST_BYTES)
+    if (found := top.text("format")) != FORMAT:
+        raise StreamError(f"{name} is no manifest of segments: its format is {found!r}; expected {FORMAT!r}.")
+    if (version := top.whole("version")) != VERSION:
+        raise StreamError(f"{name} has version {version}; this program reads {VERSION}. Install a newer structgstream.")
+    edge, window = top.fields("edge"), top.fields("window")
+    manifest = Manifest(
+        sequence=top.whole("sequence", most=2**53 - 1),
+        live=top.flag("live"),
+        fps=top.number("fps", least=MIN_FPS),
+        name=top.text("name"),
+        target_latency_seconds=top.number("target_latency_seconds", least=0.0),
+        frame_seconds=None if top.is_none("frame_seconds") else top.number("frame_seconds", least=0.0),
+        edge=Edge(
+            frame=edge.whole("frame"),
+            pts_seconds=edge.number("pts_seconds"),
+            captured_unix_seconds=_optional(edge, "captured_unix_seconds"),
+            published_unix_seconds=edge.number("published_unix_seconds"),
+        ),
+        window=Window(window.whole("first_frame"), window.whole("first_segment"), _optional(window, "seconds")),
+        periods=tuple(_period(entry) for entry in top.items("periods", most=MOST_ENTRIES)),
+        history=tuple(_page(entry) for entry in top.items("history", most=MOST_ENTRIES)),
+        segments=tuple(_segment(entry) for entry in top.items("segments", most=MOST_ENTRIES)),
+        parts=tuple(_part(entry) for entry in top.items("parts", most=MOST_GROUP_FRAMES)),
+    )
+    _check(manifest, name)
+    return manifest
+
+
+def page_to_json(entries: Sequence[SegmentEntry] | Sequence[HistoryEntry]) -> bytes:
+    """The content of a history page: of segments, or of pages of the level below."""
+    key = "segments" if isinstance(entries[0], SegmentEntry) else "history"
+    return _dumped({"format": FORMAT, "version": VERSION, key: [asdict(entry) for entry in entries]})
+
+
+def page_from_json(data: bytes, entry: HistoryEntry) -> tuple[SegmentEntry, ...] | tuple[HistoryEntry, ...]:
+    """The entries of the page that ``entry`` names: pages if its level is above 0, otherwise segments.
+
+    Raises:
+        StreamError: it is no page, or not what ``entry`` announces.
+    """
+    top = parse_object(data, entry.file, most_bytes=MOST_PAGE_BYTES)
+    if top.text("format") != FORMAT or top.whole("version") != VERSION:
+        top.refuse(f"is no history page of {FORMAT} {VERSION}")
+    if entry.level:
+        pages = tuple(_page(one) for one in top.items("history", most=MOST_ENTRIES))
+        if any(page.level != entry.level - 1 for page in pages):
+            top.refuse(f"lists pages of other levels than {entry.level - 1}")
+        _check_run(pages, entry.first_segment, entry.first_frame, entry.file)
+        counts = sum(page.segments for page in pages), sum(page.frames for page in pages)
+        found: tuple[SegmentEntry, ...] | tuple[HistoryEntry, ...] = pages
+    else:
+        segments = tuple(_segment(one) for one in top.items("segments", most=MOST_ENTRIES))
+        _check_run(segments, entry.first_segment, entry.first_frame, entry.file)
+        counts, found = (len(segments), sum(one.frames for one in segments)), segments
+    if counts != (entry.segments, entry.frames):
+        top.refuse(f"has {counts[0]} segments of {counts[1]} frames; expected {entry.segments} of {entry.frames}")
+    return found
+
+
+def _dumped(value: dict[str, Any]) -> bytes:
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode() + b"\n"
+
+
+def _optional(fields: Fields, name: str) -> float | None:
+    return None if fields.is_none(name) else fields.number(name)
+
+
+def _period(fields: Fields) -> PeriodEntry:
+    return PeriodEntry(
+        period=fields.whole("period"),
+        file=fields.file(),
+        bytes=fields.whole("bytes", least=1, most=MOST_SEGMENT_BYTES),
+        sha256=fields.sha256(),
+        first_frame=fields.whole("first_frame"),
+        first_segment=fields.whole("first_segment"),
+    )
+
+
+def _page(fields: Fields) -> HistoryEntry:
+    return HistoryEntry(
+        file=fields.file(),
+        level=fields.whole("level", most=MOST_LEVEL),
+        first_segment=fields.whole("first_segment"),
+        segments=fields.whole("segments", least=1),
+        first_frame=fields.whole("first_frame"),
+        frames=fields.whole("frames", least=1),
+        pts_seconds=fields.pair("pts_seconds"),
+        bytes=fields.whole("bytes", least=1, most=MOST_PAGE_BYTES),
+        sha256=fields.sha256(),
+    )
+
+
+def _segment(fields: Fields) -> SegmentEntry:
+    frames = fields.whole("frames", least=1, most=MOST_GROUP_FRAMES)
+    entry = SegmentEntry(
+        segment=fields.whole("segment"),
+        file=fields.file(),
+        period=fields.whole("period"),
+        first_frame=fields.whole("first_frame"),
+        frames=frames,
+        pts_seconds=fields.pair("pts_seconds"),
+        bytes=fields.whole("bytes", least=1, most=MOST_SEGMENT_BYTES),
+        key_bytes=fields.whole("key_bytes", least=1, most=2**33),
+        frame_bytes=fields.wholes("frame_bytes", count=frames, least=1, most=2**33),
+        sha256=fields.sha256(),
+    )
+    if sum(entry.frame_bytes) != entry.bytes or entry.key_bytes != entry.frame_bytes[0]:
+        fields.refuse("states lengths of frames that are not those of the segment")
+    return entry
+
+
+def _part(fields: Fields) -> PartEntry:
+    kinds = {kind.name.lower(): kind for kind in PacketKind}
+    if (kind := fields.text("kind", most=20)) not in kinds:
+        fields.refuse(f"has 'kind' {kind!r}; expected {' or '.join(kinds)}")
+    return PartEntry(
+        file=fields.file(),
+        frame=fields.whole("frame"),
+        period=fields.whole("period"),
+        kind=kinds[kind],
+        pts_seconds=fields.number("pts_seconds"),
+        bytes=fields.whole("bytes", least=1, most=2**33),
+        sha256=fields.sha256(),
+    )
+
+
+def _check(manifest: Manifest, name: str) -> None:
+    """Check that what a manifest lists follows each other, and ends at its edge."""
+    pages, window = manifest.history, manifest.window
+    segment, frame = _check_run(pages, 0, 0, name)
+    segment, frame = _check_run(manifest.segments, segment, frame, name)
+    for part in manifest.parts:
+        if part.frame != frame:
+            raise StreamError(f"{name} has a part of frame {part.frame} where one of frame {frame} belongs.")
+        frame += 1
+    if manifest.edge.frame != frame - 1:
+        raise StreamError(f"{name} lists frames 0 to {frame - 1}, and its edge is frame {manifest.edge.frame}.")
+    if manifest.parts and not manifest.live:
+        raise StreamError(f"{name} has parts although its run has ended.")
+    if manifest.parts and manifest.parts[0].kind is not PacketKind.KEY:
+        raise StreamError(f"{name} has parts that do not begin with a key frame.")
+    if window.first_frame >= frame or window.first_segment > segment:
+        raise StreamError(f"{name} has a window that begins after its edge.")
+    periods = manifest.periods
+    if not periods or periods[0].first_frame > window.first_frame:
+        raise StreamError(f"{name} names no init record of the first frame of its window.")
+    for before, after in pairwise(periods):
+        if after.period != before.period + 1 or after.first_frame <= before.first_frame:
+            raise StreamError(f"{name} does not list its periods in their order.")
+    known = {period.period for period in periods}
+    used = {entry.period for entry in (*manifest.segments, *manifest.parts) if not _gone(entry, window)}
+    if not used <= known:
+        raise StreamError(f"{name} names no init record of period {min(used - known)}.")
+
+
+def _gone(entry: SegmentEntry | PartEntry, window: Window) -> bool:
+    return isinstance(entry, SegmentEntry) and entry.segment < window.first_segment
+
+
+def _check_run(
+    entries: Sequence[SegmentEntry] | Sequence[HistoryEntry], segment: int, frame: int, name: str
+) -> tuple[int, int]:
+    """Check that entries follow each other from this segment and frame on; returns those after the last."""
+    for entry in entries:
+        if (entry.first_frame, _first_segment(entry)) != (frame, segment):
+            raise StreamError(
+                f"{name} lists {entry.file}, which begins with frame {entry.first_frame} and segment "
+                f"{_first_segment(entry)}, where frame {frame} and segment {segment} belong."
+            )
+        segment += entry.segments if isinstance(entry, HistoryEntry) else 1
+        frame += entry.frames
+    return segment, frame
+
+
+def _first_segment(entry: SegmentEntry | HistoryEntry) -> int:
+    return entry.first_segment if isinstance(entry, HistoryEntry) else entry.segment

@@ -24,8 +24,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 
-from structgstream.codec.segments.manifest import MANIFEST
-from structgstream.codec.segments.manifest_json import manifest_from_json
+from structgstream.codec.segments.manifest import MANIFEST, manifest_from_json
 from structgstream.codec.segments.recovery import stale_files
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.errors import StorageError, StreamError

@@ -1,24 +1,75 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From one manifest to the next, and the files that must be there before it."""
+"""From one manifest to the next, with the group of frames that is being written, and the files before it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from structgstream.codec.container.records import RecordType, packed, prefix
+from structgstream.codec.container.records import (
+    FRAME,
+    PACKET_KINDS,
+    RecordType,
+    packed,
+    prefix,
+    read_record,
+)
 from structgstream.codec.header import pack_header
 from structgstream.codec.packets import StreamHeader
-from structgstream.codec.segments.group import part_of, records_of, segment_of
 from structgstream.codec.segments.history import paged, verified
 from structgstream.codec.segments.manifest import (
     Edge,
     Manifest,
     PartEntry,
     PeriodEntry,
+    SegmentEntry,
     Window,
     init_name,
+    part_name,
+    segment_name,
     sha256_of,
 )
 from structgstream.codec.segments.store import Store
+from structgstream.errors import StreamError
+
+
+def part_of(record: bytes) -> PartEntry:
+    """The entry of a packet's record.
+
+    Raises:
+        StreamError: it is no whole record of a packet.
+    """
+    found = read_record(record, 0)
+    if found is None or found.type not in PACKET_KINDS or len(found.payload) < FRAME.size:
+        raise StreamError(f"{len(record)} bytes are no whole record of a packet.")
+    frame, pts_seconds = FRAME.unpack_from(found.payload)
+    sha256 = sha256_of(record)
+    kind = PACKET_KINDS[found.type]
+    return PartEntry(part_name(frame, sha256), frame, found.period, kind, pts_seconds, len(record), sha256)
+
+
+def segment_of(parts: Sequence[PartEntry], data: bytes, *, segment: int) -> SegmentEntry:
+    """The entry of the segment that consists of these parts, whose bytes are ``data``."""
+    sha256 = sha256_of(data)
+    return SegmentEntry(
+        segment=segment,
+        file=segment_name(segment, sha256),
+        period=parts[0].period,
+        first_frame=parts[0].frame,
+        frames=len(parts),
+        pts_seconds=(parts[0].pts_seconds, parts[-1].pts_seconds),
+        bytes=len(data),
+        key_bytes=parts[0].bytes,
+        frame_bytes=tuple(part.bytes for part in parts),
+        sha256=sha256,
+    )
+
+
+def records_of(entry: SegmentEntry, data: bytes) -> list[bytes]:
+    """The records of each frame of a segment."""
+    records, start = [], 0
+    for size in entry.frame_bytes:
+        records.append(data[start : start + size])
+        start += size
+    return records
 
 
 @dataclass(frozen=True)

@@ -8,17 +8,23 @@ frame's group follows, history pages. The part counts; everything else is made a
 import re
 from dataclasses import replace
 
-from structgstream.codec.container.records import PREFIX, RecordType, check_prefix, read_record
+from structgstream.codec.container.records import PREFIX, PacketKind, RecordType, check_prefix, read_record
 from structgstream.codec.header import unpack_header
-from structgstream.codec.packet_kind import PacketKind
-from structgstream.codec.segments.group import part_of
 from structgstream.codec.segments.history import verified
-from structgstream.codec.segments.manifest import MANIFEST, Edge, Manifest, PartEntry, sha256_of
-from structgstream.codec.segments.manifest_json import MOST_MANIFEST_BYTES, manifest_from_json
+from structgstream.codec.segments.manifest import (
+    MANIFEST,
+    MOST_MANIFEST_BYTES,
+    Edge,
+    Manifest,
+    PartEntry,
+    manifest_from_json,
+    sha256_of,
+)
 from structgstream.codec.segments.next_manifest import (
     Draft,
     empty_manifest,
     next_segment,
+    part_of,
     period_entry,
     reopened,
     running_period,

@@ -14,21 +14,23 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
-from structgstream.codec.container.disk_room import check_room
-from structgstream.codec.container.records import RecordType, packed
+from structgstream.codec.container.byte_source import check_room
+from structgstream.codec.container.records import RECORD_TYPES, packed
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
-from structgstream.codec.segments.group import part_of
 from structgstream.codec.segments.manifest import (
     MANIFEST,
+    MOST_MANIFEST_BYTES,
     Edge,
     Manifest,
     Window,
+    manifest_from_json,
+    manifest_to_json,
 )
-from structgstream.codec.segments.manifest_json import MOST_MANIFEST_BYTES, manifest_from_json, manifest_to_json
 from structgstream.codec.segments.next_manifest import (
     Draft,
     empty_manifest,
     init_file,
+    part_of,
     period_entry,
     periods_in,
     reopened,
@@ -41,7 +43,6 @@ from structgstream.codec.segments.retention import Retention, SegmentsOptions
 from structgstream.codec.segments.store import Store
 from structgstream.errors import StorageError, StreamError
 
-_TYPES = {PacketKind.KEY: RecordType.KEY, PacketKind.DELTA: RecordType.DELTA}
 _RECENT_FRAMES = 8
 _LATENCY_FRAMES = 3.0
 _ENTRY_BYTES = 1024
@@ -142,7 +143,7 @@ class SegmentsSink:
         period = draft.manifest.periods[-1]
         begins = packet.index == period.first_frame
         assert packet.kind is PacketKind.KEY or not begins, "a period begins with a key packet"
-        record = packed(_TYPES[packet.kind], packet.payload, period=period.period)
+        record = packed(RECORD_TYPES[packet.kind], packet.payload, period=period.period)
         self._check_room(draft, len(record))
         part = part_of(record)
         self._put([(part.file, record)])

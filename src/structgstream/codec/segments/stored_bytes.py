@@ -7,15 +7,21 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from structgstream.codec.container.index import pack_index
-from structgstream.codec.container.periods import Period
-from structgstream.codec.container.records import PREFIX, RecordType
-from structgstream.codec.packet_kind import PacketKind
+from structgstream.codec.container.index import Period, pack_index
+from structgstream.codec.container.records import PREFIX, PacketKind, RecordType
 from structgstream.codec.segments.history import segments_from, verified
-from structgstream.codec.segments.manifest import MANIFEST, Manifest, PartEntry, SegmentEntry, StoredFile
-from structgstream.codec.segments.manifest_json import MOST_MANIFEST_BYTES, manifest_from_json
+from structgstream.codec.segments.manifest import (
+    MANIFEST,
+    MOST_MANIFEST_BYTES,
+    Manifest,
+    PartEntry,
+    SegmentEntry,
+    StoredFile,
+    manifest_from_json,
+)
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.errors import StreamError
+from structgstream.whole_files import write_whole
 
 _KEPT_FILES = 2
 
@@ -210,3 +216,24 @@ def read_manifest(store: Store) -> Manifest:
     if MANIFEST not in store.names():
         raise StreamError(f"{store.name} has no {MANIFEST}; expected a folder written with --sink segments.")
     return manifest_from_json(store.get(MANIFEST, most_bytes=MOST_MANIFEST_BYTES), name=f"{MANIFEST} in {store.name}")
+
+
+def write_archive(store: Store, path: Path) -> int:
+    """Write the bytes that the file sink would have written, and return how many frames they hold.
+
+    The SHA-256 of every file is verified on the way; an existing file at ``path`` is replaced only by a whole archive.
+    A run that has not ended gives a file without an index, which may be continued with ``--resume``.
+
+    Raises:
+        StreamError: frames have left the window, or a file is missing or damaged.
+        StorageError: the file cannot be written.
+    """
+    stored = StoredBytes(store, read_manifest(store), check=True)
+    if stored.gone:
+        gone = " and ".join(f"{frames.start} to {frames.stop - 1}" for frames in stored.gone)
+        raise StreamError(
+            f"{store.name} is not whole: frames {gone} have left its window (--window). A stream file has no gaps; "
+            "reconstruct without a window to archive a whole stream."
+        )
+    write_whole(path, stored.files())
+    return len(stored.sizes)

@@ -23,12 +23,13 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import CameraRig
+from structgstream.codec.fields.quantization import float32, round_straight_through
 from structgstream.kernels.backend import Backend
 from structgstream.kernels.values import HeadWeights, MLPWeights
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FIELDS, STATE_TABLE, FieldName, scene_of, state_of
-from structgstream.training.parameters import RoundingConfig, round_straight_through
+from structgstream.training.parameters import RoundingConfig
 
 SENSITIVITY_FIELDS: tuple[FieldName, ...] = tuple(row.name for row in STATE_TABLE if row.init_step == "sensitivity")
 FINEST, COARSEST = -1, 2
@@ -198,8 +199,3 @@ def _quantize_rows(
     step = float32(most / mean**0.5 * 2.0**FINEST)
     sizes = step * torch.exp2(powers - FINEST).reshape(-1, *[1] * len(rows))
     return step, (values / sizes).round() * sizes
-
-
-def float32(value: float) -> float:
-    """The nearest float32 number."""
-    return float(torch.tensor(value, dtype=torch.float32))

@@ -25,10 +25,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from structgstream.codec.fields.quantization import round_straight_through
 from structgstream.kernels.values import HeadWeights
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import ExposureConfig
-from structgstream.training.parameters import round_straight_through
 from structgstream.training.views import View
 
 LEAST_VIEWS = 3

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from structgstream.codec.fields.quantization import RateTerm
 from structgstream.kernels.backend import Backend, nonblocking
 from structgstream.kernels.cuda_tiles import PairBudget, run_with_pair_budget
 from structgstream.scene.active_tiles import ActiveTiles
@@ -29,14 +30,7 @@ from structgstream.training.online.patching import FreeSet
 from structgstream.training.online.smoothness import MotionSmoothness
 from structgstream.training.online.split import DynamicSplit
 from structgstream.training.optim import Adam, Hooks, LastPass, MeanOfSteps, Schedule, minimize
-from structgstream.training.parameters import (
-    FREE_ROWS,
-    Parameters,
-    RateTerm,
-    detached,
-    parameters_of_fields,
-    values_of_rows,
-)
+from structgstream.training.parameters import FREE_ROWS, Parameters, detached, parameters_of_fields, values_of_rows
 from structgstream.training.result import FitResult, StepListener, Stopwatch
 from structgstream.training.views import View, shuffled_views
 
@@ -206,7 +200,7 @@ class FrameOptimizer:
         known, free = parameters, rounding.free_priced
         if start.reference is not None:
             known, free = Parameters.of(start.reference, trained=trained, steps=steps), False
-        return parameters, RateTerm.of(known, steps, weight=rounding.resolved_rate_weight, free=free)
+        return parameters, RateTerm.of(known.values, steps, weight=rounding.resolved_rate_weight, free=free)
 
 
 def rest_every(most: int, *, views: int, iterations: int) -> int:

@@ -16,10 +16,11 @@ from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.codec.encoder import SceneEncoder
+from structgstream.codec.fields.free_rows import FREE_PARAMETERS
+from structgstream.codec.fields.packet_fields import CODABLE, dequantize_state, quantize_state
+from structgstream.codec.fields.quantization import round_to_bins
+from structgstream.codec.fields.static_fields import UNCODED_FIELDS
 from structgstream.codec.packets import PacketKind, StreamHeader
-from structgstream.codec.scene.bins import FREE_PARAMETERS, dequantize_state, quantize_state, round_to_bins
-from structgstream.codec.scene.compact import CODABLE
-from structgstream.codec.scene.static_fields import UNCODED_FIELDS
 from structgstream.codec.sinks import MemorySink
 from structgstream.scene.order import morton_order
 from structgstream.scene.scene import Scene

@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 from structgstream.codec.container.byte_source import ByteSource
-from structgstream.codec.container.periods import Period
+from structgstream.codec.container.index import Period
 from structgstream.codec.container.records import (
     PREFIX,
     RecordType,
@@ -32,9 +32,9 @@ from structgstream.codec.container.records import (
     read_record,
     scan_records,
 )
+from structgstream.codec.contents import PacketInfo
 from structgstream.codec.decoder import FRAME
 from structgstream.codec.header import pack_header, unpack_header
-from structgstream.codec.packet_table import PacketInfo
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.errors import StorageError, StreamError
 from structgstream.pipeline import State

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from structgstream.codec.scene.shapes import check_shapes
+from structgstream.codec.header import check_shapes
 from structgstream.errors import StreamError
 from structgstream.pipeline import FrameTask
 from structgstream.presets import RIG

@@ -1,20 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Coding of free Gaussians: deaths, changes and births (docs/bitstream.md, section Free 3DGs)."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
-from structgstream.codec.arrays import Bins, Flags
 from structgstream.codec.entropy.adaptive import AdaptiveCoder
-from structgstream.codec.entropy.bits import bit_lengths
-from structgstream.codec.scene.bins import FREE_PARAMETERS, FreeBins
-from structgstream.codec.scene.change import Change
-from structgstream.codec.scene.rows import code_change
+from structgstream.codec.entropy.bits import Bins, Flags, bit_lengths
+from structgstream.codec.fields.quantization import dequantize, quantize
+from structgstream.codec.fields.rows import Change, code_change
 from structgstream.errors import StreamError
-from structgstream.scene.state import FREE_COLUMNS
+from structgstream.scene.state import FIELDS, FREE_COLUMNS
 
+FREE_PARAMETERS = FIELDS["free"].parameters
 _ENDS = tuple(accumulate(parameter.columns for parameter in FREE_PARAMETERS))
 GROUPS = tuple((p.path, end - p.columns, end) for p, end in zip(FREE_PARAMETERS, _ENDS, strict=True))
 MOST_FREE = 2**18
@@ -22,6 +24,52 @@ MOST_FREE = 2**18
 _MEANS = range(6, 11)  # columns predicted from the mean: quaternions and opacities
 _LED = (12, 13)  # columns predicted from the change in the column before: green and blue
 _FRAME_BITS = 32  # a birth is frame * 2^32 + number
+
+
+@dataclass(frozen=True)
+class FreeBins:
+    """Free Gaussians as bins.
+
+    Args:
+        births: int64 ``[F]``, ascending.
+        bins: ``[F, 14]``.
+        change: by the last frame; zero for Gaussians born in it.
+    """
+
+    births: NDArray[np.int64]
+    bins: Bins
+    change: Change
+
+    @classmethod
+    def none(cls) -> "FreeBins":
+        """No free Gaussians."""
+        return cls(np.zeros(0, np.int64), np.zeros((0, FREE_COLUMNS), np.int32), Change.none(0, FREE_COLUMNS))
+
+    def without_change(self) -> "FreeBins":
+        """The same bins with zero change, as after a key packet."""
+        return FreeBins(self.births, self.bins, Change.none(len(self.births), FREE_COLUMNS))
+
+    @classmethod
+    def quantized(cls, values: Tensor, births: Tensor, steps: Mapping[str, float]) -> "FreeBins":
+        """The bins of ``values`` ``[F, 14]`` and their ``births`` ``[F]``, with zero change.
+
+        Raises:
+            StreamError: a bin is beyond 22 bits.
+        """
+        return cls(
+            births.cpu().numpy().astype(np.int64),
+            quantize(values, _steps_of_columns(steps)),
+            Change.none(len(births), FREE_COLUMNS),
+        )
+
+    def dequantized(self, steps: Mapping[str, float]) -> Tensor:
+        """The values ``[F, 14]``."""
+        return dequantize(self.bins, _steps_of_columns(steps))
+
+
+def _steps_of_columns(steps: Mapping[str, float]) -> NDArray[np.float32]:
+    widths = [parameter.columns for parameter in FREE_PARAMETERS]
+    return np.repeat(np.array([steps[parameter.name] for parameter in FREE_PARAMETERS], np.float32), widths)
 
 
 def code_free(coder: AdaptiveCoder, after: FreeBins | None, before: FreeBins, *, where: str) -> FreeBins:

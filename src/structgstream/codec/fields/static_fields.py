@@ -16,11 +16,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from structgstream.codec.arrays import Bins, Contexts, Naturals
-from structgstream.codec.entropy.bits import bit_lengths, unzigzag, zigzag
-from structgstream.codec.entropy.residual_symbols import LARGEST as LARGEST_SYMBOL
+from structgstream.codec.entropy.bits import LARGEST_SYMBOL, Bins, Contexts, Naturals, bit_lengths, unzigzag, zigzag
 from structgstream.codec.entropy.section_coder import SectionCoder, SectionDecoder, SectionEncoder, Tables
-from structgstream.codec.scene.bins import LARGEST, dequantize, quantize
+from structgstream.codec.fields.quantization import check_range, dequantize, quantize
 from structgstream.errors import StreamError
 from structgstream.scene.order import CELL_BITS, morton_cells, morton_keys
 from structgstream.scene.state import FIELDS, STATE_TABLE, FieldName, InitCoding
@@ -274,6 +272,5 @@ def _bounded(number: int, most: int, what: str) -> int:
 
 
 def _checked(bins: Naturals) -> Bins:
-    if bins.size and not -LARGEST <= int(bins.min()) <= int(bins.max()) <= LARGEST:
-        raise StreamError(f"{_WHERE} has a bin beyond 22 bits, the largest allowed; it is damaged.")
+    check_range(bins, _WHERE)
     return bins.astype(np.int32)
