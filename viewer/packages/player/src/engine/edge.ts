@@ -109,13 +109,13 @@ export class Edge {
     const { timeline } = this;
     if (timeline.first > 0 && seconds < timeline.start) {
       const to = timeline.frameAt(timeline.start + LEFT_SHARE * (timeline.duration - timeline.start));
-      return { to, why: "The host no longer has this part of the stream: went on after it." };
+      return { to, why: "The host no longer has this part of the stream: playback continues after it." };
     }
     if (!this.following || rate !== 1) return { rate };
     if (this.sparse && this.seconds > seconds) return { to: timeline.count - 1 };
     const behind = this.seconds - this.distance - seconds;
     if (behind > JUMP_SECONDS && timeline.ptsOf(this.start) > seconds + LEAST_GAIN_SECONDS)
-      return { to: this.start, why: "This was too slow to keep up: went on with the newest frames." };
+      return { to: this.start, why: "Playback was too slow and continues with the newest frames." };
     this.catching = behind > (this.catching ? 0 : SLACK_SECONDS);
     return { rate: this.catching ? Math.min(1 + behind / 10, FASTEST) : 1 };
   }

@@ -300,7 +300,7 @@ export class Engine extends Emitter<EngineEvents> {
     this.emit("header", header);
     if (ranged) return;
     this.emit("notice", {
-      message: "The server gives no parts of files (Range), so that all of it has to be fetched.",
+      message: "The server does not support range requests, so the whole file is fetched.",
     });
   }
 
@@ -311,7 +311,7 @@ export class Engine extends Emitter<EngineEvents> {
     edge.changed(this.now());
     if (wasLive && !edge.live) this.emit("notice", { message: "The stream has ended; it is a recording now." });
     if (!wasLive && edge.live && this.opened) {
-      this.emit("notice", { message: "The stream goes on." });
+      this.emit("notice", { message: "The stream continues." });
       if (this.hasEnded) this.goLive();
     }
     this.startIfThere();

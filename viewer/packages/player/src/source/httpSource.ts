@@ -112,7 +112,7 @@ export class HttpSource implements ByteSource {
   }
 
   private misplaced(start: number, found: number | undefined): SourceError {
-    return new SourceError(`The server gave ${this.name} from byte ${found} on where byte ${start} was asked for.`);
+    return new SourceError(`The server sent ${this.name} from byte ${found} instead of byte ${start}.`);
   }
 }
 
@@ -145,9 +145,9 @@ export function refusal(name: string, status: number): SourceError {
     return new SourceError(`${name} was not found on the server (${status}). Check the address.`);
   }
   if (status === 401 || status === 403) {
-    return new SourceError(`The server does not give ${name} to this page (${status}).`);
+    return new SourceError(`The server refuses ${name} to this page (${status}).`);
   }
-  return new SourceError(`The server answered ${status} where ${name} was asked for.`, TEMPORARY.has(status));
+  return new SourceError(`The server answered the request for ${name} with ${status}.`, TEMPORARY.has(status));
 }
 
 /** Parses `bytes 0-9/100` or `bytes * /100`; undefined if it is missing or malformed. */

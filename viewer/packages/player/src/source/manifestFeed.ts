@@ -119,10 +119,7 @@ export class ManifestFeed {
       return "sequence" in found ? this.newer(found) : found;
     } catch (error) {
       if (!late.signal.aborted || signal.aborted) throw error;
-      throw new SourceError(
-        `The server has not answered for ${ANSWER_SECONDS} s where ${this.name} was asked for.`,
-        true,
-      );
+      throw new SourceError(`The server has not answered the request for ${this.name} for ${ANSWER_SECONDS} s.`, true);
     } finally {
       clearTimeout(timer);
       signal.removeEventListener("abort", end);

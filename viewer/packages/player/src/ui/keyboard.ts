@@ -16,8 +16,8 @@ export interface KeyActions {
 /** The list of keys in the help panel. */
 export const KEYS: readonly (readonly [keys: readonly string[], does: string])[] = [
   [["Space", "K"], "play, pause"],
-  [["←", "→"], "a second back, on"],
-  [[",", "."], "a frame back, on"],
+  [["←", "→"], "a second back, forward"],
+  [[",", "."], "a frame back, forward"],
   [["Home", "End"], "first, last frame, or live"],
   [["<", ">"], "slower, faster"],
   [["L"], "loop"],
@@ -26,7 +26,7 @@ export const KEYS: readonly (readonly [keys: readonly string[], does: string])[]
   [["+", "-"], "closer, farther"],
   [["C", "V"], "next, previous camera"],
   [["G"], "show the rig's cameras"],
-  [["R"], "the first view again"],
+  [["R"], "reset the view"],
   [["F"], "full screen"],
 ];
 

@@ -138,7 +138,7 @@ export function pictureContent(quality: QualityControl, player: Player, actions:
         player.still = motion === "still";
       },
     ),
-    acting("Open a file of yours", () => actions.openFile(), "file"),
+    acting("Open a file", () => actions.openFile(), "file"),
     made("div", { class: "more" }, ...actions.more.map(([label, act]) => acting(label, act))),
   ];
 }
