@@ -155,7 +155,7 @@ def test_targets_that_make_no_sense(config: RateConfig) -> None:
 
 
 def test_a_window_holds_a_group() -> None:
-    with pytest.raises(ConfigError, match=r"over 0.5 s cannot be kept with a key packet every 1 s; make rate.window"):
+    with pytest.raises(ConfigError, match=r"over 0.5 s cannot be met with a key packet every 1 s; make rate.window"):
         RateController(RateConfig(1.0, 0.5), FPS, keys=KeyFrames(KEY_EVERY, FPS))
 
 

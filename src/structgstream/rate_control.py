@@ -96,7 +96,7 @@ class RateController:
         window = max(2, round(config.window_seconds * fps))
         if window < keys.interval:
             raise ConfigError(
-                f"A rate over {config.window_seconds:g} s cannot be kept with a key packet every "
+                f"A rate over {config.window_seconds:g} s cannot be met with a key packet every "
                 f"{keys.interval / fps:g} s; make rate.window_seconds at least key_interval_seconds."
             )
         self._budget = config.target_mbits * 1e6 / 8.0 / fps
