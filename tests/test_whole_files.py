@@ -157,9 +157,7 @@ def test_a_real_disk_without_room(tmp_path: Path) -> None:
 
 def test_a_folder_without_permission_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "open", refuse(errno.EACCES))  # root may write anywhere
-    with pytest.raises(
-        StorageError, match=r"denied\); correct its permissions, or choose another place\.$"
-    ):
+    with pytest.raises(StorageError, match=r"denied\); correct its permissions, or choose another place\.$"):
         write_whole(tmp_path / "a", NEW)
 
 
