@@ -3,7 +3,7 @@
 
 Optimization alone cannot bridge large motion, so anchors start at their tracked positions (``tracking``). Rounds of
 flow from the rendering to the pictures, spawning and iterations follow. The rate term counts changes against frame 0,
-from which a key packet is predicted. Primitives that neither moved nor have a high error keep frame 0's exact values,
+from which a key packet is predicted. Primitives that neither moved nor have a high error retain frame 0's exact values,
 so all groups have the same background.
 """
 

@@ -225,7 +225,7 @@ describe.skipIf(!executable)("in a browser", () => {
   );
 
   test.each([
-    [{ withoutWebGL2: true }, {}, "This browser gives no WebGL2"],
+    [{ withoutWebGL2: true }, {}, "This browser does not support WebGL2"],
     [{ limits: { MAX_TEXTURE_SIZE: 1 } }, {}, "entries of anchor_offsets, at most 2048 fit its textures"],
     [{ limits: { MAX_DRAW_BUFFERS: 2 } }, { mlpPath: "mrt" }, 'limits are too small for the MLP path "mrt"'],
   ] as const)(

@@ -5,14 +5,14 @@
  * | attribute | meaning |
  * |---|---|
  * | `src` | address of a stream, of a manifest of segments (`.json`), or `#id` of an element of the page that holds one as base64 |
- * | `autoplay`, `loop` | as of a video |
+ * | `autoplay`, `loop` | as for a video |
  * | `controls="off"` | no controls; the picture can still be turned |
  * | `embed` | few controls |
- * | `theme` | `dark` or `light`; otherwise as the system's |
- * | `truth` | address of a list of cameras that have pictures, `truth.json`; they are at `truth/CAMERA/FRAME.jpg` beside it |
- * | `isolated` | the page's address (`?src=&t=&view=&embed=1`) means nothing to this player |
+ * | `theme` | `dark` or `light`; default: that of the system |
+ * | `truth` | address of a list of cameras with pictures, `truth.json`; pictures are at `truth/CAMERA/FRAME.jpg` next to it |
+ * | `isolated` | the player ignores the page's address (`?src=&t=&view=&embed=1`) |
  *
- * It dispatches what the player tells as events of these names, which do not bubble; `detail` has what each brings.
+ * It dispatches the player's events by the same names; they do not bubble, and `detail` has the event's data.
  */
 
 import { type Camera, type RenderStats, type ResourceCounts, SplatRenderer } from "@structgstream/gl";
@@ -39,7 +39,7 @@ export class StructgstreamPlayer extends HTMLElement {
   private running: Running | undefined;
   private ticking: number | undefined;
   private link: Link | undefined;
-  /** The stream's address where a link can lead to it. */
+  /** The stream's address, if a link can contain it. */
   private linked: string | undefined;
 
   connectedCallback(): void {
@@ -50,7 +50,7 @@ export class StructgstreamPlayer extends HTMLElement {
   }
 
   disconnectedCallback(): void {
-    // An element that is only being moved is connected again before this runs.
+    // An element that is moved is connected again before this runs.
     queueMicrotask(() => {
       if (!this.isConnected) this.stop();
     });
@@ -81,7 +81,7 @@ export class StructgstreamPlayer extends HTMLElement {
     this.engine?.seek(seconds);
   }
 
-  /** Pauses, and goes so many frames on or back. */
+  /** Pauses and steps forward or back by a number of frames. */
   step(frames: number): void {
     this.engine?.step(frames);
   }
@@ -115,12 +115,12 @@ export class StructgstreamPlayer extends HTMLElement {
     return this.engine?.frames.duration ?? Number.NaN;
   }
 
-  /** Goes to the edge of a live stream, and plays it from now on. */
+  /** Seeks to the edge of a live stream and follows it. */
   goLive(): void {
     this.engine?.goLive();
   }
 
-  /** Whether frames still come to a stream of segments. */
+  /** Whether further frames of a segmented stream will come. */
   get live(): boolean {
     return this.engine?.edge.live ?? false;
   }
@@ -130,7 +130,7 @@ export class StructgstreamPlayer extends HTMLElement {
     return this.engine?.behindSeconds ?? 0;
   }
 
-  /** Seconds since what is shown was filmed, by the clocks of this machine and the trainer's; NaN where that is not known. */
+  /** Seconds since the displayed frame was captured, by the clocks of this machine and the trainer; NaN if unknown. */
   get ageSeconds(): number {
     return this.running?.player.ageSeconds ?? Number.NaN;
   }
@@ -143,7 +143,7 @@ export class StructgstreamPlayer extends HTMLElement {
     return this.engine?.stored.times ?? [];
   }
 
-  /** The camera of the picture, in scene units; one that is set is flown to no more than it is looked through. */
+  /** The camera of the picture, in scene units; setting it takes effect without a flight. */
   get camera(): Camera | undefined {
     return this.running?.player.camera;
   }
@@ -158,7 +158,7 @@ export class StructgstreamPlayer extends HTMLElement {
     return this.running?.player.rig?.cameras.map(({ name }) => name) ?? [];
   }
 
-  /** Flies to a camera of the rig, in so many seconds. */
+  /** Flies to a camera of the rig in the given number of seconds. */
   show(camera: string, seconds = 0): void {
     const found = this.running?.player.rig?.cameras.find(({ name }) => name === camera);
     if (!found)
@@ -166,22 +166,22 @@ export class StructgstreamPlayer extends HTMLElement {
     this.running!.player.flyTo(found, seconds);
   }
 
-  /** What the last picture took. */
+  /** Statistics of the last picture. */
   get stats(): RenderStats | undefined {
     return this.running?.player.stats;
   }
 
-  /** What decoding a packet took in its worker, on the way to the last frame. */
+  /** Decoding time per packet in the worker, for the packets of the last frame. */
   get decodeMilliseconds(): number {
     return this.engine?.packets.decodeMilliseconds ?? 0;
   }
 
-  /** What the renderer holds. */
+  /** Memory of the renderer. */
   get resources(): ResourceCounts | undefined {
     return this.running?.player.resources;
   }
 
-  /** Listens to the player; what comes back ends the listening. Kept when another stream is loaded. */
+  /** Adds a listener and returns a function that removes it. Listeners remain when another stream is loaded. */
   on<EventName extends keyof PlayerEvents>(
     name: EventName,
     listener: (event: PlayerEvents[EventName]) => void,
@@ -191,13 +191,13 @@ export class StructgstreamPlayer extends HTMLElement {
     return () => this.removeEventListener(name, heard);
   }
 
-  /** The picture as it is, as PNG. */
+  /** The present picture as PNG. */
   async screenshot(): Promise<Blob> {
     if (!this.running) throw new Error("There is no picture: the player is not in a page, or was destroyed.");
     return this.running.player.screenshot();
   }
 
-  /** Ends workers and gives back all memory. The element can be put into a page again. */
+  /** Terminates workers and releases all memory. The element can be inserted into a page again. */
   destroy(): void {
     this.stop();
     this.remove();
@@ -250,7 +250,7 @@ export class StructgstreamPlayer extends HTMLElement {
     if (truth !== null) ui.compare.attach(new URL(truth, document.baseURI)).catch(() => undefined);
   }
 
-  /** There is no WebGL2, and a sentence says so. */
+  /** Shows that there is no WebGL2. */
   private startWithout(root: ShadowRoot, style: Node, error: unknown): void {
     const text = document.createElement("p");
     text.textContent = error instanceof Error ? error.message : String(error);
@@ -290,7 +290,7 @@ export class StructgstreamPlayer extends HTMLElement {
   private openAttribute(): void {
     const linked = this.link?.src;
     const own = this.getAttribute("src");
-    // A link names a stream of its own origin, and no redirection leads out of it.
+    // A link can only name a stream of its own origin; redirects to other origins are refused.
     if (linked !== undefined) this.open(this.sourceAt(new URL(linked), true));
     else if (own !== null) this.open(this.described(own));
     else this.running?.ui.invite();
@@ -308,18 +308,18 @@ export class StructgstreamPlayer extends HTMLElement {
   private sourceAt(url: URL, sameOrigin: boolean): SourceDescription {
     const own = url.origin === location.origin;
     const token = this.token();
-    // What opens this page opens its streams; no other host is told of it.
+    // The page's token also opens its streams; it is not sent to other hosts.
     if (own && token !== null && !url.searchParams.has("token")) url.searchParams.set("token", token);
     const found = { url: url.href, name: nameOf(url.href), sameOrigin };
     return url.pathname.endsWith(".json") ? { kind: "segments", own, ...found } : { kind: "url", ...found };
   }
 
-  /** What the page's address says that opens streams. */
+  /** The access token in the page's address. */
   private token(): string | null {
     return this.hasAttribute("isolated") ? null : new URLSearchParams(location.search).get("token");
   }
 
-  /** The address of a stream where a link can lead to it: the page's own token is in the link anyway. */
+  /** The address of a stream for a link, without the page's own token, which the link contains anyway. */
   private linkable(source: SourceDescription): string | undefined {
     if (!("url" in source)) return undefined;
     const url = new URL(source.url);
@@ -334,7 +334,7 @@ export class StructgstreamPlayer extends HTMLElement {
     const { player, ui } = running;
     const at = seconds ?? link?.seconds;
     const view = link?.view;
-    this.link = undefined; // a link is of the first stream only
+    this.link = undefined; // a link applies only to the first stream
     this.linked = this.linkable(source);
     const engine = player.load(source, at, view && ((rig) => viewFrom(view, rig.first.camera)));
     ui.begin(source.name);

@@ -6,5 +6,5 @@ export type { EngineEvents, TimeRange } from "./engine/events.js";
 export type { PlayerEvents } from "./player.js";
 export { StructgstreamPlayer };
 
-// A page may hold the module twice, as notebooks do.
+// A page may contain the module twice, as notebooks do.
 if (!customElements.get("structgstream-player")) customElements.define("structgstream-player", StructgstreamPlayer);

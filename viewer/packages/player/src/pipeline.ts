@@ -5,7 +5,7 @@ import type { FromDecoder } from "./decode/messages.js";
 import type { Pipeline } from "./engine/pipeline.js";
 import { startedWorker } from "./scripts.js";
 
-/** Starts both workers; `close` ends them, whatever they do. */
+/** Starts both workers; `close` terminates them. */
 export function startedPipeline(): Pipeline {
   const { port1, port2 } = new MessageChannel();
   const workers = [startedWorker("fetch", port1), startedWorker("decode", port2)];

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** A stream on a canvas: engine, renderer and a camera that moves. It knows nothing of buttons. */
+/** A stream on a canvas: engine, renderer and a moving camera, without a user interface. */
 
 import type { StreamHeader } from "@structgstream/core";
 import { type Camera, center, fitted, type Renderer, type RenderStats, type ResourceCounts } from "@structgstream/gl";
@@ -14,9 +14,9 @@ import type { QualityControl } from "./view/quality.js";
 import { nearPlane, type Rig, type RigCamera, rigOf } from "./view/rig.js";
 
 export interface PlayerEvents extends EngineEvents {
-  /** The camera or the picture's size is another. */
+  /** The camera or the picture's size has changed. */
   view: { readonly view: View };
-  /** The cameras may be others from now on. */
+  /** The rig's cameras may have changed. */
   rig: { readonly rig: Rig };
   /** A picture was drawn. */
   drawn: { readonly stats: RenderStats };
@@ -26,30 +26,30 @@ export interface PlayerOptions {
   readonly renderer: Renderer;
   readonly quality: QualityControl;
   readonly startPipeline: () => Pipeline;
-  /** Seconds of a clock that only goes forward. */
+  /** Seconds of a monotonic clock. */
   readonly now: () => number;
 }
 
-/** Pictures further apart than this did not follow each other: the page was hidden, or nothing changed. */
+/** Longest interval between consecutive pictures; after a longer one the page was hidden, or nothing changed. */
 const PAUSE_SECONDS = 1;
 const FLIGHT_SECONDS = 0.9;
 
 export class Player extends Emitter<PlayerEvents> {
   rig: Rig | undefined;
   view: View | undefined;
-  /** The rig's camera that the view is that of, until it moves. */
+  /** The rig's camera whose view is shown, until the camera moves. */
   atCamera: RigCamera | undefined;
-  /** Whether hands have moved the camera since the stream was opened. */
+  /** Whether the user has moved the camera since the stream was opened. */
   touched = false;
   /** Whether flights take no time. */
   still = false;
-  /** Pictures get the exposure of the camera they are seen from: to compare with its own. */
+  /** Pictures get the exposure of the camera whose view is shown, for a comparison with its own. */
   exposed = false;
   engine: Engine | undefined;
   stats: RenderStats | undefined;
-  /** Those of the last call that drew something. */
+  /** Statistics of the last call that drew something. */
   drawnStats: RenderStats | undefined;
-  /** Time between the last pictures, smoothed; undefined while none follow each other. */
+  /** Smoothed time between the last pictures; undefined if they are not consecutive. */
   pictureSeconds: number | undefined;
   loop = false;
   private rate = 1;
@@ -60,7 +60,7 @@ export class Player extends Emitter<PlayerEvents> {
   private drawnCamera: Camera | undefined;
   private drawnAt: number | undefined;
   private drawnView: View | undefined;
-  /** The first frame that the renderer was given and has not drawn yet. */
+  /** The first frame that the renderer has received and not drawn yet. */
   private given: { readonly index: number; readonly at: number } | undefined;
   private hasScene = false;
 
@@ -69,7 +69,7 @@ export class Player extends Emitter<PlayerEvents> {
     options.renderer.onError = (error) => this.emit("error", { message: error.message, fatal: false });
   }
 
-  /** Opens a stream; the one before is forgotten. `view` is taken once the rig is known. */
+  /** Opens a stream and closes the last one. `view` is set once the rig is known. */
   load(source: SourceDescription, startSeconds?: number, view?: (rig: Rig) => View): Engine {
     this.engine?.destroy();
     const engine = new Engine(this.options.startPipeline(), this.options.now);
@@ -98,13 +98,13 @@ export class Player extends Emitter<PlayerEvents> {
     return this.rate;
   }
 
-  /** Plays what is paused, pauses what plays. */
+  /** Toggles between playing and paused. */
   toggle(): void {
     if (this.engine?.paused) this.engine.play();
     else this.engine?.pause();
   }
 
-  /** Goes to the newest frame; the edge of a live stream is played from now on. */
+  /** Seeks to the newest frame; follows the edge of a live stream. */
   goToNewest(): void {
     if (this.engine?.edge.live) this.engine.goLive();
     else this.engine?.seekFrame(Number.MAX_SAFE_INTEGER);
@@ -116,13 +116,13 @@ export class Player extends Emitter<PlayerEvents> {
     this.emit("state", {});
   }
 
-  /** The canvas has so many pixels. */
+  /** Sets the number of pixels of the canvas. */
   resize(width: number, height: number): void {
     this.size = [Math.max(Math.round(width), 1), Math.max(Math.round(height), 1)];
     if (this.view) this.emit("view", { view: this.view });
   }
 
-  /** The camera of the picture: that of the view, as large as the canvas. */
+  /** The camera of the picture: that of the view, with the size of the canvas. */
   get camera(): Camera | undefined {
     const { view, size, fittedTo } = this;
     if (!view) return undefined;
@@ -135,7 +135,7 @@ export class Player extends Emitter<PlayerEvents> {
     return this.drawnCamera;
   }
 
-  /** Moves the camera by hand; flights end. */
+  /** Moves the camera for user input; ends a flight. */
   navigate(move: (view: View, rig: Rig) => View): void {
     if (!this.view || !this.rig) return;
     this.touched = true;
@@ -166,7 +166,7 @@ export class Player extends Emitter<PlayerEvents> {
     return this.flight !== undefined;
   }
 
-  /** To be called for every picture that the browser shows. */
+  /** Must be called for every picture that the browser shows. */
   tick(): void {
     const { renderer, quality, now } = this.options;
     const time = now();
@@ -200,7 +200,7 @@ export class Player extends Emitter<PlayerEvents> {
     if (this.stats.drawn) this.measure(time, this.stats);
   }
 
-  /** Seconds since the picture that is shown was filmed; undefined where that is not known. */
+  /** Seconds since the displayed frame was captured; undefined if unknown. */
   get ageSeconds(): number | undefined {
     const filmed = this.engine?.frames.live?.filmedAtZero;
     const shown = this.drawnStats?.ptsSeconds;
@@ -211,7 +211,7 @@ export class Player extends Emitter<PlayerEvents> {
     return this.options.renderer.resources;
   }
 
-  /** The picture as it is, as PNG. */
+  /** The present picture as PNG. */
   screenshot(): Promise<Blob> {
     return this.options.renderer.screenshot();
   }
@@ -239,7 +239,7 @@ export class Player extends Emitter<PlayerEvents> {
     this.emit("rig", { rig });
   }
 
-  /** The frames from now on belong to another header: the picture stays, and so does what is looked at. */
+  /** The following frames belong to another header; picture and view do not change. */
   private goOn(header: StreamHeader): void {
     const before = this.engine?.header;
     if (this.engine) this.engine.header = header;
@@ -272,8 +272,8 @@ export class Player extends Emitter<PlayerEvents> {
     this.drawnAt = time;
     const following = since !== undefined && since < PAUSE_SECONDS;
     this.pictureSeconds = following ? 0.9 * (this.pictureSeconds ?? since) + 0.1 * since : undefined;
-    // A stream of few frames a second is not a slow device: pictures of a camera that moves should follow each other at
-    // the screen's pace, and a frame should be drawn soon after it was given; sorting takes its time elsewhere.
+    // A stream of few frames per second is not a slow device. Pictures of a moving camera should follow each other at
+    // the screen's rate, and a frame should be drawn soon after its arrival; sorting runs in another thread.
     if (following && this.view !== this.drawnView) this.options.quality.picture(since);
     else if (this.given && (stats.frameIndex ?? -1) >= this.given.index) {
       this.options.quality.picture(Math.max(time - this.given.at - stats.sortMilliseconds / 1000, 0));

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** What workers run: one script for all, which learns by its first message which one it is. */
+/** The script of all workers; the first message sets a worker's role. */
 
 import { Decoding } from "./decode/decoding.js";
 import type { FromDecoder, ToDecoder } from "./decode/messages.js";
@@ -7,16 +7,16 @@ import type { ReadReply, ReadRequest } from "./source/description.js";
 import { Fetcher } from "./source/fetcher.js";
 import type { Port } from "./source/port.js";
 
-/** The first message to a worker; `port` is the line between those that fetch and decode. */
+/** The first message to a worker; `port` connects the fetch and decode workers. */
 export type Role =
   | { readonly role: "fetch" | "decode"; readonly port: MessagePort }
-  /** The renderer's sorter hears everything from then on. */
+  /** The renderer's sorter handles all further messages. */
   | { readonly role: "sort" };
 
 self.onmessage = ({ data }: MessageEvent<Role>) => {
   self.onmessage = null;
   if (data.role === "sort") {
-    // It is in this very script: before another message is heard it has been started.
+    // It is part of this script, so it starts before the next message is handled.
     void import("@structgstream/gl/sorter");
   } else if (data.role === "fetch") {
     new Fetcher(data.port as unknown as Port<ReadReply, ReadRequest>, (input, init) => fetch(input, init));
@@ -26,7 +26,7 @@ self.onmessage = ({ data }: MessageEvent<Role>) => {
   }
 };
 
-/** Lets messages in; unlike a timer it does not wait. */
+/** Lets other messages be handled; unlike a timer it has no delay. */
 function breather(): () => Promise<void> {
   const { port1, port2 } = new MessageChannel();
   let resume: () => void = () => {};

@@ -186,7 +186,7 @@ test("a starved clock waits with the last frame, and says so", async () => {
   expect(stalls).toEqual([true]);
   expect(play.engine.currentTime).toBeLessThan(before + 0.04);
   await play.until(() => play.engine.paused, "giving up");
-  expect(play.errors).toEqual(["The server answered 503 where clip.sgs was asked for."]);
+  expect(play.errors).toEqual(["The server answered the request for clip.sgs with 503."]);
   file.status = undefined;
   play.engine.play();
   await play.until(() => {
@@ -365,8 +365,8 @@ describe("damage", () => {
 
 test.each([
   [404, "clip.sgs was not found on the server (404). Check the address."],
-  [403, "The server does not give clip.sgs to this page (403)."],
-  [500, "The server answered 500 where clip.sgs was asked for."],
+  [403, "The server refuses clip.sgs to this page (403)."],
+  [500, "The server answered the request for clip.sgs with 500."],
 ])("status %i", async (status, sentence) => {
   const file = new ServedFile(CLIP);
   file.status = status;

@@ -105,7 +105,7 @@ test("nothing new, older manifests of a cache, and trouble", async () => {
   const { told } = await followed(60, true, () => answers.shift()!());
   expect(told).toEqual([
     "manifest 5",
-    "waiting 0.5: The server answered 500 where m.json was asked for.",
+    "waiting 0.5: The server answered the request for m.json with 500.",
     "waiting 1: m.json is no JSON: it was cut or changed, or is something else.",
     "recovered",
     "manifest 6",
@@ -146,7 +146,7 @@ test("a host that never answers is given up for this time", async () => {
     if (after === null) return new Response(bodyOf(live));
     return new Promise((_, refuse) => signal.addEventListener("abort", () => refuse(new Error("aborted"))));
   });
-  expect(told.join()).toContain("The server has not answered for 45 s where m.json was asked for.");
+  expect(told.join()).toContain("The server has not answered the request for m.json for 45 s.");
 });
 
 test("the first manifest must be one", async () => {

@@ -172,7 +172,7 @@ test("who is far behind jumps to a key frame, who is a little behind goes a litt
   expect(play.notices).toEqual([]);
   live.write(600);
   await play.until(() => on() && play.notices.length > 0, "jump");
-  expect(play.notices[0]).toContain("went on with the newest frames");
+  expect(play.notices[0]).toContain("continues with the newest frames");
   await play.until(() => on() && !play.engine.seeking && play.shown.at(-1)! > 600, "edge");
   expect(play.engine.behindSeconds).toBeLessThan(5);
 });
@@ -272,7 +272,7 @@ test("a run that is resumed after its end is gone on with", async () => {
   await play.until(() => on() && play.engine.ended, "end");
   live.resume().write(3);
   await play.until(() => on() && play.shown.at(-1) === 23, "newest frame");
-  expect(play.notices).toEqual(["The stream has ended; it is a recording now.", "The stream goes on."]);
+  expect(play.notices).toEqual(["The stream has ended; it is a recording now.", "The stream continues."]);
   expect(play.engine.edge.following).toBe(true);
   expect(play.errors).toEqual([]);
 });

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The fields of a scene, and its training cameras, as three's textures: four numbers to a texel, in the order in which the shader counts. */
+/** The fields of a scene and its training cameras as three.js textures: four numbers per texel, in the shader's order. */
 
 import type { FieldName, Fields, Tensor } from "@structgstream/core";
 import {
@@ -13,7 +13,7 @@ import { DataTexture, FloatType, type IUniform, RGBAFormat } from "three";
 
 const WIDTH = 1 << TABLE_WIDTH_BITS;
 
-/** Names in the shader, and the fields they are made of. */
+/** Names in the shader, and their fields. */
 const TABLES: Readonly<Record<string, readonly FieldName[]>> = {
   positions: ["anchor_positions"],
   offsetScales: ["offset_scales"],
@@ -26,7 +26,7 @@ const TABLES: Readonly<Record<string, readonly FieldName[]>> = {
 };
 
 export class FieldTextures {
-  /** By the names in the shader; three uploads what is new in them. */
+  /** By names in the shader; three.js uploads changes. */
   readonly uniforms: Readonly<Record<string, IUniform<DataTexture>>>;
   private written = new Map<FieldName, Tensor | undefined>();
 
@@ -38,7 +38,7 @@ export class FieldTextures {
     this.uniforms = { ...Object.fromEntries(empty), cameras: { value: table(training.rows) } };
   }
 
-  /** Takes a scene of the same shape; fields that are the same objects as before stay as they are. */
+  /** Sets a scene of the same shape; fields that are the same objects as before are not uploaded again. */
   write(fields: Fields): void {
     for (const [name, sources] of Object.entries(TABLES)) {
       if (sources.every((source) => fields.get(source) === this.written.get(source))) continue;
@@ -61,7 +61,7 @@ export class FieldTextures {
   }
 }
 
-/** The texture with these numbers in it, or another one where they do not fit. */
+/** The texture with these numbers, or a new one if they do not fit. */
 function written(texture: DataTexture, numbers: Float32Array): DataTexture {
   const data = texture.image.data as Float32Array;
   if (numbers.length > data.length) {

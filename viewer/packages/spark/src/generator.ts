@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
-/** What Spark runs for each splat: an anchor's MLPs for this eye, or a free Gaussian. */
+/** The function that Spark runs for each splat: an anchor's MLPs for this eye, or a free Gaussian. */
 
 import { dyno } from "@sparkjsdev/spark";
 import { evaluation, mlpLayout, SAMPLING_GLSL, type Shape, TRAINING_LOW_PASS } from "@structgstream/gl/shading";
 import type { IUniform, Vector3 } from "three";
 
-/** Beside those of the fields. */
+/** Uniforms in addition to those of the fields. */
 export interface SceneUniforms {
   readonly eye: IUniform<Vector3>;
-  /** How many of the splats are anchors'; the others are free. */
+  /** Number of splats of anchors; the others are free Gaussians. */
   readonly structuredCount: IUniform<number>;
   readonly cameraCount: IUniform<number>;
 }
@@ -55,7 +55,7 @@ void streamSplat(int i, out Gsplat splat) {
 `;
 }
 
-/** A dyno block from a splat's number to the splat, in scene units. */
+/** A dyno block from a splat's index to the splat, in scene units. */
 export function splatOfNumber(
   shape: Shape,
   uniforms: Readonly<Record<string, IUniform>> & SceneUniforms,

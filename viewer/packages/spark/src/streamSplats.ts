@@ -10,14 +10,14 @@ import { splatOfNumber } from "./generator.js";
 
 type FrameUpdateContext = Parameters<NonNullable<SplatGenerator["frameUpdate"]>>[0];
 
-/** A camera that has moved by less than this, in scene units, sees what it saw. */
+/** Movement of the camera, in scene units, below which splats are not generated again. */
 const STILL = 1e-4;
 
 /**
- * Shows one frame at a time. Its own axes are three's, y up, its units those of the capture: move it like any object.
+ * Shows one frame at a time. Its axes are those of three.js, y up, and its units those of the capture. It can be moved as any object.
  *
- * The MLPs are evaluated on the GPU when the camera or the frame is another one. Exposure of single cameras and the
- * environment behind the scene are left out: the scene around it has its own.
+ * The MLPs are evaluated on the GPU when the camera or the frame changes. Exposure of single cameras and the
+ * environment are left out, because the surrounding three.js scene has its own.
  */
 export class StreamSplats extends SplatGenerator {
   private textures: FieldTextures | undefined;
@@ -37,7 +37,7 @@ export class StreamSplats extends SplatGenerator {
   }
 
   /**
-   * Shows a frame, as `StreamReader.frame(index).fields` gives it.
+   * Shows a frame, given as `StreamReader.frame(index).fields`.
    *
    * @throws StreamError it has no anchors' fields
    */
@@ -79,7 +79,7 @@ export class StreamSplats extends SplatGenerator {
     });
   }
 
-  /** Before each picture of Spark's: where the camera is now. */
+  /** Called before each picture of Spark, with the present camera. */
   private look({ viewToWorld }: FrameUpdateContext): void {
     this.updateWorldMatrix(true, false);
     const eye = new Vector3().setFromMatrixPosition(viewToWorld);

@@ -32,7 +32,7 @@ export function openDevice(canvas: HTMLCanvasElement | OffscreenCanvas): Device 
   }) as WebGL2RenderingContext | null;
   if (!gl) {
     throw new GlError(
-      "This browser gives no WebGL2, which the player draws with; turn on hardware acceleration, or use a current browser.",
+      "This browser does not support WebGL2, which the player needs; turn on hardware acceleration, or use a current browser.",
     );
   }
   return deviceOf(gl);

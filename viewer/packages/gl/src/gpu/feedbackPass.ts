@@ -91,7 +91,7 @@ export class FeedbackPass implements MlpPass {
     const rows = this.passRows * this.passes.length;
     if (rows > maxTextureSize) {
       throw new GlError(
-        `The scene is too large for this device: what the MLPs say of ${count} visible anchors takes ${rows} rows of a ` +
+        `The scene is too large for this device: the MLP outputs of ${count} visible anchors take ${rows} rows of a ` +
           `texture, which has at most ${maxTextureSize}; set maxSplats.`,
       );
     }

@@ -84,7 +84,7 @@ export class TargetsPass implements MlpPass {
     const { maxTextureSize, maxLayers } = this.device;
     if (rows > maxTextureSize || this.layers > maxLayers) {
       throw new GlError(
-        `The scene is too large for this device: what the MLPs say of the visible anchors takes ${rows} rows of ` +
+        `The scene is too large for this device: the MLP outputs of the visible anchors take ${rows} rows of ` +
           `${this.layers} layers, at most ${maxTextureSize} of ${maxLayers} fit; set maxSplats.`,
       );
     }

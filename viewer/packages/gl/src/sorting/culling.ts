@@ -15,7 +15,7 @@ const SIZE_BINS = 1024;
 /** Bins per octave of apparent size. */
 const OCTAVE_BINS = 32;
 
-/** Writes the indices, ascending, of the anchors whose ball may reach the picture or its margin to `into`; returns their number. */
+/** Writes the ascending indices of the anchors whose ball may reach the picture or its margin to `into`; returns their number. */
 export function seenAnchors(placement: Placement, camera: Camera, into: Uint32Array): number {
   const { positions, radii } = placement;
   const planes = sidePlanes(camera);

@@ -3,41 +3,41 @@
 
 import type { Quality } from "../source/manifest.js";
 
-/** A connection must bear so many times a quality's bit rate to go up to it, and no fewer to stay. */
+/** Throughput, as a multiple of a rendition's bit rate, that is needed to switch up to it, and to stay at it. */
 const UP = 1.6;
 const STAY = 1.15;
-/** Seconds between changes: up only when it has held for a while, after going down for longer. */
+/** Seconds between switches; switching up needs a stable throughput, and takes longer after a switch down. */
 const UP_SECONDS = 4;
 const AGAIN_SECONDS = 20;
 const DOWN_SECONDS = 2;
 /**
- * Small packets say little of what a connection bears. Where it is hardly used the next quality is tried: what it needs
- * is fetched beside the packets that are shown. After a failure twice as long passes until it is tried again.
+ * Small packets determine the throughput poorly. If the connection is mostly idle, the next rendition is tried: its packets
+ * are fetched in addition to the displayed ones. After a failure the time to the next trial doubles.
  */
 const IDLE_SHARE = 0.3;
-/** What is tried has to be there by then. */
+/** Time limit of a trial. */
 const TRIAL_LIMIT_SECONDS = 15;
-/** A connection bears at most so many times what small packets say. */
+/** Upper bound of the throughput, as a multiple of that measured with small packets. */
 const UNDERESTIMATED = 16;
 const TRIAL_SECONDS = 10;
 const MOST_TRIAL_SECONDS = 320;
-/** One that could not be had for a reason that may go away is tried again. */
+/** Seconds after which a rendition with a temporary failure is tried again. */
 const RETRY_SECONDS = 2;
 
 export class AbrController {
-  /** By rising bit rate. */
+  /** Bit rates, rising. */
   steps: readonly Quality[];
-  /** What the user wants; undefined leaves it to the connection. */
+  /** The user's choice; undefined for automatic selection. */
   choice: number | undefined;
   at = 0;
-  /** Since when the step above is tried, though it is not known to be borne. */
+  /** Start time of the present trial of the next step. */
   private tryingSince: number | undefined;
-  /** So long after the last trial or change the next one is due. */
+  /** Time from the last trial or switch to the next trial. */
   private trialSeconds = TRIAL_SECONDS;
   private tried: number;
   private changed: number;
   private fell = false;
-  /** Until when, by step. */
+  /** End time of the exclusion of each step. */
   private readonly refused = new Map<number, number>();
 
   /** @param now seconds of any clock */
@@ -49,7 +49,7 @@ export class AbrController {
     this.changed = this.tried = now();
   }
 
-  /** The step to be on; `bitsPerSecond` is undefined while nothing is known. */
+  /** The step to use; `bitsPerSecond` is undefined while the throughput is unknown. */
   wanted(bitsPerSecond: number | undefined, busyShare: number): number {
     const { at, steps, choice, tryingSince } = this;
     this.tryingSince = undefined;
@@ -78,7 +78,7 @@ export class AbrController {
     return higher;
   }
 
-  /** What is known now of the bit rates, which are measured while the run goes on. */
+  /** Updates the bit rates, which are measured during the run. */
   measured(qualities: readonly Quality[]): void {
     this.steps = this.steps.map((step) => {
       const found = qualities.find(({ name }) => name === step.name);
@@ -86,11 +86,11 @@ export class AbrController {
     });
   }
 
-  /** Another step is used from now on. */
+  /** Record a switch to another step. */
   change(step: number): void {
     const now = this.now();
     this.fell = step < this.at;
-    // What has been borne for long was no failure.
+    // A step that was used for long has not failed.
     if (this.fell && now - this.changed > MOST_TRIAL_SECONDS) this.trialSeconds = TRIAL_SECONDS;
     else if (this.fell) this.giveUp();
     this.at = step;
@@ -98,7 +98,7 @@ export class AbrController {
     this.changed = this.tried = now;
   }
 
-  /** A step cannot be had, for now or ever. */
+  /** Record that a step is not available, temporarily or permanently. */
   refuse(step: number, temporary: boolean): void {
     this.refused.set(step, temporary ? this.now() + RETRY_SECONDS : Number.POSITIVE_INFINITY);
   }

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The decode worker's side of the line to the fetch worker. */
+/** The decode worker's interface to the fetch worker. */
 
 import type { ReadReply, ReadRequest, SourceDescription, StoredPlace } from "../source/description.js";
 import type { Manifest, PageContent, PageEntry, Quality } from "../source/manifest.js";
 import type { Port } from "../source/port.js";
 
-/** What becomes of one reading; after `end` or `failed` nothing more comes. */
+/** Events of one reading; none follows `end` or `failed`. */
 export interface ReadingEvents {
   begin?(reply: ReadReply & { type: "begin" }): void;
   bytes?(bytes: Uint8Array): void;
@@ -13,7 +13,7 @@ export interface ReadingEvents {
   qualities?(qualities: readonly Quality[]): void;
   page?(content: PageContent): void;
   end(): void;
-  /** A `temporary` failure may go away by itself. */
+  /** A `temporary` failure may disappear without action. */
   failed(message: string, temporary: boolean): void;
   waiting?(seconds: number, problem: string | undefined): void;
   recovered?(): void;
@@ -22,7 +22,7 @@ export interface ReadingEvents {
 export class ByteClient {
   private readonly readings = new Map<number, ReadingEvents>();
   private made = 0;
-  /** Bytes that have come so far. */
+  /** Number of bytes received so far. */
   fetchedBytes = 0;
 
   constructor(private readonly port: Port<ReadRequest, ReadReply>) {
@@ -34,7 +34,7 @@ export class ByteClient {
     this.port.postMessage({ type: "open", source }, []);
   }
 
-  /** Begins to read; the number is for {@link cancel}. `of` is a file beside a manifest instead of the source. */
+  /** Starts reading; returns the number for {@link cancel}. `of` is a file next to a manifest instead of the source. */
   read(start: number, end: number, wholeIfNeeded: boolean, events: ReadingEvents, of?: StoredPlace): number {
     const id = this.remember(events);
     this.port.postMessage({ type: "read", id, start, end, wholeIfNeeded, of }, []);

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Which packets a stream has, where they are, and which frames can be shown. */
+/** The packets of a stream, their positions, and the frames that can be shown. */
 
 import type { FileEntry } from "../source/manifest.js";
 import type { CatalogFacts, FrameRange } from "./messages.js";
 
-/** The bytes in which a packet is: of one file beside a manifest, or of the file that is the stream. */
+/** The bytes of a packet: in a file next to a manifest, or in the file of the stream. */
 export interface Place {
   readonly start: number;
   readonly end: number;
@@ -14,19 +14,19 @@ export interface Place {
 export abstract class Catalog {
   private readonly damaged = new Set<number>();
   complete = false;
-  /** The first frame that there still is. */
+  /** The first available frame. */
   first = 0;
 
-  /** The number after the last frame's. */
+  /** The number after that of the last frame. */
   abstract readonly count: number;
-  /** Where a frame's packet is, if that is known. */
+  /** Position of a frame's packet, if known. */
   abstract place(index: number): Place | undefined;
   abstract isKey(index: number): boolean;
-  /** Takes the time that stands in a packet. */
+  /** Sets the time of a frame from its packet. */
   abstract learn(index: number, ptsSeconds: number): void;
   /** The first packet that a frame needs. */
   abstract groupStart(index: number): number;
-  /** The frame after the last that needs a packet like this one. */
+  /** The frame after the last one that needs this frame's packet. */
   abstract groupEnd(index: number): number;
   abstract facts(): CatalogFacts;
 
@@ -45,7 +45,7 @@ export abstract class Catalog {
     return false;
   }
 
-  /** The frame to show for one that is lost: the last before it, or else the first after it. */
+  /** The frame to show instead of a lost one: the last before it, else the first after it. */
   shownFor(index: number): number | undefined {
     for (let i = Math.min(index, this.count - 1); i >= this.first; i--) if (!this.isLost(i)) return i;
     for (let i = Math.max(index + 1, this.first); i < this.count; i++) if (!this.isLost(i)) return i;

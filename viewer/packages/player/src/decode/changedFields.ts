@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Which fields of a frame have to be sent: copies of those that are not what was sent last. */
+/** Selects the fields of a frame to send: copies of those that differ from the last ones sent. */
 
 import type { FieldName, Fields, Tensor } from "@structgstream/core";
 
@@ -8,12 +8,12 @@ export class ChangedFields {
 
   constructor(private readonly dynamic: ReadonlySet<FieldName>) {}
 
-  /** What was sent is no longer there: everything goes again. */
+  /** The receiver has lost its fields: all are sent again. */
   forget(): void {
     this.sent = new Map();
   }
 
-  /** Copies to give away; what they are copies of is kept. */
+  /** Copies that can be transferred; the originals are stored. */
   of(fields: Fields): Map<FieldName, Tensor> {
     const changed = new Map<FieldName, Tensor>();
     for (const name of this.dynamic) {
@@ -29,7 +29,7 @@ export class ChangedFields {
 function isSame(a: Tensor, b: Tensor | undefined): boolean {
   if (!b || a.data.length !== b.data.length || a.shape.length !== b.shape.length) return false;
   if (!a.shape.every((size, i) => size === b.shape[i])) return false;
-  // Bits, so that a NaN is the same as itself.
+  // Bits are compared, so that a NaN equals itself.
   const [x, y] = [wordsOf(a), wordsOf(b)];
   for (let i = 0; i < x.length; i++) if (x[i] !== y[i]) return false;
   return true;

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 /**
- * What runs in the decode worker: frames in the order in which the engine wants them.
+ * The decode worker: decodes frames in the order that the engine requests.
  *
- * One packet is decoded at a time, and messages are heard in between, so that a seek never waits for more than one.
+ * One packet is decoded at a time, and messages are handled in between, so a seek waits for at most one packet.
  */
 
 import { type Frame, fieldBytes, type Packet, StreamError } from "@structgstream/core";
@@ -15,25 +15,25 @@ import { SegmentedStreams } from "./segmentedStreams.js";
 import type { Chapter, Stream } from "./stream.js";
 import { Throttle } from "./throttle.js";
 
-/** On a machine that decodes too slowly, a picture comes at least so often. */
+/** Longest interval between pictures on a machine that decodes too slowly. */
 const LATE_PICTURE_MILLISECONDS = 250;
-/** What changes with every packet is told no more often. */
+/** Shortest interval between messages about values that change with every packet. */
 const TELL_MILLISECONDS = 100;
 
 export class Decoding {
   private readonly client: ByteClient;
   private stream: Stream | undefined;
-  /** Where streams come from that lie in segments folders. */
+  /** Streams in segments folders. */
   private segmented: SegmentedStreams | undefined;
   private demand: Demand | undefined;
   private serial = -1;
-  /** The next frame to give. */
+  /** The next frame to send. */
   private next = 0;
   private seeking = false;
   private decoded: number | undefined;
-  /** What the packet decoded last belongs to. */
+  /** The chapter of the last decoded packet. */
   private chapter: Chapter | undefined;
-  /** What the frame given last belongs to. */
+  /** The chapter of the last sent frame. */
   private told: Chapter | undefined;
   private packets: PacketFacts[] = [];
   private milliseconds = 0;
@@ -110,7 +110,7 @@ export class Decoding {
     });
   }
 
-  /** Decodes one packet, if one is wanted and there. */
+  /** Decodes one packet, if one is needed and available. */
   private step(): boolean {
     const { demand } = this;
     if (!this.stream?.catalog.count || !demand) return false;
@@ -152,7 +152,7 @@ export class Decoding {
   private decode(chapter: Chapter, packet: Packet, target: number, key: number): void {
     const { index } = packet;
     const overdue = performance.now() - this.givenAt > LATE_PICTURE_MILLISECONDS;
-    // Key frames are shown on the way: to what is sought, or to where the clock is by now.
+    // Key frames are shown on the way to the target of a seek, or to the clock.
     const given = index === target || index === key || (!this.seeking && overdue);
     const start = performance.now();
     let frame: Frame | undefined;
@@ -171,7 +171,7 @@ export class Decoding {
     this.packets.push({ index, isKey: packet.isKey, bytes: packet.payload.length + 12, byField: fieldBytes(packet) });
     if (frame) this.give(chapter, frame, index === target);
     if (index === target) {
-      // A frame that stands for a lost one answers for all up to it.
+      // A frame that replaces a lost one counts for all frames up to it.
       this.next = Math.max(index, this.seeking ? this.next : index) + 1;
       this.seeking = false;
     }
@@ -196,7 +196,7 @@ export class Decoding {
     this.givenAt = performance.now();
   }
 
-  /** Goes on after frames that cannot be shown. */
+  /** Continues after frames that cannot be shown. */
   private passLost({ catalog }: Stream, demand: Demand): boolean {
     let end = this.next;
     while (end < catalog.count && catalog.isLost(end)) end++;
@@ -207,7 +207,7 @@ export class Decoding {
     return true;
   }
 
-  /** Frames from `first` on cannot be shown: up to before `end`, or all that need the first. */
+  /** Reports that frames from `first` to before `end`, or all that need the first one, cannot be shown. */
   private lose(first: number, end: number | undefined, reason: string): void {
     const { catalog } = this.stream!;
     catalog.markDamaged(first, end);

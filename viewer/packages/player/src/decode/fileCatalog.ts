@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The packets of one file, by its index or as they are found by reading it. */
+/** The packets of one file, from its index or as they are found during reading. */
 
 import type { IndexEntry, PacketInfo, Period } from "@structgstream/core";
 import { Catalog, type Place } from "./catalog.js";
@@ -8,12 +8,12 @@ import type { CatalogFacts } from "./messages.js";
 interface Entry {
   readonly isKey: boolean;
   readonly offset: number;
-  /** Where something else begins: records of unknown types may lie before it. */
+  /** Start of the next known record; records of unknown types may precede it. */
   readonly end: number;
   ptsSeconds: number | undefined;
 }
 
-/** Where an init record after the first is, and the first frame of its period. */
+/** Position of an init record after the first one, and the first frame of its period. */
 interface Init {
   readonly first: number;
   readonly start: number;
@@ -22,12 +22,12 @@ interface Init {
 
 export class FileCatalog extends Catalog {
   private readonly inits: Init[] = [];
-  // By frame; undefined where a packet was lost before anything was known of it.
+  // By frame; undefined for a packet that was lost before its position was known.
   private readonly entries: (Entry | undefined)[] = [];
 
   /**
-   * @param fps frames a second, for times that are not known yet
-   * @param independent whether every packet stands alone, whatever its kind: codec `raw`
+   * @param fps frames per second, for times that are not known yet
+   * @param independent whether packets are independent of each other: codec `raw`
    */
   constructor(
     private readonly fps: number,
@@ -40,7 +40,7 @@ export class FileCatalog extends Catalog {
     return this.entries.length;
   }
 
-  /** Takes everything from an index; `end` is where the index record begins. */
+  /** Adds all entries of an index; `end` is the offset of the index record. */
   fill(index: readonly IndexEntry[], end: number): void {
     for (const [i, { isKey, isInit, index: first, offset }] of index.entries()) {
       const next = index[i + 1]?.offset ?? end;
@@ -50,12 +50,12 @@ export class FileCatalog extends Catalog {
     this.complete = true;
   }
 
-  /** Takes an init record that was found by reading. */
+  /** Adds an init record that was found during reading. */
   begin({ first, offset, bytes }: Period): void {
     this.inits.push({ first, start: offset, end: offset + bytes });
   }
 
-  /** Which period a frame belongs to, counted from 0. */
+  /** The period of a frame, counted from 0. */
   period(index: number): number {
     return this.inits.filter(({ first }) => first <= index).length;
   }
@@ -70,7 +70,7 @@ export class FileCatalog extends Catalog {
     return this.inits[period]?.first ?? this.count;
   }
 
-  /** Takes a packet that was found by reading; frames that it leaves out are lost. */
+  /** Adds a packet that was found during reading; frames that it skips are lost. */
   append({ index, isKey, offset, bytes, ptsSeconds }: PacketInfo): void {
     while (this.entries.length < index) this.markDamaged(this.entries.push(undefined) - 1);
     this.entries.push({ isKey, offset, end: offset + bytes, ptsSeconds });
@@ -108,7 +108,7 @@ export class FileCatalog extends Catalog {
     const keys: number[] = [];
     for (const [i, entry] of this.entries.entries()) {
       const after = i ? ptsSeconds[i - 1]! + 1 / this.fps : 0;
-      // Guesses may be beyond a time that is known: time must rise all the same.
+      // Estimated times may exceed a known one, but times must increase.
       ptsSeconds[i] = Math.max(entry?.ptsSeconds ?? after, i ? ptsSeconds[i - 1]! + 1e-9 : Number.NEGATIVE_INFINITY);
       if (entry?.isKey) keys.push(i);
     }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** A stream that is one file: opened, then read where it is needed. */
+/** A stream in one file: opens it, then reads the parts that are needed. */
 
 import {
   ByteQueue,
@@ -23,18 +23,18 @@ import { type Chapter, Chapters, type Stream } from "./stream.js";
 
 export interface FileEvents {
   opening(loadedBytes: number, totalBytes: number | undefined, ended: boolean): void;
-  /** The header is there. */
+  /** The header is available. */
   begun(stream: FileStream, header: StreamHeader, ranged: boolean): void;
-  /** More packets are known of. */
+  /** Further packets are known. */
   changed(): void;
-  /** Packets have come. */
+  /** Packets have arrived. */
   stored(): void;
   /** Frames up to before `end`, or all that need the first one, are damaged. */
   lost(first: number, end: number | undefined, reason: string): void;
   waiting(seconds: number, problem: string | undefined): void;
-  /** Unless it is fatal, the next demand is another attempt. */
+  /** Unless it is fatal, the next demand tries again. */
   failed(message: string, fatal: boolean): void;
-  /** The first packet that is wanted now. */
+  /** The first packet that is needed at present. */
   wanted(): number;
 }
 
@@ -42,10 +42,10 @@ export class FileStream implements Stream {
   readonly catalog: FileCatalog;
   readonly store: PacketStore;
   readonly loader: PacketLoader;
-  /** By how many periods are before theirs. */
+  /** By the number of the period, from 0. */
   private readonly chapters = new Chapters();
   private readonly coming = new Set<number>();
-  /** The period that frames are wanted of. */
+  /** The period of the demanded frames. */
   private current = 0;
   private taken = 0;
   private begun = 1;
@@ -69,7 +69,7 @@ export class FileStream implements Stream {
     });
   }
 
-  /** Opens the file that the client has been told of. */
+  /** Opens the client's file. */
   static open(client: ByteClient, name: string, fromStart: boolean, budgetBytes: number, events: FileEvents): void {
     let stream: FileStream | undefined;
     const opening = new Opening(
@@ -95,7 +95,7 @@ export class FileStream implements Stream {
   chapter(index: number, ahead: number): Chapter | undefined {
     const { catalog } = this;
     this.current = catalog.period(index);
-    // What comes next is fetched before it is needed.
+    // The next period's init record is fetched in advance.
     if (catalog.period(Math.min(ahead, catalog.count) - 1) > this.current) this.opened(this.current + 1);
     return this.opened(this.current);
   }
@@ -143,7 +143,7 @@ export class FileStream implements Stream {
     return header;
   }
 
-  /** Takes the packets that the reader has found since the last time. */
+  /** Adds the packets that the reader has found since the last call. */
   private take(reader: StreamReader, ended: boolean): void {
     const { catalog, store, indexed, events } = this;
     const keepFrom = events.wanted();
@@ -154,7 +154,7 @@ export class FileStream implements Stream {
       for (; !indexed && (reader.periods[this.begun]?.first ?? Number.POSITIVE_INFINITY) <= info.index; this.begun++) {
         catalog.begin(reader.periods[this.begun]!);
         const header = reader.headerOf(this.begun);
-        // Otherwise it is fetched when it is needed.
+        // Otherwise it is fetched when needed.
         if (header && this.begun <= this.current + 1) this.chapters.put(this.begun, header);
       }
       if (indexed) catalog.learn(info.index, info.ptsSeconds);

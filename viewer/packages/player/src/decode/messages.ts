@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** What the engine and the decode worker say to each other. */
+/** Messages between the engine and the decode worker. */
 
 import type { FieldName, StreamHeader } from "@structgstream/core";
 import type { SceneUpdate } from "@structgstream/gl";
@@ -8,11 +8,11 @@ import type { SourceDescription } from "../source/description.js";
 /** Frames from the first number to before the second. */
 export type FrameRange = readonly [first: number, end: number];
 
-/** Which frames the engine wants now. */
+/** The frames that the engine needs at present. */
 export interface Demand {
-  /** A new one begins a seek: `at` is wanted soon, and the key frame before it at once. */
+  /** A new number starts a seek: the key frame before `at` is needed immediately, `at` soon. */
   readonly serial: number;
-  /** The frame that should be on the screen; those before it are late. */
+  /** The frame that should be visible; earlier ones are late. */
   readonly at: number;
   /** Frames are decoded up to before this one. */
   readonly until: number;
@@ -24,18 +24,18 @@ export type ToDecoder =
   | {
       readonly type: "open";
       readonly source: SourceDescription;
-      /** Whether the stream will be shown from its first frame on, so that its packet is fetched with the header. */
+      /** Whether playback starts at the first frame, so that its packet is fetched with the header. */
       readonly fromStart: boolean;
-      /** Packets are kept in no more bytes than these. */
+      /** Largest number of bytes of stored packets. */
       readonly budgetBytes: number;
     }
   | { readonly type: "demand"; readonly demand: Demand }
-  /** One of the qualities; undefined leaves it to the connection. */
+  /** One of the renditions; undefined for automatic selection. */
   | { readonly type: "quality"; readonly quality: number | undefined }
-  /** The next frame is to come with all its dynamic fields. */
+  /** The next frame must have all its dynamic fields. */
   | { readonly type: "refresh" };
 
-/** What one packet took. */
+/** Bytes and time of one packet. */
 export interface PacketFacts {
   readonly index: number;
   readonly isKey: boolean;
@@ -43,35 +43,35 @@ export interface PacketFacts {
   readonly byField: ReadonlyMap<FieldName, number>;
 }
 
-/** How a stream in a segments folder grows. */
+/** Growth of a stream in a segments folder. */
 export interface LiveFacts {
   /** Whether frames still come. */
   readonly live: boolean;
-  /** How far behind the newest frame playing should stay. */
+  /** Distance from the newest frame to maintain during playback. */
   readonly targetSeconds: number;
-  /** Time of a clock from frame to frame of late. */
+  /** Recent wall-clock time from frame to frame. */
   readonly frameSeconds: number | undefined;
-  /** Time of the media from frame to frame of late. */
+  /** Recent media time from frame to frame. */
   readonly mediaSeconds: number;
   readonly fps: number;
-  /** Unix time at which frames of presentation time 0 would have been filmed, by the pace of the newest. */
+  /** Unix time at which a frame of presentation time 0 would have been captured, extrapolated from the newest. */
   readonly filmedAtZero: number | undefined;
 }
 
-/** All packets that are known of. */
+/** All known packets. */
 export interface CatalogFacts {
-  /** The first frame that there still is. */
+  /** The first available frame. */
   readonly first: number;
-  /** The number after the last frame's. */
+  /** The number after that of the last frame. */
   readonly count: number;
-  /** Frames whose times are known, rising; times between them go evenly. Without it: all from 0 on. */
+  /** Frames with known times, rising; times between them are interpolated. Undefined: all frames from 0 on. */
   readonly frames?: Float64Array;
-  /** Of these frames, in seconds; rising. Times of packets not read yet are counted on from those that were. */
+  /** Times of these frames, seconds, rising. Times of packets that were not read yet are extrapolated. */
   readonly ptsSeconds: Float64Array;
   /** Those that are known. */
   readonly keys: Uint32Array;
   readonly lost: readonly FrameRange[];
-  /** Whether no more packets will come. */
+  /** Whether no further packets will come. */
   readonly complete: boolean;
   readonly live?: LiveFacts;
 }
@@ -85,27 +85,27 @@ export type FromDecoder =
     }
   | { readonly type: "header"; readonly header: StreamHeader; readonly ranged: boolean }
   | { readonly type: "catalog"; readonly facts: CatalogFacts }
-  /** Packets that are there, and bytes fetched so far, everything counted. */
+  /** Available packets, and the total number of bytes fetched so far. */
   | { readonly type: "stored"; readonly ranges: readonly FrameRange[]; readonly fetchedBytes: number }
   | {
       readonly type: "frame";
       readonly serial: number;
       readonly update: SceneUpdate;
-      /** Of what the frame belongs to, where that is something else than the frame before: another period or quality. */
+      /** The header, if the frame belongs to another period or rendition than the one before. */
       readonly header?: StreamHeader;
-      /** False for a picture on the way: the key frame before the one that was sought, or one that is late. */
+      /** False for an intermediate picture: the key frame before the target of a seek, or a late frame. */
       readonly exact: boolean;
-      /** Of all packets decoded since the last frame given. */
+      /** Facts of all packets decoded since the last frame. */
       readonly packets: readonly PacketFacts[];
       readonly decodeMilliseconds: number;
     }
   /** Frames up to before `end` cannot be shown. */
   | { readonly type: "gap"; readonly serial: number; readonly end: number }
   | { readonly type: "damage"; readonly message: string; readonly lost: FrameRange }
-  /** The qualities of the stream, and which of them frames are of. */
+  /** The renditions of the stream, and the one in use. */
   | { readonly type: "qualities"; readonly names: readonly string[]; readonly at: number }
-  /** Something the user may want to know. */
+  /** Information for the user. */
   | { readonly type: "notice"; readonly message: string }
   | { readonly type: "waiting"; readonly seconds: number; readonly problem: string | undefined }
-  /** Unless it is fatal, the next demand is another attempt. */
+  /** Unless it is fatal, the next demand tries again. */
   | { readonly type: "failed"; readonly message: string; readonly fatal: boolean };

@@ -1,10 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 /**
- * The beginning of a stream: its header, and where its packets are.
+ * Opens a stream: reads its header and the positions of its packets.
  *
- * A stored file is opened by its first bytes, which tell its size, and its last ones, where the index is; then the rest of
- * the init record is read, and nothing else. Without an index, or without ranges, all of it is read from its start on,
- * and packets are found as they come.
+ * Of a stored file only the first bytes, the index at its end and the rest of the init record are read. Without an index,
+ * or without range requests, the whole file is read from its start, and packets are found as they arrive.
  */
 
 import {
@@ -20,16 +19,16 @@ import type { ByteClient } from "./byteClient.js";
 
 const HEAD_BYTES = 4096;
 const TAIL_BYTES = 4096;
-/** More entries than this are not taken from an index: 3 hours at 100 frames a second. */
+/** Largest number of entries of an index: 3 hours at 100 frames per second. */
 const MOST_INDEX_BYTES = 2 ** 24;
 
-/** What comes out of opening, in this order: progress, the header, the index if there is one, then packets. */
+/** Events of opening, in this order: progress, the header, the index if there is one, then packets. */
 export interface OpeningEvents {
-  /** `ended`: the file ends within its header, so far. */
+  /** `ended`: the file ends within its header at present. */
   opening(loadedBytes: number, totalBytes: number | undefined, ended: boolean): void;
-  /** `index` is given when it says where all packets are, with the byte where they end. */
+  /** `index` is defined if it has the positions of all packets, with the offset after the last one. */
   header(header: StreamHeader, ranged: boolean, index: { entries: IndexEntry[]; end: number } | undefined): void;
-  /** The reader has packets that were not there before, or knows of damage; after `ended` nothing more comes. */
+  /** The reader has new packets or has found damage; no event follows `ended`. */
   read(reader: StreamReader, ended: boolean): void;
   waiting(seconds: number, problem: string | undefined): void;
   failed(message: string): void;
@@ -41,7 +40,7 @@ export class Opening {
   private fileBytes: number | undefined;
   private loaded = 0;
   private index: { entries: IndexEntry[]; end: number } | undefined;
-  /** What decides how everything else is read has been looked for. */
+  /** Decides between the index and a scan. */
   private lookedForIndex = false;
   private announced = false;
   private reading: number | undefined;
@@ -62,7 +61,7 @@ export class Opening {
     });
   }
 
-  /** Reads from `start` on into the reader; `then` when all has come. */
+  /** Reads from `start` on into the reader; calls `then` at the end. */
   private read(start: number, end: number, wholeIfNeeded: boolean, then: () => void): void {
     this.reading = this.client.read(start, end, wholeIfNeeded, {
       begin: ({ fileBytes, ranged }) => {
@@ -108,14 +107,14 @@ export class Opening {
     else this.read(this.loaded, end, false, () => this.headerByIndex(end));
   }
 
-  /** All up to `end` has been read; a damaged index would leave the header out of it. */
+  /** Called when all bytes up to `end` were read; with a damaged index the header may be missing. */
   private headerByIndex(end: number): void {
     if (this.announced) return;
     this.index = undefined;
     if (this.loaded >= end) this.scan();
   }
 
-  /** Reads all that is left, and what is appended. */
+  /** Reads the remaining bytes and those that are appended. */
   private scan(): void {
     this.lookedForIndex = true;
     this.announceIfThere();

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Fetches packets by their places, one run of neighbours with each request, and nothing that is there already. */
+/** Fetches missing packets by position, one run of neighbouring packets per request. */
 
 import { ByteQueue, HEAD_BYTES, type Packet, packetOf, RecordType, recordBytes, recordIn } from "@structgstream/core";
 import type { ByteClient } from "./byteClient.js";
@@ -7,28 +7,28 @@ import type { Catalog, Place } from "./catalog.js";
 import type { PacketStore } from "./packetStore.js";
 import { Throughput } from "./throughput.js";
 
-/** One request asks for no more than this, so that a seek never has to wait for long. */
+/** Largest size of a request, so that a seek never waits long. */
 const MOST_RUN_BYTES = 2 ** 22;
-/** So many files are asked for at once: at the edge of a live stream every packet is one. */
+/** Number of concurrent requests of files: at the edge of a live stream every packet is a file. */
 const MOST_RUNS = 4;
-/** Of the store, so much is for packets ahead; the rest keeps what was shown. */
+/** Share of the store for packets ahead; the remainder is for packets that were shown. */
 const AHEAD_SHARE = 0.6;
 
 export interface LoaderEvents {
-  /** Packets have come, or one has been found damaged. */
+  /** Packets have arrived, or one is damaged. */
   changed(): void;
   damaged(index: number, place: Place): void;
   waiting(seconds: number, problem: string | undefined): void;
-  /** Frames from `first` to before `end`, of this file where there are several, did not come. */
+  /** Frames from `first` to before `end` did not arrive; `file` is their file if there are several. */
   failed(problem: string, temporary: boolean, first: number, end: number, file: string): void;
 }
 
-/** Where a packet is, and of which kind it was when it was asked for. */
+/** Position of a packet, and its kind at the time of the request. */
 interface Expected extends Place {
   readonly isKey: boolean;
 }
 
-/** A reading that goes on: packets from `next` to before `end` are still to come. */
+/** An active reading; packets from `next` to before `end` are missing. */
 interface Run {
   id: number;
   next: number;
@@ -38,11 +38,11 @@ interface Run {
 export class PacketLoader {
   private runs: Run[] = [];
   private first = 0;
-  /** Nothing is asked for. */
+  /** Whether there is no active request. */
   blocked = false;
   readonly throughput = new Throughput();
 
-  /** @param url of the manifest beside which the files of places are */
+  /** @param url address of the manifest; files are relative to it */
   constructor(
     private readonly client: ByteClient,
     private readonly catalog: Catalog,
@@ -52,12 +52,12 @@ export class PacketLoader {
   ) {}
 
   /**
-   * Sees to it that packets come.
+   * Requests packets.
    *
-   * @param first the packet that is needed first; those before it may be let go of
-   * @param needed the frame after the last that is waited for
-   * @param ahead the frame after the last that is wanted, as far as there is room; of a stream that is one file they are
-   *   asked for when less than half of them is left
+   * @param first the packet that is needed first; earlier ones may be removed
+   * @param needed the frame after the last one that playback waits for
+   * @param ahead the frame after the last one to prefetch if there is room; of a stream in one file, packets are requested
+   *   when less than half of these remain
    */
   want(first: number, needed: number, ahead: number): void {
     this.first = first;
@@ -68,7 +68,7 @@ export class PacketLoader {
       const files = this.catalog.place(missing)!.entry !== undefined;
       const urgent = missing < needed;
       if (urgent && this.runs.some((run) => run.next < missing && run.end > first)) {
-        // What has to come before it is under way.
+        // The packets before it are being fetched.
         if (!files || this.runs.length >= MOST_RUNS) return;
       } else if (urgent) this.cancel();
       else if (files ? this.runs.length >= MOST_RUNS : this.runs.length || missing - first > (ahead - first) / 2)
@@ -80,7 +80,7 @@ export class PacketLoader {
     }
   }
 
-  /** Asks for nothing more. */
+  /** Stops requesting. */
   cancel(): void {
     for (const { id } of this.runs) {
       this.client.cancel(id);
@@ -102,7 +102,7 @@ export class PacketLoader {
     return !this.store.has(index) && !this.catalog.isDamaged(index) && this.catalog.place(index) !== undefined;
   }
 
-  /** The end of the run of missing packets that begins with `from`, as far as bytes allow; one always goes. */
+  /** The end of the run of missing packets from `from` on within the limit of bytes; at least one packet. */
   private runEnd(from: number, first: number, end: number): number {
     let room = AHEAD_SHARE * this.store.budgetBytes;
     for (let i = first; i < from; i++) room -= this.bytesOf(i);
@@ -112,7 +112,7 @@ export class PacketLoader {
     let at = this.catalog.place(from)?.start;
     while (next < Math.min(end, this.catalog.count) && this.wanted(next) && (next === first || room > 0)) {
       const place = this.catalog.place(next)!;
-      // Init records lie between periods.
+      // There is an init record between periods.
       if (place.entry?.file !== file || place.start !== at || this.comes(next)) break;
       at = place.end;
       room -= this.bytesOf(next++);
@@ -163,7 +163,7 @@ export class PacketLoader {
     run.id = this.client.read(start, places.at(-1)!.end, false, events, of);
   }
 
-  /** Takes whole packets from the queue, which begins at byte `offset`; gives back where it begins then. */
+  /** Removes complete packets from the queue, which begins at byte `offset`; returns its new offset. */
   private packetsIn(queue: ByteQueue, offset: number, run: Run, places: readonly Expected[], ended: boolean): number {
     let at = offset;
     const from = run.end - places.length;
@@ -194,13 +194,13 @@ export class PacketLoader {
   }
 }
 
-/** The packet of a whole record, its payload copied; undefined when it is damaged or something else. */
+/** The packet of a complete record, with a copy of its payload; undefined if it is damaged or not a packet. */
 function packetIn(bytes: Uint8Array, offset: number): Packet | undefined {
   const record = recordIn(bytes, offset);
   if (record?.type !== RecordType.key && record?.type !== RecordType.delta) return undefined;
   try {
     return packetOf(record.payload.slice(), record.type === RecordType.key);
   } catch {
-    return undefined; // its checksum is right and it follows no format: lost like any other that is damaged
+    return undefined; // its checksum is correct but its content is invalid: lost, as a damaged packet
   }
 }

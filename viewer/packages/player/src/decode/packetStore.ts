@@ -1,17 +1,17 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Packets that were fetched, in a bounded number of bytes. */
+/** A store of fetched packets with a limited number of bytes. */
 
 import type { Packet } from "@structgstream/core";
 import type { FrameRange } from "./messages.js";
 
-/** So much is let go of at once, so that not every packet has to look for another's place. */
+/** Share of the store that is freed at once, so that not every packet starts a search. */
 const LEFT = 0.9;
 
 export class PacketStore {
   private readonly packets = new Map<number, Packet>();
   private bytes = 0;
 
-  /** @param budgetBytes the most that payloads may take, but for the one packet that is needed now */
+  /** @param budgetBytes limit of the payloads' size, except for the one packet that is needed at present */
   constructor(readonly budgetBytes: number) {}
 
   has(index: number): boolean {
@@ -23,9 +23,9 @@ export class PacketStore {
   }
 
   /**
-   * Keeps a packet. When there is no room, others go: those before frame `first` first, then those farthest after it.
+   * Stores a packet. If there is no room, others are removed: first those before frame `first`, then the farthest after it.
    *
-   * @returns whether it was kept: one that is farther than all others is not
+   * @returns whether it was stored; a packet that is farther than all others is not
    */
   put(packet: Packet, first: number): boolean {
     if (this.packets.has(packet.index)) return true;
@@ -35,7 +35,7 @@ export class PacketStore {
     return this.packets.has(packet.index);
   }
 
-  /** Frames whose packets are there. */
+  /** Frames whose packets are available. */
   ranges(): FrameRange[] {
     const ranges: FrameRange[] = [];
     for (const index of [...this.packets.keys()].sort((a, b) => a - b)) {

@@ -1,19 +1,19 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The packets of a segments folder, by its manifests and as many of its pages as are needed. */
+/** The packets of a segments folder, from its manifests and the pages that are needed. */
 
 import type { Manifest, PageContent, PageEntry, PartEntry, PeriodEntry, SegmentEntry } from "../source/manifest.js";
 import { Catalog, type Place } from "./catalog.js";
 import type { CatalogFacts, LiveFacts } from "./messages.js";
 
-/** Pages are kept no more than these: the ones used last. */
+/** Largest number of cached pages; the ones used last are retained. */
 const MOST_PAGES = 12;
-/** The pace of the media is that of so many of the last frames, or a few more: writers state theirs over as many. */
+/** Minimum number of last frames over which the pace of the media is measured, as writers do. */
 const PACE_FRAMES = 8;
 
 export class SegmentCatalog extends Catalog {
   private manifest: Manifest | undefined;
   private readonly pages = new Map<string, PageContent>();
-  /** What was found last, and where its frames begin in it: frames are asked for one after the other. */
+  /** The last result of a search and its first frame, because frames are requested in order. */
   private found: { readonly segment: SegmentEntry; readonly offsets: Float64Array } | undefined;
 
   get count(): number {
@@ -24,7 +24,7 @@ export class SegmentCatalog extends Catalog {
     return this.manifest?.live === true;
   }
 
-  /** The newest period, whose init record will be needed next at the edge. */
+  /** The newest period, whose init record is needed next at the edge. */
   get newestPeriod(): number | undefined {
     return this.manifest?.periods.at(-1)?.period;
   }
@@ -40,13 +40,13 @@ export class SegmentCatalog extends Catalog {
     for (const file of this.pages.keys()) if (!reached.has(file)) this.pages.delete(file);
   }
 
-  /** The page that must be read before anything is known of a frame; undefined where nothing is missing. */
+  /** The page that must be read to locate a frame; undefined if none is missing. */
   missingPage(index: number): PageEntry | undefined {
     let entry = covering(this.manifest?.history, index);
     while (entry) {
       const page = this.pages.get(entry.file);
       if (!page) return entry;
-      // The ones used last are at the end.
+      // The most recently used ones are at the end.
       this.pages.delete(entry.file);
       this.pages.set(entry.file, page);
       entry = covering(page.pages, index);
@@ -59,7 +59,7 @@ export class SegmentCatalog extends Catalog {
     while (this.pages.size > MOST_PAGES) this.pages.delete(this.pages.keys().next().value as string);
   }
 
-  /** The period of a frame, as far as that is known. */
+  /** The period of a frame, if known. */
   period(index: number): PeriodEntry | undefined {
     const number = (this.part(index) ?? this.segment(index)?.segment)?.period;
     return number === undefined ? undefined : this.periodNumbered(number);
@@ -114,7 +114,7 @@ export class SegmentCatalog extends Catalog {
     const knot = (frame: number, ptsSeconds: number) => {
       if (frame <= (frames.at(-1) ?? -1)) return;
       frames.push(frame);
-      // A manifest may say anything: time must rise all the same.
+      // Times of a manifest may be wrong, but must increase.
       times.push(Math.max(ptsSeconds, (times.at(-1) ?? Number.NEGATIVE_INFINITY) + 1e-9));
     };
     const run = (entry: PageEntry | SegmentEntry) => {
@@ -175,7 +175,7 @@ export class SegmentCatalog extends Catalog {
   }
 }
 
-/** The entry that has a frame, of entries that follow each other. */
+/** The entry of consecutive ones that contains a frame. */
 function covering<Entry extends PageEntry | SegmentEntry>(
   entries: readonly Entry[] | undefined,
   index: number,
@@ -202,7 +202,7 @@ function liveFacts(manifest: Manifest): LiveFacts {
   };
 }
 
-/** Time of the media from frame to frame, over at least the last few frames where there are so many. */
+/** Media time from frame to frame, over at least the last few frames if there are so many. */
 function mediaPace({ parts, segments, edge }: Manifest): number | undefined {
   const since =
     [...segments].reverse().find(({ first_frame }) => edge.frame - first_frame >= PACE_FRAMES) ?? segments[0];

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** A stream in a segments folder: follows its manifest, and fetches pages and init records when they are needed. */
+/** A stream in a segments folder: follows its manifest and fetches pages and init records on demand. */
 
 import { StreamReader } from "@structgstream/core";
 import type { Manifest, PageEntry, Quality } from "../source/manifest.js";
@@ -10,22 +10,22 @@ import { PacketStore } from "./packetStore.js";
 import { SegmentCatalog } from "./segmentCatalog.js";
 import { type Chapter, Chapters, type Stream } from "./stream.js";
 
-/** After a file could not be fetched. */
+/** Seconds to wait after a file could not be fetched. */
 const AGAIN_MILLISECONDS = 1000;
-/** A file that the host does not have, or another in its place, is asked for so often. */
+/** Number of requests of a file that is missing or wrong. */
 const ATTEMPTS = 3;
 
 export interface SegmentEvents {
-  /** There is another manifest, or another page of it. */
+  /** There is a new manifest, or a new page of it. */
   changed(): void;
-  /** Packets have come, or can be asked for again. */
+  /** Packets have arrived, or can be requested again. */
   stored(): void;
   qualities(qualities: readonly Quality[]): void;
-  /** Frames up to before `end`, or all that need the first one, cannot be had. */
+  /** Frames up to before `end`, or all that need the first one, are not available. */
   lost(first: number, end: number | undefined, reason: string): void;
   notice(message: string): void;
   waiting(seconds: number, problem: string | undefined): void;
-  /** A `temporary` failure may go away by itself. */
+  /** A `temporary` failure may disappear without action. */
   failed(message: string, temporary?: boolean): void;
 }
 
@@ -33,9 +33,9 @@ export class SegmentStream implements Stream {
   readonly catalog = new SegmentCatalog();
   readonly store: PacketStore;
   readonly loader: PacketLoader;
-  /** By the number of the period. */
+  /** By number of the period. */
   private readonly chapters = new Chapters();
-  /** Files that are being fetched, besides those with packets. */
+  /** Files that are being fetched, except those with packets. */
   private readonly coming = new Set<string>();
   private readonly failures = new Map<string, number>();
   private following: number | undefined;
@@ -57,7 +57,7 @@ export class SegmentStream implements Stream {
       changed: () => events.stored(),
       damaged: (index: number, { entry, start }: Place) =>
         events.lost(index, undefined, `its record at byte ${start} of ${entry?.file} is damaged`),
-      // While the manifest is followed, that says how the connection is.
+      // While the manifest is followed, it reports the state of the connection.
       waiting: (seconds: number, problem: string | undefined) => {
         if (!this.catalog.live) events.waiting(seconds, problem);
       },
@@ -67,7 +67,7 @@ export class SegmentStream implements Stream {
     this.loader = new PacketLoader(client, this.catalog, this.store, loading, url);
   }
 
-  /** Begins to follow the manifest. */
+  /** Starts following the manifest. */
   follow(): void {
     this.following ??= this.client.manifests(this.url, this.name, {
       manifest: (manifest) => this.take(manifest),
@@ -75,7 +75,7 @@ export class SegmentStream implements Stream {
       end: () => {},
       failed: (message, temporary) => this.events.failed(message, temporary),
       waiting: (seconds, problem) => {
-        // Once is enough to know.
+        // Report it only once.
         if (!this.troubled) this.events.waiting(seconds, problem);
         this.troubled = true;
       },
@@ -86,7 +86,7 @@ export class SegmentStream implements Stream {
     });
   }
 
-  /** Asks for nothing more, until it is followed again. */
+  /** Stops all requests until it is followed again. */
   leave(): void {
     if (this.following !== undefined) this.client.cancel(this.following);
     this.following = undefined;
@@ -96,7 +96,7 @@ export class SegmentStream implements Stream {
   chapter(index: number, ahead: number): Chapter | undefined {
     const last = Math.min(ahead, this.catalog.count) - 1;
     const isThere = this.known(index);
-    // What comes next is fetched before it is needed.
+    // The next period's init record is fetched in advance.
     if (this.known(last)) this.opened(last);
     const { newestPeriod } = this.catalog;
     if (isThere && newestPeriod !== undefined && ahead >= this.catalog.count) this.openedPeriod(newestPeriod);
@@ -109,7 +109,7 @@ export class SegmentStream implements Stream {
     this.events.changed();
   }
 
-  /** Whether it is known where a frame is; what is missing for that is asked for. */
+  /** Whether a frame's position is known; requests missing pages. */
   private known(index: number): boolean {
     const page = this.catalog.missingPage(index);
     if (page) this.fetchPage(page);
@@ -157,7 +157,7 @@ export class SegmentStream implements Stream {
     });
   }
 
-  /** Asks for a file once, and again some time after it could not be had. */
+  /** Requests a file once, and again some time after a failure. */
   private fetch(
     file: string,
     ask: (events: { end(): void; failed(message: string, temporary: boolean): void }) => void,
@@ -178,7 +178,7 @@ export class SegmentStream implements Stream {
   }
 
   private packetsFailed(problem: string, temporary: boolean, first: number, end: number, file: string): void {
-    // Parts that have become a segment are there no longer: the next manifest says where their frames are.
+    // Parts are removed when they become a segment; the next manifest has the positions of their frames.
     const same = this.catalog.place(first)?.entry?.file === file;
     if (first < end && same && this.attempt(file, temporary) >= ATTEMPTS) {
       this.events.lost(first, end, problem.replace(/\.$/, ""));
@@ -192,7 +192,7 @@ export class SegmentStream implements Stream {
     }, AGAIN_MILLISECONDS);
   }
 
-  /** How often a file could not be had for a reason that stays. */
+  /** Number of permanent failures of a file. */
   private attempt(file: string, temporary: boolean): number {
     const count = (this.failures.get(file) ?? 0) + Number(!temporary);
     this.failures.set(file, count);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** A stream in a segments folder, or the same one in several qualities, one of which is decoded at a time. */
+/** A stream in a segments folder, or in several renditions, of which one is decoded at a time. */
 
 import type { Quality } from "../source/manifest.js";
 import { besides } from "../source/storedFile.js";
@@ -9,28 +9,28 @@ import type { Demand } from "./messages.js";
 import { type SegmentEvents, SegmentStream } from "./segmentStream.js";
 
 export interface SegmentedEvents {
-  /** The first manifest is there. */
+  /** The first manifest is available. */
   begun(stream: SegmentStream): void;
   changed(): void;
   stored(): void;
   lost(first: number, end: number | undefined, reason: string): void;
   notice(message: string): void;
   waiting(seconds: number, problem: string | undefined): void;
-  /** Unless it is fatal, the next demand is another attempt. */
+  /** Unless it is fatal, the next demand tries again. */
   failed(message: string, fatal: boolean): void;
-  /** Names of the qualities, and which of them frames are of. */
+  /** Names of the renditions, and the one in use. */
   qualities(names: readonly string[], at: number): void;
 }
 
-/** The list of qualities of a live stream is asked for again after so long. */
+/** Interval between requests of a live stream's list of renditions. */
 const LIST_MILLISECONDS = 30_000;
 
 export class SegmentedStreams {
   private active: SegmentStream;
   private abr: AbrController | undefined;
-  /** When the list of qualities was asked for last. */
+  /** Time of the last request of the list of renditions. */
   private listed = 0;
-  /** The quality that is changed to, as soon as it can be. */
+  /** The rendition to switch to as soon as possible. */
   private pending: { readonly stream: SegmentStream; readonly step: number } | undefined;
 
   constructor(
@@ -43,15 +43,15 @@ export class SegmentedStreams {
     this.active = this.followed(url, name);
   }
 
-  /** Leaves the choice of a quality to the connection, or makes it. */
+  /** Sets the rendition, or automatic selection. */
   choose(quality: number | undefined): void {
     if (this.abr) this.abr.choice = quality;
   }
 
   /**
-   * To be called before a frame is decoded.
+   * Must be called before a frame is decoded.
    *
-   * @returns the stream of another quality, if frames from `next` on are of that
+   * @returns the stream of another rendition, if frames from `next` on belong to it
    */
   changed(next: number, demand: Demand, seeking: boolean): SegmentStream | undefined {
     const { abr, active } = this;
@@ -71,7 +71,7 @@ export class SegmentedStreams {
       return this.atEdge(stream, next, demand) ? this.change() : undefined;
     }
     if (next >= catalog.count || !stream.chapter(next, demand.ahead)) return undefined;
-    // Without the frame that is needed now there is nothing to go on with.
+    // Playback cannot continue without the frame that is needed at present.
     const starved = step < abr.at && !active.store.has(next);
     if (seeking || starved) return this.change();
     const key = catalog.groupStart(next) === next ? next : catalog.groupEnd(next);
@@ -81,8 +81,8 @@ export class SegmentedStreams {
   }
 
   /**
-   * Whether a finer quality can be gone on with at its edge. Frames are published there after those of a coarser one,
-   * so its key frames always come too late for who waits for one: the newest group is fetched up to the edge instead.
+   * Whether a finer rendition can be used at its edge. Its frames are published after those of a coarser one,
+   * so waiting for its next key frame would be too late: the newest group is fetched up to the edge instead.
    */
   private atEdge(stream: SegmentStream, next: number, demand: Demand): boolean {
     const { catalog, store, loader } = stream;
@@ -120,7 +120,7 @@ export class SegmentedStreams {
           if (!begun) events.begun(stream);
           events.changed();
         }
-        begun = true; // one that is changed to later goes on there
+        begun = true; // a rendition that is used later starts there
       },
       stored: () => events.stored(),
       qualities: (qualities) => {
@@ -161,16 +161,16 @@ export class SegmentedStreams {
     this.listed = now;
     const id = this.client.manifests(this.url, this.name, {
       qualities: (qualities) => this.abr!.measured(qualities),
-      manifest: () => this.client.cancel(id), // It leads to something else by now.
+      manifest: () => this.client.cancel(id), // The address has another content by now.
       end: () => {},
-      failed: () => {}, // An outage is told by the stream that is played.
+      failed: () => {}, // The played stream reports outages.
     });
   }
 
   private refuse(message: string, temporary = false): void {
     this.abr!.refuse(this.pending!.step, temporary);
     this.drop();
-    // An outage is told by the stream that is played.
+    // The played stream reports outages.
     if (!temporary) this.events.notice(message);
   }
 

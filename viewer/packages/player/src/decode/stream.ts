@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** A stream that is being decoded: what there is of it, and what its frames belong to. */
+/** A stream that is being decoded: its packets, and the chapters of its frames. */
 
 import { SceneDecoder, type StreamHeader } from "@structgstream/core";
 import type { Catalog } from "./catalog.js";
@@ -7,7 +7,7 @@ import { ChangedFields } from "./changedFields.js";
 import type { PacketLoader } from "./packetLoader.js";
 import type { PacketStore } from "./packetStore.js";
 
-/** What one init record begins. */
+/** The part of a stream that follows one init record. */
 export class Chapter {
   readonly decoder: SceneDecoder;
   readonly changed: ChangedFields;
@@ -18,17 +18,17 @@ export class Chapter {
   }
 }
 
-/** Headers of periods that are kept are no more than these. */
+/** Largest number of cached headers of periods. */
 const MOST_CHAPTERS = 3;
 
-/** The chapters that were used last, by what names their period. */
+/** The chapters that were used last, by key of their period. */
 export class Chapters {
   private readonly kept = new Map<number, Chapter>();
 
   get(period: number): Chapter | undefined {
     const found = this.kept.get(period);
     if (found) {
-      // The one used last is at the end.
+      // The most recently used one is at the end.
       this.kept.delete(period);
       this.kept.set(period, found);
     }
@@ -46,9 +46,9 @@ export interface Stream {
   readonly store: PacketStore;
   readonly loader: PacketLoader;
   /**
-   * What a frame belongs to; undefined while what is needed to know that, or its init record, is being fetched.
+   * The chapter of a frame; undefined while its page or init record is being fetched.
    *
-   * @param ahead the frame after the last that will be wanted soon
+   * @param ahead the frame after the last one that will be needed soon
    */
   chapter(index: number, ahead: number): Chapter | undefined;
 }

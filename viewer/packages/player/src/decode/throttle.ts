@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 
-/** Calls at once when the last call is some time ago, otherwise once later, for all calls until then. */
+/** Calls immediately if the last call is some time ago; otherwise once later, for all calls until then. */
 export class Throttle {
   private last = Number.NEGATIVE_INFINITY;
   private later: ReturnType<typeof setTimeout> | undefined;

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-/** How many bits a second come while any are waited for, of late, and how much of the time that is. */
+/** Recent throughput while data is awaited, bits per second, and the share of time in which it is. */
 
-/** What is older than about so many seconds of waiting counts less and less. */
+/** Time constant of the average, in seconds of waiting. */
 const REMEMBERED_SECONDS = 6;
-/** After so many seconds what came counts half, waiting or not: packets of a small stream hardly have to be waited for. */
+/** Half-life of a measurement in wall-clock seconds, because small streams rarely wait for packets. */
 const HALF_LIFE_SECONDS = 10;
-/** Fewer bytes say nothing, unless they took long or it has been going on for a while. */
+/** Smallest number of bytes of a measurement, unless they took long. */
 const LEAST_BYTES = 30_000;
 const ENOUGH_SECONDS = 10;
 
@@ -13,7 +13,7 @@ export class Throughput {
   private active = 0;
   private since = 0;
   private seconds = 0;
-  /** Waiting or not. */
+  /** Elapsed time, waiting or not. */
   private wallSeconds = 0;
   private bytes = 0;
   private known = false;
@@ -24,7 +24,7 @@ export class Throughput {
     this.began = this.since = now();
   }
 
-  /** A reading begins; others may be under way. */
+  /** A reading starts; others may be active. */
   begin(): void {
     this.count();
     this.active++;
@@ -40,13 +40,13 @@ export class Throughput {
     this.active--;
   }
 
-  /** Undefined while too little has come. */
+  /** Undefined while there is too little data. */
   get bitsPerSecond(): number | undefined {
     this.count();
     return this.known && this.seconds > 0 ? (8 * this.bytes) / this.seconds : undefined;
   }
 
-  /** The share of the time, 0 to 1, in which something is waited for. */
+  /** The share of time, 0 to 1, in which data is awaited. */
   get busyShare(): number {
     this.count();
     return this.wallSeconds > 0 ? this.seconds / this.wallSeconds : 1;

@@ -1,20 +1,20 @@
 // SPDX-License-Identifier: Apache-2.0
-/** How many frames are wanted before their time. */
+/** Number of frames to decode and fetch in advance. */
 
 import type { Demand } from "../decode/messages.js";
 import type { Timeline } from "./timeline.js";
 
 const AHEAD_SECONDS = 10;
-/** Decoded frames wait in a queue, which takes memory: few are enough to even out decoding. */
+/** Decoded frames in the queue: few are sufficient to even out decoding, and each needs memory. */
 const LEAD_SECONDS = 0.15;
 const LEAST_LEAD = 3;
 const MOST_LEAD = 8;
 
 /**
- * What is wanted of a stream whose clock is at frame `at`.
+ * The demand of a stream whose clock is at frame `at`.
  *
- * @param rate of the clock; undefined while nothing is played
- * @param aheadSeconds packets are fetched for so long ahead
+ * @param rate rate of the clock; undefined while paused
+ * @param aheadSeconds time for which packets are fetched in advance
  */
 export function demandOf(
   timeline: Timeline,

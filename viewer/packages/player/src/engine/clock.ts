@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Media time, which runs at a rate against a clock that is given in. */
+/** Media time, which advances at a rate relative to a given clock. */
 
 export class MediaClock {
   private base = 0;

@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 
-/** Calls who listens; `Events` maps names of events to what they bring. */
+/** Calls listeners; `Events` maps names of events to their data. */
 export class Emitter<Events extends object> {
-  /** Gets every event, after those who listen to it. */
+  /** Receives every event, after its listeners. */
   relay: ((name: keyof Events, event: unknown) => void) | undefined;
   private readonly listeners = new Map<keyof Events, Set<(event: never) => void>>();
 
-  /** @returns a function that ends the listening */
+  /** @returns a function that removes the listener */
   on<Name extends keyof Events>(name: Name, listener: (event: Events[Name]) => void): () => void {
     const set = this.listeners.get(name) ?? new Set();
     this.listeners.set(name, set.add(listener as (event: never) => void));

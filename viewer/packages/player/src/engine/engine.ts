@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Playback without a page: a clock, frames that come from a decoder, and what to do when they do not. */
+/** Playback without a page: a clock, frames from a decoder, and the handling of late or missing ones. */
 
 import type { StreamHeader } from "@structgstream/core";
 import type { Demand, FromDecoder } from "../decode/messages.js";
@@ -30,9 +30,9 @@ export class Engine extends Emitter<EngineEvents> {
   /** The end of the stream while it grows. */
   readonly edge = new Edge(this.frames);
   readonly packets = new PacketLog();
-  /** Names of the qualities, and which of them frames are of; none where there is only one. */
+  /** Names of the renditions, and the one in use; undefined if there is only one. */
   qualities: { readonly names: readonly string[]; readonly at: number } = { names: [], at: 0 };
-  /** The one that is wanted; undefined leaves it to the connection. */
+  /** The chosen rendition; undefined for automatic selection. */
   quality: number | undefined;
   private opened = false;
   private rate = 1;
@@ -47,7 +47,7 @@ export class Engine extends Emitter<EngineEvents> {
   private hasEnded = false;
   private failed = false;
 
-  /** @param now seconds of a clock that only goes forward */
+  /** @param now seconds of a monotonic clock */
   constructor(
     private readonly pipeline: Pipeline,
     private readonly now: () => number,
@@ -58,8 +58,8 @@ export class Engine extends Emitter<EngineEvents> {
   }
 
   /**
-   * Opens a stream and shows its frame at `startSeconds`; without it the first, or of a live stream the last key frame that
-   * is far enough behind the newest. An engine opens one in its life.
+   * Opens a stream and shows its frame at `startSeconds`. The default is the first frame, or of a live stream the last key
+   * frame that is far enough behind the newest. An engine opens only one stream.
    */
   load(source: SourceDescription, startSeconds?: number): void {
     this.startSeconds = startSeconds;
@@ -86,7 +86,7 @@ export class Engine extends Emitter<EngineEvents> {
     this.emit("state", {});
   }
 
-  /** Goes to a time; the frame there is drawn when it has come, the key frame before it as soon as that has. */
+  /** Seeks to a time; the key frame before it and then its frame are drawn as soon as they arrive. */
   seek(seconds: number): void {
     const { frames: timeline } = this;
     if (!this.opened || !timeline.count) {
@@ -94,7 +94,7 @@ export class Engine extends Emitter<EngineEvents> {
       return;
     }
     const time = Math.min(Math.max(seconds, timeline.start), timeline.duration);
-    // Who goes to where following would be, or later, follows.
+    // A seek to the position of following, or later, starts following.
     this.edge.follow = time >= this.edge.seconds - this.edge.distance;
     this.begin(timeline.frameAt(time), time);
   }
@@ -106,7 +106,7 @@ export class Engine extends Emitter<EngineEvents> {
     this.begin(frame, timeline.ptsOf(frame));
   }
 
-  /** Goes to the edge of a live stream, and plays it from now on. */
+  /** Seeks to the edge of a live stream and follows it. */
   goLive(playing = true): void {
     if (!this.edge.live) return;
     this.wantsToPlay = playing && !this.failed;
@@ -119,13 +119,13 @@ export class Engine extends Emitter<EngineEvents> {
     return Math.max(this.edge.seconds - this.clock.at(this.now()), 0);
   }
 
-  /** Chooses one of the qualities; undefined leaves it to the connection. */
+  /** Chooses a rendition; undefined for automatic selection. */
   chooseQuality(quality: number | undefined): void {
     this.quality = quality;
     this.pipeline.send({ type: "quality", quality });
   }
 
-  /** Pauses, and goes so many frames on or back. */
+  /** Pauses and steps forward or back by a number of frames. */
   step(frames: number): void {
     this.pause();
     this.seekFrame(this.frameIndex + frames);
@@ -148,7 +148,7 @@ export class Engine extends Emitter<EngineEvents> {
     return Math.min(this.clock.at(this.now()), Math.max(this.frames.duration, 0));
   }
 
-  /** The frame that the clock is at, or that is sought. */
+  /** The frame at the clock, or the target of a seek. */
   get frameIndex(): number {
     const { seeking, target } = this.progress;
     return seeking ? target : this.frames.frameAt(this.clock.at(this.now()));
@@ -170,18 +170,18 @@ export class Engine extends Emitter<EngineEvents> {
     return this.hasEnded;
   }
 
-  /** Of a growing stream: seconds until its next frame, where its pace is known. */
+  /** Seconds until the next frame of a growing stream; undefined if its pace is unknown. */
   get nextFrameSeconds(): number | undefined {
     return this.edge.nextIn(this.now());
   }
 
-  /** The next picture comes with everything that can change: for a renderer that has lost what it had. */
+  /** Requests all dynamic fields with the next picture, for a renderer that has lost its state. */
   refresh(): void {
     this.pipeline.send({ type: "refresh" });
     if (this.frames.count) this.begin(this.frameIndex, this.clock.at(this.now()));
   }
 
-  /** To be called before each picture: moves the clock, and gives what has to be drawn, if anything new has. */
+  /** Must be called before each picture: advances the clock and returns a new update to draw, if there is one. */
   tick(): DueUpdate | undefined {
     if (!this.opened || this.failed) return undefined;
     const now = this.now();
@@ -220,7 +220,7 @@ export class Engine extends Emitter<EngineEvents> {
       this.setStalled(false);
       if (pace.to > progress.reached) this.begin(pace.to, timeline.ptsOf(pace.to));
       else {
-        // The decoder, which hears of frames sooner, has given it.
+        // The decoder knows of frames earlier and has sent it already.
         clock.set(timeline.ptsOf(pace.to), now);
         clock.start(now);
       }
@@ -250,7 +250,7 @@ export class Engine extends Emitter<EngineEvents> {
     }
     clock.stop(now);
     if (!timeline.complete) {
-      // The last frame is held until the next one has been written: who has come to the edge follows it.
+      // The last frame is shown until the next one was written; a viewer at the edge follows it.
       this.edge.follow = true;
       clock.set(Math.max(timeline.duration - 1e-3, 0), now);
       this.setStalled(true);
@@ -263,7 +263,7 @@ export class Engine extends Emitter<EngineEvents> {
     this.emit("state", {});
   }
 
-  /** Tells the decoder what is wanted, if that has changed. */
+  /** Sends the demand to the decoder, if it has changed. */
   private ask(): void {
     const { frames: timeline, clock, frameIndex: at } = this;
     const { serial } = this.progress;
@@ -300,7 +300,7 @@ export class Engine extends Emitter<EngineEvents> {
     this.emit("header", header);
     if (ranged) return;
     this.emit("notice", {
-      message: "The server gives no parts of files (Range), so that all of it has to be fetched.",
+      message: "The server does not support range requests, so the whole file is fetched.",
     });
   }
 
@@ -311,7 +311,7 @@ export class Engine extends Emitter<EngineEvents> {
     edge.changed(this.now());
     if (wasLive && !edge.live) this.emit("notice", { message: "The stream has ended; it is a recording now." });
     if (!wasLive && edge.live && this.opened) {
-      this.emit("notice", { message: "The stream goes on." });
+      this.emit("notice", { message: "The stream continues." });
       if (this.hasEnded) this.goLive();
     }
     this.startIfThere();
@@ -384,7 +384,7 @@ export class Engine extends Emitter<EngineEvents> {
   private fail(message: string, fatal: boolean): void {
     this.failed ||= fatal;
     this.pause();
-    this.demanded = undefined; // the next one is another attempt
+    this.demanded = undefined; // the next demand tries again
     this.emit("error", { message, fatal });
   }
 }

@@ -1,22 +1,22 @@
 // SPDX-License-Identifier: Apache-2.0
-/** What an engine tells. */
+/** Events of an engine. */
 
 import type { StreamHeader } from "@structgstream/core";
 
-/** Seconds from the first to before the second. */
+/** Interval in seconds: start, and end (exclusive). */
 export type TimeRange = readonly [startSeconds: number, endSeconds: number];
 
 export interface EngineEvents {
-  /** Bytes of the header are coming; the total may never be known. */
+  /** Bytes of the header have arrived; the total may be unknown. */
   opening: { readonly loadedBytes: number; readonly totalBytes: number | undefined; readonly ended: boolean };
   header: StreamHeader;
-  /** Another frame is to be drawn. */
+  /** A new frame must be drawn. */
   frame: { readonly index: number; readonly ptsSeconds: number };
-  /** The clock waits for bytes, or no longer does. */
+  /** The clock starts or stops waiting for bytes. */
   stall: { readonly stalled: boolean };
-  /** One sentence; after a fatal one nothing more can be shown. */
+  /** An error in one sentence; nothing more can be shown after a fatal one. */
   error: { readonly message: string; readonly fatal: boolean };
-  /** Something the user may want to know, and need not do anything about; empty when it is over. */
+  /** Information for the user that needs no action; empty when it does not apply any more. */
   notice: { readonly message: string };
   progress: {
     readonly buffered: readonly TimeRange[];
@@ -24,7 +24,7 @@ export interface EngineEvents {
     readonly durationSeconds: number;
     readonly complete: boolean;
   };
-  /** Playing, paused, seeking or at the end: one of them has changed. */
+  /** One of these has changed: playing, paused, seeking, ended. */
   state: Readonly<Record<string, never>>;
   ended: Readonly<Record<string, never>>;
 }

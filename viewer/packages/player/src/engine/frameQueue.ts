@@ -1,21 +1,21 @@
 // SPDX-License-Identifier: Apache-2.0
 /**
- * Updates that have come and were not drawn yet.
+ * Updates that have arrived and were not drawn yet.
  *
- * An update holds what changed since the last one given, so none may be lost: what is not drawn goes on with the next.
+ * An update contains the changes since the last one, so none may be lost: updates that are not drawn are merged.
  */
 
 import type { FieldName, StreamHeader, Tensor } from "@structgstream/core";
 import type { SceneUpdate } from "@structgstream/gl";
 
-/** An update, with the header that it and those after it belong to where that is another than before. */
+/** An update, with its header if that differs from the last update's. */
 export interface DueUpdate extends SceneUpdate {
   readonly header?: StreamHeader | undefined;
 }
 
 interface Pending {
   readonly update: DueUpdate;
-  /** To be drawn whatever the clock says. */
+  /** Draw it regardless of the clock. */
   readonly atOnce: boolean;
 }
 
@@ -28,23 +28,23 @@ export class FrameQueue {
     this.pending.push({ update, atOnce });
   }
 
-  /** Keeps what an update changes, without ever drawing it by itself. */
+  /** Merges an update into the next one without drawing it. */
   carry({ header, fields }: DueUpdate): void {
     if (header) {
-      // What was before belongs to another scene.
+      // Earlier updates belong to another scene.
       this.header = header;
       this.carried = new Map();
     }
     for (const [name, tensor] of fields) this.carried.set(name, tensor);
   }
 
-  /** All that is there belongs to another place of the stream now. */
+  /** Called after a seek: queued updates must not be drawn any more. */
   carryAll(): void {
     for (const { update } of this.pending) this.carry(update);
     this.pending = [];
   }
 
-  /** The last update that is due at frame `index`, with all that changed before it. */
+  /** The last update that is due at frame `index`, merged with all earlier ones. */
   take(index: number): DueUpdate | undefined {
     let last: DueUpdate | undefined;
     while (this.pending.length) {

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-/** What an engine may be told. */
+/** Options of an engine. */
 
 export interface EngineOptions {
-  /** Packets are kept in no more bytes than these. */
+  /** Largest number of bytes of stored packets. */
   readonly budgetBytes?: number;
-  /** While playing, packets are fetched for so many seconds ahead. */
+  /** Seconds for which packets are fetched in advance during playback. */
   readonly aheadSeconds?: number;
 }

@@ -2,7 +2,7 @@
 
 import type { FromDecoder, ToDecoder } from "../decode/messages.js";
 
-/** The decoder's end of the line. */
+/** The connection to the decoder. */
 export interface Pipeline {
   send(message: ToDecoder): void;
   onmessage: ((message: FromDecoder) => void) | undefined;

@@ -1,18 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Which frame is sought, and how far frames have come. */
+/** The target of a seek, and the progress towards it. */
 
 export class Progress {
-  /** Of the last seek. */
+  /** Number of the last seek. */
   serial = 0;
-  /** The frame that was sought last. */
+  /** The target of the last seek. */
   target = 0;
   seeking = false;
-  /** The last frame that can be drawn or need not be waited for. */
+  /** The last frame that can be drawn or is known to be lost. */
   reached = -1;
-  /** The frame that was given to be drawn last. */
+  /** The frame that was drawn last. */
   shown = -1;
 
-  /** Frame `target` is wanted. */
+  /** Starts a seek to frame `target`. */
   seek(target: number): void {
     this.serial++;
     this.target = target;
@@ -20,12 +20,12 @@ export class Progress {
     this.seeking = true;
   }
 
-  /** Frames up to `index` can be drawn or need not be waited for. */
+  /** Records that frames up to `index` can be drawn or are lost. */
   reach(index: number): void {
     this.reached = Math.max(this.reached, index);
   }
 
-  /** What was sought is there. */
+  /** Whether the target has been reached. */
   arrive(): void {
     this.seeking = false;
     this.reach(this.target);
@@ -33,8 +33,8 @@ export class Progress {
   }
 
   /**
-   * Whether frame `index`, which has come, would be a step back on the way forward. The decoder begins with a key frame
-   * again where another frame is sought, or another quality is taken, after it has decoded that frame.
+   * Whether drawing the received frame `index` would be a step back. The decoder starts at a key frame
+   * again after a seek or a switch to another rendition, although it has decoded that frame before.
    */
   isBack(index: number, exact: boolean): boolean {
     return index < this.shown && !(this.seeking && (exact || this.target < this.shown));

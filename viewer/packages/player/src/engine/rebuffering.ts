@@ -1,16 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
-/** When a clock that had to wait may go on. */
+/** Decides when a clock may continue after a stall. */
 
 import type { Edge } from "./edge.js";
 import type { StoredFrames } from "./storedFrames.js";
 import type { Timeline } from "./timeline.js";
 
-/** After a stall so much is waited for, or the next one would follow at once. */
+/** Buffer to wait for after a stall, so that the next one does not follow immediately. */
 const REBUFFER_SECONDS = 0.5;
 const MOST_REBUFFER_SECONDS = 3;
 
 export class Rebuffering {
-  /** Since when it could go on. */
+  /** Time since which it could continue. */
   private since: number | undefined;
 
   constructor(
@@ -19,16 +19,16 @@ export class Rebuffering {
     private readonly edge: Edge,
   ) {}
 
-  /** Another wait begins, or none goes on. */
+  /** Resets at the start or end of a wait. */
   begin(): void {
     this.since = undefined;
   }
 
   /**
-   * @param time of the clock
-   * @param rate of the clock
+   * @param time time of the clock
+   * @param rate rate of the clock
    * @param reached the last frame that can be drawn
-   * @param ahead the frame after the last that was asked for
+   * @param ahead the frame after the last requested one
    * @param now seconds of any clock
    */
   isOver(time: number, rate: number, reached: number, ahead: number, now: number): boolean {
@@ -39,7 +39,7 @@ export class Rebuffering {
     if (now - this.since > MOST_REBUFFER_SECONDS) return true;
     if (edge.flows) return edge.seconds - time >= Math.min(edge.distance, REBUFFER_SECONDS);
     const enough = Math.min(timeline.frameAt(time + REBUFFER_SECONDS * rate), ahead - 1);
-    // A store may be too small for that much.
+    // The store may be too small for this buffer.
     return edge.grows || reached >= enough || this.stored.has(enough);
   }
 }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Which frames' packets have been fetched. */
+/** The frames whose packets were fetched. */
 
 import type { FrameRange } from "../decode/messages.js";
 import type { TimeRange } from "./events.js";
@@ -7,7 +7,7 @@ import type { Timeline } from "./timeline.js";
 
 export class StoredFrames {
   ranges: readonly FrameRange[] = [];
-  /** Bytes fetched so far, everything counted. */
+  /** Total number of bytes fetched so far. */
   fetchedBytes = 0;
 
   constructor(private readonly timeline: Timeline) {}
@@ -16,7 +16,7 @@ export class StoredFrames {
     return this.ranges.some(([first, end]) => index >= first && index < end);
   }
 
-  /** Their times. */
+  /** Intervals of their times. */
   get times(): readonly TimeRange[] {
     const { timeline } = this;
     return this.ranges.map(([first, end]) => [timeline.ptsOf(first), timeline.endOf(end - 1)]);

@@ -13,29 +13,29 @@ export class Timeline {
     complete: false,
   };
 
-  /** Frames a second, for how long the last one is shown. */
+  /** Frames per second, for the duration of the last frame. */
   fps = 1;
 
   take(facts: CatalogFacts): void {
     this.facts = facts;
   }
 
-  /** The first frame that there still is. */
+  /** The first available frame. */
   get first(): number {
     return this.facts.first;
   }
 
-  /** The number after the last frame's. */
+  /** The number after that of the last frame. */
   get count(): number {
     return this.facts.count;
   }
 
-  /** When the first frame begins, in seconds. */
+  /** Start of the first frame, seconds. */
   get start(): number {
     return this.ptsOf(this.first);
   }
 
-  /** Whether no more frames will come. */
+  /** Whether no further frames will come. */
   get complete(): boolean {
     return this.facts.complete;
   }
@@ -44,7 +44,7 @@ export class Timeline {
     return this.facts.keys;
   }
 
-  /** How the stream grows, where a manifest says so. */
+  /** Growth of the stream, if it has a manifest. */
   get live(): LiveFacts | undefined {
     return this.facts.live;
   }
@@ -53,7 +53,7 @@ export class Timeline {
     return this.facts.lost;
   }
 
-  /** When the last frame is over, in seconds. */
+  /** End of the last frame, seconds. */
   get duration(): number {
     return this.count ? this.ptsOf(this.count - 1) + this.lastFor() : 0;
   }
@@ -68,14 +68,14 @@ export class Timeline {
     return seconds + ((index - frame) / (next - frame)) * (ptsSeconds[at + 1]! - seconds);
   }
 
-  /** When a frame is over. */
+  /** End of a frame, seconds. */
   endOf(index: number): number {
     return index + 1 < this.count ? this.ptsOf(index + 1) : this.duration;
   }
 
-  /** The frame that is shown at a time: the last one that has begun, and the first before all. */
+  /** The frame at a time: the last one that has started, or the first for earlier times. */
   frameAt(seconds: number): number {
-    // Times that come from frames must lead back to them, whatever was added and taken away meanwhile.
+    // Times of frames must map back to these frames after any additions and removals.
     const time = seconds + 1e-6;
     const { frames, ptsSeconds, first } = this.facts;
     const at = lastBefore(ptsSeconds, time);
@@ -91,7 +91,7 @@ export class Timeline {
   }
 }
 
-/** Place of the last value that is not above `limit`; 0 where there is none. */
+/** Index of the last value not above `limit`; 0 if there is none. */
 function lastBefore(values: Float64Array, limit: number): number {
   let [low, high] = [0, values.length - 1];
   while (low < high) {

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-/** A file of the user's, or bytes that a page brought with it. */
+/** A file of the user, or bytes that a page contains. */
 
 import { type ByteSink, type ByteSource, type ReadOptions, SourceError } from "./byteSource.js";
 
 export class BlobSource implements ByteSource {
-  /** A file that was chosen is as it was then: a browser gives no more of it. */
+  /** A browser provides a chosen file only with its content at that time. */
   readonly mayGrow = false;
 
   constructor(
@@ -27,9 +27,9 @@ export class BlobSource implements ByteSource {
 }
 
 /**
- * The bytes that base64 text stands for; white space counts for nothing.
+ * The bytes of a base64 text; white space is ignored.
  *
- * @throws SourceError it is no base64
+ * @throws SourceError it is not base64
  */
 export function blobOfBase64(text: string, name: string): Blob {
   let binary: string;

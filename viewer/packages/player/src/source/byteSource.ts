@@ -1,33 +1,33 @@
 // SPDX-License-Identifier: Apache-2.0
-/** A file of bytes that can be read by ranges, wherever it is. */
+/** A file of bytes that can be read by ranges, independent of its location. */
 
-/** What is known of the file when a reading begins. */
+/** Facts of the file at the start of a reading. */
 export interface Opening {
-  /** Where the first byte given is in the file: 0 instead of what was asked for when the whole file comes. */
+  /** Offset of the first byte: that of the request, or 0 if the whole file comes. */
   readonly start: number;
   readonly fileBytes: number | undefined;
-  /** Whether other ranges can be asked for. */
+  /** Whether ranges can be requested. */
   readonly ranged: boolean;
 }
 
-/** Takes one reading: `begin` once, then its bytes in order. */
+/** Receives one reading: `begin` once, then its bytes in order. */
 export interface ByteSink {
   begin(opening: Opening): void;
   take(bytes: Uint8Array): void;
 }
 
 export interface ReadOptions {
-  /** Byte after the last one; without it up to the end of the file as it is now. */
+  /** Offset after the last byte; undefined: the present end of the file. */
   readonly end?: number;
-  /** Give the whole file, from its first byte on, where only that can be had. */
+  /** Read the whole file from its first byte if ranges are not supported. */
   readonly wholeIfNeeded?: boolean;
 }
 
 export interface ByteSource {
   /**
-   * Reads bytes from `start` on; resolves when they all were given.
+   * Reads bytes from `start` on; resolves when all were passed on.
    *
-   * @throws SourceError with a sentence for the user; `temporary` ones may go away by themselves
+   * @throws SourceError with a sentence for the user; `temporary` ones may disappear without action
    */
   read(start: number, options: ReadOptions, sink: ByteSink, signal: AbortSignal): Promise<void>;
   /** Whether bytes may still be appended to the file. */
@@ -40,7 +40,7 @@ export class SourceError extends Error {
   constructor(
     message: string,
     readonly temporary = false,
-    /** Whether asking again cannot help, whatever was there before. */
+    /** Whether another request cannot succeed. */
     readonly final = false,
   ) {
     super(message);

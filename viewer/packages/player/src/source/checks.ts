@@ -3,7 +3,7 @@
 
 import { SourceError } from "./byteSource.js";
 
-/** Gives the value back as what it must be; `where` names it in messages. */
+/** Returns the value with its checked type; `where` names it in messages. */
 export type Check<Value> = (value: unknown, where: string) => Value;
 
 type Shaped<Shape extends Readonly<Record<string, Check<unknown>>>> = {
@@ -32,13 +32,13 @@ export function number(least = -1e15): Check<number> {
 
 export const flag: Check<boolean> = checked((value) => typeof value === "boolean", "true or false");
 
-/** Characters are Unicode's, and there are no halves of any: JSON may hold these. */
+/** A text of Unicode characters without lone surrogates, which JSON may contain. */
 export const text: Check<string> = checked(
   (value) => typeof value === "string" && [...value].length <= 1000 && !/\p{Cs}/u.test(value),
   "a text of at most 1000 characters",
 );
 
-/** A text that an expression describes from its first to its last character. */
+/** A text that matches a regular expression completely. */
 export function like(pattern: RegExp, expected: string): Check<string> {
   return checked((value) => typeof value === "string" && pattern.test(value), expected);
 }
@@ -54,14 +54,14 @@ export function list<Value>(check: Check<Value>, most: number): Check<Value[]> {
   };
 }
 
-/** Two numbers that do not fall. */
+/** Two numbers, the second not below the first. */
 export const span: Check<readonly [number, number]> = (value, where) => {
   const found = list(number(), 2)(value, where);
   if (found.length !== 2 || found[0]! > found[1]!) refuse(where, value, "two numbers that do not fall");
   return found as [number, number];
 };
 
-/** An object with these fields; others are left out. */
+/** An object with these fields; others are removed. */
 export function shaped<Shape extends Readonly<Record<string, Check<unknown>>>>(shape: Shape): Check<Shaped<Shape>> {
   return (value, where) => {
     if (typeof value !== "object" || value === null || Array.isArray(value)) refuse(where, value, "an object");
@@ -73,15 +73,15 @@ export function shaped<Shape extends Readonly<Record<string, Check<unknown>>>>(s
   };
 }
 
-/** Where a field is, for messages: `manifest.json: parts[0].file`. */
+/** Name of a field in messages: `manifest.json: parts[0].file`. */
 export function fieldOf(where: string, name: string): string {
   return where.includes(": ") ? `${where}.${name}` : `${where}: ${name}`;
 }
 
 /**
- * The value that JSON stands for, in UTF-8 without a byte order mark.
+ * The value of a JSON text in UTF-8 without a byte order mark.
  *
- * @throws SourceError it is none
+ * @throws SourceError it is not JSON
  */
 export function parsedJson(bytes: Uint8Array, where: string): unknown {
   try {

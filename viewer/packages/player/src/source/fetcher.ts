@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** What runs in the fetch worker: readings of one source, with patience. */
+/** The fetch worker: readings of one source, with retries. */
 
 import { BlobSource, blobOfBase64 } from "./blobSource.js";
 import { type ByteSource, SourceError } from "./byteSource.js";
@@ -13,7 +13,7 @@ import type { Port } from "./port.js";
 import { RETRY_POLICY, type RetryPolicy } from "./retryPolicy.js";
 import { besides, verify } from "./storedFile.js";
 
-/** An init record or a packet that is larger is not taken. */
+/** Largest accepted size of an init record or a packet. */
 const MOST_HELD_BYTES = 2 ** 28;
 
 export class Fetcher {
@@ -92,7 +92,7 @@ export class Fetcher {
     await feed.follow(events, signal);
   }
 
-  /** Bytes of a file that never changes; all of it is compared with what is stated of it. */
+  /** Bytes of an immutable file, which is compared with its stated size and hash. */
   private async readStored(
     id: number,
     of: StoredPlace,
@@ -140,7 +140,7 @@ export class Fetcher {
     return new BlobSource(blob, source.name);
   }
 
-  /** Reads a range, again from where it broke off while there is hope; gives back where the bytes ended. */
+  /** Reads a range, with retries from where it broke off; returns the offset of the end. */
   private async read(
     source: ByteSource,
     id: number,
@@ -177,7 +177,7 @@ export class Fetcher {
       } catch (error) {
         const wait = this.retryPolicy.retries[attempt++];
         const hopeless = !(error instanceof SourceError && error.temporary) || wait === undefined;
-        // What never answered is told at once: a wrong address should not take half a minute to say so.
+        // A source that never answered fails immediately, so that a wrong address is reported without delay.
         if (signal.aborted || hopeless || !this.answered) throw error;
         this.port.postMessage({ type: "waiting", id, seconds: wait, problem: error.message }, []);
         await pause(wait, signal);

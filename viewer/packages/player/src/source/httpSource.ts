@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 /**
- * A file on a server, by Range requests; by whole answers where a server knows no ranges.
+ * A file on a server, read by Range requests, or as a whole if the server does not support them.
  *
- * Only ranges with a first byte are asked for: browsers let these through to another origin without asking it first, and
- * a range of the last bytes not.
+ * Only ranges with a first byte are requested: browsers send these to another origin without a preflight request, but
+ * not a range of the last bytes.
  */
 
 import { type ByteSink, type ByteSource, type ReadOptions, SourceError } from "./byteSource.js";
 
-/** A file that nobody has changed for so long is not being written. */
+/** A file that has not changed for this time counts as finished. */
 const STILL_SECONDS = 600;
 const TEMPORARY = new Set([408, 429, 500, 502, 503, 504]);
 
@@ -26,7 +26,7 @@ export class HttpSource implements ByteSource {
     private readonly name: string,
     private readonly request: typeof fetch,
     private readonly sameOrigin = false,
-    /** Whether the file never changes, so that the browser's own copy will do. */
+    /** Whether the file never changes, so that the browser's cache can be used. */
     private readonly kept = false,
   ) {}
 
@@ -35,7 +35,7 @@ export class HttpSource implements ByteSource {
   }
 
   async read(start: number, options: ReadOptions, sink: ByteSink, signal: AbortSignal): Promise<void> {
-    // Browsers report every answer of 416 in their console, so what may be nothing is asked for with the byte before it.
+    // Browsers log every 416 response, so a range that may be empty is requested together with the byte before it.
     const before = options.end === undefined && start > 0 ? 1 : 0;
     const response = await this.answer(start - before, options.end, signal);
     this.noticeAge(response);
@@ -46,7 +46,7 @@ export class HttpSource implements ByteSource {
     if (response.status !== 206 && response.status !== 200) throw refusal(this.name, response.status);
     const found = response.status === 206 ? rangeOf(response.headers.get("Content-Range")) : undefined;
     if (found) {
-      // A page of another origin may not be allowed to see where the bytes are from; they are what was asked for then.
+      // A page of another origin may not see the response's range; it is that of the request then.
       const from = start - before;
       if ((found.start ?? from) !== from) throw this.misplaced(from, found.start);
       this.checkSize(found.fileBytes);
@@ -68,7 +68,7 @@ export class HttpSource implements ByteSource {
     return answered(this.request, this.url, this.name, headers, this.sameOrigin, signal, this.kept);
   }
 
-  /** Gives `count` bytes of the body after the first `skip`. */
+  /** Passes on `count` bytes of the body after the first `skip`. */
   private async pour(response: Response, skip: number, count: number, sink: ByteSink): Promise<void> {
     const reader = response.body!.getReader();
     let [left, behind] = [count, skip];
@@ -79,7 +79,7 @@ export class HttpSource implements ByteSource {
         const bytes = value.subarray(Math.min(behind, value.length), Math.min(value.length, behind + left));
         behind -= Math.min(behind, value.length);
         left -= bytes.length;
-        // A copy: what is given away is transferred, and the rest of a chunk would go with it.
+        // A copy, because the bytes are transferred, and the remainder of a chunk would be transferred with them.
         if (bytes.length) sink.take(bytes.length === value.buffer.byteLength ? bytes : bytes.slice());
       }
       await reader.cancel();
@@ -107,16 +107,16 @@ export class HttpSource implements ByteSource {
   private noticeAge(response: Response): void {
     const changed = Date.parse(response.headers.get("Last-Modified") ?? "");
     const now = Date.parse(response.headers.get("Date") ?? "");
-    // The server's own clock, as far as it tells it: the user's may be wrong.
+    // The server's clock, if known, because the user's may be wrong.
     if (!Number.isNaN(changed)) this.growing = (Number.isNaN(now) ? Date.now() : now) - changed < STILL_SECONDS * 1000;
   }
 
   private misplaced(start: number, found: number | undefined): SourceError {
-    return new SourceError(`The server gave ${this.name} from byte ${found} on where byte ${start} was asked for.`);
+    return new SourceError(`The server sent ${this.name} from byte ${found} instead of byte ${start}.`);
   }
 }
 
-/** What a server answers; it may be a refusal. */
+/** The server's response, which may be an error. */
 export async function answered(
   request: typeof fetch,
   url: string,
@@ -139,18 +139,18 @@ export async function answered(
   }
 }
 
-/** What an answer means that is none of those that were hoped for. */
+/** The error of an unexpected response. */
 export function refusal(name: string, status: number): SourceError {
   if (status === 404 || status === 410) {
     return new SourceError(`${name} was not found on the server (${status}). Check the address.`);
   }
   if (status === 401 || status === 403) {
-    return new SourceError(`The server does not give ${name} to this page (${status}).`);
+    return new SourceError(`The server refuses ${name} to this page (${status}).`);
   }
-  return new SourceError(`The server answered ${status} where ${name} was asked for.`, TEMPORARY.has(status));
+  return new SourceError(`The server answered the request for ${name} with ${status}.`, TEMPORARY.has(status));
 }
 
-/** `bytes 0-9/100` or `bytes * /100`; nothing where it cannot be seen or understood. */
+/** Parses `bytes 0-9/100` or `bytes * /100`; undefined if it is missing or malformed. */
 function rangeOf(header: string | null): ContentRange {
   const found = /^bytes (?:(\d{1,15})-\d{1,15}|\*)\/(\d{1,15}|\*)$/.exec(header?.trim() ?? "");
   if (!found) return { start: undefined, fileBytes: undefined };
@@ -161,7 +161,7 @@ function rangeOf(header: string | null): ContentRange {
   };
 }
 
-/** What a body has, where it comes as it is: a coded one has a length of its own. */
+/** Length of a body without content coding; a coded one has another length. */
 function lengthOf(response: Response): number | undefined {
   const header = response.headers.get("Content-Length");
   return header === null || response.headers.get("Content-Encoding") ? undefined : Number(header);

@@ -98,22 +98,22 @@ const qualities = list(
   MOST_QUALITIES,
 );
 
-/** What every entry states of its file. */
+/** Facts that every entry states about its file. */
 export type FileEntry = { readonly file: string; readonly bytes: number; readonly sha256: string };
 export type PeriodEntry = ReturnType<typeof period>;
 export type PageEntry = ReturnType<typeof page>;
 export type SegmentEntry = ReturnType<typeof anySegment>;
 export type PartEntry = ReturnType<typeof part>;
 export type Manifest = ReturnType<typeof manifest>;
-/** What a page lists: pages of the level below, or segments. */
+/** Entries of a page: pages of the level below, or segments. */
 export type PageContent = { readonly pages: readonly PageEntry[]; readonly segments: readonly SegmentEntry[] };
 /** One of several manifests of the same frames. */
 export type Quality = ReturnType<typeof qualities>[number];
 
 /**
- * What a JSON file lists: a manifest, or several of one stream.
+ * The content of a JSON file: a manifest, or a list of several for one stream.
  *
- * @throws SourceError it is neither, of a newer version, contradicts itself, or leaves the format's bounds
+ * @throws SourceError it is neither, has a newer version, is inconsistent, or exceeds the format's bounds
  */
 export function manifestIn(bytes: Uint8Array, name: string): Manifest | readonly Quality[] {
   const value = parsedJson(bytes, name);
@@ -131,9 +131,9 @@ export function manifestIn(bytes: Uint8Array, name: string): Manifest | readonly
 }
 
 /**
- * What a history page lists.
+ * The entries of a history page.
  *
- * @throws SourceError it is not what the entry announces
+ * @throws SourceError it differs from what its entry states
  */
 export function pageIn(bytes: Uint8Array, entry: PageEntry): PageContent {
   const { file, level } = entry;
@@ -178,7 +178,7 @@ function checkWhole(found: Manifest, name: string): void {
   if (used.some((entry) => !known.has(entry.period))) throw wrong("it lacks the init record of a period");
 }
 
-/** Checks that entries follow each other from this segment and frame on; gives back those after the last. */
+/** Checks that entries are consecutive from this segment and frame on; returns the segment and frame after the last. */
 function runEnd(
   entries: readonly (PageEntry | SegmentEntry)[],
   [segment, frame]: readonly [segment: number, frame: number],

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 /**
- * The manifest of a live stream, again whenever it has changed.
+ * The manifest of a live stream, and each newer version of it.
  *
- * Each request says which one is there (`?after=SEQUENCE`): a server that knows this answers when there is a newer one. Other
- * hosts answer at once with what they have, and are asked again after a while that grows while nothing new comes.
+ * Each request contains the present sequence (`?after=SEQUENCE`): the package's server answers when there is a newer one.
+ * Other hosts answer immediately, and are asked again after intervals that grow while there is nothing new.
  */
 
 import { SourceError } from "./byteSource.js";
@@ -13,22 +13,22 @@ import { type Manifest, MOST_MANIFEST_BYTES, manifestIn, type Quality } from "./
 import { pause } from "./pause.js";
 import type { RetryPolicy } from "./retryPolicy.js";
 
-/** A server that waits for news lets go after this at the latest; an answer that takes longer never comes. */
+/** Longest time of a waiting request; a later answer will not come. */
 const ANSWER_SECONDS = 45;
-/** Answers without news, and with news, that came sooner were not held back until there were some. */
+/** Answers without and with a newer manifest that come sooner show that the host does not wait. */
 const WAITED_SECONDS = 2;
 const HELD_SECONDS = 0.25;
 
-/** So often a host that does not wait is asked for each frame, until one takes so many times as long as those before. */
+/** Requests per frame to a host that does not wait, until a frame takes a multiple of the earlier ones' time. */
 const POLLS = 4;
 const OVERDUE = 3;
 
 export interface FeedEvents {
   manifest(manifest: Manifest): void;
   qualities(qualities: readonly Quality[]): void;
-  /** The host does not answer, or has nonsense; it is asked again in so many seconds. */
+  /** The host does not answer, or its answer is invalid; seconds until the next request. */
   waiting(seconds: number, problem: string): void;
-  /** It answers again. */
+  /** The host answers again. */
   recovered(): void;
 }
 
@@ -36,7 +36,7 @@ export class ManifestFeed {
   private etag: string | undefined;
   private last: Manifest | undefined;
 
-  /** @param own whether the host is the page's: it can be told which manifest is there without being asked for leave */
+  /** @param own whether the host is the page's own, so that the query needs no preflight request */
   constructor(
     private readonly url: string,
     private readonly name: string,
@@ -47,10 +47,10 @@ export class ManifestFeed {
   ) {}
 
   /**
-   * Gives manifests until one is of a finished stream, or the address leads to a list of qualities. A run that ends
-   * meanwhile may be resumed, so its host is asked a while longer; that of a live one for as long as it takes.
+   * Passes on manifests until the stream is finished, or the address has a list of renditions. A run that ends
+   * meanwhile may be resumed, so its host is asked for some time longer; that of a live one without limit.
    *
-   * @throws SourceError the first one cannot be had, or the stream was replaced
+   * @throws SourceError the first one is not available, or the stream was replaced
    */
   async follow(events: FeedEvents, signal: AbortSignal): Promise<void> {
     const { firstPoll, longestPoll, backOff, stillAfter } = this.retryPolicy;
@@ -70,12 +70,12 @@ export class ManifestFeed {
         const took = (performance.now() - began) / 1000;
         if (found) fresh = performance.now();
         wait = found ? firstPoll : Math.min(wait * backOff, this.longest((performance.now() - fresh) / 1000));
-        // A host that held the answer back is one that waits for news.
+        // A host that delayed its answer waits for newer manifests.
         if (!asked || took < (found ? HELD_SECONDS : WAITED_SECONDS)) await pause(wait, signal);
       } catch (error) {
         if (signal.aborted) return;
         if (this.isOver && !(error instanceof SourceError && error.final)) {
-          await pause(longestPoll, signal); // what there is plays without the host
+          await pause(longestPoll, signal); // existing frames are played without the host
           continue;
         }
         if (!this.last || (error instanceof SourceError && error.final)) throw error;
@@ -92,14 +92,14 @@ export class ManifestFeed {
     return this.last?.live === false;
   }
 
-  /** The longest wait for a frame that is expected soon; one that is overdue for long is asked for less often. */
+  /** Longest interval of requests for a frame that is expected soon; they are less frequent for one long overdue. */
   private longest(sinceNews: number): number {
     const { firstPoll, longestPoll } = this.retryPolicy;
     const pace = this.last?.frame_seconds ?? 0;
     return sinceNews > OVERDUE * pace ? longestPoll : Math.min(Math.max(pace / POLLS, firstPoll), longestPoll);
   }
 
-  /** The next manifest; undefined where it is still the last one. */
+  /** The next manifest; undefined if it has not changed. */
   private async ask(signal: AbortSignal): Promise<Manifest | readonly Quality[] | undefined> {
     const { last } = this;
     const url = new URL(this.url);
@@ -119,10 +119,7 @@ export class ManifestFeed {
       return "sequence" in found ? this.newer(found) : found;
     } catch (error) {
       if (!late.signal.aborted || signal.aborted) throw error;
-      throw new SourceError(
-        `The server has not answered for ${ANSWER_SECONDS} s where ${this.name} was asked for.`,
-        true,
-      );
+      throw new SourceError(`The server has not answered the request for ${this.name} for ${ANSWER_SECONDS} s.`, true);
     } finally {
       clearTimeout(timer);
       signal.removeEventListener("abort", end);
@@ -136,14 +133,14 @@ export class ManifestFeed {
     );
     if (replaced)
       throw new SourceError(`${this.name} is of another stream now: it was replaced. Load it again.`, false, true);
-    // A cache on the way may be behind.
+    // A cache in between may be outdated.
     if (last && found.sequence <= last.sequence) return undefined;
     this.last = found;
     return found;
   }
 }
 
-/** The whole body, unless it has more bytes than may be. */
+/** The whole body, unless it exceeds the largest size. */
 async function limited(response: Response, most: number, name: string): Promise<Uint8Array> {
   const reader = response.body!.getReader();
   const parts: Uint8Array[] = [];

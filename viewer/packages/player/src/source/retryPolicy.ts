@@ -1,15 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Waits of requests that fail, and of files that grow. */
+/** Intervals of retries after failures, and of requests for growing files. */
 
-/** Waits in seconds. */
+/** Intervals in seconds. */
 export interface RetryPolicy {
-  /** After a connection broke; when all are used up, it failed. */
+  /** After a broken connection; after the last one the request fails. */
   readonly retries: readonly number[];
-  /** For new bytes of a growing file: the first wait, the longest, and by how much each is longer than the last. */
+  /** For a growing file: the first interval, the longest, and the factor between consecutive ones. */
   readonly firstPoll: number;
   readonly longestPoll: number;
   readonly backOff: number;
-  /** A file that has not grown for so long is given up. */
+  /** A file that has not grown for this time counts as finished. */
   readonly stillAfter: number;
 }
 

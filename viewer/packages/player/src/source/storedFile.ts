@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Files of a segments folder: where they are, and whether they are what is stated of them. */
+/** Files of a segments folder: their addresses, and checks of size and hash. */
 
 import { SourceError } from "./byteSource.js";
 import type { FileEntry } from "./manifest.js";
 
-/** The address of a file beside a manifest, with the manifest's access token. The name has been checked. */
+/** The address of a file next to a manifest, with the manifest's access token. The name was checked before. */
 export function besides(manifest: string, file: string): string {
   const found = new URL(file, manifest);
   const token = new URL(manifest).searchParams.get("token");
@@ -13,10 +13,10 @@ export function besides(manifest: string, file: string): string {
 }
 
 /**
- * Compares a file with what is stated of it, where the browser lets this page count hashes: on pages that came by https,
+ * Compares a file with its stated size, and its hash if the browser supports that for this page: pages loaded by https
  * or from this machine.
  *
- * @throws SourceError it is another one
+ * @throws SourceError it differs
  */
 export async function verify(bytes: Uint8Array, { file, sha256, bytes: stated }: FileEntry): Promise<void> {
   if (bytes.length !== stated) throw new SourceError(`${file} has ${bytes.length} bytes; expected ${stated}.`);

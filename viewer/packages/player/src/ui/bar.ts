@@ -8,7 +8,7 @@ import { button, type IconName, icon } from "./icons.js";
 import { RATES } from "./keyboard.js";
 import { TimelineBar } from "./timelineBar.js";
 
-/** What a button does that concerns more than the player. */
+/** Actions of buttons outside the player itself. */
 export interface BarActions {
   toggle(panel: "cameras" | "settings" | "statistics" | "help", button: HTMLButtonElement): void;
   compare(): void;
@@ -78,7 +78,7 @@ export class Bar {
     this.update();
   }
 
-  /** To be called with every picture: sets what is different. */
+  /** Must be called with every picture; updates what has changed. */
   update(): void {
     const { engine } = this.player;
     this.timeline.update();
@@ -121,7 +121,7 @@ export class Bar {
     const fine = engine.frames.duration < 60;
     const now = timeText(engine.currentTime, fine);
     const total = timeText(engine.frames.duration, fine);
-    // Of a live stream the button beside it says how far its end is.
+    // The next button shows the distance to the edge of a live stream.
     const text = engine.edge.live ? now : `${now} / ${total}`;
     const frame = ` · frame ${engine.frameIndex}`;
     if (this.time.textContent === text + frame) return;

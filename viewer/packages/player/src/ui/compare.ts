@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** A camera's own picture beside the reconstruction, with a line to be moved between them. */
+/** A camera's own picture next to the reconstruction, with a movable line between them. */
 
 import type { Camera } from "@structgstream/gl";
 import type { Player } from "../player.js";
@@ -46,7 +46,7 @@ export class Compare {
     this.move(this.split);
   }
 
-  /** Learns which cameras have pictures; without an answer there are none. */
+  /** Requests the list of cameras with pictures; without an answer there are none. */
   async attach(list: URL): Promise<void> {
     const response = await fetch(list);
     const names: unknown = response.ok ? await response.json() : [];
@@ -55,7 +55,7 @@ export class Compare {
     this.folder = new URL("truth/", list);
   }
 
-  /** Whether the camera that one looks through has a picture. */
+  /** Whether the camera whose view is shown has a picture. */
   get possible(): boolean {
     return this.folder !== undefined && this.names.size > 0;
   }
@@ -64,13 +64,13 @@ export class Compare {
     return name !== undefined && this.names.has(name);
   }
 
-  /** A camera that has pictures, the present one first. */
+  /** A camera with pictures, preferably the present one. */
   offered(): string | undefined {
     const at = this.player.atCamera?.name;
     return this.has(at) ? at : [...this.names][0];
   }
 
-  /** Puts the picture where the camera's is in that of the canvas. */
+  /** Aligns the picture with the camera's view on the canvas. */
   update(shown: Camera | undefined): void {
     const at = this.player.atCamera;
     const there = this.active && shown !== undefined && at !== undefined && this.has(at.name);
@@ -94,7 +94,7 @@ export class Compare {
     this.handle.setAttribute("aria-valuenow", String(Math.round(this.split * 100)));
   }
 
-  /** One picture is fetched at a time: while playing, those that come too late are left out. */
+  /** One picture is fetched at a time; during playback late ones are skipped. */
   private show(name: string, frame: number): void {
     const wanted = new URL(`${encodeURIComponent(name)}/${frame}.jpg`, this.folder).href;
     if (wanted === this.wanted) return;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Making elements; text is set as text and never read as markup. */
+/** Creation of elements; text is set as text, never parsed as markup. */
 
 type Attributes = Readonly<Record<string, string | boolean>>;
 
@@ -34,7 +34,7 @@ function setAttributes(element: Element, attributes: Attributes): void {
   }
 }
 
-/** Sets text only where it differs: screen readers and layout hear of every change. */
+/** Sets text only if it differs, because every change affects screen readers and layout. */
 export function setText(element: Element, text: string): void {
   if (element.textContent !== text) element.textContent = text;
 }

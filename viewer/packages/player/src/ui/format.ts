@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Numbers as people read them; kB is 1000 bytes. */
+/** Formatted numbers; kB is 1000 bytes. */
 
 export function timeText(seconds: number, fine: boolean): string {
   const whole = Math.max(seconds, 0);

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Fingers, mouse and wheel on the picture. */
+/** Gestures on the picture: touch, mouse and wheel. */
 
 import type { Player } from "../player.js";
 import { dollied, looked, orbited, panned, type View } from "../view/navigator.js";
 
-/** A drag across the picture's height turns by this. */
+/** Rotation by a drag across the picture's height. */
 const TURN_RADIANS = Math.PI;
 const WHEEL_LINE_PIXELS = 16;
 const WHEEL_PAGE_PIXELS = 400;
@@ -17,7 +17,7 @@ interface Finger {
 }
 
 export class Gestures {
-  /** Dragging turns the camera where it stands instead of around the scene. */
+  /** Dragging turns the camera around its position instead of around the scene. */
   flying = false;
   private readonly fingers = new Map<number, Finger>();
   private travelled = 0;
@@ -70,7 +70,7 @@ export class Gestures {
     });
   }
 
-  /** Two fingers: what is between them stays there. */
+  /** Two fingers: the content between them stays there. */
   private pinch(from: Finger, to: Finger, other: Finger, pixels: number): void {
     const before = Math.hypot(from.x - other.x, from.y - other.y);
     const after = Math.hypot(to.x - other.x, to.y - other.y);
@@ -79,7 +79,7 @@ export class Gestures {
     this.player.navigate((view) => this.pannedBy(dollied(view, factor), x * pixels, y * pixels));
   }
 
-  /** By pixels of the canvas, whose camera is not the view's own. */
+  /** Moves by pixels of the canvas, whose camera differs from that of the view. */
   private pannedBy(view: View, x: number, y: number): View {
     const shown = this.player.camera;
     const factor = shown ? view.camera.K.fx / shown.K.fx : 1;
@@ -95,7 +95,7 @@ export class Gestures {
     event.preventDefault();
     const unit = [1, WHEEL_LINE_PIXELS, WHEEL_PAGE_PIXELS][event.deltaMode] ?? 1;
     const pixels = Math.min(Math.max(event.deltaY * unit, -WHEEL_PAGE_PIXELS), WHEEL_PAGE_PIXELS);
-    // A pinch on a touchpad comes as a wheel with Ctrl, in smaller steps.
+    // A pinch on a touchpad is a wheel event with Ctrl, in smaller steps.
     const speed = event.ctrlKey ? 6 * WHEEL_SPEED : WHEEL_SPEED;
     this.player.navigate((view) => dollied(view, Math.exp(pixels * speed)));
   }

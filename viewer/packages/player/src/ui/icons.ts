@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Pictures on buttons, 24 by 24, drawn in lines of the text's colour. */
+/** Icons of buttons, 24 by 24, as lines in the text's colour. */
 
 import { made, madeSvg } from "./dom.js";
 

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-/** Keys: those of video players for time, those of games for the camera. */
+/** Keyboard: the keys of video players for time, and those of games for the camera. */
 
 import type { Player } from "../player.js";
 import { dollied, flown, orbited } from "../view/navigator.js";
 
-/** What keys do that concerns more than the player; named in the list of keys. */
+/** Actions of keys outside the player itself; see the list of keys. */
 export interface KeyActions {
   fullscreen(): void;
   help(): void;
@@ -13,11 +13,11 @@ export interface KeyActions {
   frusta(): void;
 }
 
-/** For the panel. */
+/** The list of keys in the help panel. */
 export const KEYS: readonly (readonly [keys: readonly string[], does: string])[] = [
   [["Space", "K"], "play, pause"],
-  [["←", "→"], "a second back, on"],
-  [[",", "."], "a frame back, on"],
+  [["←", "→"], "a second back, forward"],
+  [[",", "."], "a frame back, forward"],
   [["Home", "End"], "first, last frame, or live"],
   [["<", ">"], "slower, faster"],
   [["L"], "loop"],
@@ -26,7 +26,7 @@ export const KEYS: readonly (readonly [keys: readonly string[], does: string])[]
   [["+", "-"], "closer, farther"],
   [["C", "V"], "next, previous camera"],
   [["G"], "show the rig's cameras"],
-  [["R"], "the first view again"],
+  [["R"], "reset the view"],
   [["F"], "full screen"],
 ];
 
@@ -38,7 +38,7 @@ const FLY: Readonly<Record<string, readonly [right: number, down: number, forwar
   KeyQ: [0, 1, 0],
   KeyE: [0, -1, 0],
 };
-/** Radii of the rig that are flown in a second. */
+/** Speed of flying, in radii of the rig per second. */
 const FLY_SPEED = 0.7;
 const TURN_RADIANS = 0.08;
 const DOLLY = 0.9;
@@ -58,7 +58,7 @@ export class Keyboard {
     root.addEventListener("focusout", () => this.held.clear());
   }
 
-  /** Moves by the keys that are held; to be called with every picture. */
+  /** Moves by the pressed keys; must be called with every picture. */
   tick(seconds: number): void {
     if (!this.held.size) return;
     const step = Math.min(seconds, 0.1) * FLY_SPEED;
@@ -75,7 +75,7 @@ export class Keyboard {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     const from = event.composedPath()[0];
     if (from instanceof HTMLSelectElement) return;
-    // Space and Enter press the button that has the focus.
+    // Space and Enter activate the focused button.
     if (from instanceof HTMLButtonElement && (event.key === " " || event.key === "Enter")) return;
     if (FLY[event.code] && !event.shiftKey) this.held.add(event.code);
     else if (!this.time(event) && !this.view(event)) return;

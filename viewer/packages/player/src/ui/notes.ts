@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** What the player says: one short note at a time, and what stands in the middle while there is no picture. */
+/** Messages of the player: one short note at a time, and the content of the middle while there is no picture. */
 
 import { made, setText } from "./dom.js";
 import { button } from "./icons.js";
@@ -25,9 +25,9 @@ export class Notes {
   }
 
   /**
-   * Says `text` when what is said has had its time; "" ends everything.
+   * Shows `text` after the present note; "" removes all.
    *
-   * @param bad it is an error: it is said at once, and stays until it is closed or another comes
+   * @param bad it is an error: shown immediately, until it is closed or another one comes
    */
   say(text: string, now: number, bad = false): void {
     if (text === "") this.later.length = 0;
@@ -42,7 +42,7 @@ export class Notes {
     this.until = bad ? Number.POSITIVE_INFINITY : now + NOTE_SECONDS;
   }
 
-  /** Says how things stand at this moment, for a second; gives way to everything else. */
+  /** Shows a state for a second; any other note replaces it. */
   status(text: string, now: number): void {
     if (!this.note.hidden && !this.passing) return;
     this.passing = true;
@@ -61,7 +61,7 @@ export class Notes {
     setText(this.spoken, text);
   }
 
-  /** Nothing can be shown, and why. */
+  /** Shows why nothing can be played. */
   fail(text: string): void {
     this.hide();
     this.middle.classList.add("bad");
@@ -84,7 +84,7 @@ export class Notes {
     this.middle.replaceChildren(made_, made("p", { class: "soft" }, text));
   }
 
-  /** Something else in the middle, or nothing. */
+  /** Shows other content in the middle, or none. */
   show(...children: Node[]): void {
     this.middle.classList.remove("bad");
     this.middle.dataset.is = "";

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The rig's cameras as frusta over the picture; one can go to each by a click. */
+/** The rig's cameras as frusta over the picture; a click selects a camera. */
 
 import { type Camera, center, frustum, projected, type Vector } from "@structgstream/gl";
 import type { Rig, RigCamera } from "../view/rig.js";
@@ -47,7 +47,7 @@ export class Overlay {
     this.root.replaceChildren(...this.drawn.map(({ group }) => group));
   }
 
-  /** Draws as seen by `camera`; `at` is the camera of the rig that one looks through, which is left out. */
+  /** Draws the frusta for `camera`; `at` is the rig's camera whose view is shown, which is left out. */
   update(camera: Camera, at: RigCamera | undefined): void {
     if (!this.shown) return;
     this.root.setAttribute("viewBox", `0 0 ${camera.width} ${camera.height}`);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** What opens at the side: cameras, the picture's quality, keys. Statistics have a module of their own. */
+/** Side panels: cameras, picture quality, keys. Statistics have a module of their own. */
 
 import type { Player } from "../player.js";
 import type { QualityChoice, QualityControl } from "../view/quality.js";
@@ -84,7 +84,7 @@ export interface PictureActions {
   readonly theme: string;
   setTheme(theme: string): void;
   openFile(): void;
-  /** What the bar has no room for on a small screen: labels and what they do. */
+  /** Actions that do not fit into the bar on a small screen: labels and functions. */
   readonly more: readonly (readonly [label: string, act: () => void])[];
 }
 
@@ -138,7 +138,7 @@ export function pictureContent(quality: QualityControl, player: Player, actions:
         player.still = motion === "still";
       },
     ),
-    acting("Open a file of yours", () => actions.openFile(), "file"),
+    acting("Open a file", () => actions.openFile(), "file"),
     made("div", { class: "more" }, ...actions.more.map(([label, act]) => acting(label, act))),
   ];
 }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The user interface of a player: the picture, the controls over it, and what they do. */
+/** The user interface of a player: the picture, the controls over it, and their actions. */
 
 import type { Player } from "../player.js";
 import type { SourceDescription } from "../source/description.js";
@@ -32,7 +32,7 @@ export interface PlayerUiOptions {
   readonly quality: QualityControl;
   readonly open: (source: SourceDescription) => void;
   readonly saveScreenshot: () => void;
-  /** The address of the stream for links, where a link can lead to it. */
+  /** The address of the stream for links; undefined if a link cannot contain it. */
   readonly linkedSource: () => string | undefined;
 }
 
@@ -103,7 +103,7 @@ export class PlayerUi {
     this.bar.root.hidden = !shown;
   }
 
-  /** Another stream is being opened. */
+  /** Shows that another stream is being opened. */
   begin(name: string): void {
     this.closePanel();
     this.playButton = undefined;
@@ -120,7 +120,7 @@ export class PlayerUi {
     this.notes.say(message, performance.now() / 1000, bad);
   }
 
-  /** Nothing is to be played yet. */
+  /** Shows that no stream is selected. */
   invite(): void {
     const choose = made("button", { type: "button", class: "glass" }, "Open a stream");
     choose.style.pointerEvents = "auto";
@@ -128,7 +128,7 @@ export class PlayerUi {
     this.notes.show(choose, made("p", { class: "soft" }, "or drop a file here"));
   }
 
-  /** To be called after the player's own tick. */
+  /** Must be called after the player's own tick. */
   tick(): void {
     const { player } = this.options;
     const now = performance.now() / 1000;
@@ -201,7 +201,7 @@ export class PlayerUi {
     });
   }
 
-  /** The first picture of a stream that is not being played asks to be played. */
+  /** Shows a large play button over the first picture of a paused stream. */
   private pictureCame(): void {
     if (this.playButton) return;
     const { engine } = this.options.player;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** What a stream costs: bytes by field, bit rate, and times. */
+/** Statistics of a stream: bytes by field, bit rate, and times. */
 
 import type { FieldName } from "@structgstream/core";
 import type { Player } from "../player.js";
@@ -23,7 +23,7 @@ export class Statistics {
     return [this.list, this.title, this.byField];
   }
 
-  /** To be called with every picture while it is to be seen. */
+  /** Must be called with every picture while the panel is open. */
   update(now: number): void {
     if (now - this.updatedAt < EVERY_SECONDS) return;
     this.updatedAt = now;
@@ -54,7 +54,7 @@ export class Statistics {
     setText(cell, value);
   }
 
-  /** Of the frames of the second before this one that have been decoded. */
+  /** Bit rate of the decoded frames in the last second. */
   private rateText(index: number): string {
     const { frames } = this.player.engine!;
     let bytes = 0;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** How the player looks, inside its shadow root: dark and light follow the page, or the attribute `theme`. */
+/** Styles of the player inside its shadow root: dark or light as the page, or by the attribute `theme`. */
 
 const DARK = `
   --ground: #0d0e10; --panel: rgb(22 23 26 / 88%); --line: rgb(255 255 255 / 14%); --text: #f2f3f5; --soft: #a9adb6;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The timeline: where the clock is, what is there, where key frames are and what is lost. */
+/** The timeline: the clock, the buffer, key frames and lost frames. */
 
 import type { Engine } from "../engine/engine.js";
 import { made, setText } from "./dom.js";
@@ -40,12 +40,12 @@ export class TimelineBar {
     this.changed();
   }
 
-  /** Buffer, keys or length are others. */
+  /** Buffer, key frames or length have changed. */
   changed(): void {
     this.version++;
   }
 
-  /** Draws what has changed. */
+  /** Draws the changes. */
   update(): void {
     const { engine, root } = this;
     if (!engine) return;
@@ -87,7 +87,7 @@ export class TimelineBar {
     for (const [start, end] of engine.stored.times) fill("--buffer", x(start), x(end), top, 4);
     fill("--accent", 0, at, top, 4);
     for (const [first, end] of frames.lost) fill("--lost", x(frames.ptsOf(first)), x(frames.endOf(end - 1)), top, 4);
-    // More keys than this would be a bar of their own.
+    // More key frames would not be distinguishable.
     if (frames.keys.length < width / 4)
       for (const key of frames.keys) fill("--key", x(frames.ptsOf(key)), 0, top + 6, 3);
     context.fillStyle = style.getPropertyValue("--accent");

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-/** A smooth way from one view to another. */
+/** A smooth flight from one view to another. */
 
 import { along, between, type Vector } from "@structgstream/gl";
 import type { View } from "./navigator.js";
 
 export class Flight {
-  /** @param startSeconds of the clock that {@link at} is asked by */
+  /** @param startSeconds start time, of the clock that {@link at} uses */
   constructor(
     private readonly from: View,
     private readonly to: View,
@@ -14,7 +14,7 @@ export class Flight {
     private readonly seconds: number,
   ) {}
 
-  /** Where it is; `over` when it has arrived. */
+  /** The view at a time; `over` if it has arrived. */
   at(now: number): { readonly view: View; readonly over: boolean } {
     const share = this.seconds > 0 ? Math.min(Math.max((now - this.startSeconds) / this.seconds, 0), 1) : 1;
     if (share === 1) return { view: this.to, over: true };

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 /**
- * What a link to a player says: `?src=&t=&view=&embed=1`.
+ * The parameters of a link to a player: `?src=&t=&view=&embed=1`.
  *
- * Anyone can write a link, so it may choose a stream of the page's own origin only, and numbers are taken only when they
+ * Anyone can write a link, so it may only choose a stream of the page's own origin, and numbers are accepted only if they
  * are those of a view.
  */
 
@@ -30,7 +30,7 @@ export interface Link {
   readonly seconds: number | undefined;
   readonly view: LinkedView | undefined;
   readonly embed: boolean;
-  /** Parameters that were not taken, in a sentence each. */
+  /** A sentence for each refused parameter. */
   readonly refused: readonly string[];
 }
 
@@ -52,7 +52,7 @@ export function linkOf(page: URL): Link {
   };
 }
 
-/** The address that shows this again. */
+/** The link to the present stream, time and view. */
 export function linkTo(page: URL, src: string | undefined, seconds: number, view: View): string {
   const link = new URL(page);
   link.hash = "";

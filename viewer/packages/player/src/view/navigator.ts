@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** A camera that hands move: around a point, with it, towards it, or freely. Values in, values out. */
+/** User navigation of a camera: around a point, with it, towards it, or freely; without state. */
 
 import type { Similarity } from "@structgstream/core";
 import {
@@ -18,17 +18,17 @@ import {
   viewmatOf,
 } from "@structgstream/gl";
 
-/** A camera and the point that it turns around. */
+/** A camera and its pivot. */
 export interface View {
   readonly camera: Camera;
   readonly pivot: Vector;
 }
 
-/** Closer to straight up or down than this, left and right would change places. */
+/** Smallest angle to the vertical, at which left and right would be swapped. */
 const POLE_RADIANS = 0.03;
 const LEAST_DISTANCE = 1e-3;
 
-/** A camera that turns around the point of its optical axis at the depth of `focus`. */
+/** A camera with its pivot on the optical axis at the depth of `focus`. */
 export function viewOf(camera: Camera, focus: Vector): View {
   const eye = center(camera);
   const forward = axes(camera)[2];
@@ -47,7 +47,7 @@ export function carried(view: View, from: Similarity, to: Similarity): View {
   return { camera: { ...camera, viewmat, near: camera.near * ratio }, pivot: moved(pivot) };
 }
 
-/** Goes round the pivot: to the right for positive `yaw`, up for positive `pitch`, both in radians. */
+/** Orbits around the pivot: to the right for positive `yaw`, up for positive `pitch`, radians. */
 export function orbited({ camera, pivot }: View, yaw: number, pitch: number, up: Vector): View {
   const arm = along(center(camera), pivot, -1);
   const turn = (vector: Vector) => rotated(vector, up, yaw);
@@ -55,14 +55,14 @@ export function orbited({ camera, pivot }: View, yaw: number, pitch: number, up:
   const right = length(side) > 1e-9 ? unit(scaled(side, -1)) : turn(axes(camera)[0]);
   const polar = Math.acos(Math.min(Math.max(dot(unit(arm), up), -1), 1));
   const wanted = Math.min(Math.max(polar - pitch, POLE_RADIANS), Math.PI - POLE_RADIANS);
-  // A camera that is beyond already is not moved by it.
+  // A camera beyond the limit is not moved by it.
   const tilt = polar < POLE_RADIANS || polar > Math.PI - POLE_RADIANS ? pitch : polar - wanted;
   const whole = (vector: Vector) => rotated(turn(vector), right, -tilt);
   const turned = axes(camera).map(whole) as unknown as Rotation;
   return { camera: placed(camera, along(pivot, whole(arm)), turned), pivot };
 }
 
-/** Turns the camera where it stands; the pivot stays in front of it. */
+/** Turns the camera around its position; the pivot stays in front of it. */
 export function looked({ camera, pivot }: View, yaw: number, pitch: number, up: Vector): View {
   const eye = center(camera);
   const right = axes(camera)[0];
@@ -72,7 +72,7 @@ export function looked({ camera, pivot }: View, yaw: number, pitch: number, up: 
   return { camera: placed(camera, eye, turned), pivot: along(eye, turned[2], distance) };
 }
 
-/** Moves with its pivot so that the scene at its depth goes by so many pixels. */
+/** Moves camera and pivot so that the scene at the pivot's depth moves by a number of pixels. */
 export function panned(view: View, x: number, y: number): View {
   const { camera, pivot } = view;
   const [right, down] = axes(camera);
@@ -81,14 +81,14 @@ export function panned(view: View, x: number, y: number): View {
   return moved(view, shift);
 }
 
-/** Goes towards the pivot: `factor` times as far from it as before. */
+/** Scales the distance to the pivot by `factor`. */
 export function dollied({ camera, pivot }: View, factor: number): View {
   const arm = along(center(camera), pivot, -1);
   const distance = Math.max(length(arm) * factor, LEAST_DISTANCE);
   return { camera: placed(camera, along(pivot, unit(arm), distance), axes(camera)), pivot };
 }
 
-/** Flies: so far to the right, down and forward, in scene units. */
+/** Flies by a distance to the right, down and forward, in scene units. */
 export function flown(view: View, right: number, down: number, forward: number): View {
   const [x, y, z] = axes(view.camera);
   return moved(view, along(along(scaled(x, right), y, down), z, forward));
@@ -102,14 +102,14 @@ function placed(camera: Camera, eye: Vector, rotation: Rotation): Camera {
   return { ...camera, viewmat: viewmatOf(eye, orthonormal(rotation)) };
 }
 
-/** Thousands of small turns must not add up to a skewed camera. */
+/** Orthonormalises the axes, because errors of many small rotations accumulate. */
 function orthonormal([right, , forward]: Rotation): Rotation {
   const z = unit(forward);
   const x = unit(along(right, z, -dot(right, z)));
   return length(x) > 0 ? [x, cross(z, x), z] : [across(z), cross(z, across(z)), z];
 }
 
-/** A vector turned around a unit axis, by the right hand. */
+/** A vector rotated around a unit axis, right-handed. */
 function rotated(vector: Vector, axis: Vector, radians: number): Vector {
   const [sine, cosine] = [Math.sin(radians), Math.cos(radians)];
   const part = scaled(axis, dot(axis, vector) * (1 - cosine));

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-/** How much is drawn: splats, and pixels. A device that is too slow gets fewer pixels, and later more again. */
+/** The numbers of drawn splats and pixels. A device that is too slow gets fewer pixels, and later more again. */
 
-/** What is known of a device before anything was drawn. */
+/** Facts of a device before the first picture. */
 export interface Device {
   readonly coarsePointer: boolean;
   readonly memoryGigabytes: number | undefined;
@@ -10,11 +10,11 @@ export interface Device {
 
 export interface Quality {
   readonly maxSplats: number;
-  /** Side of what is drawn, in pixels of the screen. */
+  /** Scale of the drawn picture relative to pixels of the screen. */
   readonly pixelScale: number;
 }
 
-/** "auto", or what the user wants. */
+/** "auto", or the user's choice. */
 export interface QualityChoice {
   readonly maxSplats: number | "auto";
   readonly pixelScale: number | "auto";
@@ -22,12 +22,12 @@ export interface QualityChoice {
 
 const WEAK_SPLATS = 180_000;
 const SCALES: readonly number[] = [1, 0.75, 0.5, 0.35];
-/** Pictures this far apart are too slow; this close there may be room. */
+/** Intervals between pictures above which a device is too slow, and below which it may have a reserve. */
 const SLOW_SECONDS = 1 / 24;
 const QUICK_SECONDS = 1 / 50;
-/** So many pictures in a row decide, and after a change so many are waited for. */
+/** Number of consecutive pictures for a decision, and of pictures to wait after a change. */
 const ENOUGH = 12;
-/** A scale that was too much is not tried again before so many pictures. */
+/** Number of pictures after which a scale that was too large is tried again. */
 const RETRY_AFTER = 600;
 
 export class QualityControl {
@@ -52,7 +52,7 @@ export class QualityControl {
     };
   }
 
-  /** Learns how long it is since the picture before, while pictures follow each other without a pause. */
+  /** Adds the time since the last picture; called while pictures are consecutive. */
   picture(seconds: number): void {
     if (this.choice.pixelScale !== "auto") return;
     this.slow = seconds > SLOW_SECONDS ? this.slow + 1 : Math.min(this.slow, 0);

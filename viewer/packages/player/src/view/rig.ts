@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The cameras of a stream as a viewer meets them. */
+/** The cameras of a stream in scene units, with focus, size and first camera. */
 
 import type { StreamHeader } from "@structgstream/core";
 import {
@@ -27,16 +27,16 @@ export interface Rig {
   readonly up: Vector;
   /** Largest distance of a camera to the mean of all. */
   readonly radius: number;
-  /** The camera that a stream begins with: the one nearest to their mean. */
+  /** The initial camera: the one nearest to the cameras' mean. */
   readonly first: RigCamera;
 }
 
-/** A free camera's near plane is at least this share of that of the nearest camera of the rig: what is nearer is a blur. */
+/** A free camera's near plane is at least this share of its nearest camera's, because nearer content is blurred. */
 const MIN_NEAR_SHARE = 0.01;
 
 /**
- * Near plane of a camera at `eye`, in scene units. That of the capture belongs to its cameras: what is left of the nearest
- * one's after the distance to it cuts nothing that the rig shows (docs/conventions.md).
+ * Near plane of a camera at `eye`, in scene units. The near plane of the capture applies to its cameras. The nearest
+ * one's, minus the distance to it, cuts nothing that the rig shows (docs/conventions.md).
  */
 export function nearPlane({ cameras }: Pick<Rig, "cameras">, eye: Vector): number {
   const away = ({ camera }: RigCamera) => length(along(eye, center(camera), -1));

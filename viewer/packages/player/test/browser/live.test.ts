@@ -112,7 +112,9 @@ describe.skipIf(!executable)("a live stream in a browser", () => {
     const page = await open('src="live/manifest.json" autoplay');
     await shows(page, 9);
     for (const [name, bytes] of live.files) stage.server.put(`/live/${name}`, bytes, { status: 503 });
-    await page.getByText("The server answered 503 where manifest.json was asked for. The next attempt is in").waitFor();
+    await page
+      .getByText("The server answered the request for manifest.json with 503. The next attempt is in")
+      .waitFor();
     await page.waitForTimeout(1500);
     expect((await notices(page)).length).toBe(1);
     write(live, 2);
@@ -132,7 +134,7 @@ describe.skipIf(!executable)("a live stream in a browser", () => {
       stage.server.publish("/live/", live.files, { bytesPerSecond: 500 });
       stage.server.put("/live/manifest.json", live.files.get("manifest.json")!);
     }, 100);
-    await page.getByText("This was too slow to keep up: went on with the newest frames.").waitFor({ timeout: 50_000 });
+    await page.getByText("Playback was too slow and continues with the newest frames.").waitFor({ timeout: 50_000 });
     const frames = await ask(page, (_, __, shown) => shown);
     expect(frames).toEqual([...frames].sort((a, b) => a - b));
     expect(await errors(page)).toEqual([]);

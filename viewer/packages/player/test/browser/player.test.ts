@@ -126,7 +126,7 @@ describe.skipIf(!executable)("the player in a browser", () => {
     stage.server.put("/clip.sgs", CLIP, { ranges: false });
     const page = await open('src="clip.sgs"', "?t=never");
     await page.getByText('The link\'s "t" was not taken').waitFor();
-    await page.getByText("gives no parts of files (Range)").waitFor();
+    await page.getByText("does not support range requests").waitFor();
     await page.getByRole("button", { name: "Close" }).click();
     await shows(page, 0);
     expectQuiet();
@@ -154,7 +154,7 @@ describe.skipIf(!executable)("the player in a browser", () => {
     stage.server.put("/clip.sgs", CLIP, { ranges: false });
     const page = await open();
     await shows(page, 0);
-    await page.getByText("gives no parts of files (Range)").waitFor();
+    await page.getByText("does not support range requests").waitFor();
     await ask(page, (player) => player.seek(0.3));
     await shows(page, 9);
     expect(stage.server.rangesOf("/clip.sgs").length).toBe(1);
@@ -230,7 +230,7 @@ describe.skipIf(!executable)("the player in a browser", () => {
 
   test.each([
     [404, "clip.sgs was not found on the server (404). Check the address."],
-    [403, "The server does not give clip.sgs to this page (403)."],
+    [403, "The server refuses clip.sgs to this page (403)."],
   ])("says what status %i means", async (status, sentence) => {
     stage.server.put("/clip.sgs", "", { status });
     const page = await open();
