@@ -146,6 +146,9 @@ def test_what_is_pressed() -> None:
     before, after = OnlineConfig(), with_rate_control(OnlineConfig(), 4.0)
     assert after.rounding.rate_weight == 4.0 * before.rounding.rate_weight
     assert after.patching.grad_threshold == 2.0 * before.patching.grad_threshold
+    assert after.spawn.rules.missing_threshold == 2.0 * before.spawn.rules.missing_threshold
+    assert after.spawn.thin_rules.missing_threshold == 2.0 * before.spawn.thin_rules.missing_threshold
+    assert with_rate_control(before, 0.25).spawn == before.spawn, "more bits do not spawn noise"
 
 
 @pytest.mark.parametrize("target_mbits", [0.0, -1.0])

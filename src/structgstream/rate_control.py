@@ -3,11 +3,11 @@
 
 Note [Pressure]
 ~~~~~~~~~~~~~~~
-The quantization steps of a stream are constant and stored in its header. Rate control changes the weight lambda of the
-rate term in the loss, and the gradient threshold for spawning free Gaussians (without effect if ``patching.spawn`` is
-off). Both are scaled by one factor, the pressure; at 1 they have the configuration's values. Gaussians that ``births``
-spawns are not affected: their number and bytes are the same at every pressure. The pressure is a function of the sizes
-of earlier packets only, so that a resumed stream is identical.
+The quantization steps of a stream are constant and stored in its header. Rate control scales the weight lambda of the
+rate term in the loss by one factor, the pressure, and the thresholds for spawning free Gaussians by its square root: by
+gradients (``patching.grad_threshold``) and, above 1, by missing content (``spawn.missing_threshold``), since a new
+Gaussian takes about 9 bytes at every pressure. At 1 all have the configuration's values. The pressure is a function of
+the sizes of earlier packets only, so that a resumed stream is identical.
 
 Note [Windows]
 ~~~~~~~~~~~~~~
@@ -204,12 +204,13 @@ class RateController:
 
 
 def with_rate_control(config: OnlineConfig, pressure: float) -> OnlineConfig:
-    """``config`` with lambda times ``pressure``, and the spawning threshold times its square root."""
+    """``config`` with the price of a bit times ``pressure``, and the thresholds for spawning times its square root."""
     if pressure == 1.0:
         return config
-    rounding, patching = config.rounding, config.patching
+    rounding, patching, spawn = config.rounding, config.patching, config.spawn
     return replace(
         config,
         rounding=replace(rounding, rate_weight=rounding.rate_weight * pressure),
         patching=replace(patching, grad_threshold=patching.grad_threshold * pressure**0.5),
+        spawn=replace(spawn, missing_threshold=spawn.missing_threshold * max(1.0, pressure) ** 0.5),
     )

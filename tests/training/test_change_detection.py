@@ -33,7 +33,7 @@ def changes(
     return detect_changes(
         now,
         before,
-        config=varied(MotionConfig(change_threshold=0.1, picture_scale=0.5), REACH_PIXELS=reach_pixels),
+        config=varied(MotionConfig(picture_scale=0.5), REACH_PIXELS=reach_pixels, CHANGE_THRESHOLD=0.1),
         backend=reference_backend(),
         flow_from=flow_from,
     )

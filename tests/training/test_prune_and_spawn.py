@@ -88,11 +88,7 @@ def test_where_no_picture_lacks_anything_nothing_is_drawn(monkeypatch: pytest.Mo
         return draw(*arguments, **options)
 
     monkeypatch.setattr("structgstream.training.online.spawn.draw", counting)
-    assert not len(
-        renewed(
-            reference_backend(), config=varied(CONFIG, RULES=replace(CONFIG.RULES, missing_threshold=10.0))
-        ).new_free
-    )
+    assert not len(renewed(reference_backend(), config=replace(CONFIG, missing_threshold=10.0)).new_free)
     assert not drawn
     assert len(renewed(reference_backend()).new_free)
     assert drawn, "where something is missing it is"
@@ -160,14 +156,14 @@ def test_a_ghost_dies() -> None:
     assert found.kept.tolist() == [False]
 
 
-BLIND = varied(CONFIG, RULES=SpawnRules(least_hits=2, missing_threshold=0.9))
-"""By these rules nothing is missing."""
+BLIND = replace(CONFIG, missing_threshold=0.9)
+"""By these rules nothing is missing; thin content needs nine times as much as its rules say."""
 THIN = varied(
     ThinSpawnConfig(enabled=True),
     RULES=replace(
         ThinSpawnConfig.RULES,
         picture_width=96,
-        missing_threshold=0.10,
+        missing_threshold=0.10 / 9,
         most_contradictions=0.34,
         most_cost=0.12,
         least_hits=2,

@@ -57,9 +57,6 @@ class MotionConfig:
 
     enabled: bool = False
     """Train only dynamic anchors and free Gaussians (paper: False, everything is trained)."""
-    change_threshold: float = 0.05
-    """A pixel has changed if its mean absolute difference to the previous picture over 3 x 3 pixels and the channels
-    (full scale 1) exceeds this; above the sensors' noise."""
     residual_threshold: float = 0.0
     """A pixel has also changed if its residual exceeds frame 0's by this (full scale 1). 0: residuals are not used."""
     hysteresis: float = 1.0
@@ -76,6 +73,9 @@ class MotionConfig:
     """Tiles (16 pixels) farther than this many tiles from one in which something has changed are not drawn, though
     dynamic Gaussians reach them. -1: all are."""
 
+    CHANGE_THRESHOLD: ClassVar[float] = 0.05
+    """A pixel has changed if its mean absolute difference to the previous picture over 3 x 3 pixels and the channels
+    (full scale 1) exceeds this; above the sensors' noise."""
     REACH_PIXELS: ClassVar[int] = 3
     """Changed pixels are dilated by this many pixels."""
     LEAST_PIXELS: ClassVar[float] = 0.3
@@ -207,6 +207,9 @@ class SpawnConfig:
     """Spawn free Gaussians where content is missing (paper: False, by gradients only)."""
     most: int = 5000
     """Largest number of Gaussians that are spawned in a frame."""
+    missing_threshold: float = 0.10
+    """Excess of the residual over frame 0's, 0 to 1, above which a pixel counts as missing; thin content needs less in
+    proportion. Rate control raises it (``rate_control``, Note [Pressure])."""
     thin: ThinSpawnConfig = field(default_factory=ThinSpawnConfig)
 
     RULES: ClassVar[SpawnRules] = SpawnRules()
@@ -218,7 +221,14 @@ class SpawnConfig:
     @property
     def rules(self) -> SpawnRules:
         """The rules of the first sweep."""
-        return replace(self.RULES, most=self.most)
+        return replace(self.RULES, most=self.most, missing_threshold=self.missing_threshold)
+
+    @property
+    def thin_rules(self) -> SpawnRules:
+        """The rules of the second sweep."""
+        rules = self.thin.rules
+        share = self.missing_threshold / self.RULES.missing_threshold
+        return replace(rules, missing_threshold=share * rules.missing_threshold)
 
 
 @dataclass(frozen=True)

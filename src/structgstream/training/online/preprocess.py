@@ -151,7 +151,7 @@ def detect_changes(
             both = _both(view.mask, last.mask)
             then, now = blackened(last.image, both), blackened(view.image, both)
             reach = round((config.REACH_PIXELS if reach_pixels is None else reach_pixels) * view.enlargement)
-            changed = backend.changed_pixels(then, now, threshold=config.change_threshold, reach_pixels=reach)
+            changed = backend.changed_pixels(then, now, threshold=config.CHANGE_THRESHOLD, reach_pixels=reach)
             changed = changed if both is None else changed & both
             small, found, far_boxes = view.evidence(config.picture_scale).camera, None, 0
             if view.index in flow_from:

@@ -513,7 +513,7 @@ def prune_and_spawn(
             return SpawnResult(kept, large.free, merged_count=large.merged_count)
         known = {entry.view.index: entry for entry in missing}
         # With all of frame 0's floor: by these low thresholds an eased one would take all that moves for thin content.
-        thin_sweep = replace(sweep, floor=floor, rules=config.thin.rules, known=known)
+        thin_sweep = replace(sweep, floor=floor, rules=config.thin_rules, known=known)
         thin = _thin_births(thin_sweep, first_birth=first_birth, room=room)
     return SpawnResult(kept, thin.free, len(thin.free), thin.refused_count)
 
