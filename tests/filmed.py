@@ -3,6 +3,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -12,8 +13,10 @@ from numpy.typing import NDArray
 from rigs import look_at
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
-from structgstream.data.lenses import Lens, LensCamera, Pinhole
+from structgstream.data.lenses import Lens, LensCamera, Pinhole, RadialTangential
 from structgstream.preparation.calibration.board import Board
+
+Picture = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,23 @@ def ring(
         viewmat = look_at(eye, torch.tensor(target, dtype=torch.float64))
         found[f"cam{index:02d}"] = LensCamera(Camera(viewmat, K, *size), lens or Pinhole())
     return found
+
+
+@cache
+def filmed_room(*, across: float = 0.0, down: float = 0.0) -> tuple[dict[str, LensCamera], dict[str, list[Picture]]]:
+    """Five cameras with mild lenses around a room, and a picture of each.
+
+    Args:
+        across: of principal points from the middle, pixels.
+        down: of principal points from the middle, pixels.
+    """
+    lens = RadialTangential(k1=-0.12, k2=0.02)
+    rig = ring(5, radius=2.6, arc_degrees=60, focal=290, lens=lens, size=(320, 240))
+    for camera in rig.values():
+        camera.camera.K[0, 2], camera.camera.K[1, 2] = 160 + across, 120 + down
+    return rig, {
+        name: [Film(one).picture(room(), noise=1, seed=index)] for index, (name, one) in enumerate(rig.items())
+    }
 
 
 def board_plane(board: Board, pose: Floats, *, pixels_a_square: int = 40) -> Plane:

@@ -1,32 +1,44 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What tests of preparation share: keypoints of a picture are found once a process.
+"""What tests of preparation share: keypoints of a picture are found once a run.
 
 Finding them takes most of the time of whatever is tested around it, and many tests look at the same pictures. A test
 marked ``finds_keypoints`` finds its own.
 """
 
+import hashlib
+import pickle
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from shared_folder import made_once
 from structgstream.preparation.calibration import keypoints
 
-_FOUND: dict[tuple[keypoints.KeypointConfig, tuple[int, ...], bytes], Any] = {}
+_FOUND: dict[str, Any] = {}
 _EXTRACTOR = keypoints._extractor
 
 
 class _Remembering:
-    """An extractor that looks at no picture twice."""
+    """An extractor that no process of the run lets look at a picture twice."""
 
     def __init__(self, config: keypoints.KeypointConfig) -> None:
         self._config, self._extractor = config, _EXTRACTOR(config)
 
     def extract_from_uint8_array(self, grey: NDArray[np.uint8]) -> Any:
-        key = (self._config, grey.shape, grey.tobytes())
+        key = hashlib.sha256(repr((self._config, grey.shape)).encode() + grey.tobytes()).hexdigest()
         if key not in _FOUND:
-            _FOUND[key] = self._extractor.extract_from_uint8_array(grey)
+
+            def extract(folder: Path) -> None:
+                listed, stored = self._extractor.extract_from_uint8_array(grey)
+                (folder / "found").write_bytes(
+                    pickle.dumps((keypoints.pycolmap_module().keypoints_to_matrix(listed), stored))
+                )
+
+            matrix, stored = pickle.loads((made_once(f"keypoints-{key}", extract) / "found").read_bytes())
+            _FOUND[key] = keypoints.pycolmap_module().keypoints_from_matrix(matrix), stored
         return _FOUND[key]
 
 

@@ -1,29 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 
-from filmed import Film, ring, room
+from filmed import filmed_room
 from structgstream.data.lenses import LensCamera, RadialTangential
 from structgstream.data.posed import rotation_matrix
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.comparison import calibration_errors
 from structgstream.preparation.calibration.refinement import refine
-
-LENS = RadialTangential(k1=-0.12, k2=0.02)
-Pictures = dict[str, list[NDArray[np.uint8]]]
-
-
-@cache
-def filmed() -> tuple[dict[str, LensCamera], Pictures]:
-    rig = ring(5, radius=2.6, arc_degrees=60, focal=290, lens=LENS, size=(320, 240))
-    return rig, {
-        name: [Film(one).picture(room(), noise=1, seed=index)] for index, (name, one) in enumerate(rig.items())
-    }
 
 
 def perturbed(rig: dict[str, LensCamera], *, degrees: float, percent: float) -> dict[str, LensCamera]:
@@ -42,7 +29,7 @@ def perturbed(rig: dict[str, LensCamera], *, degrees: float, percent: float) -> 
 
 
 def test_perturbed_poses_come_back_where_they_were() -> None:
-    rig, pictures = filmed()
+    rig, pictures = filmed_room()
     given = perturbed(rig, degrees=0.3, percent=1.0)
     found = refine(pictures, given)
     assert found.changed
@@ -68,7 +55,7 @@ def test_tracks_that_judged_are_adjusted_to_as_well(monkeypatch: pytest.MonkeyPa
     """One in five is held back until the refinement is accepted; what is returned is made from all."""
     from structgstream.preparation.calibration import refinement
 
-    rig, pictures = filmed()
+    rig, pictures = filmed_room()
     given = perturbed(rig, degrees=0.2, percent=0.5)
     found = refine(pictures, given)
     monkeypatch.setattr(refinement, "_completed", lambda graph, refined, terms, **options: refined)
@@ -79,7 +66,7 @@ def test_tracks_that_judged_are_adjusted_to_as_well(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_lens_that_was_not_known_is_found() -> None:
-    rig, pictures = filmed()
+    rig, pictures = filmed_room()
     given = {name: replace(one, lens=RadialTangential(k1=-0.06)) for name, one in rig.items()}
     found = refine(pictures, given, free="lens", lens="radial")
     assert found.changed
@@ -89,7 +76,7 @@ def test_a_lens_that_was_not_known_is_found() -> None:
 
 
 def test_intrinsics_that_are_not_free_stay() -> None:
-    rig, pictures = filmed()
+    rig, pictures = filmed_room()
     found = refine(pictures, perturbed(rig, degrees=0.2, percent=0.0), free="poses")
     for name, one in found.solved.cameras.items():
         np.testing.assert_allclose(one.camera.K, rig[name].camera.K)
@@ -100,7 +87,7 @@ def test_what_refining_makes_worse_is_given_back(monkeypatch: pytest.MonkeyPatch
     """An adjustment that goes wrong is noticed by the matches that it did not see."""
     from structgstream.preparation.calibration import refinement
 
-    rig, pictures = filmed()
+    rig, pictures = filmed_room()
     wrong = perturbed(rig, degrees=0.5, percent=1.0)
     monkeypatch.setattr(refinement, "cameras_of", lambda model: wrong)
     found = refine(pictures, rig, metres=True)
@@ -113,13 +100,13 @@ def test_what_refining_makes_worse_is_given_back(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_camera_that_is_far_off_is_named() -> None:
-    rig, pictures = filmed()
+    rig, pictures = filmed_room()
     away = perturbed(rig, degrees=25.0, percent=0.0)["cam03"]
     with pytest.raises(CalibrationError, match="agree with the given poses of 'cam03' to refine them"):
         refine(pictures, rig | {"cam03": away})
 
 
 def test_a_lens_that_cannot_be_refined_is_refused() -> None:
-    rig, pictures = filmed()
+    rig, pictures = filmed_room()
     with pytest.raises(ConfigError, match="model brown cannot be refined; take opencv"):
         refine(pictures, rig, free="lens", lens="brown")

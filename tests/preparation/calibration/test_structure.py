@@ -3,15 +3,14 @@
 
 import logging
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from filmed import Film, noise_texture, ring, room
-from structgstream.data.lenses import LensCamera, RadialTangential
+from filmed import Film, filmed_room, noise_texture, ring, room
+from structgstream.data.lenses import RadialTangential
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.calibration import structure
 from structgstream.preparation.calibration.comparison import calibration_errors
@@ -20,24 +19,12 @@ from structgstream.preparation.calibration.structure import solve_structure
 Pictures = dict[str, list[NDArray[np.uint8]]]
 
 
-@cache
-def filmed(*, across: float = 0.0, down: float = 0.0) -> tuple[dict[str, LensCamera], Pictures]:
-    """Five cameras with mild lenses, principal points so many pixels from the middle, one instant."""
-    lens = RadialTangential(k1=-0.12, k2=0.02)
-    rig = ring(5, radius=2.6, arc_degrees=60, focal=290, lens=lens, size=(320, 240))
-    for camera in rig.values():
-        camera.camera.K[0, 2], camera.camera.K[1, 2] = 160 + across, 120 + down
-    return rig, {
-        name: [Film(one).picture(room(), noise=1, seed=index)] for index, (name, one) in enumerate(rig.items())
-    }
-
-
 def noise(seed: int) -> NDArray[np.uint8]:
     return noise_texture(seed, size=320)[:240]
 
 
 def test_a_rig_is_found_from_its_pictures() -> None:
-    rig, pictures = filmed()
+    rig, pictures = filmed_room()
     found = solve_structure(pictures, lens="radial", centers=False)
     assert found.missing == ()
     assert list(found.cameras) == list(rig)
@@ -53,7 +40,7 @@ def test_a_rig_is_found_from_its_pictures() -> None:
 
 
 def test_principal_points_that_all_cameras_have_off_the_middle_are_found() -> None:
-    rig, pictures = filmed(across=4, down=-3)
+    rig, pictures = filmed_room(across=4, down=-3)
     found, middle = (
         calibration_errors(solve_structure(pictures, lens="radial", centers=centers).cameras, rig).values()
         for centers in (True, False)
@@ -65,7 +52,7 @@ def test_principal_points_that_all_cameras_have_off_the_middle_are_found() -> No
 
 
 def test_known_intrinsics_stay() -> None:
-    rig, pictures = filmed()
+    rig, pictures = filmed_room()
     found = solve_structure(pictures, known=rig)
     for name, error in calibration_errors(found.cameras, rig).items():
         assert error.rotation_degrees < 0.1
@@ -75,7 +62,7 @@ def test_known_intrinsics_stay() -> None:
 
 
 def test_shared_intrinsics_are_one() -> None:
-    rig, pictures = filmed()
+    rig, pictures = filmed_room()
     found = solve_structure(pictures, lens="radial", intrinsics="shared", field_of_view=55.0)
     first = found.cameras["cam00"]
     for name, error in calibration_errors(found.cameras, rig).items():
@@ -86,7 +73,7 @@ def test_shared_intrinsics_are_one() -> None:
 
 @pytest.mark.finds_keypoints
 def test_the_same_pictures_give_the_same_numbers() -> None:
-    _, pictures = filmed()
+    pictures = {name: shots for name, shots in filmed_room()[1].items() if name in ("cam01", "cam02", "cam03")}
     one, two = (solve_structure(pictures, lens="radial", field_of_view=60.0) for _ in range(2))
     np.testing.assert_array_equal(one.points, two.points)
     for name in one.cameras:
@@ -94,7 +81,7 @@ def test_the_same_pictures_give_the_same_numbers() -> None:
 
 
 def test_a_camera_that_looks_elsewhere_is_named(caplog: pytest.LogCaptureFixture) -> None:
-    _, pictures = filmed()
+    _, pictures = filmed_room()
     with caplog.at_level(logging.WARNING):
         found = solve_structure(pictures | {"alone": [noise(99)]}, lens="radial", field_of_view=60.0)
     assert found.missing == ("alone",)
@@ -105,17 +92,17 @@ def test_a_camera_that_looks_elsewhere_is_named(caplog: pytest.LogCaptureFixture
 
 def test_cameras_that_see_nothing_in_common_are_refused() -> None:
     with pytest.raises(CalibrationError, match="anything in common: cameras 'cam0', 'cam1', 'cam2' have no pair"):
-        solve_structure({f"cam{index}": [noise(index)] for index in range(3)})
+        solve_structure({f"cam{index}": [noise(index)[:120, :160]] for index in range(3)})
 
 
 def test_two_cameras_are_refused() -> None:
-    _, pictures = filmed()
+    _, pictures = filmed_room()
     with pytest.raises(CalibrationError, match="three cameras or more, got cameras 'cam00', 'cam01'"):
         solve_structure({name: pictures[name] for name in ("cam00", "cam01")})
 
 
 def test_pictures_that_do_not_belong_together_are_refused() -> None:
-    _, pictures = filmed()
+    _, pictures = filmed_room()
     with pytest.raises(CaptureError, match=r"pictures of the same instants; got: 'cam00' 1, .*'cam04' 2"):
         solve_structure(pictures | {"cam04": pictures["cam04"] * 2})
     twice = {name: shots * 2 for name, shots in pictures.items()}
@@ -129,7 +116,7 @@ def test_pictures_that_do_not_belong_together_are_refused() -> None:
 
 
 def test_masked_keypoints_are_not_used() -> None:
-    rig, pictures = filmed()
+    rig, pictures = filmed_room()
     left = np.zeros((240, 320), bool)
     left[:, :200] = True
     found = solve_structure(pictures, known=rig, masks={"cam02": [left]})
@@ -139,7 +126,7 @@ def test_masked_keypoints_are_not_used() -> None:
 
 
 def test_observations_are_of_the_pictures_as_filmed() -> None:
-    rig, pictures = filmed()
+    rig, pictures = filmed_room()
     found = solve_structure(pictures, known=rig)
     straight = {name: replace(one, lens=RadialTangential()) for name, one in found.cameras.items()}
     assert np.nanmedian(replace(found, cameras=straight).errors()) > 2 * np.nanmedian(found.errors())
@@ -167,7 +154,7 @@ def test_focal_lengths_that_files_state_are_tried_first(monkeypatch: pytest.Monk
 
 
 def test_what_is_stated_wrongly_is_not_the_last_word() -> None:
-    rig, pictures = filmed()
+    rig, pictures = filmed_room()
     found = solve_structure(pictures, lens="radial", focals=dict.fromkeys(rig, 3000.0))
     assert found.missing == ()
     for error in calibration_errors(found.cameras, rig).values():
