@@ -207,7 +207,7 @@ describe("a server without ranges", () => {
     play.engine.seekFrame(10);
     await play.until(() => play.shown.at(-1) === 10);
     expect(file.requests.length).toBe(1);
-    expect(play.notices.join()).toContain("(Range)");
+    expect(play.notices.join()).toContain("range requests");
   });
 
   test("is read again for what was let go of", async () => {
