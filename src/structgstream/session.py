@@ -87,7 +87,7 @@ class Session(Generic[State, Memory]):
         self._coder: FrameCoder[State] | None = None
         self._steps: Mapping[str, float] = {}
         self._first = 0  # frame of the period
-        self._shown: deque[tuple[int, float]] = deque(maxlen=2)  # its last two frames that show something
+        self._shown: deque[tuple[int, float | None]] = deque(maxlen=2)  # its last two frames that show something
         if resumed is not None:
             check_resumable(resumed.header, self._facts)
 
@@ -224,7 +224,7 @@ class Session(Generic[State, Memory]):
         self._measure(state, task)
         return Past(state, method.prepare(state, lambda: task))
 
-    def _begin(self, first: int, shown: Iterable[tuple[int, float]]) -> None:
+    def _begin(self, first: int, shown: Iterable[tuple[int, float | None]]) -> None:
         """A period has begun with frame ``first``; ``shown`` are its last frames that show something."""
         self._first = first
         self._shown.clear()
@@ -236,8 +236,11 @@ class Session(Generic[State, Memory]):
 
     @property
     def _seconds_shown(self) -> tuple[float, float] | None:
-        """Presentation times of the last two frames that show something; None before the second."""
-        return (self._shown[0][1], self._shown[1][1]) if len(self._shown) == 2 else None
+        """Presentation times of the last two frames that show something; None unless both are known."""
+        match [seconds for _, seconds in self._shown if seconds is not None]:
+            case [before, last]:
+                return before, last
+        return None
 
     def _measure(self, state: State, task: FrameTask) -> None:
         """Add the residual of a decoded frame to the plan of periods, if the plan needs it."""
@@ -262,7 +265,9 @@ class Session(Generic[State, Memory]):
         period = resumed.period(count - 1)
         first = period.first_frame
         shown = self._last_shown(count, first) if method.needs_older else [*range(max(count - 2, first), count)]
-        self._begin(first, ((index, resumed.packets[index].pts_seconds) for index in shown))
+        seconds = {info.index: info.pts_seconds for info in resumed.packets}
+        # A group of frames has packets of its own frames only: when those before were shown is not known.
+        self._begin(first, ((index, seconds.get(index)) for index in shown))
         older = resumed.scene(shown[0]) if method.needs_older and len(shown) == 2 else None
         self._keep(count - 1)
         if self._pipeline.period.enabled:

@@ -50,7 +50,7 @@ def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
 
 @pytest.mark.parametrize(
     ("told", "arguments"),
-    [("prepare.prepare_capture", ["-o", "out"]), ("checking.folder.check_folder", ["--check"])],
+    [("prepare.prepare_capture", ["-o", "out"]), ("prepare.check_folder", ["--check"])],
 )
 def test_ctrl_c_that_a_library_loses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: str, arguments: list[str]

@@ -16,6 +16,7 @@ from structgstream.codec.reader import open_stream
 from structgstream.data.open import open_capture
 from structgstream.evaluation.capture import capture_of
 from structgstream.session import FrameReport
+from structgstream.training.parameters import RoundingConfig
 
 pytestmark = pytest.mark.usefixtures("quick_presets")
 
@@ -45,7 +46,7 @@ def test_quality_and_rate_reach_the_stream(tmp_path: Path) -> None:
     header = open_stream(tmp_path / "s.sgs").header
     rounding = header.config["online"]["rounding"]
     assert rounding["quality"] == 1.5
-    assert header.steps["free_log_scales"] == pytest.approx(rounding["free_log_scale_step"] / 2**1.5)
+    assert header.steps["free_log_scales"] == pytest.approx(RoundingConfig.FREE_LOG_SCALE_STEP / 2**1.5)
     assert header.config["rate"] == {"target_mbits": 0.5}
 
 

@@ -128,7 +128,7 @@ def test_short_memory_lowers_the_budget_once(tmp_path: Path, monkeypatch: pytest
     asked, real = [], method.fit_group_start
 
     def short(*arguments, **options):
-        asked.append((options["start"].births, options["config"].start.views))
+        asked.append((options["start"].births, options["config"].scene_flow.views))
         if len(asked) == 1:
             raise OutOfMemoryError("to test")
         return real(*arguments, **options)

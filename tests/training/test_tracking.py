@@ -9,7 +9,7 @@ import torch
 from backends import quickest_backend
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
-from structgstream.groups.tracking import TrackConfig, Tracked, Tracker, _seen, track_frame
+from structgstream.groups.tracking import TrackConfig, Tracked, Tracker, _measure_view, track_frame
 from structgstream.training.online.config import LiftConfig, MotionConfig
 from worlds import World, moving_world
 
@@ -138,8 +138,10 @@ def test_coverage_is_in_pixels_of_the_reference_size(monkeypatch: pytest.MonkeyP
             for n, frame in enumerate(scenery.frames[:2])
         ]
         pictures = chosen.pictures(frames[1], chosen.pictures(frames[0], None).views)
-        seen = [_seen(chosen, scenery.scene, pictures.views[n], change) for n, change in pictures.changes.items()]
-        return torch.stack([entry.flows[:, 3] for entry in seen]).sum(0)
+        measured = [
+            _measure_view(chosen, scenery.scene, pictures.views[n], change) for n, change in pictures.changes.items()
+        ]
+        return torch.stack([entry.flows[:, 3] for entry in measured]).sum(0)
 
     small = coverage(1, 1.0)
     for found in (coverage(2, 1.0), coverage(2, 0.5)):
