@@ -62,7 +62,7 @@ class Browser:
         on_event: Callable[[str, Mapping[str, Any]], None] | None = None,
         **parameters: object,
     ) -> dict[str, Any]:
-        """The result of a method of the browser, or of the page of a session, whose events are told before it."""
+        """The result of a method of the browser, or of the page of a session, whose events are reported before it."""
         self._number += 1
         message: dict[str, object] = {"id": self._number, "method": method, "params": parameters}
         if session is not None:

@@ -194,7 +194,7 @@ def test_the_second_sweep_bears_nothing_where_it_would_bear_more_than_thin_conte
             reference_backend(), config=replace(BLIND, thin=varied(THIN, RULES=replace(THIN.RULES, most=most)))
         )
         assert len(found.new_free) == found.thin_count == born
-        assert found.counts["refused thin"] == number - born, "told in the log"
+        assert found.counts["refused thin"] == number - born, "counted in the log"
 
 
 def test_a_cap_that_makes_births_coarser_is_told_in_the_log() -> None:

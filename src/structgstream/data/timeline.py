@@ -116,7 +116,7 @@ def common_slots(
 
     It begins where the last camera begins, and ends where most cameras have ended: with the last slot that at least
     half of the cameras, and two of those for training, reach. Cameras are absent from the slots in between that they
-    lack. What is left out, and which cameras are absent from when on, is told in the log, once for each camera.
+    lack. What is left out, and which cameras are absent from when on, is logged once for each camera.
 
     Args:
         slots: camera name to the slots it has, ascending; a slot is one instant of the common timeline.

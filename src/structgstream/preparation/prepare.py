@@ -52,7 +52,7 @@ def prepare_capture(
         videos: the folder of the cameras' videos or pictures, see ``preparation.footage``.
         capture: the folder to make; the same call again does only what has changed.
         options: what is asked for.
-        listener: is told of steps and progress.
+        listener: receives steps and progress.
 
     Raises:
         CaptureError: the videos cannot be read, synchronised or calibrated, or ``capture`` holds something else.
@@ -91,7 +91,7 @@ def check_folder(path: Path, *, report: Path | None, listener: Listener | None =
     Args:
         path: its folder.
         report: folder for the report; None writes none.
-        listener: is told of the progress.
+        listener: receives the progress.
 
     Raises:
         CaptureError: the capture cannot be opened or read.

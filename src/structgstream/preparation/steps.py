@@ -168,7 +168,7 @@ class Job:
         videos: the folder of what was filmed.
         capture: the folder to make.
         options: what is asked for.
-        listener: is told of steps.
+        listener: receives the steps.
         steps: runs them, or takes their results from the disk.
         told: what each step found, in words.
     """

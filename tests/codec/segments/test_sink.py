@@ -281,7 +281,7 @@ def test_a_stream_with_a_window_is_continued_with_all_its_sizes(tmp_path: Path) 
     records = [len(packet.payload) + 12 for packet in sent[:160]]
     assert [info.bytes for info in resumed.packets] == records
     assert [info.kind for info in resumed.packets] == [packet.kind for packet in sent[:160]]
-    assert [packet.index for packet in resumed.group(159)] == [159]  # Codec raw; the sizes told the rest.
+    assert [packet.index for packet in resumed.group(159)] == [159]  # Codec raw; the sizes give the rest.
     assert resumed.scene(0) is not None
     written(stopped, sent, options=options, hands=hands)
     one, other = read_manifest(whole), read_manifest(stopped)

@@ -33,7 +33,7 @@ class FreeBins:
     Args:
         births: int64 ``[F]``, ascending.
         bins: ``[F, 14]``.
-        change: by the last frame; zero for Gaussians born in it.
+        change: by the last frame; zero for Gaussians spawned in it.
     """
 
     births: NDArray[np.int64]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What goes wrong with live cameras: counted always, told in the log when it begins and not again for a while."""
+"""What goes wrong with live cameras: counted always, logged when it begins and not again for a while."""
 
 import logging
 import threading

@@ -56,7 +56,7 @@ STAYED = Movement(0.0, np.eye(3))
 
 
 def picture_movement(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Movement | None:
-    """How a camera's picture moved between two frames; None where that cannot be told.
+    """How a camera's picture moved between two frames; None where that cannot be measured.
 
     It moved if hardly a keypoint stayed and most of them follow one homography (a camera that turns on the spot makes
     exactly that). A flat thing that moves in front of a plain background does that too.
@@ -86,7 +86,7 @@ def picture_movement(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Moveme
 def bump_findings(
     first: MultiViewFrame, last: MultiViewFrame, evidence: Evidence, cameras: Mapping[str, Camera]
 ) -> list[Finding]:
-    """Cameras that were bumped between two frames, and once those of which that cannot be told.
+    """Cameras that were bumped between two frames, and once those for which that cannot be measured.
 
     Args:
         first: the frame of ``evidence``.

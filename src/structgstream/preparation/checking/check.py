@@ -109,7 +109,7 @@ def check_capture(
     Args:
         source: the opened capture.
         unit: of length, where it is known.
-        listener: is told of the progress.
+        listener: receives the progress.
         examination: of this capture, where it was made already.
 
     Raises:
