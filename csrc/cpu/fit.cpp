@@ -50,11 +50,11 @@ class Fit {
             pixels = std::max(pixels, int64_t{v->width} * v->height);
             statics = std::max(statics, v->static_count);
         }
+        statics_.resize(2 * f_.view_count);
         const size_t m = f_.anchors, structured = m * f_.offsets_per_anchor, dynamic = structured + f_.free;
-        drawn_.resize(dynamic + statics);
-        to_drawn_.resize(dynamic);
-        intervals_.resize(f_.anchor_intervals ? dynamic + statics : 0);
-        radii_.resize(dynamic + statics);
+        drawn_.resize(dynamic), to_drawn_.resize(dynamic);
+        intervals_.resize(f_.anchor_intervals ? dynamic : 0);
+        radii_.resize(std::max<size_t>(dynamic, statics));
         ids_.resize(structured), norms_.resize(structured);
         visible_.resize(m), active_.resize(m), starts_.resize(m + 1);
         raw_.resize(structured), bits_.resize(3 * m * ((f_.hidden_size + 31) / 32));
@@ -123,7 +123,6 @@ class Fit {
             for (int64_t i = 0; i < structured_; ++i) intervals_[i] = f_.anchor_intervals[ids_[i] / k];
         add_free();
         dynamic_ = structured_ + f_.free;
-        add_static();
     }
 
     sgs_gaussians gaussians() {
@@ -142,27 +141,34 @@ class Fit {
         if (f_.anchor_intervals) std::copy_n(f_.free_intervals, count, intervals_.data() + at);
     }
 
-    void add_static() {
-        const int64_t at = dynamic_, count = view_->static_count;
-        std::copy_n(view_->means, 3 * count, drawn_.means.data() + 3 * at);
-        std::copy_n(view_->quats, 4 * count, drawn_.quats.data() + 4 * at);
-        std::copy_n(view_->scales, 3 * count, drawn_.scales.data() + 3 * at);
-        std::copy_n(view_->opacities, count, drawn_.opacities.data() + at);
-        std::copy_n(view_->colors, 3 * count, drawn_.colors.data() + 3 * at);
-        if (f_.anchor_intervals) std::copy_n(view_->intervals, count, intervals_.data() + at);
+    GaussianInputs inputs() const {
+        return {drawn_.means.data(),  drawn_.quats.data(), drawn_.scales.data(), drawn_.opacities.data(),
+                drawn_.colors.data(), nullptr,             f_.anchor_intervals ? intervals_.data() : nullptr, dynamic_};
     }
 
-    GaussianInputs inputs(int64_t count) const {
-        return {drawn_.means.data(),  drawn_.quats.data(), drawn_.scales.data(), drawn_.opacities.data(),
-                drawn_.colors.data(), nullptr,             f_.anchor_intervals ? intervals_.data() : nullptr, count};
+    // The static splats that reach the tiles: found in the first visit of the view that draws these tiles.
+    const std::vector<Splat>& statics() {
+        const sgs_fit_view& v = *view_;
+        Statics& found = statics_[2 * (view_ - f_.views) + (tiles_ == v.changed)];
+        if (!found.known) {
+            raster_.splats.resize(v.static_count);
+            project(
+                {v.means, v.quats, v.scales, v.opacities, v.colors, nullptr, v.intervals, v.static_count}, raster_,
+                radii_.data(), threads_);
+            for (const Splat& splat : raster_.splats)
+                if (splat.box[0] < splat.box[2]) found.splats.push_back(splat);
+            found.known = true;
+        }
+        return found.splats;
     }
 
     void draw() {
-        const int64_t count = dynamic_ + view_->static_count;
         look(raster_, view_->viewmat, view_->K, view_->width, view_->height, view_->near_plane, tiles_);
         raster_.trained = dynamic_;
-        raster_.splats.resize(count);
-        project(inputs(count), raster_, radii_.data(), threads_);
+        const std::vector<Splat>& at_rest = statics();
+        raster_.splats.resize(dynamic_ + at_rest.size());
+        project(inputs(), raster_, radii_.data(), threads_);
+        std::copy(at_rest.begin(), at_rest.end(), raster_.splats.begin() + dynamic_);
         bin(raster_);
         rasterize(raster_, view_->background, view_->image, alpha_.data(), threads_);
     }
@@ -224,7 +230,7 @@ class Fit {
         rasterize_backward(
             raster_, view_->background, view_->image, alpha_.data(), to_image_.data(), nullptr, moments_.data(), threads_);
         project_backward(
-            inputs(dynamic_), raster_, moments_.data(),
+            inputs(), raster_, moments_.data(),
             {to_drawn_.means.data(), to_drawn_.quats.data(), to_drawn_.scales.data(), to_drawn_.opacities.data(),
              to_drawn_.colors.data(), nullptr},
             threads_);
@@ -325,11 +331,16 @@ class Fit {
     const sgs_fit_view* view_ = nullptr;
     const uint8_t* tiles_ = nullptr;
     float* terms_ = nullptr;
-    int64_t structured_ = 0, dynamic_ = 0;  // rows of anchors' Gaussians, then free ones; static ones follow
+    int64_t structured_ = 0, dynamic_ = 0;  // anchors' Gaussians, and all with the free ones
     sgs_anchors anchors_;
     sgs_selection selection_;
     Raster raster_;
-    // Its memory, the same in all iterations.
+    struct Statics {
+        bool known = false;
+        std::vector<Splat> splats;
+    };
+    std::vector<Statics> statics_;  // by view, in full visits and in resting ones
+    // Memory of an iteration, the same in all.
     Floats rounded_[SGS_LEAVES], gradients_[SGS_LEAVES];
     Columns drawn_, to_drawn_;
     Floats folded_, to_folded_, intervals_, radii_, norms_, raw_, alpha_, ssim_gradient_, to_image_, corrected_, moments_, moved_,

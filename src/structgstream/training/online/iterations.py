@@ -29,6 +29,8 @@ from structgstream.training.parameters import ANCHOR_ROWS, FREE_ROWS, Parameters
 from structgstream.training.result import Step, StepListener, Stopwatch
 from structgstream.training.views import View
 
+LEAVES: tuple[ParameterName, ...] = (*ANCHOR_ROWS, *FREE_ROWS)
+"""Tensors of a frame's fit (``values.FIT_LEAVES``)."""
 REPORT_INTERVAL = 10
 """Iterations between reports of progress, where a back-end runs them."""
 
@@ -245,7 +247,7 @@ def _plan(
     adam: Adam[ParameterName], views: list[View], schedule: Schedule[ParameterName], hooks: OnlineHooks
 ) -> FitPlan:
     count, numbers = len(views), {view.index: n for n, view in enumerate(hooks.start.seen)}
-    rates = [[schedule.rates(i + 1)[name] for name in (*ANCHOR_ROWS, *FREE_ROWS)] for i in range(count)]
+    rates = [[found[name] for name in LEAVES] for found in map(schedule.rates, range(1, count + 1))]
     return FitPlan(
         order=torch.tensor([numbers[view.index] for view in views], dtype=torch.int32),
         rests=torch.tensor([hooks.visit(view) for view in views], dtype=torch.bool),
@@ -277,7 +279,7 @@ def _frame(adam: Adam[ParameterName], plan: FitPlan, hooks: OnlineHooks, done: i
     appears = scene.anchors.appearance is not None
     sampling, free_means = scene.sampling, values["free_means"].detach()
     return FitFrame(
-        leaves=[leaf(name) for name in (*ANCHOR_ROWS, *FREE_ROWS)],
+        leaves=[leaf(name) for name in LEAVES],
         mlps=scene.mlps,
         basis=scene.appearance_basis if appears else None,
         distance_input=scene.distance_input,
