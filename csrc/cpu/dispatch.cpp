@@ -205,6 +205,22 @@ void* sgs_raster_forward(
     }
 }
 
+int sgs_raster_radii(
+    int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
+    const float* viewmat, const float* K, int width, int height, float near_plane, const float* intervals, float* radii,
+    int threads) {
+    try {
+        Raster raster;
+        look(raster, viewmat, K, width, height, near_plane, nullptr);
+        raster.splats.resize(count);
+        // Colours are not used; any memory of the right size is sufficient.
+        project({means, quats, scales, opacities, means, nullptr, intervals, count}, raster, radii, threads);
+        return 0;
+    } catch (const std::bad_alloc&) {
+        return 1;
+    }
+}
+
 int sgs_raster_weights(
     int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
     const float* colors, const float* viewmat, const float* K, int width, int height, float near_plane,

@@ -13,7 +13,7 @@ extern "C" {
 
 /* Version of the library's interface. It is incremented with every change of the declarations in this file or in
  * cpu/anchors.h. kernels/native.py requires the same number, so that a library of another version is refused. */
-#define SGS_ABI_VERSION 9
+#define SGS_ABI_VERSION 10
 int sgs_abi_version(void);
 
 /* Instruction sets: 0 baseline (SSE2, NEON or plain C++), 1 AVX2 with FMA, 2 AVX-512. */
@@ -32,6 +32,11 @@ void* sgs_raster_forward(
     const float* colors, const float* viewmat, const float* K, int width, int height, float near_plane,
     const float* background, const float* screen_offsets, const float* intervals, const uint8_t* drawn_tiles,
     int64_t trained, float* image, float* alpha, float* radii, int threads);
+/* Out: radii [N] alone. Returns 0, or 1 if memory is not sufficient. */
+int sgs_raster_radii(
+    int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
+    const float* viewmat, const float* K, int width, int height, float near_plane, const float* intervals, float* radii,
+    int threads);
 /* weights [N,C]: for each Gaussian the sum over the pixels of its blending weight times each of maps [H,W,C], C =
  * channels >= 1. Needs C numbers of memory for each pair of a Gaussian and a tile. image [H,W,3]: the picture of colors
  * [N,3] over background [3] or null, drawn in the same pass; or null together with colors. Returns 0, or 1 if memory is

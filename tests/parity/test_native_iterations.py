@@ -10,6 +10,8 @@ import pytest
 import torch
 
 from rigs import random_scene
+from structgstream.errors import OutOfMemoryError
+from structgstream.kernels import cpu_fit
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
 from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import TileSelection, tile_grid
@@ -144,3 +146,11 @@ def test_results_do_not_depend_on_threads_nor_on_reports() -> None:
     assert all(torch.equal(value, other[name]) for other in found[1:] for name, value in found[0].items())
     assert [step.iteration for step in told] == [4, 9]
     assert {step.anchors for step in told} == {40}
+
+
+@pytest.mark.parametrize("begun", [None, 1])
+def test_no_memory(begun: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    library = SimpleNamespace(sgs_fit_new=lambda *_: begun, sgs_fit_run=lambda *_: 1, sgs_fit_free=lambda *_: None)
+    monkeypatch.setattr(cpu_fit, "native_library", lambda: library)
+    with pytest.raises(OutOfMemoryError, match="^Not enough memory"):
+        fitted(cpu_backend())

@@ -84,6 +84,7 @@ class Backend:
     iterations: Callable[[FitFrame], Callable[[int, int], None]] | None = None
 
     rasterize = Operation(reference_raster.rasterize)  # cuda: gsplat
+    projected_radii = Operation(reference_raster.projected_radii)  # cuda: gsplat, which draws a picture
     blending_weights = Operation(reference_raster.blending_weights)  # cuda: gradients of gsplat's picture
     picture_and_weights = Operation(reference_raster.picture_and_weights)  # cuda: gsplat
     generate_structured = Operation(reference_anchors.generate_structured)  # cuda: own kernels
@@ -165,6 +166,7 @@ def cuda_backend() -> Backend:
         recorder=GraphMemory(torch.device("cuda")).recorder,
     ).with_functions(
         rasterize=rasterize,
+        projected_radii=partial(reference_raster.radii_by_drawing, rasterize),
         blending_weights=partial(reference_raster.weights_by_gradient, rasterize),
         picture_and_weights=partial(reference_raster.picture_and_weights_by_gradient, rasterize),
         adam_step=cuda.adam_step,

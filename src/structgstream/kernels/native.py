@@ -16,7 +16,7 @@ from torch import Tensor
 
 from structgstream.errors import BackendError
 
-ABI_VERSION = 9
+ABI_VERSION = 10
 """Equal to the version in csrc/include/structgstream.h, which states when it is incremented."""
 ISA_NAMES = ("baseline", "avx2", "avx512")
 TYPES: Mapping[str, Any] = {
@@ -35,6 +35,7 @@ PROTOTYPES: Mapping[str, tuple[str, str]] = {
     "sgs_best_isa": ("i", ""),
     "sgs_use_isa": ("i", "i"),
     "sgs_raster_forward": ("p", "lpppppppiifpppplpppi"),
+    "sgs_raster_radii": ("i", "lppppppiifppi"),
     "sgs_raster_weights": ("i", "lpppppppiifpppippi"),
     "sgs_raster_backward": ("i", "plppppppppppppppppi"),
     "sgs_raster_free": ("v", "p"),
