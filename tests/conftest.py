@@ -16,8 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from properties import use_for_all
-from shared_folder import open_shared_folder
+from tests.support.properties import use_for_all
+from tests.support.shared_folder import open_shared_folder
 
 SHARED = pytest.StashKey[Path | None]()
 

@@ -10,8 +10,6 @@ import pytest
 import torch
 
 import structgstream
-from backends import QUICKEST
-from small_presets import QUICK
 from structgstream.cli import main
 from structgstream.data.clip import bundled_clip_path
 from structgstream.errors import CaptureError, ConfigError, StorageError, StreamError
@@ -19,6 +17,8 @@ from structgstream.evaluation.evaluate import rendered
 from structgstream.evaluation.report import as_json
 from structgstream.evaluation.run_log import read_log
 from structgstream.kernels.backend import select_backend
+from tests.support.backends import QUICKEST
+from tests.support.small_presets import QUICK
 
 CLIP = bundled_clip_path()
 PART: dict[str, Any] = {"frames": 2, "scale": 0.25, "backend": QUICKEST}

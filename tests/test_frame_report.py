@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from streams import small_scene
 from structgstream import frame_report
 from structgstream.cameras import Camera
 from structgstream.codec.encoder import Encoded
@@ -15,6 +14,7 @@ from structgstream.frame_report import counts, metered
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
 from structgstream.training.result import FitResult
+from tests.support.streams import small_scene
 
 CPU = torch.device("cpu")
 

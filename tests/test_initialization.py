@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 
-from memory_captures import MemoryCapture
 from structgstream import initialization
 from structgstream.data.points import PointsConfig
 from structgstream.initialization import frame_seed, initial_points_of
 from structgstream.similarity import Similarity
-from worlds import moving_world
+from tests.support.memory_captures import MemoryCapture
+from tests.support.worlds import moving_world
 
 WORLD = moving_world(1, cameras=4)
 SIMILARITY = Similarity((0.0, 0.1, 0.0), 2.0)

@@ -14,8 +14,6 @@ import numpy as np
 import pytest
 import torch
 
-from backends import quickest_backend
-from small_presets import TINY_RIG
 from structgstream import memory
 from structgstream.cameras import CameraRig
 from structgstream.codec.reader import open_stream
@@ -25,7 +23,9 @@ from structgstream.frames import MultiViewFrame
 from structgstream.memory import PeakKind, PeakMeter, resident_bytes
 from structgstream.session import Session
 from structgstream.struct_gstream import stream_pipeline
-from worlds import World, moving_world
+from tests.support.backends import quickest_backend
+from tests.support.small_presets import TINY_RIG
+from tests.support.worlds import World, moving_world
 
 FRAMES = 650
 SETTLED = 100  # caches, pools of allocators and the free set are full by then

@@ -9,10 +9,10 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from backends import quickest_backend
 from structgstream.pipeline import MAX_INTERVALS, FrameTask, Past
 from structgstream.training.online.preprocess import FramePictures
-from worlds import moving_world
+from tests.support.backends import quickest_backend
+from tests.support.worlds import moving_world
 
 WORLD = moving_world(1, speed=0.0, movers=4, cameras=6)
 TRAINING, (HELD_OUT, *_) = WORLD.rig.training, WORLD.rig.testing

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 import structgstream
-from pretended_gpu import DEVICE, pretended_device, pretended_gpu, rasterize
-from small_presets import FEW_POINTS
 from structgstream.data.clip import bundled_clip_path
 from structgstream.kernels import cpu_raster, cuda, cuda_library, reference_raster
 from structgstream.kernels.native import native_reason
 from structgstream.presets import PRESETS
+from tests.support.pretended_gpu import DEVICE, pretended_device, pretended_gpu, rasterize
+from tests.support.small_presets import FEW_POINTS
 
 FRAMES, SCALE = 2, 0.25
 DRAWN_BY = cpu_raster.rasterize if native_reason() is None else reference_raster.rasterize

@@ -3,8 +3,6 @@ from dataclasses import replace
 
 import pytest
 
-from rigs import arc_rig
-from streams import header_for, small_scene
 from structgstream.cameras import CameraRig
 from structgstream.errors import ConfigError
 from structgstream.pipeline import StreamFacts
@@ -12,6 +10,8 @@ from structgstream.presets import TINY, to_json
 from structgstream.rate_control import RateConfig
 from structgstream.resuming import check_resumable
 from structgstream.similarity import Similarity
+from tests.support.rigs import arc_rig
+from tests.support.streams import header_for, small_scene
 
 RIG = arc_rig(3)
 METADATA = {"capture": "test", "start": 0}

@@ -6,9 +6,6 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from rigs import random_scene
-from small_presets import TINY_RIG
-from streams import same
 from structgstream.codec.packets import StreamHeader
 from structgstream.initialization import frame_seed
 from structgstream.kernels.backend import reference_backend
@@ -20,7 +17,10 @@ from structgstream.scene_codecs import scene_codec
 from structgstream.similarity import Similarity
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.views import training_views
-from worlds import moving_world
+from tests.support.rigs import random_scene
+from tests.support.small_presets import TINY_RIG
+from tests.support.streams import same
+from tests.support.worlds import moving_world
 
 WORLD = moving_world(1, cameras=4)
 SIMILARITY = Similarity((0.0, 0.1, 0.0), 2.0)

@@ -8,9 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from memory_captures import MemoryCapture
-from small_presets import TINY_RIG
-from streams import moved, same, small_scene
 from structgstream import struct_gstream as method
 from structgstream.cameras import CameraRig
 from structgstream.codec.container.records import scan_records
@@ -28,7 +25,10 @@ from structgstream.scene.state import PAPER_DYNAMIC, state_of
 from structgstream.session import Session
 from structgstream.struct_gstream import stream_pipeline
 from structgstream.training.result import FitResult
-from worlds import moving_world
+from tests.support.memory_captures import MemoryCapture
+from tests.support.small_presets import TINY_RIG
+from tests.support.streams import moved, same, small_scene
+from tests.support.worlds import moving_world
 
 WORLD = moving_world(1)
 POINTS = np.random.default_rng(0).normal(size=(60, 3)) * 0.4

@@ -12,9 +12,6 @@ import pytest
 import torch
 from rich.console import Console
 
-from backends import quickest_backend
-from memory_captures import MemoryCapture
-from small_presets import TINY_RIG
 from structgstream.cli.progress import summary
 from structgstream.cli.tables import report_tables
 from structgstream.codec.reader import StreamReader, open_stream
@@ -34,8 +31,11 @@ from structgstream.scene.scene import Scene
 from structgstream.session import Session
 from structgstream.struct_gstream import stream_pipeline
 from structgstream.training.online.config import SpawnRules
-from tests.varied import varied
-from worlds import World, moving_world
+from tests.support.backends import quickest_backend
+from tests.support.memory_captures import MemoryCapture
+from tests.support.small_presets import TINY_RIG
+from tests.support.varied import varied
+from tests.support.worlds import World, moving_world
 
 COMPACT = PRESETS["compact"]
 CONFIG = replace(

@@ -9,10 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from backends import quickest_backend
-from memory_captures import MemoryCapture
-from small_presets import TINY_RIG
-from streams import same
 from structgstream import struct_gstream as method
 from structgstream.codec.container.records import scan_records
 from structgstream.codec.reader import StreamReader
@@ -28,8 +24,12 @@ from structgstream.struct_gstream import stream_pipeline
 from structgstream.training.frame0.seeding import EnvironmentConfig
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.parameters import RoundingConfig, pixel_size
-from tests.varied import varied
-from worlds import moving_world
+from tests.support.backends import quickest_backend
+from tests.support.memory_captures import MemoryCapture
+from tests.support.small_presets import TINY_RIG
+from tests.support.streams import same
+from tests.support.varied import varied
+from tests.support.worlds import moving_world
 
 FRAMES = 4
 WORLD = moving_world(FRAMES, speed=0.06, movers=20, emerges_at=1)

@@ -8,9 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from backends import quickest_backend
-from moving_block import PERIODS, RIG, filmed
-from small_presets import QUICK
 from structgstream.cameras import CameraRig
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
@@ -20,6 +17,9 @@ from structgstream.presets import StreamConfig
 from structgstream.recorder import record
 from structgstream.session import Session
 from structgstream.struct_gstream import stream_pipeline
+from tests.support.backends import quickest_backend
+from tests.support.moving_block import PERIODS, RIG, filmed
+from tests.support.small_presets import QUICK
 
 
 @dataclass

@@ -5,8 +5,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from memory_captures import MemoryCapture
-from small_presets import TINY_RIG
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink
 from structgstream.frames import MultiViewFrame
@@ -14,8 +12,10 @@ from structgstream.kernels.backend import reference_backend
 from structgstream.session import FrameReport, Session
 from structgstream.struct_gstream import stream_pipeline
 from structgstream.training.online.config import MotionConfig
-from tests.varied import varied
-from worlds import moving_world
+from tests.support.memory_captures import MemoryCapture
+from tests.support.small_presets import TINY_RIG
+from tests.support.varied import varied
+from tests.support.worlds import moving_world
 
 WORLD = moving_world(4, speed=0.06, movers=20)
 CONFIG = replace(

@@ -9,10 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from backends import quickest_backend
-from memory_captures import MemoryCapture
-from segment_streams import Hands, Killed, KilledStore, folder
-from streams import same
 from structgstream.codec.container.records import RecordType, scan_records
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.segments.stored_bytes import write_archive
@@ -23,8 +19,12 @@ from structgstream.presets import StreamConfig, to_json
 from structgstream.rate_control import RateConfig
 from structgstream.session import FrameReport, Session
 from structgstream.struct_gstream import stream_pipeline
-from test_session_compact import CONFIG as COMPACT_CONFIG
-from test_session_compact import WORLD
+from tests.support.backends import quickest_backend
+from tests.support.memory_captures import MemoryCapture
+from tests.support.segment_streams import Hands, Killed, KilledStore, folder
+from tests.support.streams import same
+from tests.test_session_compact import CONFIG as COMPACT_CONFIG
+from tests.test_session_compact import WORLD
 
 FRAMES = 8
 CHANGE = 3

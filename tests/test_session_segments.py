@@ -6,8 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from segment_streams import Hands, folder
-from small_presets import TINY_RIG
 from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest, write_archive
@@ -15,7 +13,9 @@ from structgstream.codec.sinks import resume_segments
 from structgstream.kernels.backend import reference_backend
 from structgstream.session import Session
 from structgstream.struct_gstream import stream_pipeline
-from test_session import capture, quick_fits, uninterrupted
+from tests.support.segment_streams import Hands, folder
+from tests.support.small_presets import TINY_RIG
+from tests.test_session import capture, quick_fits, uninterrupted
 
 __all__ = ["quick_fits"]
 

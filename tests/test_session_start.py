@@ -8,9 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from backends import quickest_backend
-from memory_captures import MemoryCapture
-from small_presets import TINY_RIG
 from structgstream.codec.container.records import scan_records
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink, MemorySink
@@ -19,8 +16,11 @@ from structgstream.presets import COMPACT
 from structgstream.session import FrameReport, Session
 from structgstream.struct_gstream import stream_pipeline
 from structgstream.training.online.config import SpawnRules
-from tests.varied import varied
-from worlds import moving_world
+from tests.support.backends import quickest_backend
+from tests.support.memory_captures import MemoryCapture
+from tests.support.small_presets import TINY_RIG
+from tests.support.varied import varied
+from tests.support.worlds import moving_world
 
 FRAMES = 4
 WORLD = moving_world(FRAMES, cameras=6, speed=0.06, movers=20, emerges_at=2, width=96, height=64)

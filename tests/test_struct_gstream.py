@@ -6,15 +6,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from backends import quickest_backend
-from rigs import random_scene
 from structgstream.errors import ConfigError
 from structgstream.pipeline import FrameTask
 from structgstream.presets import COMPACT, PAPER, StreamConfig
 from structgstream.scene.scene import Scene
 from structgstream.struct_gstream import FrameZeroContext, StructGStream, stream_pipeline
 from structgstream.training.result import FitResult
-from worlds import moving_world
+from tests.support.backends import quickest_backend
+from tests.support.rigs import random_scene
+from tests.support.worlds import moving_world
 
 WORLD = moving_world(1)
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from killed import folders_of_the_killed
 from structgstream.errors import StorageError
 from structgstream.whole_files import give_name, partial_path, replacing, sync_folder, whole_file, write_whole
+from tests.support.killed import folders_of_the_killed
 
 OLD, NEW = b"old", b"new and longer"
 

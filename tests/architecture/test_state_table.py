@@ -87,7 +87,7 @@ def test_a_dynamic_field_is_added_as_contributing_says(tmp_path: Path) -> None:
     text = (ROOT / "CONTRIBUTING.md").read_text()
     (diff,) = re.findall(r"```diff\n(.*?)```", text.split("### A dynamic field")[1].split("\n### ")[0], re.DOTALL)
     assert len(applied(diff, tmp_path)) <= 3
-    paths = [str(path) for path in (tmp_path / "src", ROOT / "tests", Path(__file__).parent)]
+    paths = [str(path) for path in (tmp_path / "src", ROOT, Path(__file__).parent)]
     code = f"import sys; sys.path[:0] = {paths}; import added_field; added_field.check()"
     command = [sys.executable, "-I", "-c", code]
     result = subprocess.run(command, capture_output=True, text=True, check=False)

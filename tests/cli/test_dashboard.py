@@ -7,11 +7,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from reports import frame_report
 from structgstream.cli.dashboard import Dashboard, LiveLines, live_display
 from structgstream.data.live.status import CameraStatus, LiveStatus
 from structgstream.run_metrics import RunMetrics
 from structgstream.training.result import Step
+from tests.support.reports import frame_report
 
 STATUS = LiveStatus(
     {"cam00": CameraStatus(True, 1234, 2), "cam01": CameraStatus(False, 7, 0, {"stuck": 3, "gone": 1})},

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from quick_streams import QUICK, error_of
 from structgstream.cli import main, render
 from structgstream.cli.progress import Lines
 from structgstream.data.clip import bundled_clip_path
 from structgstream.session import FrameReport
+from tests.support.quick_streams import QUICK, error_of
 
 pytestmark = pytest.mark.usefixtures("quick_presets")
 

@@ -10,14 +10,14 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from rigs import random_scene
-from streams import compact_header, header_for, write_stream
 from structgstream.cli import main
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
 from structgstream.exporters.bake import BakingConfig
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.scene import Scene
+from tests.support.rigs import random_scene
+from tests.support.streams import compact_header, header_for, write_stream
 
 FRAMES = 3
 

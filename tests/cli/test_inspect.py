@@ -9,9 +9,6 @@ from pathlib import Path
 import pytest
 
 import structgstream
-from drawn import pixels_of
-from rigs import random_scene
-from streams import compact_header, header_for, moved, write_stream
 from structgstream.cli import main
 from structgstream.cli.capture_table import describe_capture
 from structgstream.codec.reader import open_stream
@@ -20,6 +17,9 @@ from structgstream.errors import CaptureError
 from structgstream.evaluation.run_log import append_log, begin_log
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName
+from tests.support.drawn import pixels_of
+from tests.support.rigs import random_scene
+from tests.support.streams import compact_header, header_for, moved, write_stream
 
 FRAMES = 31
 

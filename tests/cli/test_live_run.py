@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from small_presets import few_points
 from structgstream.cli.app import INTERRUPTED, PROBLEM, USAGE, main
 from structgstream.cli.live_run import stopping
 from structgstream.codec.reader import open_stream
 from structgstream.data.open import open_capture
-from test_live_source import files
+from tests.data.live.test_live_source import files
+from tests.support.small_presets import few_points
 
 QUICKLY = ["--preset", "tiny", "--initial.iterations", "3", "--online.iterations", "2", "--device", "cpu"]
 

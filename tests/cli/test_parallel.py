@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from quick_streams import CLIP, QUARTER, error_of
 from structgstream.cli import main
 from structgstream.cli.options import CaptureOptions
 from structgstream.cli.parallel import Parallel, WorkerOptions, _job, join_words
@@ -15,6 +14,7 @@ from structgstream.executors.task import Ending
 from structgstream.owned_folders import MARKER, Owner
 from structgstream.parallel.object_folder import ObjectFolder
 from structgstream.parallel.parts import PURPOSE, Parts
+from tests.support.quick_streams import CLIP, QUARTER, error_of
 
 GROUPS = ["--frames", "4", "--groups", "2", "--allow-unaligned", "--executor", "inline"]
 pytestmark = pytest.mark.usefixtures("quick_tiny")

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from quick_streams import error_of
-from rooms import write_room
 from structgstream.cli.app import main
 from structgstream.preparation.calibration.board import Board
 from structgstream.preparation.claiming import alone, claim
 from structgstream.preparation.options import Distance, PrepareOptions
+from tests.support.quick_streams import error_of
+from tests.support.rooms import write_room
 
 
 def test_prepare_then_check_and_a_mistake(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from quick_streams import CLIP, QUARTER, error_of, stopped_by_sigterm
 from structgstream.cli import main
 from structgstream.cli.progress import Lines
 from structgstream.codec.reader import open_stream
@@ -16,7 +15,8 @@ from structgstream.codec.segments.quality_list import QUALITIES, read_list
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest
 from structgstream.frame_report import FrameReport
-from test_live_source import files
+from tests.data.live.test_live_source import files
+from tests.support.quick_streams import CLIP, QUARTER, error_of, stopped_by_sigterm
 
 pytestmark = pytest.mark.usefixtures("quick_tiny")
 

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from backends import QUICKEST
-from quick_streams import CLIP, QUARTER, QUICK, SMALL, error_of
 from structgstream import recorder
 from structgstream.cli import main
 from structgstream.cli.progress import Lines
@@ -17,6 +15,8 @@ from structgstream.data.open import open_capture
 from structgstream.evaluation.capture import capture_of
 from structgstream.session import FrameReport
 from structgstream.training.parameters import RoundingConfig
+from tests.support.backends import QUICKEST
+from tests.support.quick_streams import CLIP, QUARTER, QUICK, SMALL, error_of
 
 pytestmark = pytest.mark.usefixtures("quick_presets")
 

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from backends import QUICKEST
-from quick_streams import CLIP, QUARTER, stopped_by_sigterm
-from s3_emulator import BUCKET, emulator
 from structgstream.cli import main, segment_options
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.recovery import stale_files
 from structgstream.codec.segments.store import CloudStore, FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest, write_archive
+from tests.support.backends import QUICKEST
+from tests.support.quick_streams import CLIP, QUARTER, stopped_by_sigterm
+from tests.support.s3_emulator import BUCKET, emulator
 
 pytestmark = pytest.mark.usefixtures("quick_tiny")
 

@@ -7,9 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from period_streams import FIRSTS, FRAMES, KEYS, LENGTHS, period_header, period_of, period_packets, period_stream
-from properties import thinned
-from streams import same, small_stream
 from structgstream.codec.container.index import INDEX_ENTRY, pack_index, read_index
 from structgstream.codec.container.records import (
     MINOR_WITH_PERIODS,
@@ -26,6 +23,18 @@ from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import StreamError
 from structgstream.scene.scene import Scene
 from structgstream.similarity import Similarity
+from tests.support.period_streams import (
+    FIRSTS,
+    FRAMES,
+    KEYS,
+    LENGTHS,
+    period_header,
+    period_of,
+    period_packets,
+    period_stream,
+)
+from tests.support.properties import thinned
+from tests.support.streams import same, small_stream
 
 CODECS = ("raw", "compact")
 

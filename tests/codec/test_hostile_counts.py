@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from properties import thinned
-from streams import compact_header, small_scene
 from structgstream.codec.container.blocks import BLOCK, LENGTH, iterate_blocks, unpack_blocks
 from structgstream.codec.decoder import CompactDecoder
 from structgstream.codec.encoder import CompactEncoder
@@ -26,6 +24,8 @@ from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import FieldName, state_of
+from tests.support.properties import thinned
+from tests.support.streams import compact_header, small_scene
 
 Fields = Mapping[FieldName, bytes]
 HUGE = (2**20, 2**32 - 1)

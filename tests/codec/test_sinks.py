@@ -9,8 +9,6 @@ from typing import Any
 
 import pytest
 
-from killed import folders_of_the_killed
-from streams import header_for, moved, same, small_scene, small_stream, write_stream
 from structgstream.codec.container import byte_source
 from structgstream.codec.container.records import RecordType, scan_records
 from structgstream.codec.encoder import SceneEncoder
@@ -18,6 +16,8 @@ from structgstream.codec.packets import Packet, PacketKind
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import StorageError, StreamError
+from tests.support.killed import folders_of_the_killed
+from tests.support.streams import header_for, moved, same, small_scene, small_stream, write_stream
 
 SCENES = [moved(small_scene(), i) for i in range(4)]
 

@@ -12,22 +12,6 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrations import OF_PINHOLES, WRITERS, truths
-from captures import (
-    HEIGHT,
-    WIDTH,
-    picture,
-    small_rig,
-    write_clip,
-    write_immersive,
-    write_n3dv,
-    write_panoptic,
-    write_picture,
-    write_shared_intrinsics,
-    write_text_model,
-    write_video,
-)
-from properties import THOROUGH
 from structgstream.data.colmap import read_model
 from structgstream.data.exif import read_exif
 from structgstream.data.found_calibrations import read_calibration
@@ -42,6 +26,22 @@ from structgstream.data.timeline import Clock
 from structgstream.data.video_index import scan_videos
 from structgstream.data.video_pictures import pictures_at
 from structgstream.errors import StructGStreamError
+from tests.support.calibrations import OF_PINHOLES, WRITERS, truths
+from tests.support.captures import (
+    HEIGHT,
+    WIDTH,
+    picture,
+    small_rig,
+    write_clip,
+    write_immersive,
+    write_n3dv,
+    write_panoptic,
+    write_picture,
+    write_shared_intrinsics,
+    write_text_model,
+    write_video,
+)
+from tests.support.properties import THOROUGH
 
 PYTHONS_WORDS = re.compile(
     r"\b\w+Error\b|\b(NoneType|int|float|str|dict|tuple|object|dtype|literal|codec|subscript\w*|unpack|argument|"

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from calibrations import WRITERS, Floats, Truth, truths, write_anipose, write_cmu, write_easymocap, write_opencv
-from captures import HEIGHT, WIDTH, Picture, all_numbers, picture, write_picture, write_videos
 from structgstream.data.clip import bundled_clip
 from structgstream.data.colmap import PARAMETERS
 from structgstream.data.lenses import LensCamera, Pinhole
@@ -19,6 +17,17 @@ from structgstream.data.undistortion import UndistortedSource, Undistortion
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.pose_check.check import check_poses
 from structgstream.presets import PAPER_DATA
+from tests.support.calibrations import (
+    WRITERS,
+    Floats,
+    Truth,
+    truths,
+    write_anipose,
+    write_cmu,
+    write_easymocap,
+    write_opencv,
+)
+from tests.support.captures import HEIGHT, WIDTH, Picture, all_numbers, picture, write_picture, write_videos
 
 NAMES = ["cam00", "cam01", "cam02"]
 EXPECTED = [[(camera, frame) for camera in range(3)] for frame in range(3)]

@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from memory_captures import MemoryCapture
-from rigs import arc_rig
 from structgstream import cameras
 from structgstream.data.denoising import MOST_FRAMES, Denoised, DenoisingConfig, denoised, mean_of_still
 from structgstream.data.prefetch import Prefetch
@@ -16,7 +14,9 @@ from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import section
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MultiViewFrame
-from tests.varied import varied
+from tests.support.memory_captures import MemoryCapture
+from tests.support.rigs import arc_rig
+from tests.support.varied import varied
 
 HEIGHT, WIDTH, FRAMES = 48, 64, 12
 EIGHT = DenoisingConfig(frames=8)

@@ -4,10 +4,10 @@
 import numpy as np
 import pytest
 
-from filmed import noise_texture
 from structgstream import cameras
 from structgstream.data.matching import Features
 from structgstream.data.pair_matches import MatchConfig, PairMatcher
+from tests.support.filmed import noise_texture
 
 SIDE, SHIFT = 256, 17
 

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from captures import small_rig
 from structgstream.data.folder_files import files_of
 from structgstream.data.images import ImageSource, common_pictures, read_picture, turned
 from structgstream.data.posed import Calibration, PosedCamera
@@ -24,6 +23,7 @@ from structgstream.data.video import synchronised
 from structgstream.data.video_index import scan_videos
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.footage import find_footage
+from tests.support.captures import small_rig
 
 RIG = small_rig(3)
 OPTIONS = {"g": "4", "sc_threshold": "0", "lag-in-frames": "0"}

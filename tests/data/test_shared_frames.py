@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from rigs import arc_rig
 from structgstream.cameras import CameraRig
 from structgstream.data.shared_frames import SharedFrames
 from structgstream.data.source import frame_count, keep_frames, may_read_ahead
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
+from tests.support.rigs import arc_rig
 
 
 @dataclass

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.data.timeline import Clock, common_slots, natural, picture_slots
 from structgstream.errors import CaptureError
+from tests.support.properties import examples
 
 
 def common(**slots: list[int]) -> range:

@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from memory_captures import MemoryCapture
-from reports import mean_of
 from structgstream.cameras import CameraRig
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.data.images import ImageSource
@@ -32,7 +30,9 @@ from structgstream.memory import resident_bytes
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC
 from structgstream.similarity import Similarity
-from worlds import World, emerging_ball, moving_world
+from tests.support.memory_captures import MemoryCapture
+from tests.support.reports import mean_of
+from tests.support.worlds import World, emerging_ball, moving_world
 
 SPEED = 0.03
 
@@ -165,7 +165,7 @@ def replace_distance(scene: Scene):
 
 def drawn(scene: Scene, world: World) -> list[MultiViewFrame]:
     """The world's frames with another scene."""
-    from worlds import rendered
+    from tests.support.worlds import rendered
 
     frames = []
     for t, frame in enumerate(world.frames):

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from drawn import pixels_of
-from reports import mean_of
 from structgstream.errors import StorageError
 from structgstream.evaluation.plots import write_plots
 from structgstream.evaluation.report import (
@@ -24,6 +22,8 @@ from structgstream.evaluation.report import (
     slope_at_equal_shares,
     write_json,
 )
+from tests.support.drawn import pixels_of
+from tests.support.reports import mean_of
 
 GOOD = Scores(30.0, 0.9, 31.0, None, 30.0, 0.0, 0.1)
 

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.errors import ConfigError
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.task import Ending, Task
+from tests.support.properties import examples
 
 
 class Scripted:

@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 
-from sleepers import all_endings
 from structgstream.errors import ConfigError, MissingExtraError
 from structgstream.executors import opening, ray_cluster
 from structgstream.executors.opening import ExecutorName, ExecutorOptions, open_executor
 from structgstream.executors.places import Place
 from structgstream.executors.ray_cluster import RayOptions
 from structgstream.executors.task import Task
+from tests.support.sleepers import all_endings
 
 
 @pytest.fixture

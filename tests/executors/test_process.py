@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
-from sleepers import PATIENCE_SECONDS
 from structgstream.executors import process
 from structgstream.executors.process import CommandProcess, opened_log, tail_of, waited_for
 from structgstream.executors.task import PYTHON, TAIL_BYTES, Ending, Task
+from tests.support.properties import examples
+from tests.support.sleepers import PATIENCE_SECONDS
 
 
 def begun(*command: str, log: Path | None = None, **variables: str) -> CommandProcess:

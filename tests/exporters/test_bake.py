@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from rigs import arc_rig, random_scene
 from structgstream.errors import StreamError
 from structgstream.exporters.bake import BakingConfig, bake, blend_weights, matrix_quaternions, with_low_pass
 from structgstream.exporters.baked_gaussians import BakedGaussians
@@ -18,6 +17,7 @@ from structgstream.scene.render import Drawable, render
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
 from structgstream.similarity import Similarity
+from tests.support.rigs import arc_rig, random_scene
 
 RIG = arc_rig(6, width=64, height=48)
 CAMERAS = [RIG[name] for name in RIG.training]

@@ -6,11 +6,11 @@ import math
 import pytest
 import torch
 
-from rigs import arc_rig
 from structgstream.exporters.baked_gaussians import BakedGaussians
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.harmonics import Y0
 from structgstream.similarity import Similarity
+from tests.support.rigs import arc_rig
 
 
 def two(sh: torch.Tensor) -> BakedGaussians:

@@ -10,10 +10,10 @@ import torch
 from plyfile import PlyData
 from torch import Tensor
 
-from exporters.plain import picture, psnr, some
 from structgstream.exporters.baked_gaussians import BakedGaussians
 from structgstream.exporters.ply import ply_bytes
 from structgstream.exporters.write import write_gaussians
+from tests.support.plain import picture, psnr, some
 
 
 def column(vertices: np.ndarray, *names: str) -> Tensor:

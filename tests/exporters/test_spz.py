@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 import torch
 
-from exporters.plain import RIG, picture, psnr, some
 from structgstream.errors import ConfigError
 from structgstream.exporters.baked_gaussians import BakedGaussians
 from structgstream.exporters.spz import fractional_bits, spz_bytes
 from structgstream.exporters.write import write_gaussians
+from tests.support.plain import RIG, picture, psnr, some
 
 
 @pytest.fixture

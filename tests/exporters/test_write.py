@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from exporters.plain import some
 from structgstream.errors import StorageError, StreamError
 from structgstream.exporters.formats import FORMATS, Format
 from structgstream.exporters.write import write_gaussians
 from structgstream.similarity import Similarity
+from tests.support.plain import some
 
 
 @pytest.mark.parametrize("format", FORMATS)

@@ -9,9 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backends import quickest_backend
-from clip_groups import CAPTURE, OPTIONS, Made, fit, made, task
-from shared_folder import made_once
 from structgstream.errors import ConfigError, TaskError
 from structgstream.executors.task import PYTHON, Task
 from structgstream.groups import join
@@ -23,6 +20,9 @@ from structgstream.groups.pictures import open_for
 from structgstream.groups.seam_blend import OWN_FRAMES
 from structgstream.groups.track_pass import track_capture
 from structgstream.owned_folders import own_folder
+from tests.support.backends import quickest_backend
+from tests.support.clip_groups import CAPTURE, OPTIONS, Made, fit, made, task
+from tests.support.shared_folder import made_once
 
 FRAMES = 12
 BORDERS = (2, 2 + OWN_FRAMES)

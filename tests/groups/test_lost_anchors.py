@@ -11,7 +11,7 @@ from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig, SpawnRules
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.views import training_views
-from worlds import moved_since, moving_world
+from tests.support.worlds import moved_since, moving_world
 
 SHIFT = 0.4
 WORLD = moving_world(2, cameras=6, speed=SHIFT, width=96, height=64)

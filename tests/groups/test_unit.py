@@ -7,9 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from backends import quickest_backend
-from clip_groups import CAPTURE, LENGTH, fit, made, task
-from small_presets import QUICK
 from structgstream.api import reconstruct
 from structgstream.errors import CaptureError, ConfigError, OutOfMemoryError, StorageError, StreamError
 from structgstream.groups import method
@@ -19,6 +16,9 @@ from structgstream.groups.segment_file import inspect_segment, open_segment
 from structgstream.groups.segment_sink import GroupSoFar
 from structgstream.scene.state import state_of
 from structgstream.whole_files import partial_path
+from tests.support.backends import quickest_backend
+from tests.support.clip_groups import CAPTURE, LENGTH, fit, made, task
+from tests.support.small_presets import QUICK
 
 
 def test_a_segment_is_finished_when_it_has_its_name() -> None:

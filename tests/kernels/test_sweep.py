@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from rigs import arc_rig
 from structgstream.kernels import cpu_motion, reference_motion
 from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import SweepView, Swept
+from tests.support.rigs import arc_rig
 
 needs_native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 SWEEPERS = [

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from rigs import arc_rig
 from structgstream.presets import PAPER_DATA, PRESETS, PaperData, departures
 from structgstream.scene.state import PAPER_DYNAMIC
+from tests.support.rigs import arc_rig
 
 PAPERS = ["paper-n3dv", "paper-meetroom", "paper-immersive"]
 

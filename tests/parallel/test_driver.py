@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from stand_ins import job, sha256, workers
 from structgstream.errors import ConfigError, StorageError, TaskError
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.inline import InlineEngine
@@ -17,6 +16,7 @@ from structgstream.executors.task import PYTHON, Ending, Task
 from structgstream.parallel.driver import Job, Status, _Drive, drive
 from structgstream.parallel.exchange import SharedFolder
 from structgstream.parallel.parts import Parts, group_name
+from tests.support.stand_ins import job, sha256, workers
 
 GROUPS = [(0, 4), (4, 8), (8, 12)]
 

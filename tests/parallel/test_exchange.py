@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from stand_ins import job, sha256, workers
 from structgstream.executors.task import Task
 from structgstream.parallel.driver import drive
 from structgstream.parallel.exchange import ObjectStore, SharedFolder
@@ -13,6 +12,7 @@ from structgstream.parallel.object_folder import ObjectFolder
 from structgstream.parallel.parts import Parts
 from tests.support import stand_in
 from tests.support.flaky_store import flaky_store
+from tests.support.stand_ins import job, sha256, workers
 
 
 def plain(folder: Path) -> Path:

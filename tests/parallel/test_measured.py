@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from measured_runs import finished_run
 from structgstream.errors import ConfigError
 from structgstream.executors.task import Ending
 from structgstream.parallel.cost import measured_in
 from structgstream.parallel.parts import Parts, group_name
+from tests.support.measured_runs import finished_run
 
 
 @pytest.fixture

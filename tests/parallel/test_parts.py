@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from killed import folders_of_the_killed
 from structgstream.errors import ConfigError, StorageError
 from structgstream.executors.task import Ending
 from structgstream.owned_folders import MARKER
 from structgstream.parallel.parts import Parts, read_notes
+from tests.support.killed import folders_of_the_killed
 
 
 @pytest.fixture

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 
-from evidence_made import evidence_of, scattered, wide_ring
-from planes import room_frame, room_rig
 from structgstream.cameras import Camera
 from structgstream.data.pair_matches import pair_error
 from structgstream.pose_check import evidence
 from structgstream.pose_check.evidence import gather, pair_errors
+from tests.support.evidence_made import evidence_of, scattered, wide_ring
+from tests.support.planes import room_frame, room_rig
 
 WIDTH, FOCAL = 1000, 800.0
 PIXELS = np.random.default_rng(0).uniform(200, 700, (40, 2))

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from evidence_made import Cameras, evidence_of, scattered, turned, wide_ring
 from structgstream.cameras import Camera
 from structgstream.pose_check.explanations import explain
 from structgstream.pose_check.findings import Finding
 from structgstream.pose_check.verdicts import judge
+from tests.support.evidence_made import Cameras, evidence_of, scattered, turned, wide_ring
 
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from planes import room_frame, room_rig
 from structgstream.cameras import CameraRig
 from structgstream.data.clip import bundled_clip
 from structgstream.data.open import open_capture
@@ -15,6 +14,7 @@ from structgstream.data.wrappers import resized
 from structgstream.errors import CalibrationError
 from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.check import check_poses
+from tests.support.planes import room_frame, room_rig
 
 CLIP = resized(bundled_clip(), 0.6)
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from rigs import look_at
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.matching import project
 from structgstream.pose_check.resection import Resection, explained, resected
 from structgstream.pose_check.tracks import Tracks
+from tests.support.rigs import look_at
 
 NOISE = 0.3  # pixels
 

@@ -6,11 +6,11 @@ from itertools import combinations
 
 import numpy as np
 
-from evidence_made import wide_ring
 from structgstream.data.matching import Pair
 from structgstream.data.pair_matches import PairError
 from structgstream.pose_check.tracks import Tracks
 from structgstream.pose_check.verdicts import Suspects, accused, find_suspects
+from tests.support.evidence_made import wide_ring
 
 GOOD, WRONG = PairError(0.3, 0.02, 80), PairError(6.0, 0.3, 80)
 

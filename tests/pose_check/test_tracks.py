@@ -4,10 +4,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evidence_made import evidence_of, scattered, turned, wide_ring
 from structgstream.data.matching import project
 from structgstream.pose_check.evidence import Evidence
 from structgstream.pose_check.tracks import Tracks, build_tracks
+from tests.support.evidence_made import evidence_of, scattered, turned, wide_ring
 
 
 def truth_of(tracks: Tracks, evidence: Evidence, name: str) -> np.ndarray:

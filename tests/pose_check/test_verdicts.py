@@ -5,8 +5,8 @@ from collections.abc import Callable
 
 import pytest
 
-from evidence_made import Cameras, evidence_of, scattered, shifted, turned, wide_ring
 from structgstream.pose_check.verdicts import LEAST_MATCHES, Verdict, judge
+from tests.support.evidence_made import Cameras, evidence_of, scattered, shifted, turned, wide_ring
 
 RIG = wide_ring(7)
 

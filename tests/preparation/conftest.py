@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shared_folder import made_once
 from structgstream.preparation.calibration import keypoints
+from tests.support.shared_folder import made_once
 
 _FOUND: dict[str, Any] = {}
 _EXTRACTOR = keypoints._extractor

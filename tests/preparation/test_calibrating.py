@@ -9,9 +9,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from captures import write_video
-from filmed import ring
-from rooms import write_room
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
 from structgstream.data.posed import Calibration, PosedCamera
 from structgstream.errors import CalibrationError, ConfigError
@@ -30,6 +27,9 @@ from structgstream.preparation.calibration.solved import Observations, SolvedCal
 from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import Distance, PrepareOptions
 from structgstream.preparation.steps import Stored
+from tests.support.captures import write_video
+from tests.support.filmed import ring
+from tests.support.rooms import write_room
 
 NONE = np.empty(0, np.intp)
 

@@ -8,8 +8,6 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from footage_made import still_room
-from rooms import write_room
 from structgstream.data.posed import Calibration
 from structgstream.data.timeline import Clock
 from structgstream.errors import CalibrationError, ConfigError
@@ -20,6 +18,8 @@ from structgstream.preparation.claiming import SOURCE
 from structgstream.preparation.options import Distance, PrepareOptions
 from structgstream.preparation.solvers import TIMESTAMPS, Clocks
 from structgstream.preparation.steps import FOLDER, Job, Silent, new_job
+from tests.support.footage_made import still_room
+from tests.support.rooms import write_room
 
 NONE = PrepareOptions(synchronize="none")
 

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 
-from rooms import write_room
 from structgstream.data.prepared import PreparedCapture, prepared_entries, read_prepared
 from structgstream.data.timeline import Clock
 from structgstream.errors import ConfigError, StorageError
@@ -20,6 +19,7 @@ from structgstream.preparation.capture_steps import POINTS, CaptureSteps, assemb
 from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.steps import FOLDER, Job, Silent, new_job
+from tests.support.rooms import write_room
 
 NONE = PrepareOptions(synchronize="none", near=0.25)
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from killed import folders_of_the_killed
 from structgstream.errors import CaptureError, StorageError
 from structgstream.preparation.claiming import LOCK, SOURCE, alone, claim
 from structgstream.preparation.steps import FOLDER
+from tests.support.killed import folders_of_the_killed
 
 
 @pytest.fixture

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrations import WRITERS, truths, write_anipose, write_transforms
-from captures import small_rig, write_immersive, write_text_model
 from structgstream.data.lenses import LensCamera, Pinhole, RadialTangential
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
 from structgstream.data.rectilinear import rectilinear
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibrating import demand_calibration, find_calibration
+from tests.support.calibrations import WRITERS, truths, write_anipose, write_transforms
+from tests.support.captures import small_rig, write_immersive, write_text_model
 
 RIG = small_rig(3)
 

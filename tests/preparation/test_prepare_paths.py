@@ -9,10 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from captures import write_video, write_videos
-from filmed import Film, noise_texture, ring, room
-from footage_made import BOARD, FPS, add_sound, centred, write_board_take, write_take
-from rooms import write_room
 from structgstream.data.prepared import PreparedCapture, read_prepared
 from structgstream.data.timeline import Clock
 from structgstream.errors import CalibrationError, CaptureError
@@ -21,7 +17,11 @@ from structgstream.preparation.footage import find_footage
 from structgstream.preparation.options import Distance, PrepareOptions
 from structgstream.preparation.prepare import Preparation, prepare_capture
 from structgstream.preparation.solvers import first_clocks, matched_pictures
-from takes import heard
+from tests.support.captures import write_video, write_videos
+from tests.support.filmed import Film, noise_texture, ring, room
+from tests.support.footage_made import BOARD, FPS, add_sound, centred, write_board_take, write_take
+from tests.support.rooms import write_room
+from tests.support.takes import heard
 
 NONE = PrepareOptions(synchronize="none")
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from captures import write_video
 from structgstream.data.timeline import Clock
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.footage import Footage, find_footage
@@ -20,6 +19,7 @@ from structgstream.preparation.solvers import (
     matched_pictures,
     synchronized,
 )
+from tests.support.captures import write_video
 
 NAMES = ("a", "b", "c")
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from captures import write_video
 from structgstream.preparation.calibrating import focals_told, stated_focals, turns_told
 from structgstream.preparation.footage import find_footage
+from tests.support.captures import write_video
 
 
 def write(path: Path, film: int | None, *, orientation: int = 1) -> None:

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from killed import folders_of_the_killed
 from structgstream.errors import StorageError
 from structgstream.preparation.steps import FOLDER, Silent, Steps, Stored, fingerprint
+from tests.support.killed import folders_of_the_killed
 
 
 def run(steps: Steps, step: str, value: int, done: list[str], *, after: tuple[str, ...] = ()) -> int:

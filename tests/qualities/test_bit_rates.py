@@ -3,10 +3,10 @@ from pathlib import Path
 
 import pytest
 
-from reports import frame_report
 from structgstream.codec.segments.quality_list import QUALITIES, read_list
 from structgstream.qualities.bit_rates import LEAST_PACKETS, BitRates, bits_per_second, expected_bits
 from structgstream.qualities.ladder import Quality
+from tests.support.reports import frame_report
 
 LOW, HIGH = Quality("low", -1.0), Quality("high", 1.0)
 

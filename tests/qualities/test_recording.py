@@ -14,9 +14,6 @@ import numpy as np
 import pytest
 import torch
 
-from backends import quickest_backend
-from moving_block import PERIODS, RIG, filmed
-from small_presets import QUICK
 from structgstream import session, struct_gstream
 from structgstream.cameras import CameraRig
 from structgstream.codec.reader import open_stream
@@ -34,6 +31,9 @@ from structgstream.recorder import record, segments_at, segments_folder
 from structgstream.run_metrics import RunMetrics
 from structgstream.session import Session
 from structgstream.struct_gstream import stream_pipeline
+from tests.support.backends import quickest_backend
+from tests.support.moving_block import PERIODS, RIG, filmed
+from tests.support.small_presets import QUICK
 
 QUALITIES = qualities_in(["high=2", "low=-2"])
 NAMES = ("low", "high")

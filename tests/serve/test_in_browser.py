@@ -22,11 +22,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from chromium import Browser, Tab, opened_browser
-from pictures import decoded_picture
-from rigs import random_scene
-from serving import served
-from streams import compact_header, moved, write_stream
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.sinks import FileSink, resume_segments
@@ -38,6 +33,11 @@ from structgstream.notebook import Player
 from structgstream.serve.pages import bundle_path, linked_page
 from structgstream.serve.play import Truth
 from structgstream.serve.stream_file import StreamFile, write_page, write_site
+from tests.support.chromium import Browser, Tab, opened_browser
+from tests.support.pictures import decoded_picture
+from tests.support.rigs import random_scene
+from tests.support.serving import served
+from tests.support.streams import compact_header, moved, write_stream
 
 DOCS = Path(__file__).parents[2] / "docs"
 FRAMES = 6

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from streams import small_stream
 from structgstream.errors import PlayerError
 from structgstream.serve import pages
 from structgstream.serve.pages import (
@@ -22,6 +21,7 @@ from structgstream.serve.pages import (
     list_page,
     single_page,
 )
+from tests.support.streams import small_stream
 
 STREAM = small_stream()
 PLAYING = {"autoplay": None, "loop": None}

@@ -14,8 +14,8 @@ from structgstream.scene.scene import Scene
 from structgstream.training.online.config import ExposureConfig, OnlineConfig
 from structgstream.training.online.exposure import exposure_reference, with_exposure_of
 from structgstream.training.views import View, training_views
-from tests.varied import varied
-from worlds import World, moving_world
+from tests.support.varied import varied
+from tests.support.worlds import World, moving_world
 
 CONFIG = varied(ExposureConfig(enabled=True), PICTURE_SCALE=1.0)
 WORLD = moving_world(1, cameras=6)  # Five of them train.

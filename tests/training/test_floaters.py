@@ -5,8 +5,6 @@ from dataclasses import replace
 
 import torch
 
-from backends import quickest_backend
-from rigs import arc_rig
 from structgstream.cameras import Camera
 from structgstream.kernels.backend import Backend, reference_backend
 from structgstream.kernels.values import HeadWeights, MLPWeights
@@ -15,7 +13,9 @@ from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.training.frame0.regularizers import FreeSpaceConfig, in_free_space
-from tests.varied import varied
+from tests.support.backends import quickest_backend
+from tests.support.rigs import arc_rig
+from tests.support.varied import varied
 
 CONFIG = varied(FreeSpaceConfig(), LEAST_VIEWS=4, SCALE=1.0)
 RIG = arc_rig(9, width=64, height=48)

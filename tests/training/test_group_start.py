@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import torch
 
-from backends import quickest_backend
 from structgstream.groups.first_frame import GroupStartConfig, fit_group_start
 from structgstream.scene.state import state_of
 from structgstream.training.online.config import (
@@ -23,8 +22,9 @@ from structgstream.training.online.preprocess import detect_changes
 from structgstream.training.parameters import RoundingConfig
 from structgstream.training.residuals import residual_floor
 from structgstream.training.views import training_views
-from tests.varied import varied
-from worlds import World, moving_world, psnr, rendered
+from tests.support.backends import quickest_backend
+from tests.support.varied import varied
+from tests.support.worlds import World, moving_world, psnr, rendered
 
 SPEED, FRAME = 0.06, 4
 MOTION = MotionConfig(enabled=True, picture_scale=0.5, residual_threshold=0.05)

@@ -3,10 +3,10 @@ from dataclasses import replace
 
 import torch
 
-from rigs import random_scene
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.values import StructuredGaussians
 from structgstream.training.frame0.densify import GrowthConfig, OpacityStatistics, grow, prunable_mask
+from tests.support.rigs import random_scene
 
 VOXEL = 0.01
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from backends import quickest_backend
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend, reference_backend
@@ -20,8 +19,9 @@ from structgstream.training.frame0.regularizers import (
     in_free_space,
 )
 from structgstream.training.frame0.seeding import voxel_centers
-from tests.varied import varied
-from worlds import moving_world, psnr, rendered
+from tests.support.backends import quickest_backend
+from tests.support.varied import varied
+from tests.support.worlds import moving_world, psnr, rendered
 
 QUICK = InitialConfig(
     iterations=120,

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import torch
 
-from rigs import arc_rig, random_scene
 from structgstream.gaussians import Gaussians, concatenate
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.online.measure import (
@@ -16,7 +15,8 @@ from structgstream.training.online.measure import (
     slot_count,
     sum_by_primitive,
 )
-from worlds import emerging_ball
+from tests.support.rigs import arc_rig, random_scene
+from tests.support.worlds import emerging_ball
 
 RIG = arc_rig(4, width=48, height=32)
 CAMERA = RIG[RIG.training[0]]

@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from backends import quickest_backend
 from structgstream.kernels.backend import Backend, reference_backend
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, state_of
@@ -22,8 +21,9 @@ from structgstream.training.online.fit import fit_next_frame
 from structgstream.training.online.patching import IDS_PER_FRAME
 from structgstream.training.online.preprocess import preprocess
 from structgstream.training.result import Step
-from tests.varied import varied
-from worlds import moving_world, psnr, rendered
+from tests.support.backends import quickest_backend
+from tests.support.varied import varied
+from tests.support.worlds import moving_world, psnr, rendered
 
 QUICK = OnlineConfig(
     iterations=24,

@@ -10,8 +10,8 @@ from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.measure import ViewChange
 from structgstream.training.online.select import inlier_views, is_scene_cut, outlier_candidates, unrecognized_faults
 from structgstream.training.views import training_views
-from tests.varied import varied
-from worlds import moved_since, moving_world
+from tests.support.varied import varied
+from tests.support.worlds import moved_since, moving_world
 
 USUAL = ViewChange(changed_share=0.05, wrong_share=0.02, repeated=False)
 WORLD = moving_world(2, speed=0.06, movers=10, cameras=7)

@@ -7,8 +7,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from backends import quickest_backend
-from rigs import random_scene
 from structgstream import cameras
 from structgstream.cameras import Camera, CameraRig, enlargement
 from structgstream.frames import MultiViewFrame
@@ -25,7 +23,9 @@ from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.parameters import pixel_size
 from structgstream.training.residuals import residual_floor
 from structgstream.training.views import View, training_views
-from worlds import moving_world
+from tests.support.backends import quickest_backend
+from tests.support.rigs import random_scene
+from tests.support.worlds import moving_world
 
 CPU = torch.device("cpu")
 WIDTH, HEIGHT = 96, 64

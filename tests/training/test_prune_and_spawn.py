@@ -16,8 +16,8 @@ from structgstream.training.online.spawn import SpawnResult, prune_and_spawn
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.residuals import ResidualFloor, residual_floor
 from structgstream.training.views import training_views
-from tests.varied import varied
-from worlds import emerging_ball, moved_since, moving_world
+from tests.support.varied import varied
+from tests.support.worlds import emerging_ball, moved_since, moving_world
 
 CPU = torch.device("cpu")
 WORLD = moving_world(2, cameras=6, emerges_at=1, movers=0, width=96, height=64)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from rigs import random_scene
 from structgstream.errors import ConfigError
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.free import FreeGaussians
@@ -17,8 +16,9 @@ from structgstream.training.online.select import changed_primitives
 from structgstream.training.online.split import DynamicSplit
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.views import training_views
-from tests.varied import varied
-from worlds import moved_since, moving_world
+from tests.support.rigs import random_scene
+from tests.support.varied import varied
+from tests.support.worlds import moved_since, moving_world
 
 CPU = torch.device("cpu")
 CONFIG = varied(MotionConfig(enabled=True, picture_scale=1.0), REACH_PIXELS=1)

@@ -19,7 +19,7 @@ from structgstream.training.online.spawn import (
 )
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.views import View, training_views
-from worlds import moving_world
+from tests.support.worlds import moving_world
 
 RULES = SpawnRules()
 WORLD = moving_world(1, width=96, height=64)

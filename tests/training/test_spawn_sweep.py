@@ -13,7 +13,7 @@ from structgstream.training.online.spawn import Sweep, missing_share
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.residuals import residual_floor
 from structgstream.training.views import training_views
-from worlds import emerging_ball, moved_since, moving_world
+from tests.support.worlds import emerging_ball, moved_since, moving_world
 
 CPU = torch.device("cpu")
 WORLD = moving_world(2, cameras=6, emerges_at=1, movers=0, width=96, height=64)

@@ -12,12 +12,12 @@ from lab.robustness.load import digests, measured, parsed
 from lab.robustness.load_fetch import fetched
 from lab.robustness.load_players import play
 from lab.robustness.load_report import table
-from rigs import random_scene
-from segment_folders import GrowingFolder
-from serving import hosted
-from streams import compact_header, moved, small_stream, write_stream
 from structgstream.codec.sinks import FileSink
 from structgstream.serve.app import ServerSettings
+from tests.support.rigs import random_scene
+from tests.support.segment_folders import GrowingFolder
+from tests.support.serving import hosted
+from tests.support.streams import compact_header, moved, small_stream, write_stream
 
 STREAM = small_stream(7)
 

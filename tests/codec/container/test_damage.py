@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from streams import compact_header, moved, same, small_scene, small_stream, write_stream
 from structgstream.codec.container import damage as damage_module
 from structgstream.codec.container.damage import LEAST_PACKET_BYTES, Damage, PacketSearch, Standing
 from structgstream.codec.container.records import RECORD, RecordType, scan_records
@@ -16,6 +15,7 @@ from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import StreamError
 from structgstream.scene.scene import Scene
+from tests.support.streams import compact_header, moved, same, small_scene, small_stream, write_stream
 
 FRAMES = 8
 """Three groups: key packets are 0, 3 and 6."""

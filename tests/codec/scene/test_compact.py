@@ -13,9 +13,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples, thinned
-from rigs import random_scene
-from streams import STATIC_STEP, STEPS, compact_header, same, small_scene
 from structgstream.codec.container.blocks import coded_payloads
 from structgstream.codec.container.records import FRAME, RECORD, RecordType, scan_records
 from structgstream.codec.decoder import CompactDecoder, SceneDecoder
@@ -30,6 +27,9 @@ from structgstream.scene.appearance import with_appearance
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, flatten_head, scene_of, state_of
+from tests.support.properties import examples, thinned
+from tests.support.rigs import random_scene
+from tests.support.streams import STATIC_STEP, STEPS, compact_header, same, small_scene
 
 FREE: frozenset[FieldName] = frozenset({"free", "free_births"})
 DYNAMICS: list[frozenset[FieldName]] = [

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.codec.entropy.adaptive import AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.entropy.models import Models
 from structgstream.codec.fields import free_rows
 from structgstream.codec.fields.free_rows import MOST_FREE, FreeBins, code_free
 from structgstream.codec.fields.rows import Change
 from structgstream.errors import StreamError
+from tests.support.properties import examples
 
 
 def free(births: list[int], *, seed: int = 0, scale: float = 20.0) -> FreeBins:

@@ -11,8 +11,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
-from streams import small_scene
 from structgstream.codec.entropy.bits import varint
 from structgstream.codec.entropy.section_coder import SectionEncoder, Tables
 from structgstream.codec.fields.quantization import round_to_bins
@@ -29,6 +27,8 @@ from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.order import morton_order
 from structgstream.scene.state import STATE_TABLE, FieldName, state_of
+from tests.support.properties import examples
+from tests.support.streams import small_scene
 
 CODED: tuple[FieldName, ...] = tuple(row.name for row in STATE_TABLE if row.name not in UNCODED_FIELDS)
 STEPS: dict[FieldName, float] = {name: float(np.float32(0.01 + i / 100)) for i, name in enumerate(CODED)}

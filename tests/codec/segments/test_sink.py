@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from segment_streams import Hands, Killed, KilledStore, as_file, folder, header, packets, written
 from structgstream.codec.container.records import prefix
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import open_stream
@@ -22,6 +21,7 @@ from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest, write_archive
 from structgstream.codec.sinks import resume_segments
 from structgstream.errors import StorageError, StreamError
+from tests.support.segment_streams import Hands, Killed, KilledStore, as_file, folder, header, packets, written
 
 SENT = packets(8)
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrations import POINTS, WRITERS, pixels, truths
-from captures import HEIGHT, WIDTH
 from structgstream.data.posed import Calibration
+from tests.support.calibrations import POINTS, WRITERS, pixels, truths
+from tests.support.captures import HEIGHT, WIDTH
 
 MODULES = {"openpose": "opencv_cameras"}
 RELATIVE = ("multical", "kalibr")  # their world is the first camera

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calibrations import POINTS, pixels, truths
-from captures import HEIGHT, WIDTH
 from structgstream.data.calibration_files.reading import calibration_of, readable
 from structgstream.data.lenses import from_integer_centers
 from structgstream.data.posed import Calibration, PosedCamera, intrinsics, rigid
 from structgstream.data.text_files import number, read_text
 from structgstream.data.text_files import pixels as picture_pixels
 from structgstream.errors import CalibrationError
+from tests.support.calibrations import POINTS, pixels, truths
+from tests.support.captures import HEIGHT, WIDTH
 
 ROOT = Path(__file__).parents[3]
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrations import truths, write_kalibr, write_multical, write_opencv, write_qualisys, write_zju
 from structgstream.data.calibration_files import kalibr, multical, opencv_cameras, qualisys, zju_mocap
 from structgstream.data.lenses import RadialTangential
 from structgstream.data.posed import rigid
 from structgstream.errors import CalibrationError
+from tests.support.calibrations import truths, write_kalibr, write_multical, write_opencv, write_qualisys, write_zju
 
 
 def test_kalibrs_wiki(tmp_path: Path) -> None:

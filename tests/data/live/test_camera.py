@@ -17,12 +17,12 @@ import av.error
 import numpy as np
 import pytest
 
-from senders import moving_pictures, sent_stream
 from structgstream.data.live.camera import MOST_UNSTAMPED, CameraFeed
 from structgstream.data.live.faults import FaultLog
 from structgstream.data.live.matching import LivePicture
 from structgstream.data.live.rig_file import LiveCamera, TimeBase
 from structgstream.data.live.stamps import StampReader
+from tests.support.sender_modules import moving_pictures, sent_stream
 
 WAIT = 20.0
 PERIOD = 1 / 30

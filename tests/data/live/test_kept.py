@@ -8,7 +8,7 @@ import pytest
 from structgstream.data.live.kept import LAST, KeptFrames, kept_folder
 from structgstream.errors import CaptureError, StorageError
 from structgstream.frames import MultiViewFrame
-from test_picture_file import some_frame
+from tests.data.live.test_picture_file import some_frame
 
 
 def frame(index: int) -> MultiViewFrame:

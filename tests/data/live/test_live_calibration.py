@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from captures import small_rig
 from structgstream.data.clip import bundled_clip, bundled_clip_path
 from structgstream.data.lenses import LensCamera, RadialTangential
 from structgstream.data.live.calibration import (
@@ -21,6 +20,7 @@ from structgstream.data.live.calibration import (
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
 from structgstream.data.undistortion import Undistortion
 from structgstream.frames import MultiViewFrame
+from tests.support.captures import small_rig
 
 
 def prepared(folder: Path) -> PreparedCapture:

@@ -14,8 +14,6 @@ import av
 import numpy as np
 import pytest
 
-from rigs import arc_rig
-from senders import moving_pictures, sender, sent_loops, sent_stream
 from structgstream.data.denoising import DenoisingConfig
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.live import recording
@@ -29,7 +27,9 @@ from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_p
 from structgstream.data.source import frame_count, may_read_ahead
 from structgstream.data.video_pictures import srgb
 from structgstream.errors import CaptureError, ConfigError, StorageError
-from tests.varied import varied
+from tests.support.rigs import arc_rig
+from tests.support.sender_modules import moving_pictures, sender, sent_loops, sent_stream
+from tests.support.varied import varied
 
 NAMES = ("a", "b", "c")
 FPS = 30.0

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.data.live.faults import Fault
 from structgstream.data.live.matching import LivePicture, PictureSet, SetMatcher
+from tests.support.properties import examples
 
 PERIOD = 1 / 30
 

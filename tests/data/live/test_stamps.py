@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.data.live.faults import Fault
 from structgstream.data.live.rig_file import TimeBase
 from structgstream.data.live.stamps import Jumps, Placed, StampReader
+from tests.support.properties import examples
 
 UNIX = 1_700_000_000.0
 PERIOD = 1 / 30

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from filmed import Film, board_plane, ring, turned
 from structgstream.data.lenses import LensCamera
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.board import Board
 from structgstream.preparation.calibration.board_sightings import board_sightings
+from tests.support.filmed import Film, board_plane, ring, turned
 
 BOARD = Board(9, 5, 0.09)
 RIG = ring(2, radius=1.1, arc_degrees=30, focal=300, size=(360, 270))

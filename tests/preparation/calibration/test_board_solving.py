@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from filmed import Film, board_plane, ring, turned
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.board import Board
 from structgstream.preparation.calibration.board_solving import solve_board
 from structgstream.preparation.calibration.colmap import LensModel
 from structgstream.preparation.calibration.comparison import calibration_errors
+from tests.support.filmed import Film, board_plane, ring, turned
 
 BOARD = Board(7, 5, 0.12)
 INSTANTS = 16

@@ -3,8 +3,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from repetitive import POINTS, keypoints_of, ring
 from structgstream.preparation.calibration.matching import GuidedMatchConfig, all_matches, guided_matches
+from tests.support.repetitive import POINTS, keypoints_of, ring
 
 
 def test_what_looks_alike_is_told_apart_by_epipolar_lines() -> None:

@@ -6,13 +6,13 @@ from threading import Event
 import numpy as np
 import pytest
 
-from filmed import noise_texture
 from structgstream.preparation.calibration.keypoints import (
     KeypointConfig,
     all_keypoints,
     camera_keypoints,
     spread_order,
 )
+from tests.support.filmed import noise_texture
 
 pytestmark = pytest.mark.finds_keypoints
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from filmed import ring
 from structgstream.data.lenses import LensCamera
 from structgstream.preparation.calibration.colmap import colmap_camera
 from structgstream.preparation.calibration.comparison import calibration_errors
 from structgstream.preparation.calibration.mapping import Freedom, Mapper, adjust, cameras_of, filtered, mapped, size_of
 from structgstream.preparation.calibration.triangulation import PosedGraph, posed_model
 from structgstream.preparation.calibration.view_graph import verified_pairs, write_database
-from views_made import cloud, keypoints_of, matches_of
+from tests.support.filmed import ring
+from tests.support.views_made import cloud, keypoints_of, matches_of
 
 RIG = ring(5, radius=2.6, arc_degrees=80)
 NOTHING, FOCAL = Freedom(False, False, False), Freedom(True, False, False)

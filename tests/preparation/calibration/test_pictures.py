@@ -4,9 +4,9 @@
 import numpy as np
 import pytest
 
-from filmed import ring
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.calibration.pictures import checked_pictures
+from tests.support.filmed import ring
 
 
 def shots(count: int, *, size: tuple[int, int] = (48, 64)) -> list[np.ndarray]:

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 
-from filmed import filmed_room
 from structgstream.data.lenses import LensCamera, RadialTangential
 from structgstream.data.posed import rotation_matrix
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.comparison import calibration_errors
 from structgstream.preparation.calibration.refinement import refine
+from tests.support.filmed import filmed_room
 
 
 def perturbed(rig: dict[str, LensCamera], *, degrees: float, percent: float) -> dict[str, LensCamera]:

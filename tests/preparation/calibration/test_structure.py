@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from filmed import Film, filmed_room, noise_texture, ring, room
 from structgstream.data.lenses import RadialTangential
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.calibration import structure
 from structgstream.preparation.calibration.comparison import calibration_errors
 from structgstream.preparation.calibration.structure import solve_structure
+from tests.support.filmed import Film, filmed_room, noise_texture, ring, room
 
 Pictures = dict[str, list[NDArray[np.uint8]]]
 

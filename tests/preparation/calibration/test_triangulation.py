@@ -5,13 +5,13 @@ from functools import cache
 
 import numpy as np
 
-from filmed import ring
 from structgstream.data.lenses import RadialTangential
 from structgstream.preparation.calibration.colmap import colmap_camera
 from structgstream.preparation.calibration.mapping import observed
 from structgstream.preparation.calibration.triangulation import PosedGraph, posed_model, without
 from structgstream.preparation.calibration.view_graph import verified_pairs
-from views_made import cloud, keypoints_of, matches_of
+from tests.support.filmed import ring
+from tests.support.views_made import cloud, keypoints_of, matches_of
 
 RIG = ring(4, radius=2.6, arc_degrees=50, lens=RadialTangential(k1=-0.1))
 POINTS = cloud()

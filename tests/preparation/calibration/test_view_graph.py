@@ -7,11 +7,11 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from filmed import ring
-from properties import examples
 from structgstream.preparation.calibration.colmap import colmap_camera, pycolmap_module
 from structgstream.preparation.calibration.view_graph import connected, verified_pairs, write_database
-from views_made import cloud, keypoints_of, matches_of
+from tests.support.filmed import ring
+from tests.support.properties import examples
+from tests.support.views_made import cloud, keypoints_of, matches_of
 
 RIG = ring(3, radius=2.6, arc_degrees=40)
 CAMERAS = {name: colmap_camera(filmed, number) for number, (name, filmed) in enumerate(RIG.items(), 1)}

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from memory_captures import MemoryCapture
-from planes import room_frame, room_rig
 from structgstream.cameras import Camera, CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.evidence import gather
 from structgstream.pose_check.explanations import explain
 from structgstream.pose_check.verdicts import judge
 from structgstream.preparation.checking.check import Checked, check_capture
+from tests.support.memory_captures import MemoryCapture
+from tests.support.planes import room_frame, room_rig
 
 Cameras = dict[str, Camera]
 TURNED = ("cam02", 1.0)

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from rooms import write_room
 from structgstream.errors import CaptureError
 from structgstream.preparation.prepare import check_folder
+from tests.support.rooms import write_room
 
 
 class Noted:

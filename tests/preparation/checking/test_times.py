@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import pytest
 
-from memory_captures import MemoryCapture
-from planes import room_frame, room_rig
 from structgstream.preparation.checking.times import LEAST_FRAMES, measure_times, time_findings
 from structgstream.preparation.synchronization import SynchronizationCheck
-from takes import MadeSource, ring
+from tests.support.memory_captures import MemoryCapture
+from tests.support.planes import room_frame, room_rig
+from tests.support.takes import MadeSource, ring
 
 PERIOD = 1 / 30
 

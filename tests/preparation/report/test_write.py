@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from drawn import pixels_of
-from memory_captures import MemoryCapture
-from planes import room_frame, room_rig
 from structgstream.errors import StorageError
 from structgstream.preparation.checking.check import check_capture
 from structgstream.preparation.report.write import write_report
+from tests.support.drawn import pixels_of
+from tests.support.memory_captures import MemoryCapture
+from tests.support.planes import room_frame, room_rig
 
 
 def test_the_page_shows_everything_and_loads_nothing(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from structgstream.preparation.synchronization.audio import (
     sound_of,
 )
 from structgstream.preparation.synchronization.solving import Solution
-from takes import heard, lenses, ring
+from tests.support.takes import heard, lenses, ring
 
 CLOCKS = {"a": Clock(0.0), "b": Clock(1.2345), "c": Clock(0.6)}
 

@@ -7,7 +7,7 @@ import pytest
 from structgstream.cameras import CameraRig
 from structgstream.data.clip import bundled_clip
 from structgstream.preparation.synchronization import check_synchronization
-from takes import MadeSource, ring
+from tests.support.takes import MadeSource, ring
 
 RIG = CameraRig(ring(4))
 

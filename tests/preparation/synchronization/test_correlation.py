@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.preparation.synchronization.correlation import (
     Signal,
     best_lag,
@@ -14,6 +13,7 @@ from structgstream.preparation.synchronization.correlation import (
     lag_changes,
     resampled,
 )
+from tests.support.properties import examples
 
 
 def smooth(times: np.ndarray, channels: int, seed: int = 0) -> np.ndarray:

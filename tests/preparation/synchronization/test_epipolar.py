@@ -6,7 +6,7 @@ import pytest
 
 from structgstream.preparation.synchronization.changes import Changes
 from structgstream.preparation.synchronization.epipolar import BUNDLES, CalibratedGeometry, PairGeometry, line_signals
-from takes import HEIGHT, WIDTH, lenses, ring
+from tests.support.takes import HEIGHT, WIDTH, lenses, ring
 
 CAMERAS = lenses(ring(3))
 

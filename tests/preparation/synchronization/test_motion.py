@@ -19,7 +19,7 @@ from structgstream.preparation.synchronization.motion import (
     pair_signals,
     solve_by_motion,
 )
-from takes import MadeStreams, lenses, ring
+from tests.support.takes import MadeStreams, lenses, ring
 
 VIEWS = ring(4)
 OFFSETS = {"cam0": 0.0, "cam1": 0.35, "cam2": -0.2333, "cam3": 0.5167}

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from structgstream.preparation.synchronization.streams import StatesMetadata, period_seconds
-from takes import MadeStreams
+from tests.support.takes import MadeStreams
 
 
 def test_the_period_is_that_of_most_frames() -> None:

@@ -9,7 +9,7 @@ import pytest
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.preparation.synchronization import synchronize
-from takes import MadeStreams, heard, lenses, ring
+from tests.support.takes import MadeStreams, heard, lenses, ring
 
 VIEWS = ring(3, degrees=60)
 CLOCKS = {"cam0": Clock(0.0), "cam1": Clock(0.4), "cam2": Clock(0.15)}

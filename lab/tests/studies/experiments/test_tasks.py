@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 import torch
 
-from backends import quickest_backend
 from small_runs import CLIP, compact, quick
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
@@ -27,6 +26,7 @@ from structgstream_studies.errors import ExperimentError
 from structgstream_studies.experiments.results import Result, read_result
 from structgstream_studies.experiments.tasks import FirstFrameRun, VariantRun
 from structgstream_studies.experiments.variants import variants
+from tests.support.backends import quickest_backend
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from backends import quickest_backend
-from memory_captures import MemoryCapture
 from peers.captures import Watched, moving_capture
 from structgstream.codec.container.records import scan_records
 from structgstream.codec.packets import PacketKind
@@ -21,6 +19,8 @@ from structgstream.session import FrameReport
 from structgstream_studies.peers.codec import peer_pipeline
 from structgstream_studies.peers.methods import METHODS, TINY_METHODS, AnyMethod, open_peer
 from structgstream_studies.peers.threedgstream import ThreeDGStream, ThreeDGStreamConfig
+from tests.support.backends import quickest_backend
+from tests.support.memory_captures import MemoryCapture
 
 BACKEND = quickest_backend()
 NAMES = list(TINY_METHODS)

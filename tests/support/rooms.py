@@ -5,10 +5,10 @@ import json
 import shutil
 from pathlib import Path
 
-from captures import write_video
-from planes import HEIGHT, WIDTH, room_frame, room_rig
-from shared_folder import made_once
 from structgstream.cameras import CameraRig
+from tests.support.captures import write_video
+from tests.support.planes import HEIGHT, WIDTH, room_frame, room_rig
+from tests.support.shared_folder import made_once
 
 
 def write_room(folder: Path, *, cameras: int = 5, frames: int = 2) -> CameraRig:

@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from captures import write_video
-from filmed import Film, board_plane, ring, room, turned
 from structgstream.data.lenses import LensCamera
 from structgstream.preparation.calibration.board import Board
-from takes import balls
+from tests.support.captures import write_video
+from tests.support.filmed import Film, board_plane, ring, room, turned
+from tests.support.takes import balls
 
 FPS = 30.0
 FOCAL, SIZE = 290.0, (320, 240)

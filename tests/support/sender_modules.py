@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-FOLDER = Path(__file__).parent / "support" / "senders"
+FOLDER = Path(__file__).parent / "senders"
 
 
 def sender() -> ModuleType:

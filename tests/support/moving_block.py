@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigs import arc_rig
-from small_presets import QUICK
 from structgstream.periods import PeriodConfig
+from tests.support.rigs import arc_rig
+from tests.support.small_presets import QUICK
 
 RIG = arc_rig(4, width=40, height=30)
 PERIODS = replace(

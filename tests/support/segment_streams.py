@@ -5,13 +5,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from streams import header_for, moved, small_scene
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.sink import Clocks, SegmentsSink
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.codec.sinks import MemorySink, StoredSegments, resume_segments
+from tests.support.streams import header_for, moved, small_scene
 
 
 class Killed(BaseException):

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from rigs import arc_rig, random_scene
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians, concatenate
@@ -20,6 +19,7 @@ from structgstream.training.online.preprocess import detect_changes
 from structgstream.training.online.select import DynamicSelection, select_dynamic
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.views import View
+from tests.support.rigs import arc_rig, random_scene
 
 
 @dataclass(frozen=True)

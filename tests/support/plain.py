@@ -4,11 +4,11 @@
 import torch
 from torch import Tensor
 
-from rigs import arc_rig
 from structgstream.cameras import Camera
 from structgstream.exporters.baked_gaussians import BakedGaussians
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.render import render
+from tests.support.rigs import arc_rig
 
 RIG = arc_rig(4, width=64, height=48)
 

@@ -10,9 +10,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from captures import HEIGHT, WIDTH, small_rig
 from structgstream.data.arrays import Floats
 from structgstream.data.posed import PosedCamera
+from tests.support.captures import HEIGHT, WIDTH, small_rig
 
 POINTS = np.random.default_rng(3).uniform(-0.6, 0.6, (30, 3))
 NAMES = ("cam00", "cam01", "cam02")

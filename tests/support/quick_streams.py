@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from backends import QUICKEST
-from small_clip import small_clip_path
 from structgstream.cli import main
+from tests.support.backends import QUICKEST
+from tests.support.small_clip import small_clip_path
 
 CLIP = str(small_clip_path())
 SMALL = ["--frames", "3", "--scale", "0.25"]

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rigs import look_at
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.arrays import Floats
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.timeline import Clock
 from structgstream.frames import MultiViewFrame
+from tests.support.rigs import look_at
 
 WIDTH, HEIGHT = 160, 120
 SOUND_HERTZ = 96000

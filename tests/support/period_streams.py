@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
-from streams import compact_header, header_for, moved, small_scene
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
 from structgstream.codec.sinks import MemorySink
 from structgstream.scene.scene import Scene
+from tests.support.streams import compact_header, header_for, moved, small_scene
 
 LENGTHS = (4, 5, 3)
 """Frames of each period; key packets are every second frame, and where a period begins."""

@@ -6,7 +6,6 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-from streams import header_for, moved, small_scene, small_stream
 from structgstream.codec.container.records import PREFIX, read_record
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.header import unpack_header
@@ -15,6 +14,7 @@ from structgstream.groups.base import GroupBase
 from structgstream.groups.segment_file import SegmentIdentity
 from structgstream.groups.segment_sink import SegmentSink
 from structgstream.scene.scene import Scene
+from tests.support.streams import header_for, moved, small_scene, small_stream
 
 FIRST, END = 3, 7
 IDENTITY = SegmentIdentity("header", "capture", "track", {"iterations": 6, "births": 50}, FIRST, END)

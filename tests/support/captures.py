@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rigs import arc_rig
 from structgstream.cameras import Camera, CameraRig
+from tests.support.rigs import arc_rig
 
 Picture = NDArray[np.uint8]
 WIDTH, HEIGHT = 64, 48

@@ -12,7 +12,7 @@ from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.matching import inside, project
 from structgstream.pose_check.evidence import Evidence
-from takes import ring
+from tests.support.takes import ring
 
 Cameras = dict[str, Camera]
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import torch
 
-from rigs import arc_rig, random_scene
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.fields.packet_fields import FREE_FIELDS, dequantize_state, quantize_state
 from structgstream.codec.fields.quantization import round_to_bins
@@ -16,6 +15,7 @@ from structgstream.codec.sinks import MemorySink
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, parameters_of, scene_of, state_of
 from structgstream.similarity import Similarity
+from tests.support.rigs import arc_rig, random_scene
 
 
 def header_for(scene: Scene, *, dynamic: frozenset[FieldName] = PAPER_DYNAMIC) -> StreamHeader:

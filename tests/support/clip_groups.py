@@ -6,10 +6,6 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from backends import quickest_backend
-from shared_folder import made_once
-from small_clip import small_clip_path
-from small_presets import QUICK
 from structgstream.api import reconstruct
 from structgstream.groups.base import GroupBase
 from structgstream.groups.first_frame import GroupStartConfig
@@ -17,6 +13,10 @@ from structgstream.groups.pictures import open_for
 from structgstream.groups.track_pass import TrackOptions, track_capture
 from structgstream.groups.tracking import TrackConfig
 from structgstream.groups.unit import SegmentTask, fit_segment
+from tests.support.backends import quickest_backend
+from tests.support.shared_folder import made_once
+from tests.support.small_clip import small_clip_path
+from tests.support.small_presets import QUICK
 
 FRAMES, LENGTH = 6, 2
 START = GroupStartConfig(iterations=6, rounds=2, births=50)

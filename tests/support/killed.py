@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
-from properties import THOROUGH
+from tests.support.properties import THOROUGH
 
 _LOOKS = {"stat", "lstat", "fstat", "fspath", "getpid", "getcwd", "listdir", "scandir", "access", "get_terminal_size"}
 MOST = 500

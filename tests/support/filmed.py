@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rigs import look_at
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.lenses import Lens, LensCamera, Pinhole, RadialTangential
 from structgstream.preparation.calibration.board import Board
+from tests.support.rigs import look_at
 
 Picture = NDArray[np.uint8]
 

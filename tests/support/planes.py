@@ -5,10 +5,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rigs import look_at
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.matching import back_project, project
 from structgstream.frames import MultiViewFrame
+from tests.support.rigs import look_at
 
 WIDTH, HEIGHT = 160, 120
 # y points down: a back wall, a floor, and a board that stands in front of the wall.

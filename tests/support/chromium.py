@@ -21,9 +21,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pictures import decoded_picture
+from tests.support.pictures import decoded_picture
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PATIENCE_SECONDS = 90.0
 # WebGL2 in software, wherever this runs; root may not use the sandbox.
 FLAGS = (

@@ -5,8 +5,8 @@ import json
 import shutil
 from pathlib import Path
 
-from shared_folder import made_once
 from structgstream.data.clip import bundled_clip_path
+from tests.support.shared_folder import made_once
 
 CAMERAS = ("cam00", "cam01", "cam02", "cam03", "cam04", "cam05")
 """The held-out one, and five on an arc around it."""
