@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.codec.packets import PacketKind
-from structgstream.key_frames import LEAST_FRAMES, KeyFrames
+from structgstream.key_frames import MIN_FRAMES, KeyFrames
 
 
 def keys_of(keys: KeyFrames, times: list[float], *, first: int = 0) -> list[int]:
@@ -34,7 +34,7 @@ def test_where_frames_are_left_out_groups_last_as_long() -> None:
 def test_a_group_has_a_few_frames_however_far_apart_these_are() -> None:
     times = [3.0 * index for index in range(20)]
     found = keys_of(KeyFrames(30, 30.0), times)
-    assert {after - before for before, after in pairwise(found)} == {LEAST_FRAMES}
+    assert {after - before for before, after in pairwise(found)} == {MIN_FRAMES}
     assert keys_of(KeyFrames(2, 30.0), times) == [*range(0, 20, 2)]
 
 
@@ -49,7 +49,7 @@ def test_a_resumed_stream_has_the_same_groups(stopped: int) -> None:
     assert before + keys_of(resumed, times[stopped:], first=stopped) == whole
 
 
-@pytest.mark.parametrize(("apart", "group"), [(1 / 30, 30), (0.1, 10), (9.0, LEAST_FRAMES)])
+@pytest.mark.parametrize(("apart", "group"), [(1 / 30, 30), (0.1, 10), (9.0, MIN_FRAMES)])
 def test_frames_before_a_key_frame_are_near_it(apart: float, group: int) -> None:
     keys = KeyFrames(30, 30.0)
     assert not keys.near(0, 0.0, within=3)
@@ -57,7 +57,7 @@ def test_frames_before_a_key_frame_are_near_it(apart: float, group: int) -> None
     assert [i for i in range(group) if keys.near(i, i * apart, within=3)] == [group - 3, group - 2, group - 1]
 
 
-@pytest.mark.parametrize(("apart", "group"), [(1 / 30, 30), (0.1, 10), (9.0, LEAST_FRAMES)])
+@pytest.mark.parametrize(("apart", "group"), [(1 / 30, 30), (0.1, 10), (9.0, MIN_FRAMES)])
 @pytest.mark.parametrize("since", [0, 1, 4])
 def test_key_frames_are_foreseen(apart: float, group: int, since: int) -> None:
     keys = KeyFrames(30, 30.0)
@@ -70,4 +70,4 @@ def test_a_group_that_has_lasted_too_long_ends_with_the_next_frame() -> None:
     keys = KeyFrames(30, 30.0)
     keys.begin(0, 0.0)
     assert [*islice(keys.ahead(7, 60.0, spacing=0.1), 2)] == [1, 11]
-    assert (keys.interval, keys.least, KeyFrames(3, 30.0).least) == (30, LEAST_FRAMES, 3)
+    assert (keys.interval, keys.least, KeyFrames(3, 30.0).least) == (30, MIN_FRAMES, 3)

@@ -30,8 +30,8 @@ from tests.support.worlds import World, moving_world
 FRAMES = 650
 SETTLED = 100  # caches, pools of allocators and the free set are full by then
 # A kept packet is 17 kB and a kept set of pictures 7 kB a frame: either is more than 3.4 MB over 500 frames.
-MOST_GROWTH_BYTES = 3 * 2**20
-MOST_NEW_OBJECTS = 50
+MAX_GROWTH_BYTES = 3 * 2**20
+MAX_NEW_OBJECTS = 50
 MEGABYTES_64 = 63 * 2**20
 
 needs_resident = pytest.mark.skipif(resident_bytes() is None, reason="the system does not tell the resident size")
@@ -152,8 +152,8 @@ def held() -> tuple[int, int]:
 
 
 def check_growth(before: tuple[int, int], after: tuple[int, int]) -> None:
-    assert after[0] - before[0] < MOST_GROWTH_BYTES, f"{before[0]:,} bytes grew to {after[0]:,}"
-    assert after[1] - before[1] < MOST_NEW_OBJECTS, f"{before[1]:,} objects grew to {after[1]:,}"
+    assert after[0] - before[0] < MAX_GROWTH_BYTES, f"{before[0]:,} bytes grew to {after[0]:,}"
+    assert after[1] - before[1] < MAX_NEW_OBJECTS, f"{before[1]:,} objects grew to {after[1]:,}"
 
 
 @needs_resident
@@ -180,7 +180,7 @@ def test_a_long_run_and_reading_it_back_hold_no_more_at_the_end_than_at_the_begi
     check_growth(measured[SETTLED], measured[last])
     assert frees == [100, 100]  # a scene that grew would be no measure of what the loop keeps
     size = path.stat().st_size
-    assert size > 3 * MOST_GROWTH_BYTES  # so that a reader that keeps the file is seen
+    assert size > 3 * MAX_GROWTH_BYTES  # so that a reader that keeps the file is seen
     closed = held()
     with open_stream(path) as reader:
         for info, _ in reader.scenes():
@@ -188,4 +188,4 @@ def test_a_long_run_and_reading_it_back_hold_no_more_at_the_end_than_at_the_begi
                 measured[info.index] = held()
         assert len(reader) == last + 1
     check_growth(measured[SETTLED], measured[last])
-    assert measured[last][0] - closed[0] < MOST_GROWTH_BYTES
+    assert measured[last][0] - closed[0] < MAX_GROWTH_BYTES

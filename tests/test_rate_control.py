@@ -7,7 +7,7 @@ import pytest
 
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError
-from structgstream.key_frames import LEAST_FRAMES, KeyFrames
+from structgstream.key_frames import MIN_FRAMES, KeyFrames
 from structgstream.rate_control import LEAST, MOST, RateConfig, RateController, with_rate_control
 from structgstream.training.online.config import OnlineConfig
 
@@ -173,7 +173,7 @@ def test_the_rate_is_one_of_media_time_where_frames_are_left_out(seconds: float,
         all_changes = changes * min(index, 9) ** 0.5 if run.kind is PacketKind.KEY else changes
         run.add(int(all_changes) if index else 300)
     keys = [i for i, (_, _, kind) in enumerate(run.written) if kind is PacketKind.KEY]
-    assert LEAST_FRAMES <= (keys[-1] - keys[-2]) < KEY_EVERY, "by media time"
+    assert MIN_FRAMES <= (keys[-1] - keys[-2]) < KEY_EVERY, "by media time"
     later = run.written[60:]
     rate_mbits = sum(size for size, _, _ in later) * 8e-6 / (run.seconds - later[0][1])
     # Of five packets one is a key packet, and the slow answer of a cube root comes too late for some.

@@ -53,7 +53,7 @@ CONFIG = replace(
         iterations=8,
         patching=replace(COMPACT.online.patching, iteration=4),
         motion=replace(COMPACT.online.motion, picture_scale=0.5),
-        spawn=varied(COMPACT.online.spawn, RULES=SpawnRules(most_missing_share=1.0)),
+        spawn=varied(COMPACT.online.spawn, RULES=SpawnRules(max_missing_share=1.0)),
     ),
 )
 """Everything that the preset compact does with pictures, in seconds."""

@@ -32,7 +32,7 @@ CONFIG = replace(
         COMPACT.online,
         iterations=6,
         motion=varied(COMPACT.online.motion, REACH_PIXELS=1),
-        spawn=varied(COMPACT.online.spawn, RULES=SpawnRules(least_hits=2, residual_threshold=0.2)),
+        spawn=varied(COMPACT.online.spawn, RULES=SpawnRules(min_hits=2, residual_threshold=0.2)),
     ),
 )
 

@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 
 NEAR, ALL = (0.26, 0.53), (0.26, 1.7)  # depths, of the rig's radius
 BORDER = 0.06  # of the picture
-LEAST_DEPTH = 0.1  # of the radius
+MIN_DEPTH = 0.1  # of the radius
 ROUNDS = 4
 
 
@@ -113,7 +113,7 @@ def exactly_placed(name: str, estimate: Rig, truth: Rig) -> LensCamera:
 def _misses(found: Floats, points: Floats, estimate: Rig, truth: Rig) -> Floats:
     """Projections of ``found`` minus true ones of ``points``, ``[C, P, 2]``; NaN where a camera sees no point."""
     misses = np.full((len(estimate), len(points), 2), np.nan)
-    least = LEAST_DEPTH * _radius(truth)
+    least = MIN_DEPTH * _radius(truth)
     for index, (name, filmed) in enumerate(estimate.items()):
         camera = truth[name].camera
         viewmat, pixels = camera.viewmat.numpy(), truth[name].pixels(points)

@@ -27,7 +27,7 @@ from structgstream.frames import MultiViewFrame
 from structgstream.preparation.synchronization import Synchronization, check_synchronization, synchronize
 
 LATE_FRAMES = (1, 3)  # of two cameras, for the check
-MOST_FRAMES = 300
+MAX_FRAMES = 300
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = _options(arguments)
     source = bundled_clip() if options.capture is None else open_capture(options.capture)
     names = options.cameras or list(source.rig)
-    images = [frame.images for _, frame in zip(range(MOST_FRAMES), source.frames(), strict=False)]
+    images = [frame.images for _, frame in zip(range(MAX_FRAMES), source.frames(), strict=False)]
     for title, shifted in cases(source, images, names, keep=options.keep).items():
         _measure(title, shifted, calibrated=not options.uncalibrated)
     late = dict(zip((names[1], names[-1]), LATE_FRAMES, strict=True)) if len(names) > 2 else {}

@@ -7,7 +7,7 @@ from structgstream.cameras import CameraRig
 from structgstream.data.points import PointsConfig, initial_points
 from structgstream.data.source import FrameStream
 from structgstream.errors import CaptureError
-from structgstream.frames import LEAST_CAMERAS, MultiViewFrame
+from structgstream.frames import MIN_CAMERAS, MultiViewFrame
 from structgstream.similarity import Similarity
 
 
@@ -18,7 +18,7 @@ def frame_seed(seed: int, index: int) -> int:
 
 def shows_enough(frame: MultiViewFrame, rig: CameraRig) -> bool:
     """Whether a later frame can be fitted: at least two training cameras have pictures that are not blank."""
-    return len(frame.showing(rig.training)) >= LEAST_CAMERAS
+    return len(frame.showing(rig.training)) >= MIN_CAMERAS
 
 
 def check_enough_pictures(frame: MultiViewFrame, rig: CameraRig, capture: str) -> None:
@@ -28,10 +28,10 @@ def check_enough_pictures(frame: MultiViewFrame, rig: CameraRig, capture: str) -
         CaptureError: they do not; the message names the cameras.
     """
     present = frame.present(rig.training) if frame.index else frame.showing(rig.training)
-    if len(present) < LEAST_CAMERAS:
+    if len(present) < MIN_CAMERAS:
         raise CaptureError(
             f"Frame {frame.index} of {capture} has pictures of {', '.join(present) or 'none'} of its "
-            f"{len(rig.training)} training cameras; at least {LEAST_CAMERAS} are needed. Restore them, or choose "
+            f"{len(rig.training)} training cameras; at least {MIN_CAMERAS} are needed. Restore them, or choose "
             "frames before or after it (--start, --frames)."
         )
 

@@ -2,7 +2,7 @@
 """Selection of key frames, each of which begins a group that can be decoded without earlier packets.
 
 Without skipped frames a key frame comes at a constant interval of frames. A live run that skips pictures has fewer
-frames per second. Its groups end after the duration of that interval, but not before they have :data:`LEAST_FRAMES`
+frames per second. Its groups end after the duration of that interval, but not before they have :data:`MIN_FRAMES`
 frames, because key packets are several times as large as others.
 """
 
@@ -11,7 +11,7 @@ from itertools import count
 
 from structgstream.codec.packets import PacketKind
 
-LEAST_FRAMES = 5
+MIN_FRAMES = 5
 _SAME = 0.5  # tolerance in frames, because times of frames jitter
 
 
@@ -49,7 +49,7 @@ class KeyFrames:
     @property
     def least(self) -> int:
         """Smallest number of frames in a group."""
-        return min(self._interval, LEAST_FRAMES)
+        return min(self._interval, MIN_FRAMES)
 
     def ahead(self, index: int, pts_seconds: float, *, spacing: float) -> Iterator[int]:
         """Distances of the next key frames from frame ``index``, in frames; frames come every ``spacing`` seconds."""
@@ -67,4 +67,4 @@ class KeyFrames:
 
     def _ends(self, frames: int, seconds: float) -> bool:
         """Whether a group with this number of frames and this duration ends here."""
-        return frames >= self._interval or (frames >= LEAST_FRAMES and seconds >= self._seconds)
+        return frames >= self._interval or (frames >= MIN_FRAMES and seconds >= self._seconds)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from structgstream.errors import ConfigError
-from structgstream.key_frames import LEAST_FRAMES, KeyFrames
+from structgstream.key_frames import MIN_FRAMES, KeyFrames
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class PeriodPlan:
         """
         if self._config.residual is None or self._first is None:
             return False
-        if index == self._first[0] or self._config.frames >= LEAST_FRAMES:
+        if index == self._first[0] or self._config.frames >= MIN_FRAMES:
             return True
         return keys.near(index, pts_seconds, within=self._config.frames)
 

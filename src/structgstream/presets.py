@@ -2,6 +2,7 @@
 """Configurations as values. Paper mode is a preset; the paper's ablations are edits of a preset."""
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, ClassVar, Literal
@@ -39,7 +40,7 @@ from structgstream.training.online.config import (
 )
 from structgstream.training.parameters import RoundingConfig
 
-MOST_QUALITY = 6.0  # steps 64 times as small, or as large
+MAX_QUALITY = 6.0  # steps 64 times as small, or as large
 
 
 @dataclass(frozen=True)
@@ -117,27 +118,34 @@ RENAMED: Mapping[str, str] = {
     "online.motion.moved_ease": "hysteresis",
     "online.start": "scene_flow",
 }
-"""The names that fields of earlier versions, by their whole path, have now."""
+"""The names that fields of earlier versions, by their whole path, have now; beside them ``least_`` is ``min_`` and
+``most_`` is ``max_``."""
+
+
+def present_name(path: str) -> str:
+    """The present name of the field or group that had ``path`` in an earlier version."""
+    name = path.rpartition(".")[2]
+    return RENAMED.get(path) or re.sub("^most_", "max_", re.sub("^least_", "min_", name))
 
 
 def renamed(path: str) -> str:
     """The present path of a field or a group that had ``path`` in an earlier version."""
     parts = path.split(".")
-    return ".".join(RENAMED.get(".".join(parts[: n + 1]), part) for n, part in enumerate(parts))
+    return ".".join(present_name(".".join(parts[: n + 1])) for n in range(len(parts)))
 
 
 def from_json(values: Mapping[str, Any]) -> StreamConfig:
     """The configuration that :func:`to_json` turned into ``values``, such as a stream's header has.
 
-    Fields that ``values`` lacks, as those of an older version do, have their defaults; :data:`RENAMED` ones are read by
-    their earlier names. :data:`WITHDRAWN` ones are ignored, and so are those that are constants now and have the
-    constant's value.
+    Fields that ``values`` lacks, as those of an older version do, have their defaults; renamed ones are read by their
+    earlier names (:func:`present_name`). :data:`WITHDRAWN` ones are ignored, and so
+    are those that are constants now and have the constant's value.
 
     Raises:
         ConfigError: there is a field that this version does not have, another value than that of a constant, or a value
             that no field can have.
     """
-    values = without_constants(StreamConfig, with_present_names(without_fields(values, WITHDRAWN), RENAMED))
+    values = without_constants(StreamConfig, with_present_names(without_fields(values, WITHDRAWN), present_name))
     if unknown := [*unknown_fields(StreamConfig, values)]:
         raise ConfigError(
             f"The header's configuration has the field {unknown[0]}, which this version of structgstream does not "
@@ -193,9 +201,9 @@ def with_budget(config: StreamConfig, *, name: str | None, quality: float | None
             "Add --preset compact."
         )
     if quality is not None:
-        if not abs(quality) <= MOST_QUALITY:
+        if not abs(quality) <= MAX_QUALITY:
             raise ConfigError(
-                f"--quality {quality:g} is not one of {-MOST_QUALITY:g} to {MOST_QUALITY:g}: 0 is the preset's own, "
+                f"--quality {quality:g} is not one of {-MAX_QUALITY:g} to {MAX_QUALITY:g}: 0 is the preset's own, "
                 "and 1 more makes every step half as large."
             )
         rounding = replace(config.online.rounding, quality=quality)
@@ -318,7 +326,7 @@ COMPACT = replace(
             eligible_count=30,
             prune_visits=60,
             max_anchors=50_000,
-            least_growth=0.25,
+            min_growth=0.25,
             room_until=1600,
         ),
         losses=replace(MOTION.initial.losses, l1=0.6, ssim=0.45),

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("quick_presets")
 def test_demo_leaves_everything_to_look_at(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(render, "LEAST_PATH_SECONDS", 0.1)
+    monkeypatch.setattr(render, "MIN_PATH_SECONDS", 0.1)
     out = tmp_path / "demo"
     assert main(["demo", "--output", str(out), "--frames", "2", "--scale", "0.25", *QUICK]) == 0
     made = {str(entry.relative_to(out)) for entry in out.rglob("*") if entry.is_file()}

@@ -11,9 +11,9 @@ from collections.abc import Callable
 
 import numpy as np
 import zstandard
-from tests.vectors.generate import COMPACT_EXPECTED, COMPACT_STREAM
 
 from tests.support.documented import FREE, Model, Packet, Row, Rows, read_free
+from tests.vectors.generate import COMPACT_EXPECTED, COMPACT_STREAM
 
 NAMES = {1: "anchor_positions", 2: "offset_scales", 3: "base_scales", 4: "anchor_offsets", 5: "anchor_features"}
 NAMES |= {6: "opacity_mlp", 7: "color_mlp", 8: "covariance_mlp", 9: "free", 10: "free_births", 11: "camera_color"}

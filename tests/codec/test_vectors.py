@@ -14,6 +14,12 @@ from typing import Any
 import pytest
 import torch
 import zstandard
+
+from structgstream.codec.container.records import scan_records
+from structgstream.codec.reader import StreamReader, open_stream
+from structgstream.codec.segments.manifest import manifest_from_json, manifest_to_json
+from structgstream.codec.segments.stored_bytes import open_segments
+from structgstream.scene.state import state_of
 from tests.vectors.generate import (
     COMPACT_EXPECTED,
     COMPACT_STEPS,
@@ -30,12 +36,6 @@ from tests.vectors.generate import (
     golden_header,
     golden_stream,
 )
-
-from structgstream.codec.container.records import scan_records
-from structgstream.codec.reader import StreamReader, open_stream
-from structgstream.codec.segments.manifest import manifest_from_json, manifest_to_json
-from structgstream.codec.segments.stored_bytes import open_segments
-from structgstream.scene.state import state_of
 
 
 def canonical(data: bytes) -> tuple[bytes, bytes, list[tuple[int, bytes]], bytes]:

@@ -46,7 +46,7 @@ def rays(seed: int, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
     return pixels, (1.5 + 3 * torch.rand(150, generator=generator)).to(dtype)
 
 
-RULES = {"planes": 17, "least_supports": 2, "most_contradictions": 0.34}
+RULES = {"planes": 17, "min_supports": 2, "max_contradictions": 0.34}
 
 
 @pytest.fixture(

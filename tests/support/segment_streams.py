@@ -129,7 +129,7 @@ class KilledStore:
         """Remove, unless it is the operation."""
         self._count(f"delete {name}", lambda: self.store.delete(name))
 
-    def get(self, name: str, *, most_bytes: int | None = None) -> bytes:
+    def get(self, name: str, *, max_bytes: int | None = None) -> bytes:
         """As the store's."""
         return self.store.get(name)
 

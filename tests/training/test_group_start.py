@@ -124,7 +124,7 @@ def test_births_of_several_rounds_have_identities_of_their_own() -> None:
     world = moving_world(FRAME + 1, cameras=6, emerges_at=1, movers=0, width=96, height=64)
     none = torch.zeros(len(world.scene.anchors) + len(world.scene.free), 3)
     motion = MotionConfig(enabled=True, picture_scale=1.0)
-    config = replace(CONFIG, motion=motion, spawn=varied(SpawnConfig(enabled=True), RULES=SpawnRules(least_hits=2)))
+    config = replace(CONFIG, motion=motion, spawn=varied(SpawnConfig(enabled=True), RULES=SpawnRules(min_hits=2)))
     found = fit(world, none, start=replace(START, flow_rounds=0), config=config)
     births = found.scene.free.births
     assert len(births) > 0

@@ -11,7 +11,7 @@ from structgstream import cameras
 from structgstream.cameras import Camera, CameraRig, enlargement
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.values import TILE_PIXELS
-from structgstream.training.frame0.densify import MOST_ANCHORS, GrowthConfig
+from structgstream.training.frame0.densify import MAX_ANCHORS, GrowthConfig
 from structgstream.training.online.config import ExposureConfig, MotionConfig, SmoothnessConfig
 from structgstream.training.online.exposure import exposure_reference
 from structgstream.training.online.measure import measure
@@ -136,7 +136,7 @@ def test_larger_pictures_may_have_more_anchors() -> None:
     config = GrowthConfig(max_anchors=50_000)
     assert config.for_pictures(1.0) == config
     assert config.for_pictures(1.5).max_anchors == 75_000
-    assert config.for_pictures(100.0).max_anchors == MOST_ANCHORS
+    assert config.for_pictures(100.0).max_anchors == MAX_ANCHORS
     unbounded = GrowthConfig()
     assert unbounded.for_pictures(6.0) == unbounded
 

@@ -21,7 +21,7 @@ from tests.support.worlds import emerging_ball, moved_since, moving_world
 
 CPU = torch.device("cpu")
 WORLD = moving_world(2, cameras=6, emerges_at=1, movers=0, width=96, height=64)
-CONFIG = varied(SpawnConfig(enabled=True), RULES=SpawnRules(least_hits=2))
+CONFIG = varied(SpawnConfig(enabled=True), RULES=SpawnRules(min_hits=2))
 BACKENDS = [
     pytest.param(reference_backend, id="reference"),
     pytest.param(cpu_backend, id="cpu", marks=pytest.mark.skipif(native_reason() is not None, reason="no native")),
@@ -46,7 +46,7 @@ def renewed(
         first_birth=1 << 32,
         floor=residual_floor(WORLD.scene, first, scale=1.0, backend=backend) if floor is None else floor,
         room=room,
-        least_pixels=motion.LEAST_PIXELS,
+        min_pixels=motion.MIN_PIXELS,
         config=config,
         backend=backend,
     )
@@ -111,7 +111,7 @@ def test_off_nothing_is_born() -> None:
 
 
 def test_when_everything_is_missing_nothing_is_born_and_that_is_told() -> None:
-    found = renewed(reference_backend(), config=varied(CONFIG, RULES=replace(CONFIG.RULES, most_missing_share=1e-4)))
+    found = renewed(reference_backend(), config=varied(CONFIG, RULES=replace(CONFIG.RULES, max_missing_share=1e-4)))
     assert found.refused
     assert len(found.new_free) == 0
 
@@ -149,7 +149,7 @@ def test_a_ghost_dies() -> None:
         first_birth=1 << 32,
         floor=floor,
         room=1000,
-        least_pixels=0.3,
+        min_pixels=0.3,
         config=CONFIG,
         backend=backend,
     )
@@ -164,9 +164,9 @@ THIN = varied(
         ThinSpawnConfig.RULES,
         picture_width=96,
         missing_threshold=0.10 / 9,
-        most_contradictions=0.34,
-        most_cost=0.12,
-        least_hits=2,
+        max_contradictions=0.34,
+        max_cost=0.12,
+        min_hits=2,
     ),
 )
 
@@ -205,5 +205,5 @@ def test_a_cap_that_makes_births_coarser_is_told_in_the_log() -> None:
 
 
 def test_the_second_sweep_bears_nothing_where_much_is_missing() -> None:
-    few = varied(THIN, RULES=replace(THIN.RULES, most_missing_share=1e-4))
+    few = varied(THIN, RULES=replace(THIN.RULES, max_missing_share=1e-4))
     assert not len(renewed(reference_backend(), config=replace(BLIND, thin=few)).new_free)

@@ -32,7 +32,7 @@ def test_the_whole_in_small(tmp_path: Path) -> None:
     assert (alone["players"], together["players"]) == (0, 4)
     assert together["fast"]["exact"] == together["fast"]["players"] == 2
     assert together["slow"]["wrong"] == together["slow"]["broken"] == 0
-    assert result["live"]["server"]["most_bytes"] > 0
+    assert result["live"]["server"]["max_bytes"] > 0
     servers = result["throughput"]["segments"]["servers"]
     assert {"serve", "python -m http.server"} <= servers.keys()
     assert all(one["exact"] for one in servers.values())

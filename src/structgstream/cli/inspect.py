@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from structgstream.evaluation.byte_count import Row
 
 CHANGES = ("grown", "removed", "spawned", "pruned")
-MOST_PERIODS = 3
+MAX_PERIODS = 3
 """Tables of the fields of headers are printed for so many periods; ``--json`` has all."""
 PICTURES = (".png", ".svg", ".pdf")
 
@@ -78,7 +78,7 @@ def main(arguments: list[str]) -> None:
     for part in (
         facts_table(content["header"], rows, packets=content["packets"]),
         period_table(content["header"]["periods"]),
-        *(header_table(period) for period in content["header"]["periods"][:MOST_PERIODS]),
+        *(header_table(period) for period in content["header"]["periods"][:MAX_PERIODS]),
         packets,
     ):
         if part is None:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from structgstream.frame_report import FrameReport
     from structgstream.training.result import Step
 
-MOST_NAMES = 5
+MAX_NAMES = 5
 QUIET_SECONDS = 15.0  # without a terminal, interval of progress lines within a frame
 
 
@@ -90,7 +90,7 @@ def absences(cameras: Sequence[str]) -> str:
     """A remark on the cameras without a picture of the frame; empty without any."""
     if not cameras:
         return ""
-    names = ", ".join(cameras[:MOST_NAMES]) + (", ..." if len(cameras) > MOST_NAMES else "")
+    names = ", ".join(cameras[:MAX_NAMES]) + (", ..." if len(cameras) > MAX_NAMES else "")
     return f"  [absent: {names}]" if len(cameras) == 1 else f"  [{len(cameras)} cameras absent: {names}]"
 
 

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from structgstream.kernels.backend import Backend
     from structgstream.scene.scene import Scene
 
-LEAST_PATH_SECONDS = 4.0  # a shorter stream is played slowed, forward and backward, while the camera moves
-MOST_PATH_SECONDS = 3600.0
+MIN_PATH_SECONDS = 4.0  # a shorter stream is played slowed, forward and backward, while the camera moves
+MAX_PATH_SECONDS = 3600.0
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ def main(arguments: list[str]) -> None:
         raise UsageError("--compare needs the capture's folder after the stream, and a camera, not a --path.")
     if options.scene is not None and not options.compare:
         raise UsageError("the capture's folder is only used with --compare.")
-    if options.seconds is not None and not (options.path and 0.0 < options.seconds <= MOST_PATH_SECONDS):
-        raise UsageError(f"--seconds is the duration of a --path, above 0 and at most {MOST_PATH_SECONDS:g}.")
+    if options.seconds is not None and not (options.path and 0.0 < options.seconds <= MAX_PATH_SECONDS):
+        raise UsageError(f"--seconds is the duration of a --path, above 0 and at most {MAX_PATH_SECONDS:g}.")
     if options.between is not None and options.path != "arc":
         raise UsageError("--between gives the ends of --path arc.")
     from structgstream.codec.reader import open_stream
@@ -149,7 +149,7 @@ def path_pictures(
     from structgstream.scene.state import on_device
 
     header = reader.header
-    length = max(len(reader.packets) / header.fps, LEAST_PATH_SECONDS) if seconds is None else seconds
+    length = max(len(reader.packets) / header.fps, MIN_PATH_SECONDS) if seconds is None else seconds
     count = max(round(length * header.fps), 1)
     rig = header.rig
     views: list[Camera] = orbit(rig, count, around=camera) if path == "orbit" else arc(rig, count, between=between)

@@ -13,8 +13,8 @@ from structgstream.data.posed import Calibration, PosedCamera
 
 log = logging.getLogger(__name__)
 
-LEAST_CAMERAS = 3
-MOST_OFF = 0.03
+MIN_CAMERAS = 3
+MAX_OFF = 0.03
 """Largest residual of a camera position after alignment, as a share of the rig's extent."""
 
 
@@ -26,7 +26,7 @@ def aligned_points(model: Calibration, rig: CameraRig) -> NDArray[np.float64] | 
     if model.points is None:
         return None
     found = _common(model, rig)
-    if len(found) < LEAST_CAMERAS:
+    if len(found) < MIN_CAMERAS:
         log.warning(
             "%s has %d cameras of the rig by name; its points are not used. Its pictures need the cameras' names.",
             model.where, len(found),
@@ -38,7 +38,7 @@ def aligned_points(model: Calibration, rig: CameraRig) -> NDArray[np.float64] | 
     theirs = np.array([posed.center for posed in found.values()])
     ours = np.array([rig[name].center.numpy() for name in found])
     off = np.linalg.norm(fitted.points(theirs) - ours, axis=1).max() / np.linalg.norm(np.ptp(ours, axis=0))
-    if not off <= MOST_OFF:
+    if not off <= MAX_OFF:
         log.warning(
             "The cameras of %s lie up to %.0f %% of the rig's extent away from the rig's; its points are not used.",
             model.where, 100 * off,

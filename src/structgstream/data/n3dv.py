@@ -45,7 +45,7 @@ HELD_OUT = ("cam00", "cam_0")
 MODELS = ("", "colmap", "colmap_0")
 SIDE = 640  # pixels, of pictures that are matched to tell the order of rows
 LARGEST = 1e100  # of a number of a pose
-LEAST_CONFIRMED = 0.5  # of the pairs of neighbours
+MIN_CONFIRMED = 0.5  # of the pairs of neighbours
 
 
 def recognizes_n3dv(path: Path) -> bool:
@@ -100,7 +100,7 @@ def _as_text(by_number: FrameSource, as_text: CameraRig) -> bool:
     for rig in (by_number.rig, as_text):
         cameras = {name: rig[name].resized(small.rig[name].width, small.rig[name].height) for name in names}
         shares.append(confirmed_share(cameras, matcher))
-    if max(shares) < LEAST_CONFIRMED or shares[0] == shares[1]:
+    if max(shares) < MIN_CONFIRMED or shares[0] == shares[1]:
         log.warning(
             "%s: the pictures do not say whether the rows of %s follow the names by number or as text; by "
             "number is taken. Names with leading zeros (cam01) are clear.",

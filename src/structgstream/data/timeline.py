@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.errors import CaptureError
-from structgstream.frames import LEAST_CAMERAS
+from structgstream.frames import MIN_CAMERAS
 
 log = logging.getLogger(__name__)
 
-MOST_SINGLE = 2
+MAX_SINGLE = 2
 """Cameras that lack frames and get a line each; of more one line tells."""
 
 
@@ -156,7 +156,7 @@ def _end(slots: Mapping[str, Sequence[int]], training: Collection[str] | None) -
     """The last slot that half of the cameras, and two training cameras, reach."""
     ends = sorted((own[-1] for own in slots.values()), reverse=True)
     trained = sorted((own[-1] for name, own in slots.items() if training is None or name in training), reverse=True)
-    return min(ends[(len(ends) - 1) // 2], trained[min(LEAST_CAMERAS, len(trained)) - 1])
+    return min(ends[(len(ends) - 1) // 2], trained[min(MIN_CAMERAS, len(trained)) - 1])
 
 
 def _tell_cuts(
@@ -191,7 +191,7 @@ def _tell_absences(
     count = last - first + 1
     gaps = {camera: sorted({*range(first, own[-1] + 1)}.difference(own)) for camera, own in slots.items()}
     gaps = {camera: lacking for camera, lacking in gaps.items() if lacking}
-    if len(gaps) > MOST_SINGLE:
+    if len(gaps) > MAX_SINGLE:
         listed = ", ".join(f"{camera!r} {len(lacking)}" for camera, lacking in gaps.items())
         log.warning("%s: %d cameras lack some of %d frames and are absent there: %s", where, len(gaps), count, listed)
         gaps = {}
@@ -210,10 +210,10 @@ def _tell_absences(
     for camera, own in slots.items():
         if training is None or camera in training:
             seeing[np.array(own) - first] += 1
-    sparse = np.flatnonzero(seeing < LEAST_CAMERAS)
-    if len(sparse) and (training is None or len(training) >= LEAST_CAMERAS):
+    sparse = np.flatnonzero(seeing < MIN_CAMERAS)
+    if len(sparse) and (training is None or len(training) >= MIN_CAMERAS):
         log.warning(
             "%s: %d frames, the first of them %s, have pictures of fewer than %d training cameras, so a reconstruction "
             "stops there; restore them, or choose frames before or after",
-            where, len(sparse), label(first + int(sparse[0])), LEAST_CAMERAS,
+            where, len(sparse), label(first + int(sparse[0])), MIN_CAMERAS,
         )  # fmt: skip

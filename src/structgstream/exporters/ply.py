@@ -11,7 +11,7 @@ import torch
 
 from structgstream.exporters.baked_gaussians import BakedGaussians
 
-LEAST_OPACITY = 1e-6  # A logit of 0 or 1 is not finite.
+MIN_OPACITY = 1e-6  # A logit of 0 or 1 is not finite.
 
 
 def properties(degree: int) -> list[str]:
@@ -32,7 +32,7 @@ def ply_bytes(gaussians: BakedGaussians) -> bytes:
         torch.zeros_like(gaussians.means),
         gaussians.sh[:, 0],
         gaussians.sh[:, 1:].transpose(1, 2).flatten(1),
-        gaussians.opacities.clamp(LEAST_OPACITY, 1.0 - LEAST_OPACITY).logit()[:, None],
+        gaussians.opacities.clamp(MIN_OPACITY, 1.0 - MIN_OPACITY).logit()[:, None],
         gaussians.scales.log(),
         gaussians.quats,
     ]

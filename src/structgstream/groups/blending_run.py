@@ -24,7 +24,7 @@ from structgstream.groups.segment_file import open_segment
 from structgstream.kernels.backend import BackendName, select_backend
 from structgstream.whole_files import write_whole
 
-MOST_GROUPS = 8
+MAX_GROUPS = 8
 """Largest number of groups in a run: a process takes two seconds to start, and reports its result when it ends."""
 
 
@@ -61,7 +61,7 @@ def runs_of(lengths: Sequence[int], *, workers: int) -> list[range]:
         lengths: number of frames of each group, in order.
         workers: number of processes; there are at least as many runs if groups are long enough.
     """
-    size = min(MOST_GROUPS, -(-(len(lengths) - 1) // workers))
+    size = min(MAX_GROUPS, -(-(len(lengths) - 1) // workers))
     runs, begin = [], 1
     for number in range(2, len(lengths)):
         if number - begin >= size and lengths[number - 1] >= OWN_FRAMES:

@@ -26,7 +26,7 @@ from structgstream.struct_gstream import FrameZeroContext, stream_pipeline
 from structgstream.training.result import StepListener
 from structgstream.whole_files import partial_path
 
-LEAST_PIXELS = 0.5
+MIN_PIXELS = 0.5
 """A primitive whose tracked displacement is at most this, in pixels of a median camera, counts as not displaced."""
 
 
@@ -148,7 +148,7 @@ def _run(
 def _entry(start: TrackStart, base: GroupBase, source: FrameSource) -> GroupEntry:
     displacements, velocities = dense(base.scene(), start, step=base.position_step)
     # Smaller displacements are within the tracking error; these primitives retain frame 0's exact values.
-    least = LEAST_PIXELS / base.config.online.rounding.at_quality("position_pixels") * base.position_step
+    least = MIN_PIXELS / base.config.online.rounding.at_quality("position_pixels") * base.position_step
     displacements[(displacements.abs() <= least).all(1)] = 0.0
 
     @cache

@@ -17,10 +17,10 @@ from structgstream.data.images import opencv
 from structgstream.data.matching import project
 from structgstream.pose_check.tracks import AGREE_PIXELS, Tracks
 
-LEAST_SEEN = 8
-LEAST_POINTS = 12
-LEAST_SHARE = 0.4  # of a camera's points that a corrected camera must explain
-LEAST_GAIN = 0.5  # largest share of the error that a correction leaves, if the camera is to be off
+MIN_SEEN = 8
+MIN_POINTS = 12
+MIN_SHARE = 0.4  # of a camera's points that a corrected camera must explain
+MIN_GAIN = 0.5  # largest share of the error that a correction leaves, if the camera is to be off
 SIMPLE_ENOUGH = 1.1  # of the least error, up to which the correction with fewer causes is taken
 SIGMAS = 3.0
 TURN, MOVE, FOCAL = slice(0, 3), slice(3, 6), slice(6, 7)
@@ -61,13 +61,13 @@ class Resection:
     @property
     def better(self) -> bool:
         """Whether the corrected camera explains most points, and these much better than the given one."""
-        enough = self.points >= max(LEAST_POINTS, LEAST_SHARE * self.seen)
-        return enough and self.corrected_pixels < LEAST_GAIN * self.given_pixels
+        enough = self.points >= max(MIN_POINTS, MIN_SHARE * self.seen)
+        return enough and self.corrected_pixels < MIN_GAIN * self.given_pixels
 
     @property
     def as_given(self) -> bool:
         """Whether no other camera explains more than the given one, so that what contradicts it are wrong matches."""
-        return not self.better and self.kept >= max(LEAST_SEEN // 2, LEAST_SHARE * self.seen, self.points - BY_CHANCE)
+        return not self.better and self.kept >= max(MIN_SEEN // 2, MIN_SHARE * self.seen, self.points - BY_CHANCE)
 
     @property
     def told(self) -> str:
@@ -118,7 +118,7 @@ def resected(tracks: Tracks, camera: Camera, name: str) -> Resection | None:
         MissingExtraError: cv2 or scipy is not installed.
     """
     own = tracks.of(name) if name in tracks.names else np.zeros(len(tracks.point), bool)
-    if own.sum() < LEAST_SEEN:
+    if own.sum() < MIN_SEEN:
         return None
     points, pixels = tracks.points[tracks.point[own]], tracks.pixels[own]
     limit = AGREE_PIXELS * max(camera.width / 1000, 1)
@@ -127,9 +127,9 @@ def resected(tracks: Tracks, camera: Camera, name: str) -> Resection | None:
     best = max((_adjusted(view, start, points, pixels, limit) for start in starts), key=lambda found: found[1].sum())
     change, fits = best
     kept = np.linalg.norm(project(camera, points)[0] - pixels, axis=1) < limit
-    if fits.sum() < max(LEAST_SEEN, kept.sum()):  # nothing explains more than the given camera
+    if fits.sum() < max(MIN_SEEN, kept.sum()):  # nothing explains more than the given camera
         change, fits = np.zeros(7), kept
-    if fits.sum() < LEAST_SEEN // 2:
+    if fits.sum() < MIN_SEEN // 2:
         return None
     change, errors = _simplest(view, change, points[fits], pixels[fits], limit)
     distance = float(np.median(np.linalg.norm(points[fits] - view.center - change[MOVE], axis=1)))
@@ -185,7 +185,7 @@ def _adjusted(view: _View, start: Floats, points: Floats, pixels: Floats, limit:
     change = start
     for _ in range(2):
         near = np.linalg.norm(view.pixels(change, points) - pixels, axis=1) < 4 * limit
-        if near.sum() < LEAST_SEEN // 2:
+        if near.sum() < MIN_SEEN // 2:
             return change, near & False
         change = _solved(view, change, points[near], pixels[near], CAUSES[-1], limit)[0]
     return change, np.linalg.norm(view.pixels(change, points) - pixels, axis=1) < limit

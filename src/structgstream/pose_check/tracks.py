@@ -13,8 +13,8 @@ from structgstream.data.matching import epipolar_errors, fundamental_matrix, pro
 from structgstream.pose_check.evidence import Evidence
 
 AGREE_PIXELS = 3.0  # of pictures up to 1000 pixels wide, in proportion above
-LEAST_VIEWS = 3
-MOST_PAIRS = 45  # of a point's observations, from which it is looked for: all pairs of ten
+MIN_VIEWS = 3
+MAX_PAIRS = 45  # of a point's observations, from which it is looked for: all pairs of ten
 ROUNDS = 2
 
 
@@ -153,10 +153,10 @@ def _agreeing(table: _Table, cameras: list[Camera], limit: float) -> _Table:
     used = table.used.copy()
     rows = np.flatnonzero(table.used & np.isin(table.point, doubted))
     for own in np.split(rows[order := np.argsort(table.point[rows], kind="stable")], _starts(table.point[rows][order])):
-        if len(own) <= LEAST_VIEWS:  # two of three always agree
+        if len(own) <= MIN_VIEWS:  # two of three always agree
             continue
         pairs = np.stack(np.triu_indices(len(own), 1), axis=1)
-        pairs = pairs[np.unique(np.linspace(0, len(pairs) - 1, MOST_PAIRS).round().astype(int))]
+        pairs = pairs[np.unique(np.linspace(0, len(pairs) - 1, MAX_PAIRS).round().astype(int))]
         each = _Table(
             np.repeat(np.arange(len(pairs)), len(own)),
             np.tile(table.camera[own], len(pairs)),
@@ -167,7 +167,7 @@ def _agreeing(table: _Table, cameras: list[Camera], limit: float) -> _Table:
         within = apart < limit
         best = np.lexsort((np.where(within, apart, limit).sum(1), -within.sum(1)))[0]
         rivals = within[(within & ~within[best]).any(1)].sum(1).max(initial=0)
-        if within[best].sum() > max(rivals, LEAST_VIEWS - 1, len(own) / 2):
+        if within[best].sum() > max(rivals, MIN_VIEWS - 1, len(own) / 2):
             used[own] = within[best]
     return replace(table, used=used)
 

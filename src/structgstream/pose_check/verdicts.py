@@ -14,15 +14,15 @@ from structgstream.data.matching import Pair
 from structgstream.data.pair_matches import PairError
 from structgstream.pose_check.evidence import Evidence, pair_errors
 from structgstream.pose_check.resection import Resection, resected
-from structgstream.pose_check.tracks import LEAST_VIEWS, Tracks, build_tracks
+from structgstream.pose_check.tracks import MIN_VIEWS, Tracks, build_tracks
 
 TIMES_TYPICAL = 4.0
 FLOOR_PIXELS = 0.75  # of pictures up to 1000 pixels wide, in proportion above
-MOST_WEIGHT = 100  # matches above which a pair is not trusted more
+MAX_WEIGHT = 100  # matches above which a pair is not trusted more
 OFF_SHARE = 0.5
 VIOLATING_SHARE = 0.5
-LEAST_ACCUSING, LEAST_CAMERAS, ACCUSING_TIMES = 15, 4, 2.5
-LEAST_MATCHES = 60  # of a camera's pairs, from which on they tell something without points; chance makes 20 to 25
+MIN_ACCUSING, MIN_CAMERAS, ACCUSING_TIMES = 15, 4, 2.5
+MIN_MATCHES = 60  # of a camera's pairs, from which on they tell something without points; chance makes 20 to 25
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def find_suspects(errors: Mapping[Pair, PairError], cameras: Mapping[str, Camera
     """
     limit = _limit(errors, cameras)
     bad = {pair for pair, error in errors.items() if error.pixels > limit or error.share > VIOLATING_SHARE}
-    weights = {pair: min(error.matches, MOST_WEIGHT) for pair, error in errors.items()}
+    weights = {pair: min(error.matches, MAX_WEIGHT) for pair, error in errors.items()}
     off: list[str] = []
     remaining = [name for name in cameras if any(name in pair for pair in errors)]
     while remaining:
@@ -87,10 +87,10 @@ def accused(tracks: Tracks, suspects: Suspects, *, cleared: Collection[str] = ()
     """
     medians = {}
     for name in tracks.names:
-        seen = tracks.residuals[tracks.of(name) & (tracks.views[tracks.point] >= LEAST_VIEWS)]
-        if name not in suspects.off and len(seen) >= LEAST_ACCUSING:
+        seen = tracks.residuals[tracks.of(name) & (tracks.views[tracks.point] >= MIN_VIEWS)]
+        if name not in suspects.off and len(seen) >= MIN_ACCUSING:
             medians[name] = float(np.median(seen))
-    if len(medians) < LEAST_CAMERAS:
+    if len(medians) < MIN_CAMERAS:
         return None
     named = [name for name in medians if name not in cleared]
     if not named:
@@ -160,9 +160,9 @@ def judge(evidence: Evidence, cameras: Mapping[str, Camera]) -> Verdict:
         if found is not None and found.as_given:
             continue
         against, favouring = _matches(name, errors, suspects)
-        if _is_off(found, suspects) or (against >= LEAST_MATCHES and not favouring):
+        if _is_off(found, suspects) or (against >= MIN_MATCHES and not favouring):
             off.append(name)
-        elif against >= LEAST_MATCHES:
+        elif against >= MIN_MATCHES:
             doubtful.append(name)
         elif against:
             unchecked.append(name)

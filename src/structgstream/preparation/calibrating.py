@@ -26,7 +26,7 @@ from structgstream.preparation.footage import Footage
 from structgstream.preparation.options import METHODS, PrepareOptions
 from structgstream.preparation.steps import Stored
 
-LEAST_CAMERAS = 3
+MIN_CAMERAS = 3
 
 
 def chosen_method(footage: Footage, options: PrepareOptions) -> str | Calibration:
@@ -85,9 +85,9 @@ def check_enough(footage: Footage) -> None:
     Raises:
         CalibrationError: too few cameras for poses that can be checked.
     """
-    if len(footage.cameras) < LEAST_CAMERAS:
+    if len(footage.cameras) < MIN_CAMERAS:
         raise CalibrationError(
-            f"{footage.where} has {listed(footage.cameras)} alone; a capture needs {LEAST_CAMERAS} or more, as two "
+            f"{footage.where} has {listed(footage.cameras)} alone; a capture needs {MIN_CAMERAS} or more, as two "
             "cameras cannot confirm each other's calibration: film with more."
         )
 

@@ -8,7 +8,7 @@ from structgstream.data.calibration import listed
 from structgstream.data.posed import Calibration
 from structgstream.data.timeline import Clock
 from structgstream.errors import ConfigError
-from structgstream.frames import LEAST_CAMERAS
+from structgstream.frames import MIN_CAMERAS
 from structgstream.preparation.calibrating import (
     check_complete,
     check_enough,
@@ -75,10 +75,10 @@ class CameraSteps:
     def _check_trained(self, footage: Footage) -> None:
         """Refuses to hold out more cameras than can be spared, before anything takes time."""
         held_out = set(self.options.held_out) - {"auto"}
-        if len(footage.cameras) - len(held_out) < LEAST_CAMERAS:
+        if len(footage.cameras) - len(held_out) < MIN_CAMERAS:
             raise ConfigError(
                 f"{self.videos} has {len(footage.cameras)} cameras, {len(held_out)} of them held out; a reconstruction "
-                f"needs {LEAST_CAMERAS} or more to train on: hold out fewer."
+                f"needs {MIN_CAMERAS} or more to train on: hold out fewer."
             )
 
     def synchronize(self, footage: Footage, method: str | Calibration) -> Clocks:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.codec.container import damage as damage_module
-from structgstream.codec.container.damage import LEAST_PACKET_BYTES, Damage, PacketSearch, Standing
+from structgstream.codec.container.damage import MIN_PACKET_BYTES, Damage, PacketSearch, Standing
 from structgstream.codec.container.records import RECORD, RecordType, scan_records
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink, MemorySink
@@ -139,7 +139,7 @@ def test_frames_that_cannot_have_been_there_are_not_believed() -> None:
     data, _, offsets = whole()
     start, end = offsets[4], offsets[5]
     far = bytearray(data[start:end])
-    room = (start - offsets[3]) // LEAST_PACKET_BYTES
+    room = (start - offsets[3]) // MIN_PACKET_BYTES
     for index, believed in ((2**32 - 1, False), (2 + room + 1, False), (2 + room, True)):
         struct.pack_into("<I", far, RECORD.size, index)
         struct.pack_into("<I", far, len(far) - 4, zlib.crc32(far[:-4]))

@@ -16,12 +16,12 @@ from structgstream.codec.entropy.section_coder import SectionEncoder, Tables
 from structgstream.codec.fields.quantization import round_to_bins
 from structgstream.codec.fields.static_fields import (
     FREE_NUMBERS,
-    MOST_ANCHORS,
-    MOST_WEIGHTS,
+    MAX_ANCHORS,
+    MAX_WEIGHTS,
     UNCODED_FIELDS,
     decode_fields,
     encode_fields,
-    most_columns,
+    max_columns,
 )
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
@@ -179,8 +179,8 @@ def test_fields_without_a_coding() -> None:
 
 def test_more_numbers_than_allowed_are_refused() -> None:
     coded = encode_fields(fields_of(), STEPS)
-    limits: dict[FieldName, int] = {"anchor_positions": MOST_ANCHORS, "color_mlp": MOST_WEIGHTS}
-    limits |= {row.name: most_columns(row.name) for row in STATE_TABLE if row.init_coding == "rows"}
+    limits: dict[FieldName, int] = {"anchor_positions": MAX_ANCHORS, "color_mlp": MAX_WEIGHTS}
+    limits |= {row.name: max_columns(row.name) for row in STATE_TABLE if row.init_coding == "rows"}
     assert [*limits.values()][2:] == [3, 3, 3 * 64, 256, 256]
     for name, most in limits.items():
         rest = coded[name][1:]

@@ -36,7 +36,7 @@ class Memory:
     def put(self, name: str, data: bytes) -> None:
         self.files[name] = data
 
-    def get(self, name: str, *, most_bytes: int | None = None) -> bytes:
+    def get(self, name: str, *, max_bytes: int | None = None) -> bytes:
         return self.files[name]
 
     def delete(self, name: str) -> None:

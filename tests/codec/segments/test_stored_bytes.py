@@ -102,9 +102,9 @@ def test_few_files_are_kept_in_memory_and_none_after_closing(whole: Path, monkey
     read: list[str] = []
     get = FolderStore.get
 
-    def counted(self: FolderStore, name: str, *, most_bytes: int | None = None) -> bytes:
+    def counted(self: FolderStore, name: str, *, max_bytes: int | None = None) -> bytes:
         read.append(name)
-        return get(self, name, most_bytes=most_bytes)
+        return get(self, name, max_bytes=max_bytes)
 
     stored = open_segments(whole)
     monkeypatch.setattr(FolderStore, "get", counted)

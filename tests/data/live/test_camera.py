@@ -17,7 +17,7 @@ import av.error
 import numpy as np
 import pytest
 
-from structgstream.data.live.camera import MOST_UNSTAMPED, CameraFeed
+from structgstream.data.live.camera import MAX_UNSTAMPED, CameraFeed
 from structgstream.data.live.faults import FaultLog
 from structgstream.data.live.matching import LivePicture
 from structgstream.data.live.rig_file import LiveCamera, TimeBase
@@ -250,10 +250,10 @@ def test_pictures_without_stamps(base: TimeBase, caplog: pytest.LogCaptureFixtur
     frames = [SimpleNamespace(pts=None, time_base=None)] * 60
     with caplog.at_level(logging.WARNING):
         placed = [feed._placed(frame, n * PERIOD, None) for n, frame in enumerate(frames)]  # type: ignore[arg-type]
-    assert placed[:MOST_UNSTAMPED] == [None] * MOST_UNSTAMPED
+    assert placed[:MAX_UNSTAMPED] == [None] * MAX_UNSTAMPED
     assert faults.counts["a"] == {"no stamp": 60}
     if base is TimeBase.ARRIVAL:
-        steps = np.diff(np.array(placed[MOST_UNSTAMPED:], np.float64))
+        steps = np.diff(np.array(placed[MAX_UNSTAMPED:], np.float64))
         assert np.allclose(steps, PERIOD)
     else:
         assert placed == [None] * 60

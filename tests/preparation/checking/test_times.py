@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from structgstream.preparation.checking.times import LEAST_FRAMES, measure_times, time_findings
+from structgstream.preparation.checking.times import MIN_FRAMES, measure_times, time_findings
 from structgstream.preparation.synchronization import SynchronizationCheck
 from tests.support.memory_captures import MemoryCapture
 from tests.support.planes import room_frame, room_rig
@@ -20,7 +20,7 @@ def measured(*, off: tuple[str, ...] = (), sigma: float = 1e-4, **late: float) -
 
 def test_a_capture_too_short_to_tell() -> None:
     rig = room_rig(3)
-    assert measure_times(MemoryCapture(rig, [room_frame(rig)] * (LEAST_FRAMES - 1))) is None
+    assert measure_times(MemoryCapture(rig, [room_frame(rig)] * (MIN_FRAMES - 1))) is None
     assert time_findings(None) == []
 
 

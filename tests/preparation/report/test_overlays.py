@@ -44,7 +44,7 @@ def test_pairs_are_the_worst_of_who_is_off_then_the_worst_and_the_surest(checked
     examined = checked.examination
     errors = pair_errors(examined.evidence, examined.cameras)
     pairs = overlays.chosen_pairs(examined)
-    assert len(set(pairs)) == len(pairs) == overlays.MOST_PAIRS
+    assert len(set(pairs)) == len(pairs) == overlays.MAX_PAIRS
     assert pairs[0] == max((pair for pair in errors if OFF in pair), key=lambda pair: errors[pair].pixels)
     assert max(errors, key=lambda pair: errors[pair].pixels) in pairs[:2]
     assert max(errors, key=lambda pair: errors[pair].matches) in pairs

@@ -12,7 +12,7 @@ from structgstream.codec.container.records import PREFIX, PacketKind, RecordType
 from structgstream.codec.segments.history import segments_from, verified
 from structgstream.codec.segments.manifest import (
     MANIFEST,
-    MOST_MANIFEST_BYTES,
+    MAX_MANIFEST_BYTES,
     Manifest,
     PartEntry,
     SegmentEntry,
@@ -179,7 +179,7 @@ class StoredBytes:
     def _read(self, entry: StoredFile) -> bytes:
         if self._check:
             return verified(self._store, entry)
-        data = self._store.get(entry.file, most_bytes=entry.bytes)
+        data = self._store.get(entry.file, max_bytes=entry.bytes)
         if len(data) != entry.bytes:
             raise StreamError(
                 f"{entry.file} in {self._store.name} has {len(data)} bytes; the manifest states {entry.bytes}."
@@ -215,7 +215,7 @@ def read_manifest(store: Store) -> Manifest:
     """
     if MANIFEST not in store.names():
         raise StreamError(f"{store.name} has no {MANIFEST}; expected a folder written with --sink segments.")
-    return manifest_from_json(store.get(MANIFEST, most_bytes=MOST_MANIFEST_BYTES), name=f"{MANIFEST} in {store.name}")
+    return manifest_from_json(store.get(MANIFEST, max_bytes=MAX_MANIFEST_BYTES), name=f"{MANIFEST} in {store.name}")
 
 
 def write_archive(store: Store, path: Path) -> int:

@@ -19,7 +19,7 @@ from structgstream.data.text_files import Unreadable, number, read_text
 
 EXPECTED = "a projection matrix of 3x4 numbers, pixels of the pictures"
 LARGEST_TEXT = 2000  # bytes of a file of twelve numbers
-LEAST_FOCAL_LENGTH = 10.0  # pixels; a pose without intrinsics has 1
+MIN_FOCAL_LENGTH = 10.0  # pixels; a pose without intrinsics has 1
 
 
 def find(folder: Path) -> Iterator[tuple[Path, ...]]:
@@ -85,6 +85,6 @@ def decomposed(matrix: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float
     K, rotation = K * signs, signs[:, None] * rotation
     viewmat = rigid(rotation, np.linalg.solve(K, P[:, 3]))
     K = K / K[2, 2]
-    if min(K[0, 0], K[1, 1]) < LEAST_FOCAL_LENGTH:
+    if min(K[0, 0], K[1, 1]) < MIN_FOCAL_LENGTH:
         raise Unreadable("a pose without intrinsics, in place of a projection matrix")
     return K, viewmat

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-FIRST_WAIT_SECONDS, MOST_WAIT_SECONDS = 0.5, 8.0
+FIRST_WAIT_SECONDS, MAX_WAIT_SECONDS = 0.5, 8.0
 MPEGTS_STAMPS = 2**33
-MOST_UNSTAMPED = 30  # pictures before a camera is taken to have no stamps
+MAX_UNSTAMPED = 30  # pictures before a camera is taken to have no stamps
 SAMPLED_ROWS = 4  # every so many rows are compared to find pictures that stand still
 ENDED = "it ended"
 PROBE_OPTIONS = {"analyzeduration": "2000000", "probesize": "2000000", "fpsprobesize": "0"}
@@ -144,7 +144,7 @@ class CameraFeed:
                 self._end(reason)
                 return
             self._gone(reason)
-            wait = FIRST_WAIT_SECONDS if self.decoded > before else min(2 * wait, MOST_WAIT_SECONDS)
+            wait = FIRST_WAIT_SECONDS if self.decoded > before else min(2 * wait, MAX_WAIT_SECONDS)
             self._wait(wait)
 
     def _connection(self) -> str:
@@ -274,7 +274,7 @@ class CameraFeed:
             self._faults.say(self.name, Fault.NO_STAMP.value, text)
             return None
         # The first ones of a connection may have none, and others that follow do.
-        return unix if self._without_stamp > MOST_UNSTAMPED else None
+        return unix if self._without_stamp > MAX_UNSTAMPED else None
 
     def _fits(self, frame: "VideoFrame") -> bool:
         """Whether the picture has the proportions that were calibrated; a uniform reduction has."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from structgstream.data.live.picture_file import read_pictures, write_pictures
 from structgstream.errors import CaptureError, StorageError
-from structgstream.frames import LEAST_CAMERAS, MultiViewFrame
+from structgstream.frames import MIN_CAMERAS, MultiViewFrame
 from structgstream.owned_folders import check_owned, own_folder
 
 LAST = 3
@@ -63,7 +63,7 @@ class KeptFrames:
             StorageError: they cannot be written.
         """
         images = {name: image for name, image in frame.images.items() if name in self._cameras}
-        if len(frame.showing(self._cameras)) < min(LEAST_CAMERAS, len(self._cameras)):  # a held frame, of any length
+        if len(frame.showing(self._cameras)) < min(MIN_CAMERAS, len(self._cameras)):  # a held frame, of any length
             images = {name: np.zeros_like(image) for name, image in images.items()}
         masks = {name: mask for name, mask in frame.masks.items() if name in self._cameras}
         own_folder(self._folder, PURPOSE)

@@ -16,7 +16,7 @@ from typing import Any
 
 from structgstream.data.live.faults import Fault
 
-LEAST_SPACING = 0.75
+MIN_SPACING = 0.75
 """Of a frame's length between two instants: a leader that runs faster gives every second picture or fewer."""
 Count = Callable[[str, Fault, int], None]
 
@@ -97,7 +97,7 @@ class SetMatcher:
         begun: float = -float("inf"),
     ) -> None:
         self._queues = {name: _Queue(last_arrived=begun) for name in cameras}
-        self._spacing = LEAST_SPACING / fps
+        self._spacing = MIN_SPACING / fps
         self._tolerance, self._deadline = tolerance_seconds, deadline_seconds
         self._most, self._count = queue_frames, count
         self._last = -float("inf")

@@ -23,7 +23,7 @@ Convert = Callable[[PictureSet], MultiViewFrame]
 GIGABYTE = 10**9
 PURPOSE = "queue of a live stream"
 SETS = re.compile(r"set-\d{8,}(\.partial)?")
-MOST_UNWRITTEN = 8  # sets whose pictures wait in memory
+MAX_UNWRITTEN = 8  # sets whose pictures wait in memory
 ROOM_AGAIN = 0.5  # of the queue must be empty before sets are taken again, so that gaps are few
 
 
@@ -116,21 +116,21 @@ class Latest:
 class DiskQueue:
     """Keeps every set in a file until the trainer takes it; a thread writes them.
 
-    When the files reach ``most_bytes``, further sets are skipped until half of them are taken, and so are sets that
+    When the files reach ``max_bytes``, further sets are skipped until half of them are taken, and so are sets that
     come faster than they can be written; both are told.
 
     Args:
         folder: is made, and removed at the end.
         resume: whether sets that an earlier run was killed over are taken first; else they are removed.
-        most_bytes: of its files.
+        max_bytes: of its files.
         convert: makes a set's pictures.
 
     Raises:
         StorageError: the folder cannot be used.
     """
 
-    def __init__(self, folder: Path, *, most_bytes: int, convert: Convert, resume: bool = False) -> None:
-        self._folder, self._most, self._convert = folder, most_bytes, convert
+    def __init__(self, folder: Path, *, max_bytes: int, convert: Convert, resume: bool = False) -> None:
+        self._folder, self._most, self._convert = folder, max_bytes, convert
         self._sets: deque[PictureSet] = deque()
         self._files: deque[tuple[Path, int, SetTimes | None]] = deque()
         self.taken: SetTimes | None = None
@@ -155,7 +155,7 @@ class DiskQueue:
     def put(self, found: PictureSet) -> None:
         with self._changed:
             self._full = self._full and self._bytes > ROOM_AGAIN * self._most
-            slow = len(self._sets) >= MOST_UNWRITTEN
+            slow = len(self._sets) >= MAX_UNWRITTEN
             if self._full or slow or self._failed is not None:
                 self._skipped += 1
                 if slow and not self._slow:

@@ -26,7 +26,7 @@ from structgstream.whole_files import write_whole
 FORMAT = "structgstream-pictures-2"
 WITHOUT_RESIDUALS = "structgstream-pictures-1"  # which a run of an earlier version may have left
 LEVEL = 1  # 300 MB/s and more, at about the sizes of higher levels: noise does not compress
-MOST_HEADER = 1 << 20
+MAX_HEADER = 1 << 20
 
 
 def write_pictures(path: Path, frame: MultiViewFrame, *, sync: bool, **facts: Any) -> int:
@@ -66,7 +66,7 @@ def read_pictures(path: Path) -> tuple[MultiViewFrame, dict[str, Any]]:
     """
     try:
         with path.open("rb") as file:
-            header: dict[str, Any] = json.loads(file.readline(MOST_HEADER))
+            header: dict[str, Any] = json.loads(file.readline(MAX_HEADER))
             written = header.pop("format")
             if written not in (FORMAT, WITHOUT_RESIDUALS):
                 raise ValueError("another format")

@@ -37,7 +37,7 @@ from structgstream.data.source import FrameSource
 from structgstream.data.video_index import load_av
 from structgstream.data.video_pictures import srgb
 from structgstream.errors import CaptureError, ConfigError, StorageError
-from structgstream.frames import LEAST_CAMERAS, MultiViewFrame
+from structgstream.frames import MIN_CAMERAS, MultiViewFrame
 
 log = logging.getLogger(__name__)
 
@@ -269,7 +269,7 @@ class LiveSource:
             if frame is None:
                 if ended and complete:
                     raise CaptureError(
-                        f"{self.name} has no frame: {ended}. Frame 0 needs pictures of {LEAST_CAMERAS} training "
+                        f"{self.name} has no frame: {ended}. Frame 0 needs pictures of {MIN_CAMERAS} training "
                         "cameras of one instant; the warnings before this say what is wrong with each camera."
                     )
                 if ended:
@@ -283,7 +283,7 @@ class LiveSource:
             absent = [name for name in self._filmed if name not in frame.images]
             if complete and now - begun < self._live.start_seconds and {*absent} & {*coming}:
                 continue
-            if len(frame.showing(self.rig.training)) < LEAST_CAMERAS:
+            if len(frame.showing(self.rig.training)) < MIN_CAMERAS:
                 arrivals.count_small()
                 continue
             if complete and absent:
@@ -322,7 +322,7 @@ class LiveSource:
             return Latest(self._converted())
         most = round(self._options.queue_gigabytes * GIGABYTE)
         folder = self._stream.with_name(f"{self._stream.name}.queue")
-        return DiskQueue(folder, most_bytes=most, convert=self._converted(), resume=self._options.resume)
+        return DiskQueue(folder, max_bytes=most, convert=self._converted(), resume=self._options.resume)
 
     def _converted(self) -> Convert:
         """What makes a set a frame; a camera whose colours cannot be converted is absent from it."""

@@ -13,8 +13,8 @@ from structgstream.data.images import opencv
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.board import Board, dictionaries
 
-LEAST_CORNERS = 6
-LEAST_SIGHTINGS = 4
+MIN_CORNERS = 6
+MIN_SIGHTINGS = 4
 WRONG_LAYOUT = 0.5
 MANY_MARKERS = 6
 
@@ -50,7 +50,7 @@ def board_sightings(
         sights = pool.map(lambda task: _sighted(pictures[task[0]][task[1]], board), tasks)
         for (name, instant), (corners, pixels, ids) in zip(tasks, sights, strict=True):
             markers[name] |= ids
-            if len(corners) >= LEAST_CORNERS and not _collinear(corners, board):
+            if len(corners) >= MIN_CORNERS and not _collinear(corners, board):
                 found[name].append(Sighting(instant, corners, pixels))
             elif len(ids) >= MANY_MARKERS and len(corners) == 0:
                 without_corners += 1
@@ -61,7 +61,7 @@ def board_sightings(
         )
     _check_markers(pictures, board, markers, found)
     _check_layout(board, found)
-    few = [name for name in pictures if len(found[name]) < LEAST_SIGHTINGS]
+    few = [name for name in pictures if len(found[name]) < MIN_SIGHTINGS]
     if few:
         raise CalibrationError(_too_few(board, {name: (len(found[name]), len(pictures[name])) for name in few}, found))
     return {name: tuple(sights) for name, sights in found.items()}
@@ -73,12 +73,12 @@ def _too_few(board: Board, seen: Mapping[str, tuple[int, int]], found: Mapping[s
         most = max(total for _, total in seen.values())
         return (
             f"No camera shows the board ({board.text}) in any of its {most} pictures that were looked at; show it "
-            f"whole, closer and sharper ({LEAST_CORNERS} corners are needed), name the board that was "
+            f"whole, closer and sharper ({MIN_CORNERS} corners are needed), name the board that was "
             "filmed with --board, or the folder in which it was with --board-videos."
         )
     told = ", ".join(f"{name!r} in {count} of {total} pictures" for name, (count, total) in seen.items())
     return (
-        f"The board ({board.text}) is seen too rarely: by {told}, where {LEAST_SIGHTINGS} with {LEAST_CORNERS} corners "
+        f"The board ({board.text}) is seen too rarely: by {told}, where {MIN_SIGHTINGS} with {MIN_CORNERS} corners "
         "each are needed; show it whole, closer and sharper to each camera, tilted in several directions."
     )
 

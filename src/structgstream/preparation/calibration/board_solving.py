@@ -42,7 +42,7 @@ FIELDS_OF_VIEW: Mapping[LensModel, tuple[float, ...]] = {
     "brown": (30.0, 50.0, 70.0, 90.0),
     "fisheye": (60.0, 90.0, 120.0, 150.0, 175.0),
 }
-MOST_SIGHTINGS_ALONE = 24
+MAX_SIGHTINGS_ALONE = 24
 POSE_PIXELS = 0.02  # of the longer side: coarse, since the lens is not known yet
 OUTLIER_PIXELS = 2.0
 
@@ -117,9 +117,9 @@ def _own_view(
     name: str, sights: Sequence[Sighting], board: Board, starts: Sequence[Any], *, fixed: bool, seed: int
 ) -> _View:
     """Intrinsics from the best start, and a pose for each sighting that agrees with them."""
-    chosen = sorted(sights, key=lambda sight: (-len(sight.corners), sight.instant))[: 2 * MOST_SIGHTINGS_ALONE]
+    chosen = sorted(sights, key=lambda sight: (-len(sight.corners), sight.instant))[: 2 * MAX_SIGHTINGS_ALONE]
     chosen = sorted(chosen, key=lambda sight: sight.instant)
-    picks = np.linspace(0, len(chosen) - 1, min(len(chosen), MOST_SIGHTINGS_ALONE)).round().astype(int)
+    picks = np.linspace(0, len(chosen) - 1, min(len(chosen), MAX_SIGHTINGS_ALONE)).round().astype(int)
     sample = [chosen[index] for index in picks]
     best: tuple[float, Any] | None = None
     for camera in starts:

@@ -22,7 +22,7 @@ Indices = NDArray[np.intp]
 
 HUBER = 1.345  # standard deviations of the noise: 95 % as exact as least squares if there are no outliers
 RIDGE = 1e-10  # of the diagonal: the equations do not fix where the world's axes are
-MOST_STEPS = 50
+MAX_STEPS = 50
 SMALL = 1e-6
 
 
@@ -115,7 +115,7 @@ class Bundle:
         return np.einsum("mab,mb->ma", scene.rotations[seen.camera], world) + scene.translations[seen.camera]
 
 
-def solved(bundle: Bundle, scene: Scene, *, most: int = MOST_STEPS) -> Scene:
+def solved(bundle: Bundle, scene: Scene, *, most: int = MAX_STEPS) -> Scene:
     """The scene of least cost near ``scene``, or after ``most`` steps."""
     damping, cost = 1e-4, bundle.cost(scene)
     for _ in range(most):

@@ -20,7 +20,7 @@ from structgstream.data.matching import Features, Pair, mutually_best
 from structgstream.preparation.calibration.keypoints import Keypoints
 
 Indices = NDArray[np.intp]
-LEAST_SINE = 0.02  # rays along the baseline belong to every epipolar plane
+MIN_SINE = 0.02  # rays along the baseline belong to every epipolar plane
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ def _near_planes(
     across /= np.linalg.norm(across)
     turns = [np.arctan2(ray @ np.cross(base, across), ray @ across) for ray in rays]
     sines = [np.linalg.norm(np.cross(base, ray), axis=1) for ray in rays]
-    usable = [np.flatnonzero(np.isfinite(turn) & (sine > LEAST_SINE)) for turn, sine in zip(turns, sines, strict=True)]
+    usable = [np.flatnonzero(np.isfinite(turn) & (sine > MIN_SINE)) for turn, sine in zip(turns, sines, strict=True)]
     if not len(usable[0]) or not len(usable[1]):
         return none, none
     slack = pixels / max(float(filmed.camera.K[0, 0]) for filmed in cameras)

@@ -35,7 +35,7 @@ Free = Literal["poses", "focal", "lens", "all"]
 
 HELD_BACK = 5  # one in five tracks judges and is not adjusted
 ROUNDS = (1.0, 0.4, 0.2)
-LEAST_HELD_BACK = 30
+MIN_HELD_BACK = 30
 
 
 @dataclass(frozen=True)
@@ -211,7 +211,7 @@ def _held_back(graph: PosedGraph) -> dict[Pair, NDArray[np.bool_]]:
     # A track's number follows the order of its first keypoint; a shuffle spreads those that judge.
     chosen = np.random.default_rng(0).permutation(track.max() + 1) % HELD_BACK == 0
     judging = {pair: chosen[track[one]] for pair, (one, _) in zip(graph.matches, ends, strict=True)}
-    if sum(int(held.sum()) for held in judging.values()) < LEAST_HELD_BACK:
+    if sum(int(held.sum()) for held in judging.values()) < MIN_HELD_BACK:
         raise CalibrationError(
             f"Only {len(first)} matches agree with the given poses, too few to refine them: take more instants, or "
             "let neighbouring cameras see more of the same."

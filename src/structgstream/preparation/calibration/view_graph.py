@@ -24,14 +24,14 @@ class PairConfig:
     Args:
         pixels: largest epipolar distance of a match, for pictures of 1000 pixels on the longer side; never under 1.
         least: fewest matches that agree.
-        least_share: least share of a pair's matches that agree. In rigs with repetitive walls nearly all pairs have
+        min_share: least share of a pair's matches that agree. In rigs with repetitive walls nearly all pairs have
             some matches that agree by chance; among those of 0.3 and more nearly all were right.
         trials: most samples of the robust estimation.
     """
 
     pixels: float = 3.0
     least: int = 20
-    least_share: float = 0.3
+    min_share: float = 0.3
     trials: int = 2000
 
 
@@ -70,7 +70,7 @@ def verified_pairs(
     return {
         pair: geometry
         for pair, geometry in found.items()
-        if len(geometry.inlier_matches) >= max(config.least, config.least_share * len(matches[pair]))
+        if len(geometry.inlier_matches) >= max(config.least, config.min_share * len(matches[pair]))
     }
 
 

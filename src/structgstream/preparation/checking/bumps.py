@@ -28,9 +28,9 @@ RATIO = 0.8
 STILL_PIXELS = 1.0  # of pictures up to 1000 pixels wide, in proportion above
 STILL_SHARE = 0.2
 MOVED_SHARE = 0.5
-LEAST_MATCHES = 30
+MIN_MATCHES = 30
 CLEAR = 0.5  # largest ratio of the errors of two explanations at which a match speaks for the better one
-LEAST_VOTES = 15
+MIN_VOTES = 15
 Judgement = Literal["bumped", "stood", "unknown"]
 
 
@@ -65,10 +65,10 @@ def picture_movement(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Moveme
         MissingExtraError: cv2 is not installed.
     """
     before, after = (sift_features(picture, count=KEYPOINTS) for picture in (one, other))
-    if min(len(before.pixels), len(after.pixels)) < LEAST_MATCHES:
+    if min(len(before.pixels), len(after.pixels)) < MIN_MATCHES:
         return None
     rows, columns = mutual_matches(before.descriptors, after.descriptors, ratio=RATIO).T
-    if len(rows) < LEAST_MATCHES:
+    if len(rows) < MIN_MATCHES:
         return None
     start, end = before.pixels[rows], after.pixels[columns]
     still = STILL_PIXELS * max(one.shape[1] / 1000, 1)
@@ -124,7 +124,7 @@ def _judged(
         _votes(name, change, evidence, cameras)
         for evidence, change in zip(instants, (movement.homography, back), strict=True)
     ]
-    enough = [(stood, bumped) for stood, bumped in votes if stood + bumped >= LEAST_VOTES]
+    enough = [(stood, bumped) for stood, bumped in votes if stood + bumped >= MIN_VOTES]
     if any(bumped > stood for stood, bumped in enough):
         return "bumped"
     # By its calibration at the first instant alone a camera that was bumped later would stand, too.

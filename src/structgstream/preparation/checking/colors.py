@@ -15,7 +15,7 @@ from structgstream.pose_check.findings import Finding
 PATCH = 7
 DARK, BRIGHT = 12.0, 243.0
 ROUNDS = 20
-LEAST_MATCHES = 15
+MIN_MATCHES = 15
 EXPOSURE_STOPS, BALANCE_STOPS = 0.33, 0.2
 
 
@@ -46,7 +46,7 @@ def compare_colors(evidence: Evidence) -> dict[str, Color]:
     for pair in evidence.overlapping():
         one, other = (_samples(smooth[name], pixels) for name, pixels in zip(pair, evidence.pixels(pair)))
         valid = ((one > DARK) & (one < BRIGHT) & (other > DARK) & (other < BRIGHT)).all(1)
-        if valid.sum() < LEAST_MATCHES:
+        if valid.sum() < MIN_MATCHES:
             continue
         first.append(np.full(valid.sum(), names.index(pair[0])))
         second.append(np.full(valid.sum(), names.index(pair[1])))

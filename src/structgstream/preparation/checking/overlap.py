@@ -12,7 +12,7 @@ from structgstream.data.calibration import listed
 from structgstream.data.matching import Pair, inside, project
 from structgstream.preparation.checking.findings import Coverage, Finding
 
-LEAST_OVERLAPS = 2
+MIN_OVERLAPS = 2
 
 
 def cameras_per_point(points: Floats, cameras: Mapping[str, Camera]) -> NDArray[np.intp]:
@@ -65,7 +65,7 @@ def overlap_findings(pairs: Collection[Pair], names: Collection[str]) -> list[Fi
                 )
             )
     for name, count in overlaps(pairs, names).items():
-        if name in whole and count < LEAST_OVERLAPS <= len(names) - 1:
+        if name in whole and count < MIN_OVERLAPS <= len(names) - 1:
             findings.append(
                 Finding(
                     "warning",

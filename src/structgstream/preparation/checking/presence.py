@@ -15,9 +15,9 @@ from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.findings import Finding
 
 Presence = dict[str, NDArray[np.bool_]]
-MOST_TRIED = 4  # frames, where pictures that should be there cannot be decoded
-MOST_SINGLE = 2  # cameras that drop frames and get a sentence each
-LOST_SECONDS, LOST_SHARE, MOST_LOST_SHARE = 0.5, 0.05, 0.25  # at the end, of the take
+MAX_TRIED = 4  # frames, where pictures that should be there cannot be decoded
+MAX_SINGLE = 2  # cameras that drop frames and get a sentence each
+LOST_SECONDS, LOST_SHARE, MAX_LOST_SHARE = 0.5, 0.05, 0.25  # at the end, of the take
 
 
 def stated_presence(source: FrameSource) -> Presence:
@@ -61,7 +61,7 @@ def whole_frame(source: FrameSource, presence: Presence) -> MultiViewFrame:
     counts = np.sum(list(presence.values()), axis=0)
     fullest = np.flatnonzero(counts == counts.max())
     best: MultiViewFrame | None = None
-    for place in np.unique(np.linspace(0, len(fullest) - 1, MOST_TRIED).round().astype(int)):
+    for place in np.unique(np.linspace(0, len(fullest) - 1, MAX_TRIED).round().astype(int)):
         frame = _read(source, int(fullest[place]), presence)
         best = frame if best is None or len(frame.images) > len(best.images) else best
         if len(best.images) == counts.max():
@@ -111,13 +111,13 @@ def presence_findings(
             told.append(
                 f"Camera {name!r} has no picture of any frame that can be read; leave it out, or restore its files."
             )
-        if name in dropping and len(dropping) <= MOST_SINGLE:
+        if name in dropping and len(dropping) <= MAX_SINGLE:
             told.append(_dropped(name, dropping[name], len(present), fps))
         if 0 < ends.get(name, 0) < len(present):
             told.append(_ended(name, ends[name], len(present), fps))
         if told:
             findings.append(Finding("warning", " ".join(told), (name,)))
-    if len(dropping) > MOST_SINGLE:
+    if len(dropping) > MAX_SINGLE:
         findings.append(_all_dropped(dropping, max(map(len, presence.values()))))
     if late := tuple(name for name, own in presence.items() if own.any() and not own[0]):
         findings.append(_without_start(late, presence))
@@ -150,7 +150,7 @@ def _slow(passed: Mapping[str, NDArray[np.intp]], fps: float) -> Finding:
 def _slack(frames: int, fps: float) -> int:
     """Frames that a camera may lack at the end: half a second or 5 % of the take, whichever is more, and never more
     than a quarter of it."""
-    return round(min(max(LOST_SECONDS * fps, LOST_SHARE * frames), MOST_LOST_SHARE * frames))
+    return round(min(max(LOST_SECONDS * fps, LOST_SHARE * frames), MAX_LOST_SHARE * frames))
 
 
 def _stopped(ends: Mapping[str, int], last: int, fps: float) -> Finding:

@@ -9,11 +9,11 @@ from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.matching import project
 from structgstream.pose_check.findings import Finding
-from structgstream.pose_check.tracks import LEAST_VIEWS, Tracks
+from structgstream.pose_check.tracks import MIN_VIEWS, Tracks
 from structgstream.preparation.checking.overlap import cameras_per_point
 
 NEAR_PERCENTILE = 0.5
-LEAST_POINTS = 30
+MIN_POINTS = 30
 CUT_SHARE = 0.02
 CLOSEST_NEAR = 0.0007  # of the depth of the nearest points: a near plane any closer looks like one in another unit
 PLAUSIBLE_METRES = (0.03, 60.0)  # of a rig's radius: a desk, a stadium's corner
@@ -22,13 +22,13 @@ UNITS = {1000.0: "1000 times too small (metres among millimetres)", 0.001: "1000
          "metres)", 100.0: "100 times too small (metres among centimetres)", 0.01: "100 times too large (centimetres "
          "among metres)"}  # fmt: skip
 FIT = 0.5
-LEAST_EXTENT = 0.03  # of the points that a rig sees, as a share of their depth
+MIN_EXTENT = 0.03  # of the points that a rig sees, as a share of their depth
 
 
 def observed_depths(tracks: Tracks, cameras: Mapping[str, Camera], *, off: Collection[str] = ()) -> Floats:
     """Depths of points in the cameras, of those not ``off``, that observed them; of three cameras, or else of two."""
     views = tracks.views
-    least = LEAST_VIEWS if (views >= LEAST_VIEWS).sum() >= LEAST_POINTS else 2
+    least = MIN_VIEWS if (views >= MIN_VIEWS).sum() >= MIN_POINTS else 2
     depths = []
     for number, name in enumerate(tracks.names):
         if name in off:
@@ -41,7 +41,7 @@ def observed_depths(tracks: Tracks, cameras: Mapping[str, Camera], *, off: Colle
 def nearest_depth(depths: Floats) -> float | None:
     """The depth that only few points fall below; None when there are too few."""
     depths = depths[depths > 0]
-    return float(np.percentile(depths, NEAR_PERCENTILE)) if len(depths) >= LEAST_POINTS else None
+    return float(np.percentile(depths, NEAR_PERCENTILE)) if len(depths) >= MIN_POINTS else None
 
 
 def scale_findings(
@@ -64,7 +64,7 @@ def scale_findings(
     findings = []
     near = float(np.median([camera.near for camera in cameras.values()]))
     depths = depths[depths > 0]
-    if len(depths) >= LEAST_POINTS and (cut := float((depths < near).mean())) > CUT_SHARE:
+    if len(depths) >= MIN_POINTS and (cut := float((depths < near).mean())) > CUT_SHARE:
         typical = float(np.median(depths))
         hint = "; poses and near plane look like different units of length" if near > 50 * typical else ""
         findings.append(
@@ -93,7 +93,7 @@ def scale_findings(
                 f"look like {like}; convert them, or give a distance between two cameras.",
             )
         )
-    if points is not None and len(points) >= LEAST_POINTS and (told := _foreign(points, depths, cameras)):
+    if points is not None and len(points) >= MIN_POINTS and (told := _foreign(points, depths, cameras)):
         findings.append(Finding("error", told))
     return findings
 
@@ -101,7 +101,7 @@ def scale_findings(
 def _foreign(points: Floats, depths: Floats, cameras: Mapping[str, Camera]) -> str | None:
     """A sentence when the points that came along are not of these cameras."""
     fits = _share_seen(points, cameras)
-    if len(depths) < LEAST_POINTS:
+    if len(depths) < MIN_POINTS:
         return None
     typical = float(np.median(depths))
     if fits >= FIT and 0.02 < _typical_depth(points, cameras) / typical < 50:
@@ -110,7 +110,7 @@ def _foreign(points: Floats, depths: Floats, cameras: Mapping[str, Camera]) -> s
     apart = {
         factor: abs(np.log(_typical_depth(points * factor, cameras) / typical))
         for factor in FACTORS
-        if factor * extent > LEAST_EXTENT * typical  # any points, made small enough, lie in the middle of a rig
+        if factor * extent > MIN_EXTENT * typical  # any points, made small enough, lie in the middle of a rig
     }
     likely = min(apart, key=lambda factor: apart[factor], default=None)
     if likely is not None and apart[likely] < np.log(5):

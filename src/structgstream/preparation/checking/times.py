@@ -6,7 +6,7 @@ from structgstream.pose_check.findings import Finding
 from structgstream.preparation.synchronization import SynchronizationCheck, check_synchronization
 
 FRAMES = 90
-LEAST_FRAMES = 8
+MIN_FRAMES = 8
 WARNED_SECONDS = 5e-3
 SIGMAS, SURE_SIGMAS = 3.0, 2.0
 
@@ -18,7 +18,7 @@ def measure_times(source: FrameSource) -> SynchronizationCheck | None:
         CaptureError: the pictures cannot be read.
         MissingExtraError: cv2 or scipy is not installed.
     """
-    return check_synchronization(source, frames=FRAMES) if len(source) >= LEAST_FRAMES else None
+    return check_synchronization(source, frames=FRAMES) if len(source) >= MIN_FRAMES else None
 
 
 def time_findings(measured: SynchronizationCheck | None) -> list[Finding]:

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 LIMIT_MS = 5.0
-MOST_NUMBERED = 16  # cameras
+MAX_NUMBERED = 16  # cameras
 FAR_PERCENTILE = 97.0
-MOST_LABELS = 60
+MAX_LABELS = 60
 LABEL_REACH = 0.06  # of the rig's radius: closer cameras share a label
 
 
@@ -51,7 +51,7 @@ def draw_matrix(path: Path, report: CheckReport, *, limit_pixels: float, stray: 
     axis.spines[:].set_visible(False)
     crossed = {(names.index(one), names.index(other)) for pair in stray for one, other in (pair, pair[::-1])}
     for row, column in zip(*np.nonzero(np.isfinite(values))):
-        told = [f"{values[row, column]:.1f}"] * (len(names) <= MOST_NUMBERED) + ["x"] * ((row, column) in crossed)
+        told = [f"{values[row, column]:.1f}"] * (len(names) <= MAX_NUMBERED) + ["x"] * ((row, column) in crossed)
         if told:
             dark = values[row, column] < 1.3 * limit_pixels
             axis.text(column, row, " ".join(told), ha="center", va="center", fontsize=7, color="white" if dark else INK)
@@ -98,7 +98,7 @@ def draw_coverage(path: Path, examined: Examination, *, near: float, unit: str) 
             )  # fmt: skip
             axis.plot(start[across], start[up], "s", color=color, markersize=5)
         labels = [
-            name for name in cameras if name in examined.suspects.off or (len(cameras) <= MOST_LABELS and across == 0)
+            name for name in cameras if name in examined.suspects.off or (len(cameras) <= MAX_LABELS and across == 0)
         ]
         _draw_labels(axis, examined, labels, centers[:, [across, up]], axes[:, [across, up]], radius=radius)
         axis.set_aspect("equal", adjustable="datalim")

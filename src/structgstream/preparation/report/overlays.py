@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 WIDTH_INCHES = 7.0
-MOST_POINTS = 400
+MAX_POINTS = 400
 LINES = 7
 USUAL_PERCENTILE = 75  # of the matches of a pair, by their distance to their lines
-MOST_PAIRS = 6
+MAX_PAIRS = 6
 
 
 def draw_overlay(path: Path, examined: Examination, report: CheckReport, name: str) -> None:
@@ -36,7 +36,7 @@ def draw_overlay(path: Path, examined: Examination, report: CheckReport, name: s
     axis = figure.subplots()
     _picture(axis, examined, name)
     own = np.flatnonzero(tracks.of(name) & np.isfinite(tracks.residuals)) if name in tracks.names else np.empty(0, int)
-    own = own[:: max(len(own) // MOST_POINTS, 1)]
+    own = own[:: max(len(own) // MAX_POINTS, 1)]
     limit = 2 * examined.suspects.limit_pixels
     if len(own):
         order = own[np.argsort(tracks.residuals[own])]
@@ -70,11 +70,11 @@ def chosen_pairs(examined: Examination) -> list[Pair]:
     errors = pair_errors(examined.evidence, examined.cameras)
     ranked = sorted(errors, key=lambda pair: -errors[pair].pixels)
     chosen: list[Pair] = []
-    for name in examined.suspects.off[: MOST_PAIRS - 2]:
+    for name in examined.suspects.off[: MAX_PAIRS - 2]:
         chosen += [pair for pair in ranked if name in pair][:1]
     solid = sorted(ranked, key=lambda pair: -errors[pair].matches)
     chosen += [*ranked[:1], *solid]
-    return list(dict.fromkeys(chosen))[:MOST_PAIRS]
+    return list(dict.fromkeys(chosen))[:MAX_PAIRS]
 
 
 def draw_epipolar(path: Path, examined: Examination, pair: Pair) -> None:

@@ -36,22 +36,22 @@ from structgstream.preparation.synchronization.solving import Solution, Tie, con
 
 CLOSING_SECONDS = 3e-4  # by which the lags of a loop may miss each other
 DOUBT = 1 / 3  # that a closed loop leaves: its lags, if wrong, would be spread over several milliseconds
-MOST_LOOPS = 3
+MAX_LOOPS = 3
 SPEED_OF_SOUND = 343.0  # metres a second, at 20 degrees Celsius
 STEP_SECONDS = 0.004  # of onsets
 SMOOTHING_STEPS = 1.0  # standard deviation; ways of sound that differ by a metre are apart by less than a step
 BANDS_HERTZ = (LOW_HERTZ, 600.0, 1500.0, 3500.0, HIGH_HERTZ)
-LEAST_OVERLAP_SECONDS = 1.0
+MIN_OVERLAP_SECONDS = 1.0
 RIVAL_RATIO = 0.8  # of the second best lag to the best one
 SINGLE_RIVAL_RATIO = 0.5  # the same where one bang alone agrees, which any other may do
 SEVERAL_SHARE, SEVERAL_SECONDS = 0.3, 0.15  # of a second bang: its share of the first one, and its distance
 CHANCE_DEVIATIONS = 7.0  # that a coarse peak exceeds: the largest of 300000 normal numbers is at 4.5
 COARSE_SIGMA_SECONDS = 2.5e-3  # of a lag by onsets: claps from several places, echoes
-MOST_WINDOWS = 16
+MAX_WINDOWS = 16
 SLACK_SECONDS = 0.02  # what drift may make of a lag before rates are known
 FINE_SIGMA_SECONDS = 1e-4  # of a window's peak in a room that echoes
-AGREEING_SECONDS, MOST_DRIFT = 1.5e-4, 2e-4  # between windows
-LEAST_AGREEING, LEAST_AGREEING_SHARE = 4, 0.4
+AGREEING_SECONDS, MAX_DRIFT = 1.5e-4, 2e-4  # between windows
+MIN_AGREEING, MIN_AGREEING_SHARE = 4, 0.4
 STRIDES = (1, 2, 3, 5)  # between partners, where there are more cameras than the next number
 ALL_PAIRS = 12
 
@@ -109,7 +109,7 @@ def doubts(lags: Sequence[PairLag]) -> list[float]:
             joined, count = joined | group[0], count + group[1]
         groups.append((joined, count))
     loops = {pair: count for pairs, count in groups for pair in pairs}
-    return [DOUBT ** min(loops.get((lag.first, lag.second), 0), MOST_LOOPS) for lag in lags]
+    return [DOUBT ** min(loops.get((lag.first, lag.second), 0), MAX_LOOPS) for lag in lags]
 
 
 def _closes(three: Sequence[str], known: dict[tuple[str, str], PairLag]) -> bool:
@@ -155,9 +155,9 @@ def sound_of(name: str, audio: tuple[NDArray[np.float32], float]) -> Sound:
         UnusableSoundError: silence, or less than a second.
     """
     samples, rate = audio
-    if len(samples) < LEAST_OVERLAP_SECONDS * rate:
+    if len(samples) < MIN_OVERLAP_SECONDS * rate:
         raise UnusableSoundError(
-            f"Camera {name!r} has {len(samples) / rate:.2f} s of sound, less than the {LEAST_OVERLAP_SECONDS:g} s "
+            f"Camera {name!r} has {len(samples) / rate:.2f} s of sound, less than the {MIN_OVERLAP_SECONDS:g} s "
             "that can be compared",
             "synchronise by motion or timestamps.csv",
         )
@@ -226,8 +226,8 @@ def _pairs(names: list[str]) -> list[Pair]:
 
 def _pair_lag(first: str, second: str, sounds: Mapping[str, Sound]) -> PairLag | None:
     one, other = sounds[first], sounds[second]
-    least = round(LEAST_OVERLAP_SECONDS / STEP_SECONDS)
-    coarse = best_lag(one.onsets, other.onsets, least_overlap=least)
+    least = round(MIN_OVERLAP_SECONDS / STEP_SECONDS)
+    coarse = best_lag(one.onsets, other.onsets, min_overlap=least)
     # The right lag is the one at which all sounds agree; another one has a clap agree with another clap.
     if coarse is None or coarse.rival > RIVAL_RATIO * coarse.judged:
         return None
@@ -281,7 +281,7 @@ def _on_a_line(found: list[Window]) -> list[Window]:
 
     Echoes and noise give lags that are spread over the range that is searched, so a few that agree are right.
     """
-    if len(found) < LEAST_AGREEING:
+    if len(found) < MIN_AGREEING:
         return []
     times = np.array([window.middle for window in found])
     lags = np.array([window.seconds for window in found])
@@ -289,10 +289,10 @@ def _on_a_line(found: list[Window]) -> list[Window]:
     for i, j in combinations(range(len(found)), 2):
         slope = (lags[j] - lags[i]) / (times[j] - times[i]) if times[i] != times[j] else np.inf
         for drift in (0.0, slope):
-            if abs(drift) <= MOST_DRIFT:
+            if abs(drift) <= MAX_DRIFT:
                 on = np.abs(lags - lags[i] - drift * (times - times[i])) < AGREEING_SECONDS
                 best = on if on.sum() > best.sum() else best
-    if best.sum() < max(LEAST_AGREEING, LEAST_AGREEING_SHARE * len(found)):
+    if best.sum() < max(MIN_AGREEING, MIN_AGREEING_SHARE * len(found)):
         return []
     return [window for window, agrees in zip(found, best, strict=True) if agrees]
 
@@ -322,7 +322,7 @@ def _windows(one: Signal, other: Signal, lag: float) -> list[float]:
     start, end = max(one.start, other.start - lag), min(one.end, other.end - lag)
     if end - start <= WINDOW_SECONDS:
         return [(start + end) / 2]
-    count = min(int(2 * (end - start) / WINDOW_SECONDS), MOST_WINDOWS)
+    count = min(int(2 * (end - start) / WINDOW_SECONDS), MAX_WINDOWS)
     times = np.arange(start + WINDOW_SECONDS / 2, end - WINDOW_SECONDS / 2, 0.1)
     totals = [np.concatenate([[0.0], np.cumsum(signal.values.sum(1))]) for signal in (one, other)]
     loudness = np.ones(len(times))

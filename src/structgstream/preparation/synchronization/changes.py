@@ -13,7 +13,7 @@ from structgstream.data.images import opencv
 LONGER_SIDE = 160  # of reduced pictures, pixels: events are compared along lines, so positions need not be finer
 SMOOTHING = 1.0  # standard deviation, reduced pixels
 SAMPLED = 100  # frames whose noise is measured
-NOISE_FACTOR, LEAST_NOISE = 4.0, 0.5  # changes below this many times the median change are noise
+NOISE_FACTOR, MIN_NOISE = 4.0, 0.5  # changes below this many times the median change are noise
 MOST = 30.0  # larger changes count as this one: a bright shirt is not more of an event than a dark one
 UNITS = 4  # of stored changes in a grey level
 STILL = 5e-4  # share of MOST of a mean change below which nothing moves
@@ -92,4 +92,4 @@ def _noise(reduced: Sequence[NDArray[np.uint8]]) -> float:
     for first in firsts.tolist():
         pair = [cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SMOOTHING) for grey in reduced[first : first + 2]]
         steps.append(np.abs(pair[1] - pair[0]))
-    return NOISE_FACTOR * max(float(np.median(np.stack(steps))), LEAST_NOISE)
+    return NOISE_FACTOR * max(float(np.median(np.stack(steps))), MIN_NOISE)

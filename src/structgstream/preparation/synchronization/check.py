@@ -24,8 +24,8 @@ from structgstream.preparation.synchronization.result import WARNED_SECONDS
 
 OFF_PERIODS = 0.25  # of a camera's frames, from which on it is off; true synchronous captures show up to 0.16
 OFF_SIGMAS = 3.0
-MOST_SIGMA_PERIODS = 1 / 3  # so that a whole frame shows
-MOST_FRAMES = 300
+MAX_SIGMA_PERIODS = 1 / 3  # so that a whole frame shows
+MAX_FRAMES = 300
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class SynchronizationCheck:
         return f"Camera {name!r} is {amount} {'late' if late > 0 else 'early'}; shift its frames, or synchronise again."
 
 
-def check_synchronization(source: FrameSource, *, frames: int = MOST_FRAMES) -> SynchronizationCheck:
+def check_synchronization(source: FrameSource, *, frames: int = MAX_FRAMES) -> SynchronizationCheck:
     """By how much each camera of a calibrated capture is late, from its first ``frames`` frames.
 
     All cameras are looked at, those that are held out, too: nothing is fitted to their pictures.
@@ -125,7 +125,7 @@ def check_synchronization(source: FrameSource, *, frames: int = MOST_FRAMES) -> 
     solution = solve_by_motion({name: takes[name] for name in group}, good, slack_seconds=period / 2, drift=False)
     middle = float(np.median(list(solution.offsets.values())))
     # A clock that is unsure by a good part of a frame tells nothing, however far it is from the others.
-    told = tuple(name for name in group if solution.sigmas[name] <= MOST_SIGMA_PERIODS * period)
+    told = tuple(name for name in group if solution.sigmas[name] <= MAX_SIGMA_PERIODS * period)
     late = {name: solution.offsets[name] - middle for name in told}
     errors = {name: solution.sigmas[name] for name in told}
     off = tuple(name for name in told if abs(late[name]) > max(OFF_PERIODS * period, OFF_SIGMAS * errors[name]))

@@ -81,7 +81,7 @@ def resampled(values: Floats, stamps: Floats, *, step: float) -> Signal:
 
 
 def best_lag(
-    first: Signal, second: Signal, *, within: tuple[float, float] | None = None, least_overlap: int = 8
+    first: Signal, second: Signal, *, within: tuple[float, float] | None = None, min_overlap: int = 8
 ) -> Lag | None:
     """The lag of the largest correlation; None if there is no overlap, no change in
     it, or no peak.
@@ -90,9 +90,9 @@ def best_lag(
         first: a signal.
         second: another, of the same step and channels.
         within: least and largest lag in seconds; None for all.
-        least_overlap: least number of samples in common.
+        min_overlap: least number of samples in common.
     """
-    score, numerators, energy, counts, lags = _scores(first, second, least_overlap)
+    score, numerators, energy, counts, lags = _scores(first, second, min_overlap)
     seconds = second.start - first.start + lags * first.step
     if within is not None:
         score = np.where((seconds >= within[0]) & (seconds <= within[1]), score, -np.inf)

@@ -27,13 +27,13 @@ Straighten = Callable[[Floats], Floats]
 """From pixels ``[S, 2]`` as filmed to points that obey the fundamental matrix; NaN where the lens has no inverse."""
 
 BUNDLES = 64
-LEAST_SHARE = 0.25  # of the pixels of the view that sees less of the common lines
+MIN_SHARE = 0.25  # of the pixels of the view that sees less of the common lines
 SAME_PLACE = 1e-6  # distance of cameras at one place, as a share of theirs to the origin
 FEATURES = 3000
 LONGER_SIDE = 960  # of pictures in which static features are looked for, pixels
 RATIO = 0.8
 INLIER_SHARE = 1 / 640  # of the picture's longer side
-LEAST_INLIERS = 16
+MIN_INLIERS = 16
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def line_signals(first: Changes, second: Changes, geometry: PairGeometry) -> tup
     high = min(_high(one), _high(other))
     if not high > low:
         return None
-    if min(((each >= low) & (each <= high)).mean() for each in (one, other)) < LEAST_SHARE:
+    if min(((each >= low) & (each <= high)).mean() for each in (one, other)) < MIN_SHARE:
         return None
     # Bundles of equally many pixels: lines fan out, and a bundle of few pixels is noise.
     both = np.concatenate([each[(each >= low) & (each <= high)] for each in (one, other)])
@@ -165,10 +165,10 @@ class StaticGeometry:
     def pair(self, first: str, second: str, /) -> PairGeometry | None:
         """None if the views have too few features in common."""
         one, other = self.features[first], self.features[second]
-        if min(len(one.pixels), len(other.pixels)) < LEAST_INLIERS:
+        if min(len(one.pixels), len(other.pixels)) < MIN_INLIERS:
             return None
         matches = mutual_matches(one.descriptors, other.descriptors, ratio=RATIO)
-        if len(matches) < LEAST_INLIERS:
+        if len(matches) < MIN_INLIERS:
             return None
         F, inliers = opencv().findFundamentalMat(
             one.pixels[matches[:, 0]],
@@ -178,7 +178,7 @@ class StaticGeometry:
             0.999,
             5000,
         )
-        if F is None or F.shape != (3, 3) or int(inliers.sum()) < LEAST_INLIERS:
+        if F is None or F.shape != (3, 3) or int(inliers.sum()) < MIN_INLIERS:
             return None
         return PairGeometry(F, (_same, _same), estimated=True)
 

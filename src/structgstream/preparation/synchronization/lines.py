@@ -19,10 +19,10 @@ from structgstream.preparation.synchronization.correlation import Signal
 
 Floats = NDArray[np.float64]
 
-MOST_RATE = 2e-3  # between two clocks; 29.97 and 30 frames a second taken for each other are 1e-3
+MAX_RATE = 2e-3  # between two clocks; 29.97 and 30 frames a second taken for each other are 1e-3
 RATE_STEP, LAG_STEP = 1e-4, 0.05  # of the search; lags in samples
 NEAR_SAMPLES = 2  # on both sides of the expected lag
-LEAST_ENERGY = 0.05  # of a block, of the mean one: below it is no more reliable
+MIN_ENERGY = 0.05  # of a block, of the mean one: below it is no more reliable
 
 
 @dataclass(frozen=True)
@@ -81,20 +81,20 @@ def fitted_line(
         rates: whether the lag may change.
     """
     half = (edges[-1] - edges[0]) / 2
-    reach = NEAR_SAMPLES + (round(MOST_RATE * half / first.step) if rates else 0)
+    reach = NEAR_SAMPLES + (round(MAX_RATE * half / first.step) if rates else 0)
     blocks = _blocks(first, second, expected_seconds, edges, reach + 2)
     if blocks is None:
         return None
     count, step = len(edges) - 1, first.step
     middle = float(blocks.times.mean())
-    tried = np.arange(-MOST_RATE, MOST_RATE + RATE_STEP / 2, RATE_STEP) if rates else np.zeros(1)
+    tried = np.arange(-MAX_RATE, MAX_RATE + RATE_STEP / 2, RATE_STEP) if rates else np.zeros(1)
     lags = np.arange(-NEAR_SAMPLES, NEAR_SAMPLES + LAG_STEP / 2, LAG_STEP)
     gains = _gains(blocks, (blocks.times - middle) / step, tried, lags, reach)
     best = _best(gains, np.arange(len(blocks.times)), tried, lags)
     without = np.array(
         [_best(gains, np.delete(np.arange(len(blocks.times)), k), tried, lags) for k in range(len(blocks.times))]
     )
-    told = len(tried) > 1 and bool(np.abs([best[1], *without[:, 1]]).max() < MOST_RATE - RATE_STEP)
+    told = len(tried) > 1 and bool(np.abs([best[1], *without[:, 1]]).max() < MAX_RATE - RATE_STEP)
     if not told and len(tried) > 1:
         return fitted_line(first, second, expected_seconds=expected_seconds, edges=edges, rates=False)
     changes = np.zeros((count, 2))
@@ -155,7 +155,7 @@ def _gains(blocks: _Blocks, times: Floats, rates: Floats, lags: Floats, reach: i
     """
     most = blocks.own.shape[1] // 2
     energy = blocks.own[:, most]
-    weights = 1 / np.maximum(energy, LEAST_ENERGY * energy.mean())
+    weights = 1 / np.maximum(energy, MIN_ENERGY * energy.mean())
     seen = np.arange(-reach, reach + 1)
     first, second = blocks.own[:, most + 1], blocks.own[:, most + 2]
     smooth = blocks.own.copy()

@@ -28,19 +28,19 @@ from structgstream.preparation.synchronization.lines import Line, fitted_line
 from structgstream.preparation.synchronization.solving import Solution, Tie, connected, solve_clocks
 from structgstream.preparation.synchronization.streams import period_seconds
 
-LEAST_SAMPLES = 6  # that two views must have in common, in frames
-LEAST_OVERLAP = 0.2  # of the shorter take
-LEAST_PEAK = 0.25  # correlation of views that see the same
+MIN_SAMPLES = 6  # that two views must have in common, in frames
+MIN_OVERLAP = 0.2  # of the shorter take
+MIN_PEAK = 0.25  # correlation of views that see the same
 # Of activities, and of lines whose geometry is an estimate from few features, a peak must stand out more.
 CHANCE_DEVIATIONS = 4.5
 ESTIMATED_PEAK, CONTROL_RATIO = 0.5, 1.2
 RIVAL_RATIO = 0.9  # another lag that is nearly as good makes a pair ambiguous
-LEAST_SUPPORT = 0.3  # share of a camera's pairs that agree with its clock
-LEAST_DRIFT_SECONDS = 6.0  # of the take, from which on drift is looked for
-BLOCK_SECONDS, MOST_BLOCKS = 1.0, 12
+MIN_SUPPORT = 0.3  # share of a camera's pairs that agree with its clock
+MIN_DRIFT_SECONDS = 6.0  # of the take, from which on drift is looked for
+BLOCK_SECONDS, MAX_BLOCKS = 1.0, 12
 NEAR_BLOCKS, NEAR_SAMPLES = 6, 8  # most blocks of shorter takes, left out one by one, and least samples of each
 NEAR_PERIODS = 2.0
-LEAST_LINE_SIGMA = 0.02  # periods: few blocks may agree by chance
+MIN_LINE_SIGMA = 0.02  # periods: few blocks may agree by chance
 # Standard deviation of a camera's own error, that all its pairs share because views see different parts of what moves;
 # in periods, with a known geometry, with one from static features, and by activities.
 BIAS_PERIODS, ESTIMATED_BIAS_PERIODS, ACTIVITY_BIAS_PERIODS = 0.06, 0.3, 1.0
@@ -94,12 +94,12 @@ def motion_ties(pairs: Sequence[PairSignals], *, near: Solution | None = None) -
         for pair in pairs
     ]
     low, high = min(low for low, _ in bounds), max(high for _, high in bounds)
-    if high - low < LEAST_DRIFT_SECONDS:
+    if high - low < MIN_DRIFT_SECONDS:
         count = min(int((high - low) / max(pair.signals[0].step for pair in pairs)) // NEAR_SAMPLES, NEAR_BLOCKS)
         # Of a second, what is left without a block has no peak of its own.
         edges = np.linspace(low, high, count + 1) if count > 2 else None
         return [tie for pair in pairs for tie in _near(pair, near, edges)]
-    edges = np.linspace(low, high, min(int((high - low) / BLOCK_SECONDS), MOST_BLOCKS) + 1)
+    edges = np.linspace(low, high, min(int((high - low) / BLOCK_SECONDS), MAX_BLOCKS) + 1)
     return [tie for pair in pairs for tie in _along(pair, near, edges)]
 
 
@@ -167,7 +167,7 @@ def _supported(tie: Tie, ties: Sequence[Tie], agreeing: Sequence[Tie]) -> bool:
     """Whether enough pairs of both cameras agree with their clocks, so that it is no chance."""
     for name in (tie.first, tie.second):
         all_, own = (sum(name in (each.first, each.second) for each in some) for some in (ties, agreeing))
-        if own < LEAST_SUPPORT * all_ or (own == 1 and all_ > 1):
+        if own < MIN_SUPPORT * all_ or (own == 1 and all_ > 1):
             return False
     return True
 
@@ -184,9 +184,9 @@ def _apart(apart: Sequence[str], group: Sequence[str], seconds: float) -> str:
 
 def _whole(pair: PairSignals) -> list[Tie]:
     one, other = pair.signals
-    least = max(LEAST_SAMPLES, round(LEAST_OVERLAP * min(len(one.values), len(other.values))))
-    lag = best_lag(one, other, least_overlap=least)
-    if lag is None or lag.peak < LEAST_PEAK or lag.rival > RIVAL_RATIO * lag.judged:
+    least = max(MIN_SAMPLES, round(MIN_OVERLAP * min(len(one.values), len(other.values))))
+    lag = best_lag(one, other, min_overlap=least)
+    if lag is None or lag.peak < MIN_PEAK or lag.rival > RIVAL_RATIO * lag.judged:
         return []
     if not pair.epipolar and lag.judged < CHANCE_DEVIATIONS * chance_deviation(one, other):
         return []
@@ -200,7 +200,7 @@ def _control(pair: PairSignals, least: int) -> float:
     one, other = pair.signals
     half = other.values.shape[1] // 2
     wrong = (other.values[:, ::-1], np.roll(other.values, half, 1), np.roll(other.values[:, ::-1], half, 1))
-    lags = [best_lag(one, replace(other, values=values), least_overlap=least) for values in wrong]
+    lags = [best_lag(one, replace(other, values=values), min_overlap=least) for values in wrong]
     return max((lag.judged for lag in lags if lag is not None), default=0.0)
 
 
@@ -216,11 +216,11 @@ def _near(pair: PairSignals, near: Solution, edges: NDArray[np.float64] | None) 
     reach = NEAR_PERIODS * one.step
     start, end = max(one.start, other.start - expected), min(one.end, other.end - expected)
     cut = one.cut(start, end), other.cut(start + expected - reach, end + expected + reach)
-    if min(len(signal.values) for signal in cut) < LEAST_SAMPLES:
+    if min(len(signal.values) for signal in cut) < MIN_SAMPLES:
         return []
-    least = max(LEAST_SAMPLES, round(0.8 * len(cut[0].values) - 2 * NEAR_PERIODS))
-    lag = best_lag(*cut, within=(expected - reach, expected + reach), least_overlap=least)
-    if lag is None or lag.peak < LEAST_PEAK or abs(lag.seconds - expected) >= reach - one.step / 2:
+    least = max(MIN_SAMPLES, round(0.8 * len(cut[0].values) - 2 * NEAR_PERIODS))
+    lag = best_lag(*cut, within=(expected - reach, expected + reach), min_overlap=least)
+    if lag is None or lag.peak < MIN_PEAK or abs(lag.seconds - expected) >= reach - one.step / 2:
         return []
     tie = _tie(pair, lag.middle, lag.seconds, lag.sigma_seconds, lag.peak)
     if edges is None:
@@ -238,7 +238,7 @@ def _along(pair: PairSignals, near: Solution, edges: NDArray[np.float64]) -> lis
     line = fitted_line(one, other, expected_seconds=_expected(pair, near), edges=edges - near.offsets[pair.first])
     if line is None:
         return []
-    least = LEAST_LINE_SIGMA * one.step if pair.epipolar else one.step / 2
+    least = MIN_LINE_SIGMA * one.step if pair.epipolar else one.step / 2
     sigma = max(line.lag_sigma, least)
     if line.rate is None:
         return [_line_tie(pair, line, 0.0, sigma)]

@@ -16,7 +16,7 @@ WINDOW_SECONDS = 2
 LOW_HERTZ, HIGH_HERTZ = 150.0, 8000.0
 GRID_HERTZ = 96000  # of the correlation
 REACH_SECONDS = 0.008  # on both sides of the expected lag
-LEAST_STANDING_OUT = 6.0  # of a peak, over the root mean square of the correlation
+MIN_STANDING_OUT = 6.0  # of a peak, over the root mean square of the correlation
 SMOOTHING_BINS = 101  # over which spectra are made white
 OTHER_SECONDS = 3e-4  # from the best peak, from where on a peak is another one
 RIVAL_POWER = 6  # of a peak's share of the best one: how likely it is the right one instead
@@ -65,7 +65,7 @@ def phase_window(one: Recording, other: Recording, middle: float, lag: float) ->
     reach = round(REACH_SECONDS * GRID_HERTZ)
     near = np.concatenate([curve[-reach:], curve[: reach + 1]]) / level
     best = int(near.argmax())
-    if not 0 < best < len(near) - 1 or near[best] < LEAST_STANDING_OUT:
+    if not 0 < best < len(near) - 1 or near[best] < MIN_STANDING_OUT:
         return None
     left, top, right = near[best - 1 : best + 2]
     vertex = (left - right) / (2 * (left - 2 * top + right))

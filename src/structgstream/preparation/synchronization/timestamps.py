@@ -20,9 +20,9 @@ from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.streams import period_seconds
 
 COLUMNS = ("camera", "frame", "seconds")
-MOST_DEVIATION = 0.5  # of a row from a steady clock, in frame periods
+MAX_DEVIATION = 0.5  # of a row from a steady clock, in frame periods
 RATE_ROWS = 2
-MOST_DRIFT = 0.01
+MAX_DRIFT = 0.01
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def _clock(file: Path, name: str, rows: Mapping[int, float], stamps: Floats) -> 
         # What rounding of the rows could be is no drift.
         if abs(rate - 1) * (own[-1] - own[0]) < 1e-3:
             rate = 1.0
-    if abs(rate - 1) > MOST_DRIFT:
+    if abs(rate - 1) > MAX_DRIFT:
         raise CaptureError(
             f"By {file} the clock of camera {name!r} runs {rate:.4g} times as fast as its video; frames lack in the "
             "video or in "
@@ -114,7 +114,7 @@ def _clock(file: Path, name: str, rows: Mapping[int, float], stamps: Floats) -> 
     offset = float(np.mean(seconds - rate * own))
     off = seconds - offset - rate * own
     worst = int(np.abs(off).argmax())
-    if abs(off[worst]) > MOST_DEVIATION * period:
+    if abs(off[worst]) > MAX_DEVIATION * period:
         raise CaptureError(
             f"By {file} frame {frames[worst]} of camera {name!r} is {abs(off[worst]):.4f} s off a steady clock, "
             "more than half a "

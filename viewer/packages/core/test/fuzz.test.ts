@@ -5,11 +5,11 @@ import { afterEach, beforeEach, describe, expect, test, vi } from "vitest";
 import { AdaptiveDecoder } from "../src/adaptive.ts";
 import { Models } from "../src/decisions.ts";
 import { StreamError } from "../src/errors.ts";
-import { decodedFree, MOST_FREE, noFree } from "../src/freeRows.ts";
+import { decodedFree, MAX_FREE, noFree } from "../src/freeRows.ts";
 import { readStream } from "../src/reader.ts";
 import { bytesOf, FIXTURES, joined, piecesOf, record, VECTORS } from "./streams.ts";
 
-const MOST_BYTES = 2 ** 20;
+const MAX_BYTES = 2 ** 20;
 const STREAMS: [string, Uint8Array][] = [
   ["raw", bytesOf(VECTORS, "version-2.sgs")],
   ["compact", bytesOf(FIXTURES, "tiny.sgs")],
@@ -65,7 +65,7 @@ describe.each(STREAMS)("the %s stream", (_, stream) => {
       before = frames;
     }
     expect(before).toBe(records);
-    expect(largest).toBeLessThan(MOST_BYTES);
+    expect(largest).toBeLessThan(MAX_BYTES);
   });
 
   test("with every byte changed", async () => {
@@ -76,7 +76,7 @@ describe.each(STREAMS)("the %s stream", (_, stream) => {
       const frames = framesOf(damaged);
       expect(frames === undefined || frames <= records).toBe(true);
     }
-    expect(largest).toBeLessThan(MOST_BYTES);
+    expect(largest).toBeLessThan(MAX_BYTES);
   });
 
   test("with every byte changed and a checksum that says it is right", async () => {
@@ -111,7 +111,7 @@ describe.each(STREAMS)("the %s stream", (_, stream) => {
         expect(framesOf(joined(...pieces.slice(0, place), cut, ...pieces.slice(place + 1)))).toBeUndefined();
       }
     }
-    expect(largest).toBeLessThan(MOST_BYTES);
+    expect(largest).toBeLessThan(MAX_BYTES);
   });
 });
 
@@ -133,7 +133,7 @@ test("more births than a scene may have are refused before anything is allocated
   expect(most).toThrow("ends too early in free_births");
   largest = 0;
   const more = () => decodedFree(bornOf(64, 62, 189, 124, 228), noFree(), "It");
-  expect(more).toThrow(`adds ${MOST_FREE + 1} free Gaussians`);
+  expect(more).toThrow(`adds ${MAX_FREE + 1} free Gaussians`);
   const huge = () => decodedFree(bornOf(64, 62, 143, 66, 0, 2, 244), noFree(), "It");
   expect(huge).toThrow("adds 2147483647 free Gaussians");
   expect(() => decodedFree(bornOf(33), noFree(), "It")).toThrow("adds -1 free Gaussians");
