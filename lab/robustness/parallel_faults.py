@@ -31,8 +31,8 @@ from structgstream.data.clip import bundled_clip_path
 from structgstream.errors import StorageError, TaskError
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.local import LocalEngine
-from structgstream.executors.places import Place
 from structgstream.executors.task import PYTHON
+from structgstream.executors.worker_slots import WorkerSlot
 from structgstream.parallel.driver import Job, drive
 from structgstream.parallel.exchange import ObjectStore
 from structgstream.parallel.object_folder import ObjectFolder
@@ -89,7 +89,7 @@ def driven(folder: Path, engine: LocalEngine, *, real: bool, url: str | None = N
 
 def engine() -> LocalEngine:
     """Two workers of one thread."""
-    return LocalEngine([Place(1)] * 2)
+    return LocalEngine([WorkerSlot(1)] * 2)
 
 
 def killed_workers(row: Row, folder: Path, *, whole: str, kills: int, most: float, seed: int, real: bool) -> Row:

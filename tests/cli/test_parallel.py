@@ -10,7 +10,7 @@ from structgstream.cli.options import CaptureOptions
 from structgstream.cli.parallel import Parallel, WorkerOptions, _job, join_words
 from structgstream.codec.reader import open_stream
 from structgstream.evaluation.environment import usable_cores
-from structgstream.executors.task import Ending
+from structgstream.executors.task import TaskResult
 from structgstream.owned_folders import MARKER, Owner
 from structgstream.parallel.object_folder import ObjectFolder
 from structgstream.parallel.parts import PURPOSE, Parts
@@ -115,7 +115,7 @@ def test_folders_and_stores_of_others_are_refused_with_every_option_and_nothing_
     else:
         with parts.held():
             parts.header.write_bytes(b"mine")
-            parts.note(Ending("header", 0, 1.0), "key", parts.header, frames=1)
+            parts.note(TaskResult("header", 0, 1.0), "key", parts.header, frames=1)
     (store / "segments").mkdir()
     (store / "segments" / "group-000000-000004.sgs").write_bytes(b"mine")
     if whose in ("ours", "other run"):

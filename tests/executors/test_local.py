@@ -13,13 +13,13 @@ import pytest
 from structgstream.errors import ConfigError
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.local import LocalEngine
-from structgstream.executors.places import Place
 from structgstream.executors.task import Task
+from structgstream.executors.worker_slots import WorkerSlot
 from tests.support.sleepers import PATIENCE_SECONDS, all_endings, begun, module, writes
 
 
 def local(count: int = 2, gpu: int | None = None) -> TaskQueue:
-    return TaskQueue(LocalEngine([Place(1, gpu)] * count))
+    return TaskQueue(LocalEngine([WorkerSlot(1, gpu)] * count))
 
 
 def test_two_run_at_a_time(tmp_path: Path) -> None:
@@ -64,7 +64,7 @@ def test_a_place_gives_threads_and_hides_other_gpus() -> None:
 
 def test_a_task_without_a_gpu_leaves_it_to_those_that_need_one(tmp_path: Path) -> None:
     meets = 'until [ "$(wc -l < "$0/begun")" = 2 ]; do sleep 0.02; done'
-    with TaskQueue(LocalEngine([Place(1, gpu=0), Place(1)])) as executor:
+    with TaskQueue(LocalEngine([WorkerSlot(1, gpu=0), WorkerSlot(1)])) as executor:
         executor.submit(writes("plain", tmp_path, then=meets))
         executor.submit(writes("needs", tmp_path, then=meets), gpus=1)
         assert all(ending.done for ending in all_endings(executor).values())

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from structgstream.atomic_files import partial_path
 from structgstream.errors import StorageError
 from structgstream.groups.growing_file import GrowingFile, name_finished
-from structgstream.whole_files import partial_path
 from tests.support.killed import folders_of_the_killed
 
 

@@ -12,7 +12,7 @@ import pytest
 from structgstream.errors import ConfigError, StorageError, TaskError
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.inline import InlineEngine
-from structgstream.executors.task import PYTHON, Ending, Task
+from structgstream.executors.task import PYTHON, Task, TaskResult
 from structgstream.parallel.driver import Job, Status, _Drive, drive
 from structgstream.parallel.exchange import SharedFolder
 from structgstream.parallel.parts import Parts, group_name
@@ -62,7 +62,7 @@ class ElsewhereEngine(InlineEngine):
     def start(self, task: Task, *, gpus: int, attempt: int) -> None:
         super().start(replace(task, log=None), gpus=gpus, attempt=attempt)
 
-    def ended(self, seconds: float) -> list[Ending]:
+    def ended(self, seconds: float) -> list[TaskResult]:
         return [replace(ending, output=f"{ending.name} says: {ending.output}") for ending in super().ended(seconds)]
 
 
@@ -160,5 +160,5 @@ def test_the_log_has_what_the_last_attempt_on_another_machine_has_printed(tmp_pa
     parts = Parts(tmp_path / "parts")
     drive = _Drive(job(tmp_path), parts, workers(), SharedFolder(), print)
     for said in ("first failure\n", "second failure\n", "second failure\n"):
-        drive._keep_words(Ending("header", 1, 1.0, 1, 0, said))
+        drive._keep_words(TaskResult("header", 1, 1.0, 1, 0, said))
     assert parts.log("header").read_text() == "first failure\nsecond failure\n"

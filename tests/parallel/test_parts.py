@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.errors import ConfigError, StorageError
-from structgstream.executors.task import Ending
+from structgstream.executors.task import TaskResult
 from structgstream.owned_folders import MARKER
 from structgstream.parallel.parts import Parts, read_notes
 from tests.support.killed import folders_of_the_killed
@@ -18,7 +18,7 @@ def parts(tmp_path: Path) -> Parts:
     made = Parts(tmp_path / "parts")
     with made.held():
         made.header.write_bytes(b"header")
-        made.note(Ending("header", 0, 2.5, 3, 1000), "key", made.header, frames=1)
+        made.note(TaskResult("header", 0, 2.5, 3, 1000), "key", made.header, frames=1)
     return made
 
 
@@ -28,7 +28,7 @@ def test_a_note_is_read_again(parts: Parts) -> None:
 
 
 def test_what_was_only_found_whole_keeps_what_it_took(parts: Parts) -> None:
-    parts.note(Ending("header", 0, 0.1), "key", parts.header, frames=1)
+    parts.note(TaskResult("header", 0, 0.1), "key", parts.header, frames=1)
     assert Parts(parts.folder).notes["header"].seconds == 2.5
 
 
@@ -52,7 +52,7 @@ def test_killed_at_any_step_of_a_note_the_notes_are_those_before_or_one_more(tmp
     """And the next note is not lost, as it was when it was appended to a line that a kill had cut."""
 
     def noted(folder: Path) -> None:
-        Parts(folder).note(Ending("track", 0, 1.0), "key", folder / "header.sgs", frames=5)
+        Parts(folder).note(TaskResult("track", 0, 1.0), "key", folder / "header.sgs", frames=5)
 
     def begin(folder: Path) -> None:
         shutil.copytree(parts.folder, folder, dirs_exist_ok=True)
@@ -68,7 +68,7 @@ def test_a_note_after_one_that_was_cut_is_not_lost(parts: Parts) -> None:
     path = parts.folder / "done.jsonl"
     path.write_text(path.read_text() + '{"name": "track", "ke')
     again = Parts(parts.folder)
-    again.note(Ending("join", 0, 1.0), "key", parts.header, frames=5)
+    again.note(TaskResult("join", 0, 1.0), "key", parts.header, frames=5)
     assert set(read_notes(parts.folder)) == {"header", "join"}
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.local import LocalEngine
-from structgstream.executors.places import Place
 from structgstream.executors.task import PYTHON
+from structgstream.executors.worker_slots import WorkerSlot
 from structgstream.parallel.driver import Job
 from structgstream.parallel.unit import Unit
 from tests.support import stand_in
@@ -22,7 +22,7 @@ def job(folder: Path, *, frames: int = 12, group: int = 4, program: tuple[str, .
 
 
 def workers(count: int = 2) -> TaskQueue:
-    return TaskQueue(LocalEngine([Place(1)] * count))
+    return TaskQueue(LocalEngine([WorkerSlot(1)] * count))
 
 
 def sha256(path: Path) -> str:

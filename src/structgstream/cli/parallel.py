@@ -187,12 +187,12 @@ def gpus_of(device: Device) -> int:
 def join_words(options: WorkerOptions, device: Device) -> tuple[str, ...]:
     """As many processes as the workers have threads; where these are elsewhere, or GPUs, what ``join`` takes itself."""
     from structgstream.evaluation.environment import usable_cores
-    from structgstream.executors.places import shared_out
+    from structgstream.executors.worker_slots import allocate_slots
 
     if options.executor == "ray" or gpus_of(device):
         return ()
     cores = usable_cores()
-    places = shared_out(workers=options.workers, cores=cores, threads=options.threads)
+    places = allocate_slots(workers=options.workers, cores=cores, threads=options.threads)
     threads = 1 if options.executor == "inline" else min(cores, sum(place.threads for place in places))
     return ("--workers", str(threads))
 

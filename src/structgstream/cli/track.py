@@ -66,6 +66,7 @@ def main(arguments: list[str]) -> None:
     """Tracks with a progress bar, and lists the groups."""
     options = parse_options(Track, "track", arguments=arguments)
     check_ending(options.output, command="track")
+    from structgstream.atomic_files import partial_path
     from structgstream.cli.app import usage_errors
     from structgstream.groups.base import GroupBase
     from structgstream.groups.boundaries import check_length
@@ -75,7 +76,6 @@ def main(arguments: list[str]) -> None:
     from structgstream.groups.track_pass import TrackOptions
     from structgstream.groups.tracking import TrackConfig
     from structgstream.kernels.backend import select_backend
-    from structgstream.whole_files import partial_path
 
     base = GroupBase.read(options.init)
     length = base.key_interval if options.groups is None else options.groups

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.whole_files import write_whole
+from structgstream.atomic_files import atomic_write
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 RGB, FILTER_UP = 2, 2
@@ -38,7 +38,7 @@ def write_png(path: Path, picture: NDArray[np.uint8]) -> None:
     Raises:
         StorageError: the file cannot be written.
     """
-    write_whole(path, png_bytes(picture), called="The picture", new_folder=True, sync=False)
+    atomic_write(path, png_bytes(picture), called="The picture", new_folder=True, sync=False)
 
 
 def _chunk(kind: bytes, body: bytes) -> bytes:

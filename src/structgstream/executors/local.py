@@ -4,21 +4,21 @@
 from collections.abc import Sequence
 
 from structgstream.errors import ConfigError
-from structgstream.executors.places import Place
 from structgstream.executors.process import CommandProcess, waited_for
-from structgstream.executors.task import Ending, Task
+from structgstream.executors.task import Task, TaskResult
+from structgstream.executors.worker_slots import WorkerSlot
 
 
 class LocalEngine:
-    """Processes in places: shares of the cores, or GPUs (``places.shared_out``)."""
+    """Processes in slots: shares of the cores, or GPUs (``worker_slots.allocate_slots``)."""
 
     name = "local"
     repeats = False
 
-    def __init__(self, places: Sequence[Place]) -> None:
-        self._free = list(places)
-        self._has_gpu = any(place.gpu is not None for place in places)
-        self._running: dict[str, tuple[CommandProcess, Place]] = {}
+    def __init__(self, slots: Sequence[WorkerSlot]) -> None:
+        self._free = list(slots)
+        self._has_gpu = any(slot.gpu is not None for slot in slots)
+        self._running: dict[str, tuple[CommandProcess, WorkerSlot]] = {}
 
     @property
     def processes(self) -> dict[str, int]:
@@ -32,33 +32,33 @@ class LocalEngine:
 
     def has_room(self, gpus: int) -> bool:
         """See ``Engine.has_room``."""
-        return any(place.gpu is not None for place in self._free) if gpus else bool(self._free)
+        return any(slot.gpu is not None for slot in self._free) if gpus else bool(self._free)
 
     def start(self, task: Task, *, gpus: int, attempt: int) -> None:
         """See ``Engine.start``."""
         # A task without a GPU prefers a slot without one.
-        order = sorted(self._free, key=lambda place: (place.gpu is None) == bool(gpus))
-        place = order[0]
-        self._free.remove(place)
-        self._running[task.name] = (CommandProcess(task, environment=place.environment(gpus=gpus)), place)
+        order = sorted(self._free, key=lambda slot: (slot.gpu is None) == bool(gpus))
+        slot = order[0]
+        self._free.remove(slot)
+        self._running[task.name] = (CommandProcess(task, environment=slot.environment(gpus=gpus)), slot)
 
-    def ended(self, seconds: float) -> list[Ending]:
+    def ended(self, seconds: float) -> list[TaskResult]:
         """See ``Engine.ended``."""
         waited_for([process for process, _ in self._running.values()], seconds)
         results = []
-        for name, (process, place) in list(self._running.items()):
+        for name, (process, slot) in list(self._running.items()):
             result = process.ended()
             if result is not None:
                 del self._running[name]
-                self._free.append(place)
+                self._free.append(slot)
                 results.append(result)
         return results
 
     def stop(self) -> None:
         """See ``Engine.stop``; all tasks are asked to end at the same time."""
-        for process, place in self._running.values():
+        for process, slot in self._running.values():
             process.ask()
-            self._free.append(place)
+            self._free.append(slot)
         for process, _ in self._running.values():
             process.stop()
         self._running.clear()

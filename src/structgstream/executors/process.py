@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from structgstream.executors import launch
-from structgstream.executors.task import TAIL_BYTES, Ending, Task, words
+from structgstream.executors.task import TAIL_BYTES, Task, TaskResult, argv_of
 
 ENDING_SECONDS = 10.0
 """Time in which a command may end by itself; then it is killed, which does not damage complete results."""
@@ -35,7 +35,7 @@ class CommandProcess:
         self._started = time.monotonic()
         tied = [sys.executable, "-I", "-S", str(Path(launch.__file__)), str(os.getpid())]
         self._process = subprocess.Popen(
-            [*tied, *words(task.command)],
+            [*tied, *argv_of(task.command)],
             stdin=subprocess.DEVNULL,
             stdout=self._log,
             stderr=self._log,
@@ -49,7 +49,7 @@ class CommandProcess:
         """Process id of the command."""
         return self._process.pid
 
-    def ended(self, *, attempts: int = 1) -> Ending | None:
+    def ended(self, *, attempts: int = 1) -> TaskResult | None:
         """Its result; None while it runs. Must not be called again after it has returned a result."""
         if os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
             return None
@@ -60,7 +60,7 @@ class CommandProcess:
         seconds = time.monotonic() - self._started
         with self._log:
             output = tail_of(self._log, self._began_at)
-        return Ending(self.name, code, seconds, attempts, usage.ru_maxrss * 1024, output)
+        return TaskResult(self.name, code, seconds, attempts, usage.ru_maxrss * 1024, output)
 
     def ask(self) -> None:
         """Sends SIGTERM to the process group."""

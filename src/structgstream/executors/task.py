@@ -37,7 +37,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Ending:
+class TaskResult:
     """The result of a task.
 
     Args:
@@ -67,6 +67,6 @@ class Ending:
         return self.status < 0
 
 
-def words(command: tuple[str, ...]) -> list[str]:
+def argv_of(command: tuple[str, ...]) -> list[str]:
     """The argument vector on this machine."""
     return [sys.executable if word == PYTHON and not i else word for i, word in enumerate(command)]

@@ -5,13 +5,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
 
+from structgstream.atomic_files import atomic_write
 from structgstream.errors import StreamError
 from structgstream.exporters.baked_gaussians import BakedGaussians
 from structgstream.exporters.formats import Format
 from structgstream.exporters.ply import ply_bytes
 from structgstream.exporters.splat import splat_bytes
 from structgstream.exporters.spz import spz_bytes
-from structgstream.whole_files import write_whole
 
 FORMAT_BYTES: Mapping[Format, Callable[[BakedGaussians], bytes]] = {
     "ply": ply_bytes,
@@ -40,7 +40,7 @@ def write_gaussians(path: Path, gaussians: BakedGaussians, *, format: Format) ->
     """
     check_finite(gaussians)
     data = FORMAT_BYTES[format](gaussians)
-    write_whole(path, data, new_folder=True)
+    atomic_write(path, data, new_folder=True)
     return len(data)
 
 

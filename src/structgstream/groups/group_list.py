@@ -4,8 +4,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from structgstream.atomic_files import atomic_write
 from structgstream.errors import StreamError
-from structgstream.whole_files import write_whole
 
 Groups = Sequence[tuple[int, int]]
 """First frame and end of each group, in order."""
@@ -22,7 +22,7 @@ def write_groups(track: Path, groups: Groups) -> None:
     Raises:
         StorageError: it cannot be written.
     """
-    write_whole(groups_path(track), "".join(f"{first}:{end}\n" for first, end in groups).encode())
+    atomic_write(groups_path(track), "".join(f"{first}:{end}\n" for first, end in groups).encode())
 
 
 def read_groups(track: Path) -> Groups | None:

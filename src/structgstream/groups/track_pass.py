@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from structgstream.atomic_files import partial_path
 from structgstream.data.prefetch import read_ahead
 from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError, StreamError
@@ -30,7 +31,6 @@ from structgstream.lookahead import Lookahead
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
 from structgstream.training.online.split import with_displacements
-from structgstream.whole_files import partial_path
 
 
 @dataclass(frozen=True)

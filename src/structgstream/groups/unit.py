@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
+from structgstream.atomic_files import partial_path
 from structgstream.data.denoising import denoised
 from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError, StorageError
@@ -24,7 +25,6 @@ from structgstream.recorder import LogExtras, Run, record
 from structgstream.scene.scene import Scene
 from structgstream.struct_gstream import FrameZeroContext, stream_pipeline
 from structgstream.training.result import StepListener
-from structgstream.whole_files import partial_path
 
 MIN_PIXELS = 0.5
 """A primitive whose tracked displacement is at most this, in pixels of a median camera, counts as not displaced."""

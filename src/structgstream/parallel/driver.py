@@ -6,16 +6,16 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 
+from structgstream.atomic_files import atomic_write
 from structgstream.errors import StorageError, TaskError
 from structgstream.executors.executor import Executor, TaskQueue
 from structgstream.executors.local import LocalEngine
-from structgstream.executors.places import Place
-from structgstream.executors.task import Ending, Task
+from structgstream.executors.task import Task, TaskResult
+from structgstream.executors.worker_slots import WorkerSlot
 from structgstream.groups.group_list import Groups, groups_path, read_groups
 from structgstream.parallel.exchange import SharedFolder
 from structgstream.parallel.parts import Parts, group_name, key_of, sha256_of
 from structgstream.parallel.unit import HEADER, JOIN, TRACK, Unit
-from structgstream.whole_files import write_whole
 
 POLL_SECONDS = 0.5
 LINES_TOLD = 6
@@ -117,7 +117,7 @@ class _Drive:
         self._status = Status(HEADER)
         self._index: dict[str, int] = {}
         self._next = 0  # of the groups, the first that is not submitted
-        self._failed: list[Ending] = []
+        self._failed: list[TaskResult] = []
         self._header_key = ""
 
     def run(self) -> Groups:
@@ -186,7 +186,7 @@ class _Drive:
     def _key(self, task: Task) -> str:
         return key_of(task.command, self._header_key)
 
-    def _ended(self, ending: Ending) -> None:
+    def _ended(self, ending: TaskResult) -> None:
         self._keep_words(ending)
         if not ending.done:
             self._failed.append(ending)
@@ -205,13 +205,13 @@ class _Drive:
             self._parts.note(ending, self._key(task), Path(task.result), frames=end - first)
         self._mark({ending.name: State.DONE if ending.done else State.FAILED})
 
-    def _keep_words(self, ending: Ending) -> None:
+    def _keep_words(self, ending: TaskResult) -> None:
         """What a task on another machine has printed is kept here."""
         log = self._parts.log(ending.name)
         try:
             there = log.read_bytes() if log.exists() else b""
             if ending.output.strip()[-END_CHARACTERS:] not in there.decode(errors="replace"):
-                write_whole(log, [there, ending.output.encode()], new_folder=True)
+                atomic_write(log, [there, ending.output.encode()], new_folder=True)
         except OSError as error:
             raise StorageError(f"{log} cannot be read ({error.strerror}).") from error
 
@@ -234,7 +234,7 @@ class _Drive:
         key = key_of([self._parts.notes[group_name(*group)].sha256 for group in groups])
         if self._parts.is_whole(JOIN, key, output):
             return groups
-        with TaskQueue(LocalEngine([Place(1)])) as here:
+        with TaskQueue(LocalEngine([WorkerSlot(1)])) as here:
             here.submit(task)
             while not (endings := here.wait(POLL_SECONDS)):
                 self._tell(self._status)
@@ -247,7 +247,7 @@ class _Drive:
         self._status = replace(self._status, **changes)  # type: ignore[arg-type]
 
 
-def _sentence(failed: Iterable[Ending], parts: Parts) -> str:
+def _sentence(failed: Iterable[TaskResult], parts: Parts) -> str:
     """Which tasks failed, and what the first of them said."""
     failed = list(failed)
     first = failed[0]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from structgstream.atomic_files import atomic_write, partial_path
 from structgstream.errors import StorageError
 from structgstream.evaluation.run_log import log_path
 from structgstream.executors.task import PYTHON, Task
@@ -15,7 +16,6 @@ from structgstream.parallel.object_folder import ObjectFolder
 from structgstream.parallel.parts import OURS, Parts
 from structgstream.parallel.staged import HERE, STORE
 from structgstream.parallel.unit import CutsTrack
-from structgstream.whole_files import partial_path, write_whole
 
 STAGED = (PYTHON, "-m", "structgstream.parallel.staged")
 LOOK_SECONDS = 1.0
@@ -85,7 +85,7 @@ class ObjectStore(SharedFolder):
     def fetch(self, part: Path) -> None:
         """See :meth:`SharedFolder.fetch`."""
         if (data := self._store.read(self._name(part))) is not None:
-            write_whole(part, data, new_folder=True)
+            atomic_write(part, data, new_folder=True)
 
     def follow(self) -> None:
         """See :meth:`SharedFolder.follow`; asks the store once a second."""

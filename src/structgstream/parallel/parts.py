@@ -16,11 +16,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from structgstream.atomic_files import atomic_write
 from structgstream.errors import ConfigError, StorageError
-from structgstream.executors.task import Ending
+from structgstream.executors.task import TaskResult
 from structgstream.file_locks import lock_file, open_lockable
 from structgstream.owned_folders import Owner, check_owned, own_folder, remove_own
-from structgstream.whole_files import write_whole
 
 PLAN = "plan.json"
 NOTES = "done.jsonl"
@@ -143,7 +143,7 @@ class Parts:
         path, wanted = self.folder / PLAN, json.loads(json.dumps(plan))
         found = _json_of(path)
         if found is None:
-            write_whole(path, json.dumps({**wanted, _RUN: uuid.uuid4().hex}, indent=1).encode() + b"\n")
+            atomic_write(path, json.dumps({**wanted, _RUN: uuid.uuid4().hex}, indent=1).encode() + b"\n")
             return
         found.pop(_RUN, None)
         if found == wanted:
@@ -164,7 +164,7 @@ class Parts:
         except OSError:
             return False
 
-    def note(self, ending: Ending, key: str, part: Path, *, frames: int) -> Note:
+    def note(self, ending: TaskResult, key: str, part: Path, *, frames: int) -> Note:
         """Notes that a task has ended well; one that has only found its part whole again is noted already.
 
         Raises:
@@ -190,7 +190,7 @@ class Parts:
         if earlier is not None and (earlier.key, earlier.sha256) == (note.key, note.sha256):
             return earlier
         self.notes[note.name] = note
-        write_whole(self.folder / NOTES, [f"{json.dumps(asdict(each))}\n".encode() for each in self.notes.values()])
+        atomic_write(self.folder / NOTES, [f"{json.dumps(asdict(each))}\n".encode() for each in self.notes.values()])
         return note
 
 

@@ -18,11 +18,11 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from structgstream.atomic_files import atomic_write
 from structgstream.errors import StructGStreamError
-from structgstream.executors.task import words
+from structgstream.executors.task import argv_of
 from structgstream.owned_folders import MARKER, own_folder, owner_of, remove_own
 from structgstream.parallel.object_folder import ObjectFolder
-from structgstream.whole_files import write_whole
 
 HERE = "{here}"
 """In a word of the command: the folder of this machine."""
@@ -51,7 +51,7 @@ class Staging:
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         if (anew or not path.exists()) and (data := self.store.read(name)) is not None:
-            write_whole(path, data)
+            atomic_write(path, data)
 
     def put(self, name: str) -> None:
         """Copies a file to the store, if there is one."""
@@ -82,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
     if not all((staging.folder / name).exists() for name in options.gives):
         for name in options.grows:
             staging.fetch(name)
-    process = subprocess.Popen(words(tuple(word.replace(HERE, str(staging.folder)) for word in options.command)))
+    process = subprocess.Popen(argv_of(tuple(word.replace(HERE, str(staging.folder)) for word in options.command)))
     status = None
     while status is None:
         with suppress(subprocess.TimeoutExpired):

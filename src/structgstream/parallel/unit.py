@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
+from structgstream.atomic_files import partial_path
 from structgstream.errors import StreamError
-from structgstream.executors.places import thread_environment
 from structgstream.executors.task import PYTHON, Task
+from structgstream.executors.worker_slots import thread_environment
 from structgstream.groups.group_list import Groups
 from structgstream.parallel.parts import Parts, group_name
-from structgstream.whole_files import partial_path
 
 HEADER, TRACK, JOIN = "header", "track", "join"
 PROGRAM = (PYTHON, "-m", "structgstream")

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.atomic_files import atomic_file
 from structgstream.cameras import CameraRig
 from structgstream.data.calibration import NEAR_IN_RIG_RADII
 from structgstream.data.folder_files import REPORT
@@ -36,7 +37,6 @@ from structgstream.preparation.linking import bring, drop_others, unbring
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.steps import FOLDER, Job, Stored, fingerprint
 from structgstream.similarity import rig_radius
-from structgstream.whole_files import whole_file
 
 POINTS = "points.npy"
 NEAR_SHARE = 0.5  # of the depth of the nearest points: what comes closer later is still drawn
@@ -117,7 +117,7 @@ class CaptureSteps:
             summary=lambda points: f"{len(points):,} points of frame 0",
             after=("synchronize",),
         )  # fmt: skip
-        with whole_file(self.capture / POINTS) as file:
+        with atomic_file(self.capture / POINTS) as file:
             np.save(file, found)
         content = replace(content, points=POINTS)
         write_prepared(self.capture, content)

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from structgstream.atomic_files import partial_path, replacing
 from structgstream.errors import CaptureError, StorageError
 from structgstream.file_locks import lock_file, open_lockable
 from structgstream.preparation.steps import FOLDER
-from structgstream.whole_files import partial_path, replacing
 
 SOURCE = "source.json"
 LOCK = ".preparing"

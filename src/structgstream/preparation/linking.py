@@ -7,8 +7,8 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Literal
 
+from structgstream.atomic_files import give_name, partial_path
 from structgstream.errors import StorageError
-from structgstream.whole_files import give_name, partial_path
 
 Link = Literal["hard", "symlink", "copy"]
 

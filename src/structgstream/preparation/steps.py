@@ -17,9 +17,9 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.atomic_files import replacing
 from structgstream.errors import StorageError
 from structgstream.preparation.options import PrepareOptions
-from structgstream.whole_files import replacing
 
 FOLDER = "work"
 VERSION = 4  # of the steps' results; a new one does all steps again

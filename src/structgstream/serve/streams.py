@@ -12,11 +12,11 @@ from itertools import islice
 from pathlib import Path
 from typing import Final
 
+from structgstream.atomic_files import side_path
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.quality_list import MAX_LIST_BYTES, QUALITIES, list_from_json
 from structgstream.errors import PlayerError, StreamError
 from structgstream.serve.files import STREAM_SUFFIX, OpenedFile, is_stream_name, open_below
-from structgstream.whole_files import side_path
 
 REFRESH_SECONDS: Final = 1.0
 MAX_ENTRIES: Final = 10_000

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from structgstream.atomic_files import atomic_write
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.store import read_bounded
 from structgstream.codec.segments.strict_json import Fields, parse_object
 from structgstream.errors import StreamError
-from structgstream.whole_files import write_whole
 
 QUALITIES = "qualities.json"
 """The name of the list."""
@@ -92,7 +92,7 @@ def write_list(folder: Path, qualities: Sequence[ListedQuality]) -> None:
     Raises:
         StorageError: it cannot be written; what was there before stays.
     """
-    write_whole(folder / QUALITIES, list_to_json(qualities), called="The list of qualities")
+    atomic_write(folder / QUALITIES, list_to_json(qualities), called="The list of qualities")
 
 
 def _quality(entry: Fields) -> ListedQuality:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from structgstream.atomic_files import atomic_write
 from structgstream.codec.container.index import Period, pack_index
 from structgstream.codec.container.records import PREFIX, PacketKind, RecordType
 from structgstream.codec.segments.history import segments_from, verified
@@ -21,7 +22,6 @@ from structgstream.codec.segments.manifest import (
 )
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.errors import StreamError
-from structgstream.whole_files import write_whole
 
 _KEPT_FILES = 2
 
@@ -235,5 +235,5 @@ def write_archive(store: Store, path: Path) -> int:
             f"{store.name} is not whole: frames {gone} have left its window (--window). A stream file has no gaps; "
             "reconstruct without a window to archive a whole stream."
         )
-    write_whole(path, stored.files())
+    atomic_write(path, stored.files())
     return len(stored.sizes)

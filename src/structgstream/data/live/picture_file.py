@@ -19,9 +19,9 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
+from structgstream.atomic_files import atomic_write
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
-from structgstream.whole_files import write_whole
 
 FORMAT = "structgstream-pictures-2"
 WITHOUT_RESIDUALS = "structgstream-pictures-1"  # which a run of an earlier version may have left
@@ -54,7 +54,7 @@ def write_pictures(path: Path, frame: MultiViewFrame, *, sync: bool, **facts: An
     header = {"format": FORMAT, "index": frame.index, "pts_seconds": frame.pts_seconds,
               "captured_unix_seconds": frame.captured_unix_seconds, **facts, **entries}  # fmt: skip
     content = [json.dumps(header).encode() + b"\n", *(data for own in packed.values() for data in own.values())]
-    write_whole(path, content, called="The pictures", sync=sync)
+    atomic_write(path, content, called="The pictures", sync=sync)
     return sum(map(len, content))
 
 

@@ -5,13 +5,13 @@ import json
 import re
 from pathlib import Path
 
+from structgstream.atomic_files import atomic_write
 from structgstream.errors import StorageError
 from structgstream.preparation.checking.check import Checked
 from structgstream.preparation.report.charts import draw_colors, draw_coverage, draw_matrix, draw_times
 from structgstream.preparation.report.overlays import chosen_pairs, draw_epipolar, draw_overlay
 from structgstream.preparation.report.page import page
 from structgstream.preparation.steps import Listener, Silent
-from structgstream.whole_files import write_whole
 
 PAGE, NUMBERS = "index.html", "report.json"
 
@@ -54,8 +54,8 @@ def write_report(folder: Path, checked: Checked, *, listener: Listener | None = 
         "Rig and coverage": ["coverage.png"],
         "Times and colours" if len(charts) == 2 else "Times" if "times.png" in charts else "Colours": charts,
     }
-    write_whole(folder / NUMBERS, f"{json.dumps(report.as_json(), indent=1)}\n".encode())
-    write_whole(folder / PAGE, page(report, off=examined.suspects.off, sections=sections).encode())
+    atomic_write(folder / NUMBERS, f"{json.dumps(report.as_json(), indent=1)}\n".encode())
+    atomic_write(folder / PAGE, page(report, off=examined.suspects.off, sections=sections).encode())
     listener.progress(total, total, "")
     return folder / PAGE
 

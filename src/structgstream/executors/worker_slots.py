@@ -10,7 +10,7 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENC
 
 
 @dataclass(frozen=True)
-class Place:
+class WorkerSlot:
     """A worker slot, which runs one task at a time: a number of threads, and the index of its GPU if it has one."""
 
     threads: int
@@ -27,7 +27,9 @@ def thread_environment(threads: int) -> dict[str, str]:
     return dict.fromkeys(_THREADS, str(threads))
 
 
-def shared_out(*, workers: int | None, cores: int, gpus: int = 0, threads: int | None = None) -> tuple[Place, ...]:
+def allocate_slots(
+    *, workers: int | None, cores: int, gpus: int = 0, threads: int | None = None
+) -> tuple[WorkerSlot, ...]:
     """Slots for ``workers`` concurrent tasks, which use GPUs in turn.
 
     Args:
@@ -44,4 +46,4 @@ def shared_out(*, workers: int | None, cores: int, gpus: int = 0, threads: int |
             raise ConfigError(f"The number of {name} must be 1 or more, got {value}.")
     count = workers or gpus or cores
     share = max(1, cores // count) if threads is None else threads
-    return tuple(Place(share, number % gpus if gpus else None) for number in range(count))
+    return tuple(WorkerSlot(share, number % gpus if gpus else None) for number in range(count))

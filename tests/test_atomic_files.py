@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from structgstream.atomic_files import atomic_file, atomic_write, give_name, partial_path, replacing, sync_folder
 from structgstream.errors import StorageError
-from structgstream.whole_files import give_name, partial_path, replacing, sync_folder, whole_file, write_whole
 from tests.support.killed import folders_of_the_killed
 
 OLD, NEW = b"old", b"new and longer"
@@ -26,11 +26,11 @@ def refuse(number: int) -> Callable[..., object]:
 
 def test_pieces_follow_each_other_and_a_folder_is_made_when_asked(tmp_path: Path) -> None:
     path = tmp_path / "a" / "b" / "c.bin"
-    write_whole(path, [b"one", memoryview(b"two"), b""], new_folder=True)
+    atomic_write(path, [b"one", memoryview(b"two"), b""], new_folder=True)
     assert path.read_bytes() == b"onetwo"
     assert [entry.name for entry in path.parent.iterdir()] == ["c.bin"]
     with pytest.raises(StorageError, match=r"other/x cannot be written \(No such file or directory\)\.$"):
-        write_whole(tmp_path / "other" / "x", NEW)
+        atomic_write(tmp_path / "other" / "x", NEW)
 
 
 @pytest.mark.parametrize("there", [False, True])
@@ -39,14 +39,14 @@ def test_killed_at_any_step_a_file_is_the_old_one_or_the_new_one(tmp_path: Path,
         if there:
             (folder / "a").write_bytes(OLD)
 
-    killed = folders_of_the_killed(tmp_path, lambda folder: write_whole(folder / "a", [NEW] * 1000), begin=begin)
+    killed = folders_of_the_killed(tmp_path, lambda folder: atomic_write(folder / "a", [NEW] * 1000), begin=begin)
     found = [(folder / "a").read_bytes() if (folder / "a").exists() else None for folder in killed]
     before = OLD if there else None
     first_new = found.index(NEW * 1000)
     assert found == [before] * first_new + [NEW * 1000] * (len(found) - first_new)
     assert first_new >= 5, "opened, locked, emptied, written, synced"
     for folder in killed:
-        write_whole(folder / "a", NEW)  # What was left is in nobody's way.
+        atomic_write(folder / "a", NEW)  # What was left is in nobody's way.
         assert [(entry.name, entry.read_bytes()) for entry in folder.iterdir()] == [("a", NEW)]
 
 
@@ -67,11 +67,11 @@ def test_content_and_folder_are_synced_before_and_after_the_rename(
 
     monkeypatch.setattr(os, "fsync", synced)
     monkeypatch.setattr(Path, "replace", replaced)
-    write_whole(tmp_path / "a", NEW)
+    atomic_write(tmp_path / "a", NEW)
     partial_path(tmp_path / "b").write_bytes(NEW)
     give_name(partial_path(tmp_path / "b"), tmp_path / "b")
     assert steps == ["sync file", "rename", "sync folder"] * 2
-    write_whole(tmp_path / "c", NEW, sync=False)
+    atomic_write(tmp_path / "c", NEW, sync=False)
     assert steps[6:] == ["rename"]
 
 
@@ -86,7 +86,7 @@ def test_what_ends_the_writing_leaves_what_was_there_and_nothing_else(
     path = tmp_path / "a"
     path.write_bytes(OLD)
     with pytest.raises(StorageError if ended is OSError else ended):
-        write_whole(path, pieces())
+        atomic_write(path, pieces())
     with pytest.raises(ended), replacing(path) as file:  # noqa: PT012
         file.write(NEW)
         raise ended
@@ -109,7 +109,7 @@ def test_a_disk_that_fails_at_a_step_is_told_and_leaves_what_was_there(
     with monkeypatch.context() as patch:
         patch.setattr(step, refuse(number))
         with pytest.raises(StorageError, match=rf"^The picture .*a cannot be written {told}$"):
-            write_whole(tmp_path / "a", NEW, called="The picture")
+            atomic_write(tmp_path / "a", NEW, called="The picture")
     assert [(entry.name, entry.read_bytes()) for entry in tmp_path.iterdir()] == [("a", OLD)]
 
 
@@ -117,7 +117,7 @@ def test_a_device_stays_one(tmp_path: Path) -> None:
     """Of ``--json /dev/stdout`` root would make a file."""
     path = tmp_path / "a"
     path.symlink_to("/dev/null")
-    write_whole(path, NEW)
+    atomic_write(path, NEW)
     assert path.is_char_device()
     assert [entry.name for entry in tmp_path.iterdir()] == ["a"]
 
@@ -127,7 +127,7 @@ def test_a_pipe_gets_what_is_written(tmp_path: Path) -> None:
     os.mkfifo(path)
     reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     try:
-        write_whole(path, NEW)
+        atomic_write(path, NEW)
         assert os.read(reader, 100) == NEW
     finally:
         os.close(reader)
@@ -138,7 +138,7 @@ def test_a_link_stays_one(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "a").symlink_to(tmp_path / "folder" / "file")
     for content in (OLD, NEW):
-        write_whole(tmp_path / "a", content)
+        atomic_write(tmp_path / "a", content)
         assert (tmp_path / "a").is_symlink()
         assert [(each.name, each.read_bytes()) for each in (tmp_path / "folder").iterdir()] == [("file", content)]
 
@@ -150,7 +150,7 @@ def test_a_real_disk_without_room(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(OLD)
     partial_path(tmp_path / "a").symlink_to("/dev/full")
     with pytest.raises(StorageError, match="a cannot be written"):
-        write_whole(tmp_path / "a", NEW)
+        atomic_write(tmp_path / "a", NEW)
     assert (tmp_path / "a").read_bytes() == OLD
     assert [entry.name for entry in tmp_path.iterdir()] == ["a"]
 
@@ -158,19 +158,19 @@ def test_a_real_disk_without_room(tmp_path: Path) -> None:
 def test_a_folder_without_permission_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "open", refuse(errno.EACCES))  # root may write anywhere
     with pytest.raises(StorageError, match=r"denied\); correct its permissions, or choose another place\.$"):
-        write_whole(tmp_path / "a", NEW)
+        atomic_write(tmp_path / "a", NEW)
 
 
 def test_a_file_in_the_place_of_the_folder_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(StorageError, match=r"file/x cannot be written \(.*file is a file\)\.$"):
-        write_whole(tmp_path / "file" / "x", b"", new_folder=True)
+        atomic_write(tmp_path / "file" / "x", b"", new_folder=True)
 
 
 def test_a_folder_in_the_place_of_the_file_is_told(tmp_path: Path) -> None:
     (tmp_path / "taken").mkdir()
     with pytest.raises(StorageError, match=r"taken cannot be written \(Is a directory\)"):
-        write_whole(tmp_path / "taken", NEW)
+        atomic_write(tmp_path / "taken", NEW)
     assert [entry.name for entry in tmp_path.iterdir()] == ["taken"]
 
 
@@ -186,7 +186,7 @@ def test_a_file_system_that_cannot_sync_folders_gets_its_files(
         fsync(descriptor)
 
     monkeypatch.setattr(os, "fsync", refused)
-    write_whole(tmp_path / "a", NEW)
+    atomic_write(tmp_path / "a", NEW)
     assert (tmp_path / "a").read_bytes() == NEW
 
 
@@ -198,11 +198,11 @@ def test_a_disk_that_fails_to_sync_a_folder_is_told(tmp_path: Path, monkeypatch:
 
 def test_two_writers_do_not_mix(tmp_path: Path) -> None:
     path = tmp_path / "a"
-    with whole_file(path) as file:
+    with atomic_file(path) as file:
         file.write(b"the first")
         file.flush()
         with pytest.raises(StorageError, match="Another process writes .*a; wait for its end, or choose another name"):
-            write_whole(path, NEW)
+            atomic_write(path, NEW)
     assert [(entry.name, entry.read_bytes()) for entry in tmp_path.iterdir()] == [("a", b"the first")]
 
 
@@ -215,7 +215,7 @@ def test_who_opens_while_another_gives_the_name_does_not_write_into_the_finished
     def write(content: bytes) -> None:
         for _ in range(rounds):
             try:
-                write_whole(path, content, sync=False)
+                atomic_write(path, content, sync=False)
             except StorageError:
                 continue
             if (found := path.read_bytes()) not in contents:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Atomic writes of files.
 
-Note [Whole files]
+Note [Atomic files]
 ~~~~~~~~~~~~~~~~~~
 A file is written as ``PATH.partial`` and renamed, so a reader of ``PATH`` gets the old or the complete new content,
 even if the process is killed. The content is synced before the renaming; otherwise the file may be empty after a power
@@ -40,7 +40,7 @@ def side_path(stream: Path, ending: str) -> Path:
     return stream.with_name(f"{stream.name.removesuffix('.sgs')}{ending}")
 
 
-def write_whole(
+def atomic_write(
     path: Path,
     content: bytes | Iterable[bytes | memoryview],
     *,
@@ -48,7 +48,7 @@ def write_whole(
     new_folder: bool = False,
     sync: bool = True,
 ) -> None:
-    """Writes or replaces the file ``path`` atomically (Note [Whole files]).
+    """Writes or replaces the file ``path`` atomically (Note [Atomic files]).
 
     Args:
         path: the file.
@@ -68,8 +68,8 @@ def write_whole(
 
 
 @contextmanager
-def whole_file(path: Path, *, check: Callable[[Path], object] | None = None) -> Iterator[BinaryIO]:
-    """A file that is renamed to ``path`` at the end of the block, unless it raises (Note [Whole files]).
+def atomic_file(path: Path, *, check: Callable[[Path], object] | None = None) -> Iterator[BinaryIO]:
+    """A file that is renamed to ``path`` at the end of the block, unless it raises (Note [Atomic files]).
 
     Args:
         path: the file.
@@ -77,7 +77,7 @@ def whole_file(path: Path, *, check: Callable[[Path], object] | None = None) -> 
             not affected.
 
     Raises:
-        StorageError: see :func:`write_whole`.
+        StorageError: see :func:`atomic_write`.
     """
     with _as_storage_error(path, ""), replacing(path) as file:
         yield file
@@ -88,7 +88,7 @@ def whole_file(path: Path, *, check: Callable[[Path], object] | None = None) -> 
 
 @contextmanager
 def replacing(path: Path, *, partial: Path | None = None, sync: bool = True) -> Iterator[BinaryIO]:
-    """As :func:`whole_file`, but raises errors of the system unchanged.
+    """As :func:`atomic_file`, but raises errors of the system unchanged.
 
     Args:
         path: the file.
@@ -105,7 +105,7 @@ def replacing(path: Path, *, partial: Path | None = None, sync: bool = True) -> 
         return
     path = path.resolve() if path.is_symlink() else path  # The link is retained.
     partial = partial or partial_path(path)
-    file = open_alone(partial, of=path)
+    file = open_exclusive(partial, of=path)
     try:
         file.truncate()  # remains of a killed process
         yield file
@@ -124,7 +124,7 @@ def replacing(path: Path, *, partial: Path | None = None, sync: bool = True) -> 
         sync_folder(path.parent)
 
 
-def open_alone(partial: Path, *, of: Path, buffering: int = -1) -> BinaryIO:
+def open_exclusive(partial: Path, *, of: Path, buffering: int = -1) -> BinaryIO:
     """Opens the file ``partial`` exclusively for writing, at its beginning and without truncation.
 
     Args:
@@ -147,7 +147,7 @@ def open_alone(partial: Path, *, of: Path, buffering: int = -1) -> BinaryIO:
 
 
 def give_name(partial: Path, path: Path) -> None:
-    """Syncs the complete file ``partial``, renames it, and syncs the folder (Note [Whole files]).
+    """Syncs the complete file ``partial``, renames it, and syncs the folder (Note [Atomic files]).
 
     Raises:
         OSError: one of these operations failed.
