@@ -34,7 +34,7 @@ from structgstream.data.prepared import PreparedCamera, open_prepared, read_prep
 from structgstream.data.timeline import Clock
 from structgstream.preparation.calibration.comparison import rig_alignment
 from structgstream.preparation.footage import find_footage
-from structgstream.presets import PRESETS, StreamConfig
+from structgstream.session.presets import PRESETS, StreamConfig
 
 SEED_POINTS = "points.npy"
 

@@ -6,13 +6,13 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from structgstream import frame_report
 from structgstream.cameras import Camera
 from structgstream.codec.encoder import Encoded
 from structgstream.codec.packets import Packet, PacketKind
-from structgstream.frame_report import counts, metered
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
+from structgstream.session import frame_report
+from structgstream.session.frame_report import counts, metered
 from structgstream.training.result import FitResult
 from tests.support.streams import small_scene
 

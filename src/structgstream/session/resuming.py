@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping
 from structgstream.cameras import CameraRig
 from structgstream.codec.packets import StreamHeader
 from structgstream.errors import ConfigError
-from structgstream.pipeline import StreamFacts
-from structgstream.presets import completed
+from structgstream.session.pipeline import StreamFacts
+from structgstream.session.presets import completed
 
 
 def check_resumable(header: StreamHeader, facts: StreamFacts) -> None:

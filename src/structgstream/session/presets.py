@@ -21,8 +21,8 @@ from structgstream.config_fields import (
 from structgstream.data.denoising import DenoisingConfig
 from structgstream.data.points import PointsConfig
 from structgstream.errors import ConfigError
-from structgstream.periods import PeriodConfig
-from structgstream.rate_control import RateConfig
+from structgstream.session.periods import PeriodConfig
+from structgstream.session.rate_control import RateConfig
 from structgstream.training.frame0.densify import GrowthConfig
 from structgstream.training.frame0.fit import InitialConfig, InitialRates
 from structgstream.training.frame0.regularizers import DepthDistortionConfig, FreeSpaceConfig, PerturbationConfig

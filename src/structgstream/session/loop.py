@@ -20,16 +20,25 @@ from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHe
 from structgstream.data.denoising import denoised
 from structgstream.data.source import FrameStream, frame_count, keep_frames, may_read_ahead
 from structgstream.errors import StorageError
-from structgstream.frame_report import FrameReport, metered
 from structgstream.frames import MultiViewFrame
-from structgstream.initialization import check_enough_pictures, frame_seed, initial_points_of, shows_enough
 from structgstream.kernels.backend import Backend
-from structgstream.key_frames import KeyFrames
 from structgstream.lookahead import Lookahead
-from structgstream.periods import PeriodPlan
-from structgstream.pipeline import FrameCoder, FrameTask, Memory, Past, Pipeline, State, StoredStream, StreamFacts
-from structgstream.rate_control import RateController
-from structgstream.resuming import check_resumable
+from structgstream.session.frame_report import FrameReport, metered
+from structgstream.session.initialization import check_enough_pictures, frame_seed, initial_points_of, shows_enough
+from structgstream.session.key_frames import KeyFrames
+from structgstream.session.periods import PeriodPlan
+from structgstream.session.pipeline import (
+    FrameCoder,
+    FrameTask,
+    Memory,
+    Past,
+    Pipeline,
+    State,
+    StoredStream,
+    StreamFacts,
+)
+from structgstream.session.rate_control import RateController
+from structgstream.session.resuming import check_resumable
 from structgstream.similarity import normalizing_similarity
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.result import StepListener

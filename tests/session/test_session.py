@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from structgstream import struct_gstream as method
 from structgstream.cameras import CameraRig
 from structgstream.codec.container.records import scan_records
 from structgstream.codec.packets import Packet
@@ -16,14 +15,15 @@ from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import ConfigError, StorageError
 from structgstream.evaluation.run_log import log_entry
-from structgstream.frame_report import FrameReport
 from structgstream.frames import MultiViewFrame
-from structgstream.initialization import frame_seed
 from structgstream.kernels.backend import reference_backend
-from structgstream.presets import StreamConfig
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
-from structgstream.session import Session
-from structgstream.struct_gstream import stream_pipeline
+from structgstream.session import struct_gstream as method
+from structgstream.session.frame_report import FrameReport
+from structgstream.session.initialization import frame_seed
+from structgstream.session.loop import Session
+from structgstream.session.presets import StreamConfig
+from structgstream.session.struct_gstream import stream_pipeline
 from structgstream.training.result import FitResult
 from tests.support.memory_captures import MemoryCapture
 from tests.support.small_presets import TINY_RIG

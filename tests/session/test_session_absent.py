@@ -24,12 +24,12 @@ from structgstream.evaluation.optional_metrics import OF_WHOLE_PICTURES
 from structgstream.evaluation.plots import write_plots
 from structgstream.evaluation.report import as_json
 from structgstream.evaluation.run_log import log_entry
-from structgstream.frame_report import FrameReport
 from structgstream.frames import MultiViewFrame
-from structgstream.presets import PRESETS, StreamConfig
 from structgstream.scene.scene import Scene
-from structgstream.session import Session
-from structgstream.struct_gstream import stream_pipeline
+from structgstream.session.frame_report import FrameReport
+from structgstream.session.loop import Session
+from structgstream.session.presets import PRESETS, StreamConfig
+from structgstream.session.struct_gstream import stream_pipeline
 from structgstream.training.online.config import SpawnRules
 from tests.support.backends import quickest_backend
 from tests.support.memory_captures import MemoryCapture

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from structgstream import initialization
 from structgstream.data.points import PointsConfig
-from structgstream.initialization import frame_seed, initial_points_of
+from structgstream.session import initialization
+from structgstream.session.initialization import frame_seed, initial_points_of
 from structgstream.similarity import Similarity
 from tests.support.memory_captures import MemoryCapture
 from tests.support.worlds import moving_world

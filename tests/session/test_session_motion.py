@@ -9,8 +9,8 @@ from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
-from structgstream.session import FrameReport, Session
-from structgstream.struct_gstream import stream_pipeline
+from structgstream.session.loop import FrameReport, Session
+from structgstream.session.struct_gstream import stream_pipeline
 from structgstream.training.online.config import MotionConfig
 from tests.support.memory_captures import MemoryCapture
 from tests.support.small_presets import TINY_RIG

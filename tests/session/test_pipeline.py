@@ -9,7 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from structgstream.pipeline import MAX_INTERVALS, FrameTask, Past
+from structgstream.session.pipeline import MAX_INTERVALS, FrameTask, Past
 from structgstream.training.online.preprocess import FramePictures
 from tests.support.backends import quickest_backend
 from tests.support.worlds import moving_world

@@ -11,11 +11,11 @@ from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest, write_archive
 from structgstream.codec.sinks import resume_segments
 from structgstream.kernels.backend import reference_backend
-from structgstream.session import Session
-from structgstream.struct_gstream import stream_pipeline
+from structgstream.session.loop import Session
+from structgstream.session.struct_gstream import stream_pipeline
+from tests.session.test_session import capture, quick_fits, uninterrupted
 from tests.support.segment_streams import Hands, folder
 from tests.support.small_presets import TINY_RIG
-from tests.test_session import capture, quick_fits, uninterrupted
 
 __all__ = ["quick_fits"]
 

@@ -14,17 +14,17 @@ from structgstream.codec.reader import StreamReader
 from structgstream.codec.segments.stored_bytes import write_archive
 from structgstream.codec.sinks import FileSink, MemorySink, resume_segments
 from structgstream.frames import MultiViewFrame
-from structgstream.periods import PeriodConfig
-from structgstream.presets import StreamConfig, to_json
-from structgstream.rate_control import RateConfig
-from structgstream.session import FrameReport, Session
-from structgstream.struct_gstream import stream_pipeline
+from structgstream.session.loop import FrameReport, Session
+from structgstream.session.periods import PeriodConfig
+from structgstream.session.presets import StreamConfig, to_json
+from structgstream.session.rate_control import RateConfig
+from structgstream.session.struct_gstream import stream_pipeline
+from tests.session.test_session_compact import CONFIG as COMPACT_CONFIG
+from tests.session.test_session_compact import WORLD
 from tests.support.backends import quickest_backend
 from tests.support.memory_captures import MemoryCapture
 from tests.support.segment_streams import Hands, Killed, KilledStore, folder
 from tests.support.streams import same
-from tests.test_session_compact import CONFIG as COMPACT_CONFIG
-from tests.test_session_compact import WORLD
 
 FRAMES = 8
 CHANGE = 3
@@ -113,7 +113,7 @@ def test_a_killed_writer_of_segments_goes_on_to_the_same_bytes(tmp_path: Path) -
 
 def test_each_frame_starts_from_what_a_reader_sees(monkeypatch: pytest.MonkeyPatch) -> None:
     """The next frame after a period has begun starts from that period's scene, and the period from the one before."""
-    from structgstream import struct_gstream as method
+    from structgstream.session import struct_gstream as method
 
     started = {}
     fit, again, number = method.fit_next_frame, method.fit_first_frame_again, count(1)
@@ -135,7 +135,7 @@ def test_each_frame_starts_from_what_a_reader_sees(monkeypatch: pytest.MonkeyPat
 
 
 def test_without_periods_nothing_is_measured_and_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
-    from structgstream import struct_gstream as method
+    from structgstream.session import struct_gstream as method
 
     monkeypatch.setattr(method, "mean_residual", lambda *_, **__: pytest.fail("measured"))
     run(sink := MemorySink(), COMPACT_CONFIG, length=3)

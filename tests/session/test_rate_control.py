@@ -7,8 +7,8 @@ import pytest
 
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError
-from structgstream.key_frames import MIN_FRAMES, KeyFrames
-from structgstream.rate_control import LEAST, MOST, RateConfig, RateController, with_rate_control
+from structgstream.session.key_frames import MIN_FRAMES, KeyFrames
+from structgstream.session.rate_control import LEAST, MOST, RateConfig, RateController, with_rate_control
 from structgstream.training.online.config import OnlineConfig
 
 FPS, KEY_EVERY = 30.0, 30

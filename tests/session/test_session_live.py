@@ -13,10 +13,10 @@ from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
 from structgstream.data.live.kept import KeptFrames, kept_folder
 from structgstream.frames import MultiViewFrame
-from structgstream.presets import StreamConfig
 from structgstream.recorder import record
-from structgstream.session import Session
-from structgstream.struct_gstream import stream_pipeline
+from structgstream.session.loop import Session
+from structgstream.session.presets import StreamConfig
+from structgstream.session.struct_gstream import stream_pipeline
 from tests.support.backends import quickest_backend
 from tests.support.moving_block import PERIODS, RIG, filmed
 from tests.support.small_presets import QUICK

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from structgstream.errors import ConfigError
-from structgstream.pipeline import FrameTask
-from structgstream.presets import COMPACT, PAPER, StreamConfig
 from structgstream.scene.scene import Scene
-from structgstream.struct_gstream import FrameZeroContext, StructGStream, stream_pipeline
+from structgstream.session.pipeline import FrameTask
+from structgstream.session.presets import COMPACT, PAPER, StreamConfig
+from structgstream.session.struct_gstream import FrameZeroContext, StructGStream, stream_pipeline
 from structgstream.training.result import FitResult
 from tests.support.backends import quickest_backend
 from tests.support.rigs import random_scene

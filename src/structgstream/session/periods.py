@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from structgstream.errors import ConfigError
-from structgstream.key_frames import MIN_FRAMES, KeyFrames
+from structgstream.session.key_frames import MIN_FRAMES, KeyFrames
 
 
 @dataclass(frozen=True)

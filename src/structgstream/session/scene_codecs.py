@@ -14,12 +14,12 @@ from structgstream.codec.packets import StreamHeader
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink
 from structgstream.errors import CalibrationError
-from structgstream.pipeline import FrameTask, StreamFacts
-from structgstream.presets import StreamConfig
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.order import in_morton_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, fields_of, parameters_of, scene_of, state_of, with_dynamic_fields
+from structgstream.session.pipeline import FrameTask, StreamFacts
+from structgstream.session.presets import StreamConfig
 from structgstream.training.frame0.quantization import estimate_sensitivity, quantize_first_frame, regauge
 from structgstream.training.parameters import pixel_size
 

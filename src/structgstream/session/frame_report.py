@@ -12,9 +12,9 @@ import torch
 from structgstream.codec.encoder import Encoded
 from structgstream.codec.packets import PacketKind
 from structgstream.memory import PeakKind, PeakMeter
-from structgstream.pipeline import FrameRemarks
 from structgstream.scene.render import Drawable
 from structgstream.scene.scene import Scene
+from structgstream.session.pipeline import FrameRemarks
 from structgstream.training.result import FitResult
 
 T = TypeVar("T")

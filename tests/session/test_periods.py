@@ -5,8 +5,8 @@ import pytest
 
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError
-from structgstream.key_frames import KeyFrames
-from structgstream.periods import PeriodConfig, PeriodPlan
+from structgstream.session.key_frames import KeyFrames
+from structgstream.session.periods import PeriodConfig, PeriodPlan
 
 FPS, KEY_EVERY = 25.0, 5
 

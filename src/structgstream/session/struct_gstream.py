@@ -8,13 +8,13 @@ from structgstream.cameras import CameraRig
 from structgstream.errors import ConfigError
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
-from structgstream.pipeline import FrameTask, Past, Pipeline
-from structgstream.presets import StreamConfig, to_json
-from structgstream.rate_control import with_rate_control
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
-from structgstream.scene_codecs import scene_codec
+from structgstream.session.pipeline import FrameTask, Past, Pipeline
+from structgstream.session.presets import StreamConfig, to_json
+from structgstream.session.rate_control import with_rate_control
+from structgstream.session.scene_codecs import scene_codec
 from structgstream.training.frame0.fit import fit_first_frame, fit_first_frame_again
 from structgstream.training.frame0.seeding import fit_environment
 from structgstream.training.online.exposure import ExposureReference, exposure_reference

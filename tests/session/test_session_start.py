@@ -12,9 +12,9 @@ from structgstream.codec.container.records import scan_records
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.frames import MultiViewFrame
-from structgstream.presets import COMPACT
-from structgstream.session import FrameReport, Session
-from structgstream.struct_gstream import stream_pipeline
+from structgstream.session.loop import FrameReport, Session
+from structgstream.session.presets import COMPACT
+from structgstream.session.struct_gstream import stream_pipeline
 from structgstream.training.online.config import SpawnRules
 from tests.support.backends import quickest_backend
 from tests.support.memory_captures import MemoryCapture

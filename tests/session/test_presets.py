@@ -9,7 +9,7 @@ import pytest
 
 from structgstream.data.plane_sweep import DEFAULT_LEVELS
 from structgstream.errors import ConfigError
-from structgstream.presets import (
+from structgstream.session.presets import (
     DEFAULT_PRESET,
     DEMO_PRESET,
     PAPER_METHOD_PRESET,

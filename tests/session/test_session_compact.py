@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 import torch
 
-from structgstream import struct_gstream as method
 from structgstream.codec.container.records import scan_records
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import ConfigError
-from structgstream.presets import COMPACT, PRESETS, StreamConfig
-from structgstream.rate_control import RateConfig
 from structgstream.scene.order import morton_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, parameters_of, state_of
-from structgstream.session import FrameReport, Session
-from structgstream.struct_gstream import stream_pipeline
+from structgstream.session import struct_gstream as method
+from structgstream.session.loop import FrameReport, Session
+from structgstream.session.presets import COMPACT, PRESETS, StreamConfig
+from structgstream.session.rate_control import RateConfig
+from structgstream.session.struct_gstream import stream_pipeline
 from structgstream.training.frame0.seeding import EnvironmentConfig
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.parameters import RoundingConfig, pixel_size

@@ -22,9 +22,9 @@ from structgstream.data.denoising import DenoisingConfig
 from structgstream.data.points import PointsConfig
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
-from structgstream.periods import PeriodConfig
-from structgstream.rate_control import RateConfig
 from structgstream.scene.render import Drawable
+from structgstream.session.periods import PeriodConfig
+from structgstream.session.rate_control import RateConfig
 from structgstream.similarity import Similarity
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.result import FitResult, StepListener

@@ -34,7 +34,7 @@ from typing import ClassVar
 
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError
-from structgstream.key_frames import KeyFrames
+from structgstream.session.key_frames import KeyFrames
 from structgstream.training.online.config import OnlineConfig
 
 _log = logging.getLogger(__name__)

@@ -7,13 +7,13 @@ import numpy as np
 import torch
 
 from structgstream.codec.packets import StreamHeader
-from structgstream.initialization import frame_seed
 from structgstream.kernels.backend import reference_backend
-from structgstream.pipeline import FrameTask, StreamFacts
-from structgstream.presets import TINY, StreamConfig, to_json
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import state_of
-from structgstream.scene_codecs import scene_codec
+from structgstream.session.initialization import frame_seed
+from structgstream.session.pipeline import FrameTask, StreamFacts
+from structgstream.session.presets import TINY, StreamConfig, to_json
+from structgstream.session.scene_codecs import scene_codec
 from structgstream.similarity import Similarity
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.views import training_views
