@@ -43,6 +43,10 @@ CHAPTER = re.compile(r"(G[HLPSX]\d\d|GOPR)", re.IGNORECASE)  # of a GoPro, GX010
 LAYOUTS = "CAMERA.mp4, CAMERA/anything.mp4, CAMERA/FRAME.jpg or CAMERA.jpg"
 
 
+class NoFootage(CaptureError):
+    """A folder without a video or a picture."""
+
+
 @dataclass(frozen=True)
 class Footage:
     """What the cameras filmed.
@@ -193,7 +197,7 @@ def find_footage(where: Path, *, picture_fps: float | None = None) -> Footage:
         return _footage(where, ordered, picture_fps or PICTURE_FPS)
     held = ", ".join(sorted(entry.name for entry in where.iterdir())[:6])
     found = f"holds no videos and no pictures, but {held}" if held else "is empty"
-    raise CaptureError(f"{where} {found}; expected {LAYOUTS}.")
+    raise NoFootage(f"{where} {found}; expected {LAYOUTS}.")
 
 
 def _of_size(picture: NDArray[np.uint8], size: tuple[int, int], name: str, file: Path) -> NDArray[np.uint8]:
