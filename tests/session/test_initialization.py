@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from structgstream.data.points import PointsConfig
-from structgstream.session import initialization
+from structgstream.session.loop import initialization
 from structgstream.session.initialization import frame_seed, initial_points_of
 from structgstream.similarity import Similarity
 from tests.support.memory_captures import MemoryCapture

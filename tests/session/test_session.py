@@ -18,7 +18,7 @@ from structgstream.evaluation.run_log import log_entry
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
-from structgstream.session import struct_gstream as method
+from structgstream.session.loop import struct_gstream as method
 from structgstream.session.frame_report import FrameReport
 from structgstream.session.initialization import frame_seed
 from structgstream.session.loop import Session

@@ -113,7 +113,7 @@ def test_a_killed_writer_of_segments_goes_on_to_the_same_bytes(tmp_path: Path) -
 
 def test_each_frame_starts_from_what_a_reader_sees(monkeypatch: pytest.MonkeyPatch) -> None:
     """The next frame after a period has begun starts from that period's scene, and the period from the one before."""
-    from structgstream.session import struct_gstream as method
+    from structgstream.session.loop import struct_gstream as method
 
     started = {}
     fit, again, number = method.fit_next_frame, method.fit_first_frame_again, count(1)
@@ -135,7 +135,7 @@ def test_each_frame_starts_from_what_a_reader_sees(monkeypatch: pytest.MonkeyPat
 
 
 def test_without_periods_nothing_is_measured_and_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
-    from structgstream.session import struct_gstream as method
+    from structgstream.session.loop import struct_gstream as method
 
     monkeypatch.setattr(method, "mean_residual", lambda *_, **__: pytest.fail("measured"))
     run(sink := MemorySink(), COMPACT_CONFIG, length=3)
