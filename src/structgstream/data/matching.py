@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
-from structgstream.data.images import opencv
+from structgstream.data.images import opencv, reduced_mask, reduced_picture
 
 Pair = tuple[str, str]
 """Names of two cameras."""
@@ -33,10 +33,16 @@ class Features:
 
 
 def sift_features(
-    image: NDArray[np.uint8], *, count: int, contrast: float = 0.01, mask: NDArray[np.bool_] | None = None
+    image: NDArray[np.uint8],
+    *,
+    count: int,
+    contrast: float = 0.01,
+    mask: NDArray[np.bool_] | None = None,
+    longest_side: int | None = None,
 ) -> Features:
     """The strongest ``count`` SIFT keypoints of an RGB picture ``[H, W, 3]``, of its pixels ``mask`` ``[H, W]``.
 
+    Larger pictures are reduced to ``longest_side`` pixels; keypoints are in pixels of ``image`` all the same.
     Descriptors are square-rooted after L1 normalisation, so that their dot product is the Hellinger kernel
     (Arandjelovic and Zisserman, CVPR 2012).
 
@@ -44,6 +50,10 @@ def sift_features(
         MissingExtraError: cv2 is not installed.
     """
     cv2 = opencv()
+    height, width = image.shape[:2]
+    if longest_side is not None:
+        image = reduced_picture(image, longest_side)
+        mask = None if mask is None else reduced_mask(mask, image.shape[1::-1])
     # Without the precise upscale every keypoint would be off by a quarter of a pixel.
     sift = cv2.SIFT.create(
         nfeatures=count,
@@ -58,6 +68,7 @@ def sift_features(
     if descriptors is None or len(keypoints) == 0:
         return Features(np.empty((0, 2)), np.empty((0, 128), np.float32))
     pixels = np.array([keypoint.pt for keypoint in keypoints], np.float64) + 0.5
+    pixels *= width / image.shape[1], height / image.shape[0]
     rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9), dtype=np.float32)
     return Features(pixels, rooted)
 

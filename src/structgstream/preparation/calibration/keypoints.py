@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
-from structgstream.data.images import opencv
+from structgstream.data.images import opencv, reduced_picture
 from structgstream.preparation.calibration.colmap import pycolmap_module
 
 
@@ -188,13 +188,10 @@ def _extracted(
     cv2 = opencv()
     grey = cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2GRAY)
     height, width = grey.shape
-    share = min(1.0, longest_side / max(height, width))
-    size = (max(1, round(width * share)), max(1, round(height * share)))
-    if share < 1:
-        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    grey = reduced_picture(grey, longest_side)
     listed, stored = extractor.extract_from_uint8_array(grey)
     places = pycolmap_module().keypoints_to_matrix(listed)[:, :2].astype(np.float64)
-    pixels, found = places * (width / size[0], height / size[1]), np.asarray(stored.data)
+    pixels, found = places * (width / grey.shape[1], height / grey.shape[0]), np.asarray(stored.data)
     if mask is not None:
         column, row = np.minimum(pixels, (width - 1, height - 1)).astype(np.intp).T
         inside = mask[row, column]

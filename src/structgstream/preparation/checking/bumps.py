@@ -18,6 +18,7 @@ from structgstream.data.calibration import listed
 from structgstream.data.descriptor_matches import mutual_matches
 from structgstream.data.images import opencv
 from structgstream.data.matching import epipolar_errors, fundamental_matrix, sift_features
+from structgstream.data.pair_matches import KEYPOINT_SIDE
 from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.evidence import Evidence, gather
 from structgstream.pose_check.findings import Finding
@@ -64,7 +65,7 @@ def picture_movement(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Moveme
     Raises:
         MissingExtraError: cv2 is not installed.
     """
-    before, after = (sift_features(picture, count=KEYPOINTS) for picture in (one, other))
+    before, after = (sift_features(picture, count=KEYPOINTS, longest_side=KEYPOINT_SIDE) for picture in (one, other))
     if min(len(before.pixels), len(after.pixels)) < MIN_MATCHES:
         return None
     rows, columns = mutual_matches(before.descriptors, after.descriptors, ratio=RATIO).T

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
-from structgstream.data.images import opencv
+from structgstream.data.images import opencv, reduced_picture
 
 LONGER_SIDE = 160  # of reduced pictures, pixels: events are compared along lines, so positions need not be finer
 SMOOTHING = 1.0  # standard deviation, reduced pixels
@@ -54,18 +54,15 @@ def picture_changes(pictures: Iterable[NDArray[np.uint8]], stamps: Floats) -> Ch
     size = (0, 0)
     for picture in pictures:
         size = (picture.shape[1], picture.shape[0])
-        reduced.append(reduced_picture(picture))
+        reduced.append(reduced_grey(picture))
     return reduced_changes(reduced, stamps[: len(reduced)], size)
 
 
-def reduced_picture(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A picture ``[H, W, 3]`` as grey ``[h, w]`` whose longer side is :data:`LONGER_SIDE`."""
+def reduced_grey(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A picture ``[H, W, 3]`` as grey ``[h, w]`` whose longer side is at most :data:`LONGER_SIDE`."""
     cv2 = opencv()
-    height, width = picture.shape[:2]
-    factor = LONGER_SIDE / max(width, height)
-    small = (max(round(width * factor), 1), max(round(height * factor), 1))
     # Reduced first: grey of a large picture would take longer than all else.
-    return cv2.cvtColor(cv2.resize(picture, small, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+    return cv2.cvtColor(reduced_picture(picture, LONGER_SIDE), cv2.COLOR_RGB2GRAY)
 
 
 def reduced_changes(reduced: Sequence[NDArray[np.uint8]], stamps: Floats, size: tuple[int, int]) -> Changes:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import apart_seconds
-from structgstream.preparation.synchronization.changes import Changes, reduced_changes, reduced_picture
+from structgstream.preparation.synchronization.changes import Changes, reduced_changes, reduced_grey
 from structgstream.preparation.synchronization.correlation import demand_scipy
 from structgstream.preparation.synchronization.epipolar import CalibratedGeometry
 from structgstream.preparation.synchronization.motion import (
@@ -139,7 +139,7 @@ def _changes(source: FrameSource, frames: int) -> dict[str, Changes]:
     apart = apart_seconds(source)
     for frame in islice(source.frames(), frames):
         for name, picture in frame.images.items():
-            reduced[name].append(reduced_picture(picture))
+            reduced[name].append(reduced_grey(picture))
             later = float(apart[name][frame.index]) if name in apart else 0.0
             stamps[name].append(frame.index / source.fps + later)
     sizes = {name: (source.rig[name].width, source.rig[name].height) for name in source.rig}

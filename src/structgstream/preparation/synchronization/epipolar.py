@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
 from structgstream.data.descriptor_matches import mutual_matches
-from structgstream.data.images import opencv
+from structgstream.data.images import opencv, reduced_picture
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Features, sift_features
 from structgstream.preparation.synchronization.changes import Changes
@@ -185,14 +185,10 @@ class StaticGeometry:
 
 def static_features(pictures: list[NDArray[np.uint8]]) -> Features:
     """Features of the median of pictures ``[H, W, 3]`` of one camera, in pixels of these."""
-    cv2 = opencv()
     height, width = pictures[0].shape[:2]
-    factor = min(LONGER_SIDE / max(width, height), 1.0)
-    size = (max(round(width * factor), 1), max(round(height * factor), 1))
-    reduced = [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in pictures]
-    still = np.median(np.stack(reduced), axis=0).astype(np.uint8)
+    still = np.median([reduced_picture(picture, LONGER_SIDE) for picture in pictures], axis=0).astype(np.uint8)
     found = sift_features(still, count=FEATURES, contrast=0.005)
-    return Features(found.pixels * [width / size[0], height / size[1]], found.descriptors)
+    return Features(found.pixels * [width / still.shape[1], height / still.shape[0]], found.descriptors)
 
 
 def _same(pixels: Floats) -> Floats:
