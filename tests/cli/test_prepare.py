@@ -12,8 +12,8 @@ import pytest
 
 from structgstream.cli.app import main
 from structgstream.preparation.calibration.board import Board
-from structgstream.preparation.claiming import alone, claim
 from structgstream.preparation.options import Distance, PrepareOptions
+from structgstream.preparation.output_folder import alone, claim
 from tests.support.quick_streams import error_of
 from tests.support.rooms import write_room
 

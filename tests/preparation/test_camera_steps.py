@@ -14,8 +14,8 @@ from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibrating import chosen_method
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.camera_steps import CameraSteps
-from structgstream.preparation.claiming import SOURCE
 from structgstream.preparation.options import Distance, PrepareOptions
+from structgstream.preparation.output_folder import SOURCE
 from structgstream.preparation.solvers import TIMESTAMPS, Clocks
 from structgstream.preparation.steps import FOLDER, Job, Silent, new_job
 from tests.support.footage_made import still_room

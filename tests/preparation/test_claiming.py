@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.errors import CaptureError, StorageError
-from structgstream.preparation.claiming import LOCK, SOURCE, alone, claim
+from structgstream.preparation.output_folder import LOCK, SOURCE, alone, claim
 from structgstream.preparation.steps import FOLDER
 from tests.support.killed import folders_of_the_killed
 
@@ -102,7 +102,7 @@ def test_one_process_at_a_time(tmp_path: Path, videos: Path) -> None:
     with alone(tmp_path / "capture"), alone(tmp_path / "other"):
         with pytest.raises(StorageError, match="Another process prepares .*capture now; wait for its end"):
             alone(tmp_path / "capture").__enter__()
-        code = "import sys, pathlib; from structgstream.preparation.claiming import alone\n"
+        code = "import sys, pathlib; from structgstream.preparation.output_folder import alone\n"
         code += "with alone(pathlib.Path(sys.argv[1])): pass"
         command = [sys.executable, "-c", code, str(tmp_path / "capture")]
         assert "Another process prepares" in subprocess.run(command, capture_output=True, text=True, check=False).stderr

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.errors import StorageError
-from structgstream.preparation.linking import Link, bring, drop_others, unbring
+from structgstream.preparation.output_folder import Link, bring, drop_others, unbring
 
 
 def test_each_kind_of_link(tmp_path: Path) -> None:

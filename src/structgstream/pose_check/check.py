@@ -22,9 +22,8 @@ from structgstream.data.calibration import listed
 from structgstream.data.pair_matches import PAIR_SHARE, PairError, PairMatcher, neighbor_errors
 from structgstream.errors import CalibrationError
 from structgstream.frames import MultiViewFrame
-from structgstream.pose_check.evidence import ALL_PAIRS, Evidence, gather, pair_errors
-from structgstream.pose_check.explanations import explain, readings_of
-from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.findings import Finding, explain, readings_of
+from structgstream.pose_check.tracks import ALL_PAIRS, Evidence, gather, pair_errors
 from structgstream.pose_check.verdicts import Verdict, find_suspects, judge
 
 MIN_MATCHES = 100  # of a rig, for a verdict

@@ -12,9 +12,8 @@ import numpy as np
 from structgstream.cameras import Camera
 from structgstream.data.matching import Pair
 from structgstream.data.pair_matches import PairError
-from structgstream.pose_check.evidence import Evidence, pair_errors
 from structgstream.pose_check.resection import Resection, resected
-from structgstream.pose_check.tracks import MIN_VIEWS, Tracks, build_tracks
+from structgstream.pose_check.tracks import MIN_VIEWS, Evidence, Tracks, build_tracks, pair_errors
 
 TIMES_TYPICAL = 4.0
 FLOOR_PIXELS = 0.75  # of pictures up to 1000 pixels wide, in proportion above

@@ -23,9 +23,9 @@ from structgstream.preparation.calibrating import (
     unpacked,
 )
 from structgstream.preparation.calibration.solved import SolvedCalibration
-from structgstream.preparation.claiming import claim
 from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import PrepareOptions
+from structgstream.preparation.output_folder import claim
 from structgstream.preparation.solvers import (
     TIMESTAMPS,
     Clocks,

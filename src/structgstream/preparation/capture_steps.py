@@ -33,8 +33,8 @@ from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.checking.check import Examination, check_capture, examine_capture
 from structgstream.preparation.checking.scales import nearest_depth, observed_depths
 from structgstream.preparation.footage import Footage
-from structgstream.preparation.linking import bring, drop_others, unbring
 from structgstream.preparation.options import PrepareOptions
+from structgstream.preparation.output_folder import bring, drop_others, unbring
 from structgstream.preparation.steps import FOLDER, Job, Stored, fingerprint
 from structgstream.similarity import rig_radius
 
@@ -124,7 +124,7 @@ class CaptureSteps:
         return content
 
     def check(self, content: PreparedCapture) -> tuple[Finding, ...]:
-        from structgstream.preparation.report.write import write_report
+        from structgstream.preparation.report.page import write_report
 
         def look() -> tuple[Finding, ...]:
             source = self._source(content)

@@ -11,9 +11,9 @@ from structgstream.data.rectilinear import check_field_of_view
 from structgstream.errors import ConfigError
 from structgstream.preparation.calibration.board import Board
 from structgstream.preparation.calibration.colmap import LensModel
-from structgstream.preparation.linking import Link
 from structgstream.preparation.synchronization import Method
 
+Link = Literal["hard", "symlink", "copy"]
 METHODS = ("auto", "sfm", "board")
 UNITS_IN_METRES = {"": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "in": 0.0254, "ft": 0.3048}
 

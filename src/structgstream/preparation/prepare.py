@@ -17,10 +17,10 @@ from structgstream.preparation.calibrating import check_board, check_used, chose
 from structgstream.preparation.camera_steps import CameraSteps
 from structgstream.preparation.capture_steps import CaptureSteps, assembled
 from structgstream.preparation.checking.check import Checked, check_capture
-from structgstream.preparation.claiming import alone
 from structgstream.preparation.footage import Footage
 from structgstream.preparation.options import PrepareOptions
-from structgstream.preparation.report.write import write_report
+from structgstream.preparation.output_folder import alone
+from structgstream.preparation.report.page import write_report
 from structgstream.preparation.steps import Job, Listener, Silent, new_job
 
 

@@ -7,8 +7,8 @@ import numpy as np
 from structgstream.preparation.calibration.adjustment import Limits, adjust_together
 from structgstream.preparation.calibration.comparison import calibration_errors
 from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DOWN, FOCAL
-from structgstream.preparation.calibration.rematching import RematchConfig, rematched
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
+from structgstream.preparation.calibration.triangulation import RematchConfig, rematched
 from tests.support.repetitive import keypoints_of, points, ring
 
 LIMITS = Limits(2.0, 1.5)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from structgstream.errors import CaptureError
-from structgstream.preparation.synchronization.timestamps import read_timestamps
+from structgstream.preparation.synchronization.stated_clocks import read_timestamps
 
 STAMPS = {"left": np.arange(90) / 30, "right": np.arange(150) / 50}
 

@@ -43,8 +43,8 @@ from structgstream.preparation.calibration.mapping import (
 )
 from structgstream.preparation.calibration.matching import KeypointMatchConfig, all_matches
 from structgstream.preparation.calibration.pictures import checked_pictures
-from structgstream.preparation.calibration.rematching import RematchConfig, rematched
 from structgstream.preparation.calibration.solved import SolvedCalibration, normalized
+from structgstream.preparation.calibration.triangulation import RematchConfig, rematched
 from structgstream.preparation.calibration.view_graph import (
     Matches,
     PairConfig,

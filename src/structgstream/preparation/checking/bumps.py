@@ -20,9 +20,8 @@ from structgstream.data.images import opencv
 from structgstream.data.matching import epipolar_errors, fundamental_matrix, sift_features
 from structgstream.data.pair_matches import KEYPOINT_SIDE
 from structgstream.frames import MultiViewFrame
-from structgstream.pose_check.evidence import Evidence, gather
 from structgstream.pose_check.findings import Finding
-from structgstream.pose_check.tracks import AGREE_PIXELS
+from structgstream.pose_check.tracks import AGREE_PIXELS, Evidence, gather
 
 KEYPOINTS = 1200
 RATIO = 0.8

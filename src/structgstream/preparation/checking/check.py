@@ -11,10 +11,8 @@ from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import select_cameras
 from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.check import examine_poses
-from structgstream.pose_check.evidence import Evidence, pair_errors
-from structgstream.pose_check.explanations import explain
-from structgstream.pose_check.findings import worst_first
-from structgstream.pose_check.tracks import MIN_VIEWS, Tracks
+from structgstream.pose_check.findings import explain, worst_first
+from structgstream.pose_check.tracks import MIN_VIEWS, Evidence, Tracks, pair_errors
 from structgstream.pose_check.verdicts import Suspects, Verdict
 from structgstream.preparation.checking.bumps import bump_findings
 from structgstream.preparation.checking.colors import Color, color_findings, compare_colors

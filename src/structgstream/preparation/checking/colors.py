@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv
-from structgstream.pose_check.evidence import Evidence
 from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.tracks import Evidence
 
 PATCH = 7
 DARK, BRIGHT = 12.0, 243.0

@@ -12,13 +12,17 @@ from numpy.typing import NDArray
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import apart_seconds
-from structgstream.preparation.synchronization.changes import Changes, reduced_changes, reduced_grey
 from structgstream.preparation.synchronization.correlation import demand_scipy
-from structgstream.preparation.synchronization.epipolar import CalibratedGeometry
 from structgstream.preparation.synchronization.motion import (
     agreeing_cameras,
     pair_signals,
     solve_by_motion,
+)
+from structgstream.preparation.synchronization.motion_signals import (
+    CalibratedGeometry,
+    Changes,
+    reduced_changes,
+    reduced_grey,
 )
 from structgstream.preparation.synchronization.result import WARNED_SECONDS
 

@@ -2,9 +2,9 @@
 """Instants that pairs of cameras share, from what moves in their pictures.
 
 Without geometry the activity of whole pictures is compared, which is good to a frame where enough happens. With
-epipolar geometry signals of corresponding lines are compared (``epipolar.py``), which is good to a tenth of a frame
-for one pair. A first round considers all lags; the second one looks near those that most pairs agree on, and, in takes
-that are long enough, for drift.
+epipolar geometry signals of corresponding lines are compared (``motion_signals.py``), which is good to a tenth of a
+frame for one pair. A first round considers all lags; the second one looks near those that most pairs agree on, and, in
+takes that are long enough, for drift.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.errors import CaptureError
-from structgstream.preparation.synchronization.changes import Changes
 from structgstream.preparation.synchronization.correlation import (
     Signal,
     best_lag,
@@ -23,8 +22,8 @@ from structgstream.preparation.synchronization.correlation import (
     lag_changes,
     resampled,
 )
-from structgstream.preparation.synchronization.epipolar import Geometry, line_signals
 from structgstream.preparation.synchronization.lines import Line, fitted_line
+from structgstream.preparation.synchronization.motion_signals import Changes, Geometry, line_signals
 from structgstream.preparation.synchronization.solving import Solution, Tie, connected, solve_clocks
 from structgstream.preparation.synchronization.streams import period_seconds
 

@@ -20,22 +20,22 @@ from structgstream.preparation.synchronization.audio import (
     solve_by_audio,
     sound_of,
 )
-from structgstream.preparation.synchronization.changes import Changes, picture_changes
 from structgstream.preparation.synchronization.correlation import demand_scipy
-from structgstream.preparation.synchronization.epipolar import (
-    CalibratedGeometry,
-    Geometry,
-    StaticGeometry,
-    static_features,
-)
 from structgstream.preparation.synchronization.motion import (
     pair_signals,
     solve_by_motion,
 )
+from structgstream.preparation.synchronization.motion_signals import (
+    CalibratedGeometry,
+    Changes,
+    Geometry,
+    StaticGeometry,
+    picture_changes,
+    static_features,
+)
 from structgstream.preparation.synchronization.result import Synchronization, synchronization
+from structgstream.preparation.synchronization.stated_clocks import read_timestamps, wall_clocks
 from structgstream.preparation.synchronization.streams import StatesMetadata, Streams, period_seconds
-from structgstream.preparation.synchronization.timestamps import read_timestamps
-from structgstream.preparation.synchronization.wall_clocks import wall_clocks
 
 _log = logging.getLogger(__name__)
 
