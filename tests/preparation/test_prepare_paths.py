@@ -12,11 +12,11 @@ import pytest
 from structgstream.data.prepared import PreparedCapture, read_prepared
 from structgstream.data.timeline import Clock
 from structgstream.errors import CalibrationError, CaptureError
-from structgstream.preparation.calibration.comparison import calibration_errors
 from structgstream.preparation.footage import find_footage
 from structgstream.preparation.options import Distance, PrepareOptions
 from structgstream.preparation.prepare import Preparation, prepare_capture
 from structgstream.preparation.solvers import first_clocks, matched_pictures
+from tests.support.calibration_errors import calibration_errors
 from tests.support.captures import write_video, write_videos
 from tests.support.filmed import Film, noise_texture, ring, room
 from tests.support.footage_made import BOARD, FPS, add_sound, centred, write_board_take, write_take

@@ -10,9 +10,9 @@ from structgstream.cameras import Camera
 from structgstream.data.lenses import LensCamera, RadialTangential
 from structgstream.data.posed import rotation_matrix
 from structgstream.preparation.calibration.adjustment import Limits, adjust_together, cleaned
-from structgstream.preparation.calibration.comparison import calibration_errors
 from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
+from tests.support.calibration_errors import calibration_errors
 
 CAMERAS, POINTS = 9, 300
 FREE = (FOCAL, ASPECT, ACROSS, DOWN, *DISTORTION["brown"])

@@ -8,8 +8,8 @@ import torch
 from structgstream.data.lenses import LensCamera, RadialTangential
 from structgstream.data.posed import rotation_matrix
 from structgstream.errors import CalibrationError, ConfigError
-from structgstream.preparation.calibration.comparison import calibration_errors
 from structgstream.preparation.calibration.refinement import refine
+from tests.support.calibration_errors import calibration_errors
 from tests.support.filmed import filmed_room
 
 

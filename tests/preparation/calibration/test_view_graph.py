@@ -28,7 +28,6 @@ def test_true_matches_are_kept_and_wrong_ones_go() -> None:
         keypoints_of(RIG, points, noise=0.2),
         {("cam00", "cam01"): matches["cam00", "cam01"]},
         CAMERAS,
-        seed=0,
         workers=1,
     ).values()
     inliers = {tuple(row) for row in geometry.inlier_matches.tolist()}
@@ -52,7 +51,6 @@ def test_pairs_that_agree_by_chance_or_in_a_few_points_do_not_pass() -> None:
             ("cam01", "cam02"): matches["cam01", "cam02"][:20],
         },
         CAMERAS,
-        seed=0,
         workers=1,
     )
     assert set(found) == {("cam01", "cam02")}
@@ -68,7 +66,7 @@ def test_the_database_holds_what_was_written(tmp_path: Path) -> None:
         matches[pair][:, 1] = np.argsort(order)[matches[pair][:, 1]]
     numbers = dict(zip(RIG, (1, 1, 2), strict=True))
     cameras = {name: colmap_camera(filmed, numbers[name]) for name, filmed in RIG.items()}
-    geometries = verified_pairs(keypoints, matches, cameras, seed=0, workers=1)
+    geometries = verified_pairs(keypoints, matches, cameras, workers=1)
     ids = write_database(tmp_path / "database.db", keypoints, cameras, geometries)
     assert sorted(ids) == sorted(RIG)
     with pycolmap_module().Database.open(tmp_path / "database.db") as database:

@@ -18,6 +18,7 @@ from structgstream.preparation.calibration.solved import Observations, SolvedCal
 _log = logging.getLogger(__name__)
 
 
+MAX_PIXELS = 3.0
 ROUNDS, STEPS, SAME = 8, 2, 0.05
 NORMAL_MEDIAN = 1.1774  # of the length of a pair of standard normal numbers
 
@@ -32,7 +33,12 @@ class Limits:
     """
 
     pixels: float
-    degrees: float
+    degrees: float = 1.5
+
+    @classmethod
+    def for_pictures(cls, longest_side: int) -> "Limits":
+        """Three pixels of pictures of 1000 pixels on the longer side, in proportion, and never under one."""
+        return cls(max(1.0, MAX_PIXELS * longest_side / 1000))
 
 
 def adjust_together(

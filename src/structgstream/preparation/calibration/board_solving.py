@@ -31,7 +31,6 @@ from structgstream.preparation.calibration.colmap import (
 )
 from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL
 from structgstream.preparation.calibration.mapping import Freedom, adjust
-from structgstream.preparation.calibration.pictures import checked_pictures
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
 
 Sightings = Mapping[str, Sequence[Sighting]]
@@ -140,7 +139,6 @@ def solve_board(
     *,
     lens: LensModel = "opencv",
     known: Mapping[str, LensCamera] | None = None,
-    seed: int = 0,
 ) -> SolvedCalibration:
     """Poses, intrinsics and lenses from pictures of ``board`` at many instants.
 
@@ -162,14 +160,13 @@ def solve_board(
         MissingExtraError: pycolmap or cv2 is not installed.
     """
     pycolmap_module()
-    checked_pictures(pictures)
     sightings = board_sightings(pictures, board)
     known = known or {}
     views = {}
     for number, (name, shots) in enumerate(pictures.items(), 1):
         size = shots[0].shape[1], shots[0].shape[0]
         starts = [colmap_camera(known[name], number)] if name in known else _guesses(lens, number, size)
-        views[name] = _own_view(name, sightings[name], board, starts, fixed=name in known, seed=seed)
+        views[name] = _own_view(name, sightings[name], board, starts, fixed=name in known)
     sensors = _connected_sensors(views)
     poses = _rig_poses(views, sensors, sightings)
     cameras = {name: view.camera for name, view in views.items()}
@@ -200,9 +197,7 @@ def _guesses(lens: LensModel, number: int, size: tuple[int, int]) -> list[Any]:
     return [guessed_camera(lens, number, size, degrees) for degrees in FIELDS_OF_VIEW[lens]]
 
 
-def _own_view(
-    name: str, sights: Sequence[Sighting], board: Board, starts: Sequence[Any], *, fixed: bool, seed: int
-) -> _View:
+def _own_view(name: str, sights: Sequence[Sighting], board: Board, starts: Sequence[Any], *, fixed: bool) -> _View:
     """Intrinsics from the best start, and a pose for each sighting that agrees with them."""
     chosen = sorted(sights, key=lambda sight: (-len(sight.corners), sight.instant))[: 2 * MAX_SIGHTINGS_ALONE]
     chosen = sorted(chosen, key=lambda sight: sight.instant)
@@ -210,7 +205,7 @@ def _own_view(
     sample = [chosen[index] for index in picks]
     best: tuple[float, Any] | None = None
     for camera in starts:
-        poses = _poses(camera, sample, board, seed=seed)
+        poses = _poses(camera, sample, board)
         if len(poses) < max(3, len(sample) // 2):
             continue
         if not fixed:
@@ -219,11 +214,11 @@ def _own_view(
             adjust(model, freedom=Freedom(), constant_points=True)
             camera = model.camera(camera.camera_id)
             model.update_point_3d_errors()
-        error = _misfit(camera, sample, board, seed=seed)
+        error = _misfit(camera, sample, board)
         if best is None or error < best[0]:
             best = error, camera
     if best is not None:
-        poses = _poses(best[1], sights, board, seed=seed, share=0.005)
+        poses = _poses(best[1], sights, board, share=0.005)
         if len(poses) >= 3:
             return _View(best[1], poses)
     raise CalibrationError(
@@ -233,14 +228,12 @@ def _own_view(
     )
 
 
-def _poses(
-    camera: Any, sights: Sequence[Sighting], board: Board, *, seed: int, share: float = POSE_PIXELS
-) -> dict[int, Floats]:
+def _poses(camera: Any, sights: Sequence[Sighting], board: Board, *, share: float = POSE_PIXELS) -> dict[int, Floats]:
     """Board-to-camera matrices by instant, of the sightings of which most corners agree."""
     pycolmap = pycolmap_module()
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = max(2.0, share * max(camera.width, camera.height))
-    options.ransac.random_seed = seed
+    options.ransac.random_seed = 0
     found = {}
     for sight in sights:
         result = pycolmap.estimate_and_refine_absolute_pose(sight.pixels, board.corners[sight.corners], camera, options)
@@ -249,10 +242,10 @@ def _poses(
     return found
 
 
-def _misfit(camera: Any, sights: Sequence[Sighting], board: Board, *, seed: int) -> float:
+def _misfit(camera: Any, sights: Sequence[Sighting], board: Board) -> float:
     """Median over the sightings of the median reprojection error, pixels; infinite for one without a pose."""
     errors = []
-    poses = _poses(camera, sights, board, seed=seed)
+    poses = _poses(camera, sights, board)
     for sight in sights:
         if sight.instant not in poses:
             errors.append(np.inf)
