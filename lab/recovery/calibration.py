@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         start = perturbed(given, degrees=options.degrees, percent=options.percent)
         _print("perturbed", calibration_errors(start, given).values())
         found = refine(pictures, start)
-        print(f"held back {found.held_back}: {found.before_pixels:.2f} to {found.after_pixels:.2f} pixels")
+        print(f"held back {found.held_out}: {found.before_pixels:.2f} to {found.after_pixels:.2f} pixels")
         solved = found.solved
     else:
         known = given if options.known else None

@@ -87,7 +87,7 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig) -> PoseCheck:
     matcher = PairMatcher(frame.images, masks=frame.masks)
     near = neighbor_errors(cameras, matcher)
     check = _summed({pair: error for pair, error in near.items() if error is not None}, cameras)
-    if check.conclusive and not check.unmatched and not _accused(near, cameras):
+    if check.conclusive and not check.unmatched and not _contradicted(near, cameras):
         return check
     evidence, verdict = examine_poses(frame, cameras, matcher=matcher)
     check = _summed(pair_errors(evidence, cameras), cameras)
@@ -109,7 +109,7 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig) -> PoseCheck:
     return PoseCheck(check.matches, check.share_violating, off, check.unmatched, tuple(findings))
 
 
-def _accused(errors: Mapping[tuple[str, str], PairError | None], cameras: Mapping[str, Camera]) -> bool:
+def _contradicted(errors: Mapping[tuple[str, str], PairError | None], cameras: Mapping[str, Camera]) -> bool:
     """Whether a pair of neighbours contradicts the poses."""
     found = {pair: error for pair, error in errors.items() if error is not None}
     return bool(find_suspects(found, cameras).bad) or any(error.share > PAIR_SHARE for error in found.values())

@@ -88,10 +88,10 @@ def explain(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Verdict)
         return [_explain_all(evidence, cameras)]
     findings, left = _exchanged(evidence, cameras, verdict)
     for name in left:
-        told = _single(evidence, cameras, name, verdict) or _moved(evidence, cameras, name, verdict)
+        sentence = _single(evidence, cameras, name, verdict) or _moved(evidence, cameras, name, verdict)
         found = verdict.resections.get(name)
         slight = found is not None and found.given_pixels < SLIGHT_PIXELS * max(cameras[name].width / 1000, 1)
-        findings.append(Finding("warning" if slight else "error", told, (name,)))
+        findings.append(Finding("warning" if slight else "error", sentence, (name,)))
     findings += [_doubtful(evidence, cameras, name, verdict) for name in verdict.doubtful]
     return findings + [_unchecked(evidence, cameras, name, verdict) for name in verdict.unchecked]
 
@@ -143,14 +143,14 @@ def _exchanged(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Verdi
     if not moved or set(names) != {other for _, other in moved}:
         return [], list(off)
     if len(moved) == 2:
-        told = f"The names of cameras {names[0]!r} and {names[1]!r} are exchanged"
+        sentence = f"The names of cameras {names[0]!r} and {names[1]!r} are exchanged"
     else:
-        told = "Names of cameras are exchanged: " + ", ".join(
+        sentence = "Names of cameras are exchanged: " + ", ".join(
             f"the pictures of {name!r} belong to the calibration of {other!r}" for name, other in moved
         )
     worst = max(costs[same.index(name), same.index(other)] for name, other in moved)
-    told += f": put right, {1 - worst:.0%} of their matches or more fit; rename files or the calibration's cameras."
-    return [Finding("error", told, tuple(names))], [name for name in off if name not in names]
+    sentence += f": put right, {1 - worst:.0%} of their matches or more fit; rename files or the calibration's cameras."
+    return [Finding("error", sentence, tuple(names))], [name for name in off if name not in names]
 
 
 def _size(cameras: Mapping[str, Camera], off: Sequence[str]) -> tuple[int, int]:
@@ -179,57 +179,59 @@ def _single(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdic
         f"{own.width}x{own.height}; scale them by {factor:g}": _scaled(factor)
         for factor in SIZES
     }
-    shares = {told: _share_with(evidence, cameras, name, change(own), verdict) for told, change in changes.items()}
-    told = min(shares, key=lambda told: shares[told])
-    return f"Camera {name!r} {told}." if shares[told] < EXPLAINED else None
+    shares = {
+        sentence: _share_with(evidence, cameras, name, change(own), verdict) for sentence, change in changes.items()
+    }
+    sentence = min(shares, key=lambda sentence: shares[sentence])
+    return f"Camera {name!r} {sentence}." if shares[sentence] < EXPLAINED else None
 
 
 def _moved(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> str:
     """How far a camera stands from where its pictures say that it does, as far as they do say so."""
     found = verdict.resections.get(name)
     if found is not None:
-        told = (
+        sentence = (
             f"Camera {name!r} is off: {found.points} points that other cameras agree on lie {found.given_pixels:.1f} "
             "pixels (median) from where its picture shows them"
         )
-        told += f"; its pictures {found.told}" if found.told else ""
+        sentence += f"; its pictures {found.sentence}" if found.sentence else ""
     else:
-        told = (
-            f"Camera {name!r} is off: its matches with {_pairs_told(evidence, cameras, name, verdict)}, which agree "
+        sentence = (
+            f"Camera {name!r} is off: its matches with {_bad_pairs(evidence, cameras, name, verdict)}, which agree "
             "with each other, do not lie on the epipolar lines of its pose"
         )
-    return told + ". It was bumped or its calibration is another's: calibrate again, or leave it out."
+    return sentence + ". It was bumped or its calibration is another's: calibrate again, or leave it out."
 
 
 def _doubtful(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> Finding:
     """A camera that matches contradict which may be wrong ones."""
-    told = (
-        f"Camera {name!r} may be off: its matches with {_pairs_told(evidence, cameras, name, verdict)} do not lie on "
+    sentence = (
+        f"Camera {name!r} may be off: its matches with {_bad_pairs(evidence, cameras, name, verdict)} do not lie on "
         "the epipolar lines of its pose, but other matches do; wrong matches of repeated texture look like that, too: "
         "see in the report whether its dots lie where they should."
     )
-    return Finding("warning", told, (name,))
+    return Finding("warning", sentence, (name,))
 
 
 def _unchecked(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> Finding:
     """A camera with too few matches to tell wrong ones from a wrong pose."""
-    told = (
+    sentence = (
         f"The pose of camera {name!r} could not be checked: its few matches, with "
-        f"{_pairs_told(evidence, cameras, name, verdict)}, do not lie on the epipolar lines, as wrong matches do not "
+        f"{_bad_pairs(evidence, cameras, name, verdict)}, do not lie on the epipolar lines, as wrong matches do not "
         "either; move it closer to its neighbours, or add texture."
     )
-    return Finding("note", told, (name,))
+    return Finding("note", sentence, (name,))
 
 
-def _pairs_told(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> str:
+def _bad_pairs(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> str:
     """Names, with errors in pixels, of the cameras whose matches a camera's pose does not explain."""
-    told = []
+    sentence = []
     for pair in verdict.suspects.bad:
         if name in pair and not set(pair) & set(verdict.suspects.off) - {name}:
             (other,) = set(pair) - {name}
             error = pair_error(cameras[pair[0]], cameras[pair[1]], *evidence.pixels(pair))
-            told.append(f"{other!r} ({error.matches}, off by {error.pixels:.1f} pixels)")
-    return ", ".join(told[:4]) + (f" and {len(told) - 4} more" if len(told) > 4 else "")
+            sentence.append(f"{other!r} ({error.matches}, off by {error.pixels:.1f} pixels)")
+    return ", ".join(sentence[:4]) + (f" and {len(sentence) - 4} more" if len(sentence) > 4 else "")
 
 
 def _by_viewmat(change: Callable[[torch.Tensor], torch.Tensor]) -> Change:

@@ -129,9 +129,9 @@ class _Table:
         if not len(self.point):
             return self
         views = np.bincount(self.point[self.used], minlength=int(self.point.max()) + 1)
-        kept = views[self.point] >= 2
-        _, numbered = np.unique(self.point[kept], return_inverse=True)
-        return _Table(numbered.astype(np.intp), self.camera[kept], self.pixels[kept], self.used[kept])
+        rows = views[self.point] >= 2
+        _, numbered = np.unique(self.point[rows], return_inverse=True)
+        return _Table(numbered.astype(np.intp), self.camera[rows], self.pixels[rows], self.used[rows])
 
 
 def build_tracks(evidence: Evidence, cameras: Mapping[str, Camera], *, off: Collection[str] = ()) -> Tracks:
@@ -204,8 +204,8 @@ def _components(
     _, position, count = np.unique(once, return_inverse=True, return_counts=True)
     twice = np.zeros(label.max() + 1, bool)
     twice[label[count[position] > 1]] = True
-    kept = ~twice[label]
-    return label[kept], camera[kept], node[kept] - first[camera[kept]]
+    unique = ~twice[label]
+    return label[unique], camera[unique], node[unique] - first[camera[unique]]
 
 
 def _agreeing(table: _Table, cameras: list[Camera], limit: float) -> _Table:

@@ -48,7 +48,7 @@ class PrepareOptions:
         near: near plane in the capture's units; None to take it from the points.
         fps: frames a second of pictures; None for 30.
         without: names of cameras to leave out.
-        link: how files are brought into the capture.
+        link: how files get into the capture.
         instants: most instants that structure from motion looks at; it looks at three where these have texture enough.
     """
 

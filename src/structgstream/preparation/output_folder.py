@@ -20,11 +20,11 @@ from structgstream.preparation.steps import FOLDER
 
 SOURCE = "source.json"
 LOCK = ".preparing"
-_CLAIMS = (Path(FOLDER), partial_path(Path(FOLDER, SOURCE)))
+_MARKS = (Path(FOLDER), partial_path(Path(FOLDER, SOURCE)))
 """What a claim that was killed or met a full disk leaves in a folder, which is as free as before."""
 
 
-def claim(capture: Path, videos: Path) -> None:
+def mark_output(capture: Path, videos: Path) -> None:
     """Marks ``capture`` as the one of these videos.
 
     Raises:
@@ -44,7 +44,7 @@ def claim(capture: Path, videos: Path) -> None:
                 f"{capture} was prepared from {before}, not from {origin}; choose another folder with -o, or remove it."
             )
         return
-    if any(entry not in _CLAIMS for entry in _below(capture)):
+    if any(entry not in _MARKS for entry in _below(capture)):
         raise CaptureError(f"The folder {capture} is not empty and was not made by prepare; choose another with -o.")
     try:
         marker.parent.mkdir(parents=True, exist_ok=True)
@@ -55,7 +55,7 @@ def claim(capture: Path, videos: Path) -> None:
 
 
 @contextmanager
-def alone(capture: Path) -> Iterator[None]:
+def lock_output(capture: Path) -> Iterator[None]:
     """No other process prepares the same capture within the block.
 
     Args:
@@ -88,13 +88,13 @@ def _origin(marker: Path) -> str | None:
         return None
 
 
-def bring(source: Path, target: Path, *, link: Link) -> None:
+def link(source: Path, target: Path, *, how: Link) -> None:
     """Makes ``target`` the file or the folder of files ``source``; what is there already stays.
 
     Args:
         source: a file, or a folder of files.
         target: its place in the capture.
-        link: ``hard`` links, and copies where file systems differ; ``symlink`` points to the source; ``copy`` copies.
+        how: ``hard`` links, and copies where file systems differ; ``symlink`` points to the source; ``copy`` copies.
 
     Raises:
         StorageError: it cannot be written.
@@ -103,38 +103,38 @@ def bring(source: Path, target: Path, *, link: Link) -> None:
         if source.is_dir():
             target.mkdir(parents=True, exist_ok=True)
             for file in sorted(entry for entry in source.iterdir() if entry.is_file()):
-                _bring_file(file, target / file.name, link)
+                _link_file(file, target / file.name, how)
         else:
             target.parent.mkdir(parents=True, exist_ok=True)
-            _bring_file(source, target, link)
+            _link_file(source, target, how)
     except OSError as error:
         raise StorageError(
-            f"{source} cannot be brought to {target} ({error.strerror}); make room, or use --link symlink."
+            f"{source} cannot be linked or copied to {target} ({error.strerror}); make room, or use --link symlink."
         ) from None
 
 
-def drop_others(folder: Path, kept: Collection[str]) -> None:
-    """Removes what an earlier run has brought to ``folder`` and is no more among the files of the names ``kept``.
+def remove_others(folder: Path, names: Collection[str]) -> None:
+    """Removes files that an earlier run linked into ``folder`` and whose names are not among ``names``.
 
     Raises:
         StorageError: it cannot be removed.
     """
-    for file in sorted(entry for entry in folder.iterdir() if entry.name not in kept and not entry.is_dir()):
+    for file in sorted(entry for entry in folder.iterdir() if entry.name not in names and not entry.is_dir()):
         _remove(file)
 
 
-def unbring(source: Path, target: Path) -> None:
-    """Removes what :func:`bring` has made of ``source``, a file or a folder of files; what is another's stays.
+def unlink(source: Path, target: Path) -> None:
+    """Removes what :func:`link` made of ``source``, a file or a folder of files; other files stay.
 
     Raises:
         StorageError: it cannot be removed.
     """
     if source.is_dir():
         for file in sorted(entry for entry in source.iterdir() if entry.is_file()):
-            unbring(file, target / file.name)
+            unlink(file, target / file.name)
         if target.is_dir() and not any(target.iterdir()):
             target.rmdir()
-    elif target.is_file() and any(_same(source, target, link) for link in ("hard", "symlink", "copy")):
+    elif target.is_file() and any(_same(source, target, how) for how in ("hard", "symlink", "copy")):
         _remove(target)
 
 
@@ -142,18 +142,20 @@ def _remove(file: Path) -> None:
     try:
         file.unlink()
     except OSError as error:
-        raise StorageError(f"{file} is of no camera now and cannot be removed ({error.strerror}); remove it.") from None
+        raise StorageError(
+            f"{file} belongs to no camera now and cannot be removed ({error.strerror}); remove it."
+        ) from None
 
 
-def _bring_file(source: Path, target: Path, link: Link) -> None:
-    if _same(source, target, link):
+def _link_file(source: Path, target: Path, how: Link) -> None:
+    if _same(source, target, how):
         return
     target.unlink(missing_ok=True)
     source = source.resolve()
-    if link == "symlink":
+    if how == "symlink":
         target.symlink_to(source)
         return
-    if link == "hard":
+    if how == "hard":
         try:
             os.link(source, target)
             return
@@ -168,13 +170,13 @@ def _bring_file(source: Path, target: Path, link: Link) -> None:
         raise
 
 
-def _same(source: Path, target: Path, link: Link) -> bool:
-    """Whether the target is that of an earlier run."""
+def _same(source: Path, target: Path, how: Link) -> bool:
+    """Whether the target was made by an earlier run."""
     if not target.exists():
         return False
-    if link == "symlink" or target.is_symlink():
-        return link == "symlink" and target.is_symlink() and target.resolve() == source.resolve()
+    if how == "symlink" or target.is_symlink():
+        return how == "symlink" and target.is_symlink() and target.resolve() == source.resolve()
     if target.samefile(source):
-        return link != "copy"
+        return how != "copy"
     one, other = source.stat(), target.stat()
     return (one.st_size, one.st_mtime_ns) == (other.st_size, other.st_mtime_ns)

@@ -20,7 +20,7 @@ ADJUST = partial(
     adjust_together,
     lens=range(COUNT),
     free=(FOCAL, ASPECT, ACROSS, DOWN),
-    held=np.zeros(COUNT, bool),
+    fixed=np.zeros(COUNT, bool),
     limits=LIMITS,
 )
 

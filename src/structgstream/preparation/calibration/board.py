@@ -158,15 +158,15 @@ def board_sightings(
 def _too_few(board: Board, seen: Mapping[str, tuple[int, int]], found: Mapping[str, Sequence[Sighting]]) -> str:
     """The sentence for cameras with too few of their pictures that show the board."""
     if not any(found.values()):
-        most = max(total for _, total in seen.values())
+        largest = max(total for _, total in seen.values())
         return (
-            f"No camera shows the board ({board.text}) in any of its {most} pictures that were looked at; show it "
+            f"No camera shows the board ({board.text}) in any of its {largest} pictures that were looked at; show it "
             f"whole, closer and sharper ({MIN_CORNERS} corners are needed), name the board that was "
             "filmed with --board, or the folder in which it was with --board-videos."
         )
-    told = ", ".join(f"{name!r} in {count} of {total} pictures" for name, (count, total) in seen.items())
+    counts = ", ".join(f"{name!r} in {count} of {total} pictures" for name, (count, total) in seen.items())
     return (
-        f"The board ({board.text}) is seen too rarely: by {told}, where {MIN_SIGHTINGS} with {MIN_CORNERS} corners "
+        f"The board ({board.text}) is seen too rarely: by {counts}, where {MIN_SIGHTINGS} with {MIN_CORNERS} corners "
         "each are needed; show it whole, closer and sharper to each camera, tilted in several directions."
     )
 
@@ -200,9 +200,9 @@ def _check_markers(
     needed = board.columns * board.rows // 2
     beyond = [name for name, ids in markers.items() if ids and max(ids) >= needed and len(ids) > 3]
     if len(beyond) > len(pictures) / 2:
-        most = max(max(markers[name]) for name in beyond)
+        largest = max(max(markers[name]) for name in beyond)
         raise CalibrationError(
-            f"The pictures show markers up to number {most}, a board of {board.columns} x {board.rows} squares has "
+            f"The pictures show markers up to number {largest}, a board of {board.columns} x {board.rows} squares has "
             f"{needed} of them: give the board's real numbers of squares, as printed on its page."
         )
     if any(found.values()):

@@ -20,7 +20,7 @@ from structgstream.data.lenses import LensCamera
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.adjustment import cameras_in, estimated, posed_problem
 from structgstream.preparation.calibration.board import Board, Sighting, board_sightings
-from structgstream.preparation.calibration.bundle import Scene, Sights
+from structgstream.preparation.calibration.bundle import BodyObservations, Scene
 from structgstream.preparation.calibration.colmap import (
     LensModel,
     colmap_camera,
@@ -173,16 +173,16 @@ def solve_board(
     fixed = frozenset(cameras[name].camera_id for name in known)
     free = Freedom(*[len(known) < len(pictures)] * 3)
     filmed = _filmed(cameras, sensors)
-    kept: Sightings = {name: [s for s in sightings[name] if s.instant in view.poses] for name, view in views.items()}
+    inliers: Sightings = {name: [s for s in sightings[name] if s.instant in view.poses] for name, view in views.items()}
     for _ in range(2):
-        model = board_model(board, kept, cameras, sensors, poses)
+        model = board_model(board, inliers, cameras, sensors, poses)
         adjust(model, freedom=free, fixed=fixed, constant_points=True)
         cameras = {name: model.camera(camera.camera_id) for name, camera in cameras.items()}
         sensors, poses = sensor_poses(model, cameras), rig_poses(model)
         filmed = _filmed(cameras, sensors)
-        kept = _without_outliers(kept, _solved(board, kept, filmed, poses))
-    filmed, poses = adjust_board(board, kept, filmed, poses, lens=lens, known=frozenset(known))
-    return _solved(board, kept, filmed, poses)
+        inliers = _without_outliers(inliers, _solved(board, inliers, filmed, poses))
+    filmed, poses = adjust_board(board, inliers, filmed, poses, lens=lens, known=frozenset(known))
+    return _solved(board, inliers, filmed, poses)
 
 
 @dataclass(frozen=True)
@@ -329,14 +329,14 @@ def _without_outliers(sightings: Sightings, solved: SolvedCalibration) -> Sighti
     errors = solved.errors()
     limit = max(OUTLIER_PIXELS, 6 * float(np.nanmedian(errors)))
     good = iter((errors <= limit).tolist())
-    kept: dict[str, list[Sighting]] = {}
+    inliers: dict[str, list[Sighting]] = {}
     for name, sights in sightings.items():
-        kept[name] = []
+        inliers[name] = []
         for sight in sights:
             inside = np.array([next(good) for _ in sight.corners], bool)
             if inside.sum() >= 4:
-                kept[name].append(replace(sight, corners=sight.corners[inside], pixels=sight.pixels[inside]))
-    return kept
+                inliers[name].append(replace(sight, corners=sight.corners[inside], pixels=sight.pixels[inside]))
+    return inliers
 
 
 def adjust_board(
@@ -357,7 +357,7 @@ def adjust_board(
     number = {instant: index for index, instant in enumerate(poses)}
     seen = [(index, sight) for index, name in enumerate(cameras) for sight in sightings[name]]
     counts = [len(sight.corners) for _, sight in seen]
-    sights = Sights(
+    sights = BodyObservations(
         np.repeat([index for index, _ in seen], counts).astype(np.intp),
         np.repeat([number[sight.instant] for _, sight in seen], counts).astype(np.intp),
         np.concatenate([board.corners[sight.corners] for _, sight in seen]),
@@ -370,8 +370,8 @@ def adjust_board(
         (stack[:, :3, :3], stack[:, :3, 3]),
         lens=np.arange(len(cameras)),
         free=(FOCAL, ASPECT, ACROSS, DOWN, *DISTORTION[lens]),
-        held=np.array([name in known for name in cameras]),
-        turning=True,
+        fixed=np.array([name in known for name in cameras]),
+        rotating=True,
     )
     bundle, scene = estimated(bundle, scene)
     scene = _from_first(scene)

@@ -44,16 +44,16 @@ class Refinement:
 
     Args:
         solved: refined cameras, in the coordinates of the given ones; these themselves if refining did not help.
-        before_pixels: median distance of matches that were held back to the epipolar lines of the given cameras.
+        before_pixels: median distance of matches that were held out to the epipolar lines of the given cameras.
         after_pixels: the same of the refined cameras, before they are adjusted to these matches, too.
-        held_back: number of these matches.
+        held_out: number of these matches.
         changed: whether ``solved`` has refined cameras.
     """
 
     solved: SolvedCalibration
     before_pixels: float
     after_pixels: float
-    held_back: int
+    held_out: int
     changed: bool
 
 
@@ -67,7 +67,7 @@ def refine(
 ) -> Refinement:
     """Adjust ``cameras`` to pictures of the same instants.
 
-    One track in five is held back. Only if the refined cameras fit these better than the given ones do, they are
+    One track in five is held out. Only if the refined cameras fit these better than the given ones do, they are
     returned, after a last adjustment to all tracks (adjustment.py); they are moved, turned and scaled to lie as close
     to the given ones as they can.
 
@@ -87,7 +87,7 @@ def refine(
         )
     graph = posed_graph(pictures, cameras, slack_degrees=SLACK_DEGREES)
     _check_connected(cameras, graph)
-    judging = _held_back(graph)
+    judging = _held_out(graph)
     learning = without(graph, judging)
     judges = {pair: graph.matches[pair][judging[pair]] for pair in graph.matches}
     refined, solved = dict(cameras), None
@@ -121,7 +121,7 @@ def refine(
                 result = everything
         return Refinement(result, before, after, count, True)
     _log.warning(
-        "Refining does not help: matches that were held back are %.2f pixels off with the given cameras and %.2f with "
+        "Refining does not help: matches that were held out are %.2f pixels off with the given cameras and %.2f with "
         "refined ones; the given ones are kept.", before, after,
     )  # fmt: skip
     given = triangulated(graph, cameras, limits=limits)
@@ -148,7 +148,7 @@ def _completed(
         normalized(triangulated(graph, refined.cameras, limits=limits)),
         lens=range(count),
         free=terms,
-        held=np.zeros(count, np.bool_),
+        fixed=np.zeros(count, np.bool_),
         limits=limits,
     )
 
@@ -163,7 +163,7 @@ def _check_connected(cameras: Mapping[str, LensCamera], graph: PosedGraph) -> No
         )
 
 
-def _held_back(graph: PosedGraph) -> dict[Pair, NDArray[np.bool_]]:
+def _held_out(graph: PosedGraph) -> dict[Pair, NDArray[np.bool_]]:
     """Which matches belong to the tracks that judge; a track is all keypoints that matches connect."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -180,7 +180,7 @@ def _held_back(graph: PosedGraph) -> dict[Pair, NDArray[np.bool_]]:
     # A track's number follows the order of its first keypoint; a shuffle spreads those that judge.
     chosen = np.random.default_rng(0).permutation(track.max() + 1) % HELD_OUT_TRACKS == 0
     judging = {pair: chosen[track[one]] for pair, (one, _) in zip(graph.matches, ends, strict=True)}
-    if sum(int(held.sum()) for held in judging.values()) < MIN_HELD_OUT:
+    if sum(int(fixed.sum()) for fixed in judging.values()) < MIN_HELD_OUT:
         raise CalibrationError(
             f"Only {len(first)} matches agree with the given poses, too few to refine them: take more instants, or "
             "let neighbouring cameras see more of the same."

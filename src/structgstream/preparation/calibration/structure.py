@@ -126,7 +126,7 @@ def solve_structure(
 
 def missing_cameras(missing: Sequence[str], matches: Matches, pairs: Mapping[Pair, Any]) -> str:
     """One sentence for each camera that could not be placed: with whom it has how many matches."""
-    told = []
+    reasons = []
     for name in missing:
         others = {
             (two if name == one else one): _agreeing((one, two), matches, pairs)
@@ -134,10 +134,10 @@ def missing_cameras(missing: Sequence[str], matches: Matches, pairs: Mapping[Pai
             if name in (one, two)
         }
         best = sorted(others, key=lambda other: -others[other][0])[:2]
-        most = " and ".join(f"{others[other][0]} of {others[other][1]} matches with {other!r}" for other in best)
-        told.append(f"{name!r} ({most} agree)")
+        best_pairs = " and ".join(f"{others[other][0]} of {others[other][1]} matches with {other!r}" for other in best)
+        reasons.append(f"{name!r} ({best_pairs} agree)")
     return (
-        f"{listed(missing)} could not be placed: {'; '.join(told)}. Let neighbouring cameras see more of the same "
+        f"{listed(missing)} could not be placed: {'; '.join(reasons)}. Let neighbouring cameras see more of the same "
         "from at most 30 degrees apart, take more instants, or film a board (structgstream board)."
     )
 
@@ -262,7 +262,7 @@ def _finished(
         adjust_together,
         lens=[lenses.index(numbers[name]) for name in cameras],
         free=_free_terms(lens, freedom=attempt.freedom, centers=centers),
-        held=np.array([number in attempt.fixed for number in lenses]),
+        fixed=np.array([number in attempt.fixed for number in lenses]),
         limits=limits,
     )
     return normalized(

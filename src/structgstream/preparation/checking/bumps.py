@@ -112,7 +112,7 @@ def bump_findings(
             findings.append(_bumped(name, movement, (first.index, last.index)))
         elif judged == "unknown":
             unknown.append(name)
-    return findings + ([_untold(unknown, (first.index, last.index))] if unknown else [])
+    return findings + ([_undecided(unknown, (first.index, last.index))] if unknown else [])
 
 
 def _judged(
@@ -162,7 +162,7 @@ def _bumped(name: str, movement: Movement, frames: tuple[int, int]) -> Finding:
     )
 
 
-def _untold(names: list[str], frames: tuple[int, int]) -> Finding:
+def _undecided(names: list[str], frames: tuple[int, int]) -> Finding:
     return Finding(
         "note",
         f"Whether {listed(names)} stood still between frame {frames[0]} and frame {frames[1]} cannot be told: nearly "

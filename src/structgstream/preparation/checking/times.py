@@ -42,12 +42,12 @@ def time_findings(measured: SynchronizationCheck | None) -> list[Finding]:
         # What is surely more than half a frame another choice of frames mends.
         surely = abs(late) - SURE_SIGMAS * measured.uncertainty_seconds[name]
         if abs(late) > 0.6 * measured.period_seconds and surely > 0.5 * measured.period_seconds:
-            told = f"Camera {name!r} is {amount} {which}; synchronise again, or correct its clock in capture.json."
-            findings.append(Finding("error", told, (name,)))
+            sentence = f"Camera {name!r} is {amount} {which}; synchronise again, or correct its clock in capture.json."
+            findings.append(Finding("error", sentence, (name,)))
         elif name in measured.off:
-            told = (
+            sentence = (
                 f"Camera {name!r} is {amount} {which}: less than a frame, which choosing frames cannot mend; what "
                 "moves fast will blur there. Cameras that one signal starts have no such rest."
             )
-            findings.append(Finding("warning", told, (name,)))
+            findings.append(Finding("warning", sentence, (name,)))
     return findings

@@ -63,7 +63,7 @@ def page(report: CheckReport, *, off: Sequence[str], sections: Mapping[str, Sequ
     ]
     if report.steps:
         rows = "".join(
-            f"<tr><td>{escape(step)}<td class=text>{escape(str(told))}" for step, told in report.steps.items()
+            f"<tr><td>{escape(step)}<td class=text>{escape(str(summary))}" for step, summary in report.steps.items()
         )
         parts.append(f"<h2>Preparation</h2><table>{rows}</table>")
     parts.append(f"<h2>Cameras</h2><div class=wide>{_table(report, off)}</div>")

@@ -60,10 +60,12 @@ def draw_matrix(path: Path, report: CheckReport, *, limit_pixels: float, stray: 
     axis.spines[:].set_visible(False)
     crossed = {(names.index(one), names.index(other)) for pair in stray for one, other in (pair, pair[::-1])}
     for row, column in zip(*np.nonzero(np.isfinite(values))):
-        told = [f"{values[row, column]:.1f}"] * (len(names) <= MAX_NUMBERED) + ["x"] * ((row, column) in crossed)
-        if told:
+        label = [f"{values[row, column]:.1f}"] * (len(names) <= MAX_NUMBERED) + ["x"] * ((row, column) in crossed)
+        if label:
             dark = values[row, column] < 1.3 * limit_pixels
-            axis.text(column, row, " ".join(told), ha="center", va="center", fontsize=7, color="white" if dark else INK)
+            axis.text(
+                column, row, " ".join(label), ha="center", va="center", fontsize=7, color="white" if dark else INK
+            )
     bar = figure.colorbar(shown, ax=axis, shrink=0.7, pad=0.02, extend="max")
     bar.set_label("median distance to epipolar lines, pixels", fontsize=8)
     bar.ax.tick_params(labelsize=8)
@@ -177,8 +179,8 @@ def draw_times(path: Path, report: CheckReport) -> None:
             axis.errorbar(
                 np.flatnonzero(mask), values[mask], yerr=2 * spread[mask], fmt="o", color=color, markersize=5, capsize=3
             )
-    most = max(2 * LIMIT_MS, 1.2 * float((np.abs(values) + 2 * spread).max(initial=0)))
-    axis.set_ylim(-most, most)
+    limit = max(2 * LIMIT_MS, 1.2 * float((np.abs(values) + 2 * spread).max(initial=0)))
+    axis.set_ylim(-limit, limit)
     axis.set_xticks(range(len(names)), names, rotation=90 if len(names) > 12 else 0, fontsize=8)
     axis.set_ylabel("late by, milliseconds", fontsize=8)
     axis.set_title("Time against the other cameras (bars: two standard deviations)", fontsize=10, loc="left", color=INK)

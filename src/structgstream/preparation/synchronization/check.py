@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import apart_seconds
-from structgstream.preparation.synchronization.correlation import demand_scipy
+from structgstream.preparation.synchronization.correlation import require_scipy
 from structgstream.preparation.synchronization.motion import (
     agreeing_cameras,
     pair_signals,
@@ -75,16 +75,16 @@ class SynchronizationCheck:
         """A sentence for each thing to know."""
         if not self.conclusive:
             return "It cannot be told whether the cameras are synchronous: too little moves that several of them see."
-        said = [self._off_message(name) for name in self.off]
-        if not said:
+        sentences = [self._off_message(name) for name in self.off]
+        if not sentences:
             worst = max(abs(late) for late in self.late_seconds.values())
-            said = [f"The cameras are synchronous within {worst * 1e3:.1f} ms."]
+            sentences = [f"The cameras are synchronous within {worst * 1e3:.1f} ms."]
             if self.between:
-                said = [f"The clocks of the cameras agree within {worst * 1e3:.1f} ms.", self.between_message]
+                sentences = [f"The clocks of the cameras agree within {worst * 1e3:.1f} ms.", self.between_message]
         if self.undecided:
             names = ", ".join(repr(name) for name in self.undecided)
-            said.append(f"Too little moves before {names} to tell about them.")
-        return " ".join(said)
+            sentences.append(f"Too little moves before {names} to tell about them.")
+        return " ".join(sentences)
 
     @property
     def between_message(self) -> str:
@@ -115,7 +115,7 @@ def check_synchronization(source: FrameSource, *, frames: int = MAX_FRAMES) -> S
         CaptureError: the pictures cannot be read.
         MissingExtraError: cv2 or scipy is not installed.
     """
-    demand_scipy()
+    require_scipy()
     period = 1 / source.fps
     changes = _changes(source, frames)
     cameras = {name: LensCamera(source.rig[name], Pinhole()) for name in source.rig}
@@ -129,11 +129,11 @@ def check_synchronization(source: FrameSource, *, frames: int = MAX_FRAMES) -> S
     solution = solve_by_motion({name: takes[name] for name in group}, good, slack_seconds=period / 2, drift=False)
     middle = float(np.median(list(solution.offsets.values())))
     # A clock that is unsure by a good part of a frame tells nothing, however far it is from the others.
-    told = tuple(name for name in group if solution.sigmas[name] <= MAX_SIGMA_PERIODS * period)
-    late = {name: solution.offsets[name] - middle for name in told}
-    errors = {name: solution.sigmas[name] for name in told}
-    off = tuple(name for name in told if abs(late[name]) > max(OFF_PERIODS * period, OFF_SIGMAS * errors[name]))
-    undecided = tuple(name for name in source.rig if name not in told)
+    judged = tuple(name for name in group if solution.sigmas[name] <= MAX_SIGMA_PERIODS * period)
+    late = {name: solution.offsets[name] - middle for name in judged}
+    errors = {name: solution.sigmas[name] for name in judged}
+    off = tuple(name for name in judged if abs(late[name]) > max(OFF_PERIODS * period, OFF_SIGMAS * errors[name]))
+    undecided = tuple(name for name in source.rig if name not in judged)
     return SynchronizationCheck(late, errors, off, undecided, period, apart)
 
 

@@ -58,7 +58,7 @@ class Lag:
     middle: float
 
 
-def demand_scipy() -> None:
+def require_scipy() -> None:
     """
     Raises:
         MissingExtraError: scipy is not installed.
@@ -170,7 +170,7 @@ def chance_deviation(first: Signal, second: Signal) -> float:
 
 
 def _scores(
-    first: Signal, second: Signal, least: int
+    first: Signal, second: Signal, min_overlap: int
 ) -> tuple[Floats, Floats, Floats, NDArray[np.intp], NDArray[np.intp]]:
     """For each lag: correlation, its numerator by channel, energy, number of samples; and the lags."""
     from scipy.fft import irfft, next_fast_len, rfft
@@ -191,7 +191,9 @@ def _scores(
     energy_y = (squares_y - sums_y**2 / counts[:, None]).sum(1)
     energy = np.sqrt(np.maximum(energy_x * energy_y, 0.0))
     # Where hardly anything happens in an overlap, noise would agree with noise.
-    enough = (counts >= least) & (energy_x > 0.02 * energy_x.max()) & (energy_y > 0.02 * energy_y.max()) & (energy > 0)
+    enough = (
+        (counts >= min_overlap) & (energy_x > 0.02 * energy_x.max()) & (energy_y > 0.02 * energy_y.max()) & (energy > 0)
+    )
     score = np.where(enough, numerators.sum(1) / np.where(energy > 0, energy, 1.0), -np.inf)
     return score, numerators, energy, counts, lags
 

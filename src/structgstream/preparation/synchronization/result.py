@@ -66,14 +66,16 @@ def synchronization(
         CaptureError: two cameras have no instant in common.
     """
     common = {name: clocks[name].common_seconds(own) for name, own in stamps.items()}
-    _demand_overlap(common)
-    left = frame_residuals(common)
-    estimates = {name: ClockEstimate(clocks[name], method, float(uncertainties[name]), left[name]) for name in stamps}
-    late = [name for name in stamps if abs(left[name]) > WARNED_SECONDS]
+    _require_overlap(common)
+    residuals = frame_residuals(common)
+    estimates = {
+        name: ClockEstimate(clocks[name], method, float(uncertainties[name]), residuals[name]) for name in stamps
+    }
+    late = [name for name in stamps if abs(residuals[name]) > WARNED_SECONDS]
     if late:
-        worst = max(late, key=lambda name: abs(left[name]))
+        worst = max(late, key=lambda name: abs(residuals[name]))
         warnings += (
-            f"Nearest frames of {_listed(late)} are up to {abs(left[worst]) * 1e3:.1f} ms off the common instants "
+            f"Nearest frames of {_listed(late)} are up to {abs(residuals[worst]) * 1e3:.1f} ms off the common instants "
             f"(camera {worst!r}): what moves fast is seen elsewhere there. Cameras that start by one signal have no "
             "such rest.",
         )
@@ -100,7 +102,7 @@ def frame_residuals(common: Mapping[str, Floats]) -> dict[str, float]:
     phase = float(np.angle(np.sum(turns))) / (2 * np.pi) * period
     first = np.ceil((start - phase) / period - 0.5)
     instants = phase + period * np.arange(first, first + max(int((end - start) / period), 1))
-    left = {}
+    residuals = {}
     for name, times in common.items():
         nearest = np.clip(np.searchsorted(times, instants), 1, len(times) - 1) if len(times) > 1 else np.zeros(1, int)
         before = np.maximum(nearest - 1, 0)
@@ -108,16 +110,16 @@ def frame_residuals(common: Mapping[str, Floats]) -> dict[str, float]:
         late = times[chosen] - instants
         # A frame that a camera lacks is absent, not late.
         late = late[np.abs(late) <= period / 2 + 1e-9]
-        left[name] = float(late[np.abs(late).argmax()]) if len(late) else 0.0
-    return left
+        residuals[name] = float(late[np.abs(late).argmax()]) if len(late) else 0.0
+    return residuals
 
 
 def _inside(times: Floats, start: float, end: float) -> Floats:
-    kept = times[(times >= start - 1e-9) & (times <= end + 1e-9)]
-    return kept if len(kept) else times
+    inside = times[(times >= start - 1e-9) & (times <= end + 1e-9)]
+    return inside if len(inside) else times
 
 
-def _demand_overlap(common: Mapping[str, Floats]) -> None:
+def _require_overlap(common: Mapping[str, Floats]) -> None:
     for first, second in combinations(common, 2):
         one, other = common[first], common[second]
         if one[-1] < other[0] or other[-1] < one[0]:

@@ -24,7 +24,7 @@ SIGMAS = 5.0  # ties further off than this many standard deviations are wrong
 
 
 @dataclass(frozen=True)
-class Tie:
+class TimeCorrespondence:
     """One instant by the clocks of two cameras.
 
     Args:
@@ -82,11 +82,11 @@ class _Graph:
     cameras: int
 
 
-def connected(cameras: Sequence[str], ties: Sequence[Tie]) -> tuple[tuple[str, ...], ...]:
+def connected(cameras: Sequence[str], matches: Sequence[TimeCorrespondence]) -> tuple[tuple[str, ...], ...]:
     """Groups of cameras that ties connect, the largest first."""
     group = {name: {name} for name in cameras}
-    for tie in ties:
-        one, other = group[tie.first], group[tie.second]
+    for match in matches:
+        one, other = group[match.first], group[match.second]
         if one is not other:
             one |= other
             for name in other:
@@ -98,7 +98,7 @@ def connected(cameras: Sequence[str], ties: Sequence[Tie]) -> tuple[tuple[str, .
 
 def solve_clocks(
     takes: Mapping[str, tuple[float, float]],
-    ties: Sequence[Tie],
+    matches: Sequence[TimeCorrespondence],
     *,
     drift: bool,
     slack_seconds: float,
@@ -114,8 +114,8 @@ def solve_clocks(
     names = list(takes)
     middles = np.array([(start + end) / 2 for start, end in takes.values()])
     halves = np.array([(end - start) / 2 for start, end in takes.values()])
-    graph = _graph(names, ties, middles)
-    offsets = _consensus(graph, [tie.confidence for tie in ties], slack_seconds)
+    graph = _graph(names, matches, middles)
+    offsets = _consensus(graph, [match.confidence for match in matches], slack_seconds)
     corrections = np.zeros(len(names))
     free = np.zeros(len(names), bool)
     unknown = np.zeros(len(names))
@@ -137,16 +137,16 @@ def solve_clocks(
     )
 
 
-def _graph(names: list[str], ties: Sequence[Tie], middles: Floats) -> _Graph:
+def _graph(names: list[str], matches: Sequence[TimeCorrespondence], middles: Floats) -> _Graph:
     position = {name: index for index, name in enumerate(names)}
-    first = np.array([position[tie.first] for tie in ties], np.intp)
-    second = np.array([position[tie.second] for tie in ties], np.intp)
-    at_first = np.array([tie.first_seconds for tie in ties])
-    at_second = np.array([tie.second_seconds for tie in ties])
-    sigmas = np.array([tie.sigma_seconds for tie in ties])
-    changes = np.zeros((max((len(tie.changes) for tie in ties), default=0), len(ties)))
-    for number, tie in enumerate(ties):
-        changes[: len(tie.changes), number] = np.negative(tie.changes)
+    first = np.array([position[match.first] for match in matches], np.intp)
+    second = np.array([position[match.second] for match in matches], np.intp)
+    at_first = np.array([match.first_seconds for match in matches])
+    at_second = np.array([match.second_seconds for match in matches])
+    sigmas = np.array([match.sigma_seconds for match in matches])
+    changes = np.zeros((max((len(match.changes) for match in matches), default=0), len(matches)))
+    for number, match in enumerate(matches):
+        changes[: len(match.changes), number] = np.negative(match.changes)
     return _Graph(
         first,
         second,
@@ -174,14 +174,14 @@ def _consensus(graph: _Graph, confidences: Sequence[float], slack_seconds: float
     generator = np.random.default_rng(0)
     reach = SIGMAS * np.hypot(graph.sigmas, slack_seconds / 2)
     share = np.array(confidences) / np.bincount(_pair_numbers(graph))[_pair_numbers(graph)]
-    best, least = np.zeros(graph.cameras), np.inf
+    best, best_cost = np.zeros(graph.cameras), np.inf
     for trial in range(TREES if len(graph.first) >= graph.cameras else 1):
         chance = generator.exponential(size=len(share)) if trial else np.ones(len(share))
         offsets = _along_tree(graph, np.argsort(-share * chance))
         off = np.abs(_residuals(graph, offsets, np.zeros(graph.cameras)))
         cost = float((share * np.minimum(off / reach, 1.0)).sum())
-        if cost < least:
-            best, least = offsets, cost
+        if cost < best_cost:
+            best, best_cost = offsets, cost
     return best
 
 
@@ -189,13 +189,13 @@ def _along_tree(graph: _Graph, order: NDArray[np.intp]) -> Floats:
     """Offsets that satisfy the ties of a spanning tree, taken greedily in ``order`` (Kruskal)."""
     group = np.arange(graph.cameras)
     offsets = np.zeros(graph.cameras)
-    for tie in order:
-        one, other = graph.first[tie], graph.second[tie]
+    for match in order:
+        one, other = graph.first[match], graph.second[match]
         if group[one] == group[other]:
             continue
         moved = group == group[other]
         # The whole group of the second camera moves, so that ties that joined it stay satisfied.
-        offsets[moved] += offsets[one] + graph.differences[tie] - offsets[other]
+        offsets[moved] += offsets[one] + graph.differences[match] - offsets[other]
         group[moved] = group[one]
     return offsets
 
@@ -248,12 +248,12 @@ def _step(
     prior = np.concatenate([np.zeros(count), np.full(count, 1 / RATE_PRIOR**2)])
     normal += np.diag(prior)
     right -= prior * np.concatenate([np.zeros(count), corrections])
-    kept = np.flatnonzero(used)
-    inverse = np.linalg.pinv(normal[np.ix_(kept, kept)], rcond=1e-13, hermitian=True)
+    free_columns = np.flatnonzero(used)
+    inverse = np.linalg.pinv(normal[np.ix_(free_columns, free_columns)], rcond=1e-13, hermitian=True)
     moved, covariance = np.zeros(2 * count), np.zeros((2 * count, 2 * count))
-    moved[kept] = inverse @ right[kept]
-    shared = _shared(inverse @ (design * weights[:, None]).T[kept] @ graph.changes.T)
-    covariance[np.ix_(kept, kept)] = inverse * _inflation(graph, off, weights, scale) + shared
+    moved[free_columns] = inverse @ right[free_columns]
+    shared = _shared(inverse @ (design * weights[:, None]).T[free_columns] @ graph.changes.T)
+    covariance[np.ix_(free_columns, free_columns)] = inverse * _inflation(graph, off, weights, scale) + shared
     return moved, covariance
 
 
@@ -274,10 +274,10 @@ def _inflation(graph: _Graph, off: Floats, weights: Floats, scale: Floats) -> fl
     means.
     """
     inliers = weights > 0
-    ties, pairs = int(inliers.sum()), np.unique(_pair_numbers(graph)[inliers])
+    matches, pairs = int(inliers.sum()), np.unique(_pair_numbers(graph)[inliers])
     factor = 1.0
-    if ties > graph.cameras:
-        factor = max(factor, float(((off / scale)[inliers] ** 2).sum()) / (ties - graph.cameras + 1))
+    if matches > graph.cameras:
+        factor = max(factor, float(((off / scale)[inliers] ** 2).sum()) / (matches - graph.cameras + 1))
     if len(pairs) > graph.cameras - 1:
         numbers = _pair_numbers(graph)
         total = np.bincount(numbers, weights)[pairs]

@@ -20,7 +20,7 @@ from structgstream.preparation.synchronization.audio import (
     solve_by_audio,
     sound_of,
 )
-from structgstream.preparation.synchronization.correlation import demand_scipy
+from structgstream.preparation.synchronization.correlation import require_scipy
 from structgstream.preparation.synchronization.motion import (
     pair_signals,
     solve_by_motion,
@@ -89,7 +89,7 @@ def synchronize(
         return _unchanged(stamps)
     if method == "stamps":
         return _by_stamps(streams, stamps)
-    demand_scipy()
+    require_scipy()
     if method == "motion":
         return _by_motion(streams, stamps, cameras, motion_seconds, "motion was asked for")
     if method == "audio":
@@ -189,7 +189,7 @@ def _by_motion(
         return _unchanged(stamps)
     used = {name: own[own <= own[0] + seconds] for name, own in stamps.items()}
     changes = {name: picture_changes(_pictures(streams, name, len(own)), own) for name, own in used.items()}
-    demand_motion(changes)
+    require_motion(changes)
     geometry: Geometry = CalibratedGeometry(cameras) if cameras else _static_geometry(streams, used)
     period = max(period_seconds(own) for own in stamps.values())
     takes = {name: (float(own[0]), float(own[-1])) for name, own in used.items()}
@@ -204,7 +204,7 @@ def _by_motion(
     )
 
 
-def demand_motion(changes: Mapping[str, Changes]) -> None:
+def require_motion(changes: Mapping[str, Changes]) -> None:
     """
     Raises:
         CaptureError: in a camera hardly anything moves.
