@@ -6,7 +6,7 @@ Neighbours are chosen by the cameras' geometry, and a keypoint is only compared 
 pixel's centre at (0.5, 0.5).
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -163,6 +163,18 @@ def unique_pairs(neighbours: Mapping[str, tuple[str, ...]]) -> list[Pair]:
         for other in others:
             pairs.setdefault(frozenset((name, other)), (name, other))
     return list(pairs.values())
+
+
+def connected_groups(names: Iterable[str], pairs: Iterable[Pair]) -> list[tuple[str, ...]]:
+    """Groups of cameras that pairs connect, the largest first; each in the order of ``names``."""
+    group = {name: index for index, name in enumerate(names)}
+    for one, two in pairs:
+        old, new = max(group[one], group[two]), min(group[one], group[two])
+        group = {name: new if index == old else index for name, index in group.items()}
+    members: dict[int, list[str]] = {}
+    for name, index in group.items():
+        members.setdefault(index, []).append(name)
+    return sorted(map(tuple, members.values()), key=len, reverse=True)
 
 
 def fundamental_matrix(first: Camera, second: Camera) -> Floats:

@@ -7,8 +7,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from structgstream.data.matching import connected_groups
 from structgstream.preparation.calibration.colmap import colmap_camera, pycolmap_module
-from structgstream.preparation.calibration.view_graph import connected, verified_pairs, write_database
+from structgstream.preparation.calibration.view_graph import verified_pairs, write_database
 from tests.support.filmed import ring
 from tests.support.properties import examples
 from tests.support.views_made import cloud, keypoints_of, matches_of
@@ -86,7 +87,7 @@ def test_the_database_holds_what_was_written(tmp_path: Path) -> None:
 @given(st.sets(st.sampled_from(list(combinations(NAMES, 2)))))
 def test_groups_are_what_pairs_connect(pairs: set[tuple[str, str]]) -> None:
     """A pair lies in one group, no smaller groups would do, and the largest comes first."""
-    groups = connected(dict.fromkeys(NAMES), dict.fromkeys(sorted(pairs)))
+    groups = connected_groups(NAMES, sorted(pairs))
     assert sorted(name for group in groups for name in group) == NAMES
     assert [len(group) for group in groups] == sorted(map(len, groups), reverse=True)
     assert all(list(group) == sorted(group) for group in groups)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from structgstream.data.timeline import Clock
-from structgstream.preparation.synchronization.solving import Solution, TimeCorrespondence, connected, solve_clocks
+from structgstream.preparation.synchronization.solving import Solution, TimeCorrespondence, solve_clocks
 
 TRUTH = {"a": Clock(0.0), "b": Clock(1.25), "c": Clock(-0.5), "d": Clock(3.0)}
 TAKES = dict.fromkeys(TRUTH, (0.0, 60.0))
@@ -93,15 +93,6 @@ def test_drift_within_the_noise_is_no_drift() -> None:
     truth = {**TRUTH, "c": Clock(-0.5, 1 + 5e-6)}
     solution = solve_clocks(TAKES, matches_of(truth, sigma=1e-3), drift=True, slack_seconds=0.01)
     assert set(solution.rates.values()) == {1.0}
-
-
-def test_groups_of_connected_cameras() -> None:
-    matches = [
-        TimeCorrespondence("a", "b", 0, 0, 1),
-        TimeCorrespondence("d", "c", 0, 0, 1),
-        TimeCorrespondence("b", "e", 0, 0, 1),
-    ]
-    assert connected("abcdef", matches) == (("a", "b", "e"), ("c", "d"), ("f",))
 
 
 def test_a_rate_that_is_not_known_widens_what_is_stated() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.lenses import LensCamera
-from structgstream.data.matching import Pair
+from structgstream.data.matching import Pair, connected_groups
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.adjustment import Limits, adjust_together
 from structgstream.preparation.calibration.colmap import MODELS, LensModel, holding
@@ -25,7 +25,6 @@ from structgstream.preparation.calibration.triangulation import (
     triangulated,
     without,
 )
-from structgstream.preparation.calibration.view_graph import connected
 
 _log = logging.getLogger(__name__)
 
@@ -154,7 +153,7 @@ def _completed(
 
 
 def _check_connected(cameras: Mapping[str, LensCamera], graph: PosedGraph) -> None:
-    groups = connected(cameras, graph.matches)
+    groups = connected_groups(cameras, graph.matches)
     if len(groups) > 1:
         alone = ", ".join(repr(name) for group in groups[1:] for name in group)
         raise CalibrationError(

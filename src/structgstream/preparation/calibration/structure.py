@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera
-from structgstream.data.matching import Pair
+from structgstream.data.matching import Pair, connected_groups
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.adjustment import Limits, adjust_together
 from structgstream.preparation.calibration.colmap import (
@@ -46,7 +46,6 @@ from structgstream.preparation.calibration.solved import SolvedCalibration, norm
 from structgstream.preparation.calibration.triangulation import rematched
 from structgstream.preparation.calibration.view_graph import (
     Matches,
-    connected,
     verified_pairs,
     write_database,
 )
@@ -224,7 +223,7 @@ def _attempt(
     with tempfile.TemporaryDirectory(prefix="structgstream-sfm-") as folder:
         database = Path(folder) / "database.db"
         write_database(database, keypoints, cameras, pairs)
-        reachable = len(connected(keypoints, pairs)[0])
+        reachable = len(connected_groups(keypoints, pairs)[0])
         for mapper in ("incremental", "global"):
             found = mapped(database, mapper=mapper, freedom=freedom, fixed=fixed)
             if found is not None and size_of(found) > attempt.size:
@@ -283,7 +282,7 @@ def _agreeing(pair: Pair, matches: Matches, pairs: Mapping[Pair, Any]) -> tuple[
 def _nothing(pictures: Pictures, matches: Matches, pairs: Mapping[Pair, Any]) -> str:
     alone = [name for name in pictures if not any(name in pair for pair in pairs)]
     if not alone:
-        groups = connected(pictures, pairs)
+        groups = connected_groups(pictures, pairs)
         return (
             f"The pictures of {len(pictures)} cameras give no model: {len(pairs)} of {len(matches)} pairs have matches "
             f"that agree, in {len(groups)} groups ({'; '.join(', '.join(group) for group in groups[:4])}). Let "

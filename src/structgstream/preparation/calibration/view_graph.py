@@ -87,15 +87,3 @@ def write_database(
             database.write_matches(number[one], number[two], geometry.inlier_matches)
             database.write_two_view_geometry(number[one], number[two], geometry)
     return number
-
-
-def connected(names: Mapping[str, object], pairs: Mapping[Pair, object]) -> list[tuple[str, ...]]:
-    """Groups of cameras that pairs connect, the largest first; each in the order of ``names``."""
-    group = {name: index for index, name in enumerate(names)}
-    for one, two in pairs:
-        old, new = max(group[one], group[two]), min(group[one], group[two])
-        group = {name: new if index == old else index for name, index in group.items()}
-    members: dict[int, list[str]] = {}
-    for name, index in group.items():
-        members.setdefault(index, []).append(name)
-    return sorted((tuple(found) for found in members.values()), key=lambda found: -len(found))

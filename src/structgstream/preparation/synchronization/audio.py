@@ -18,9 +18,7 @@ from itertools import combinations, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
-from structgstream.data.lenses import LensCamera
-from structgstream.data.matching import Pair
+from structgstream.data.matching import Pair, connected_groups
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.correlation import Signal, best_lag
 from structgstream.preparation.synchronization.phases import (
@@ -32,7 +30,7 @@ from structgstream.preparation.synchronization.phases import (
     ambiguity_seconds,
     phase_window,
 )
-from structgstream.preparation.synchronization.solving import Solution, TimeCorrespondence, connected, solve_clocks
+from structgstream.preparation.synchronization.solving import Solution, TimeCorrespondence, solve_clocks
 
 CLOSING_SECONDS = 3e-4  # by which the lags of a loop may miss each other
 LOOP_WEIGHT = 1 / 3  # that a closed loop leaves: its lags, if wrong, would be spread over several milliseconds
@@ -169,22 +167,13 @@ def sound_of(name: str, audio: tuple[NDArray[np.float32], float]) -> Sound:
     return Sound(samples, rate, _onsets(samples, rate))
 
 
-def distances_from(position: Floats, cameras: Mapping[str, LensCamera]) -> dict[str, float]:
-    """Metres from each camera to where a sound was made, ``[3]``, for a calibration in metres."""
-    return {name: float(np.linalg.norm(own.camera.center.numpy() - position)) for name, own in cameras.items()}
-
-
 def audio_lags(sounds: Mapping[str, Sound]) -> list[PairLag]:
     """Lags of the pairs of cameras that hear the same; pairs whose best lag is ambiguous have none."""
     return [lag for pair in _pairs(list(sounds)) if (lag := _pair_lag(*pair, sounds)) is not None]
 
 
 def solve_by_audio(
-    takes: Mapping[str, tuple[float, float]],
-    lags: Sequence[PairLag],
-    *,
-    drift: bool = True,
-    distances: Mapping[str, float] | None = None,
+    takes: Mapping[str, tuple[float, float]], lags: Sequence[PairLag], *, drift: bool = True
 ) -> Solution:
     """Clocks by sound.
 
@@ -192,12 +181,9 @@ def solve_by_audio(
         takes: camera to the first and last second of its take.
         lags: what :func:`audio_lags` gives; they must connect all cameras (:func:`connected_by`).
         drift: whether rates other than 1 are considered.
-        distances: camera to its distance from the source of the sound in metres, where it is known.
     """
-    delays = {name: (distances[name] / SPEED_OF_SOUND if distances else 0.0) for name in takes}
-    left = ambiguity_weights(lags)
-    # A wrong peak is off by as much in all windows of a pair, so drift is told by windows, and offsets by pairs.
-    sharp = solve_clocks(takes, _matches(lags, [0.0] * len(lags), delays), drift=drift, slack_seconds=SLACK_SECONDS)
+    # A wrong peak is off by as much in all windows of a pair, so windows tell drift, and pairs tell offsets.
+    sharp = solve_clocks(takes, _matches(lags, [0.0] * len(lags)), drift=drift, slack_seconds=SLACK_SECONDS)
     rates = sharp.rates
     matches = [
         replace(
@@ -205,7 +191,7 @@ def solve_by_audio(
             first_seconds=rates[match.first] * match.first_seconds,
             second_seconds=rates[match.second] * match.second_seconds,
         )
-        for match in _matches(lags, left, delays)
+        for match in _matches(lags, ambiguity_weights(lags))
     ]
     spans = {name: (rates[name] * start, rates[name] * end) for name, (start, end) in takes.items()}
     found = solve_clocks(spans, matches, drift=False, slack_seconds=SLACK_SECONDS)
@@ -213,9 +199,9 @@ def solve_by_audio(
     return replace(found, rates=rates, sigmas=sigmas)
 
 
-def connected_by(cameras: Sequence[str], lags: Sequence[PairLag]) -> tuple[tuple[str, ...], ...]:
+def connected_by(cameras: Sequence[str], lags: Sequence[PairLag]) -> list[tuple[str, ...]]:
     """Groups of cameras that lags connect, the largest first."""
-    return connected(cameras, _matches(lags, [0.0] * len(lags), dict.fromkeys(cameras, 0.0)))
+    return connected_groups(cameras, [(lag.first, lag.second) for lag in lags])
 
 
 def _pairs(names: list[str]) -> list[Pair]:
@@ -261,16 +247,15 @@ def _several(one: Signal, other: Signal, lag: float) -> bool:
     return bool(apart.any()) and float(both[apart].max()) > SEVERAL_SHARE * float(both[first])
 
 
-def _matches(lags: Sequence[PairLag], left: Sequence[float], delays: Mapping[str, float]) -> list[TimeCorrespondence]:
-    """Ties whose errors are those of windows, and that of the peak that all windows of a pair share, as far as it is
-    ``left`` open."""
+def _matches(lags: Sequence[PairLag], weights: Sequence[float]) -> list[TimeCorrespondence]:
+    """Correspondences with the errors of windows and the ``weights`` share of the error that all windows of a pair have
+    in common because another peak may be the right one."""
     matches = []
-    for lag, weight in zip(lags, left, strict=True):
+    for lag, weight in zip(lags, weights, strict=True):
         shared = lag.ambiguity_seconds * weight * len(lag.instants) ** 0.5 if lag.fine else 0.0
         sigma = float(np.hypot(lag.sigma_seconds, shared))
-        one, other = delays[lag.first], delays[lag.second]
         matches += [
-            TimeCorrespondence(lag.first, lag.second, at - one, at + apart - other, sigma, lag.confidence)
+            TimeCorrespondence(lag.first, lag.second, at, at + apart, sigma, lag.confidence)
             for at, apart in lag.instants
         ]
     return matches

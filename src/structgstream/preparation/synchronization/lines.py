@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.preparation.synchronization.correlation import Signal
-
-Floats = NDArray[np.float64]
+from structgstream.data.arrays import Floats
+from structgstream.preparation.synchronization.correlation import Signal, parabola_top
 
 MAX_RATE = 2e-3  # between two clocks; 29.97 and 30 frames a second taken for each other are 1e-3
 RATE_STEP, LAG_STEP = 1e-4, 0.05  # of the search; lags in samples
@@ -198,9 +197,7 @@ def _top(values: Floats, best: int, places: Floats) -> float:
     """Place of the top of the parabola around the best value; the best place at an end."""
     if not 0 < best < len(values) - 1:
         return float(places[best])
-    left, middle, right = values[best - 1 : best + 2]
-    curvature = left - 2 * middle + right
-    shift = (left - right) / (2 * curvature) if curvature < 0 else 0.0
+    shift = float(parabola_top(*values[best - 1 : best + 2], flat=0.0))
     return float(places[best] + shift * (places[1] - places[0]))
 
 

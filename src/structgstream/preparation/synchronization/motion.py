@@ -14,6 +14,8 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.matching import connected_groups
+from structgstream.data.timeline import period_seconds
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.correlation import (
     Signal,
@@ -24,8 +26,7 @@ from structgstream.preparation.synchronization.correlation import (
 )
 from structgstream.preparation.synchronization.lines import Line, fitted_line
 from structgstream.preparation.synchronization.motion_signals import Changes, Geometry, line_signals
-from structgstream.preparation.synchronization.solving import Solution, TimeCorrespondence, connected, solve_clocks
-from structgstream.preparation.synchronization.streams import period_seconds
+from structgstream.preparation.synchronization.solving import Solution, TimeCorrespondence, camera_pairs, solve_clocks
 
 MIN_SAMPLES = 6  # that two views must have in common, in frames
 MIN_OVERLAP = 0.2  # of the shorter take
@@ -121,7 +122,7 @@ def solve_by_motion(
         seconds = min(end - start for start, end in takes.values())
         raise CaptureError(_apart([name for name in takes if name not in group], group, seconds))
     matches = motion_correspondences(good, near=coarse)
-    if len(connected(list(takes), matches)) > 1:  # too little is left near the clocks of the first round
+    if len(connected_groups(takes, camera_pairs(matches))) > 1:  # too little is left near the clocks of the first round
         matches = motion_correspondences(good)
     solution = solve_clocks(takes, matches, drift=drift, slack_seconds=slack_seconds)
     errors = {
@@ -136,7 +137,7 @@ def agreeing_cameras(
     """The largest group of cameras whose motion agrees, its clocks by whole takes, and the pairs that agree with
     these."""
     matches = motion_correspondences(pairs)
-    group = connected(list(takes), matches)[0]
+    group = connected_groups(takes, camera_pairs(matches))[0]
     solution = None
     good: list[PairSignals] = []
     while len(group) > 1:
@@ -147,7 +148,7 @@ def agreeing_cameras(
         supported = [match for match in agreeing if _supported(match, inside, agreeing)]
         names = {(match.first, match.second) for match in supported}
         good = [pair for pair in pairs if (pair.first, pair.second) in names]
-        smaller = connected(list(group), supported)[0]
+        smaller = connected_groups(group, camera_pairs(supported))[0]
         if len(smaller) == len(group):
             return group, solution, good
         group = smaller

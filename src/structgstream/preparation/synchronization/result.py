@@ -8,10 +8,10 @@ from itertools import combinations
 import numpy as np
 
 from structgstream.data.arrays import Floats
+from structgstream.data.calibration import listed
 from structgstream.data.instants import counted_rate
-from structgstream.data.timeline import Clock
+from structgstream.data.timeline import Clock, period_seconds
 from structgstream.errors import CaptureError
-from structgstream.preparation.synchronization.streams import period_seconds
 
 WARNED_SECONDS = 5e-3
 
@@ -75,14 +75,14 @@ def synchronization(
     if late:
         worst = max(late, key=lambda name: abs(residuals[name]))
         warnings += (
-            f"Nearest frames of {_listed(late)} are up to {abs(residuals[worst]) * 1e3:.1f} ms off the common instants "
-            f"(camera {worst!r}): what moves fast is seen elsewhere there. Cameras that start by one signal have no "
-            "such rest.",
+            f"Nearest frames of {listed(late, 8)} are up to {abs(residuals[worst]) * 1e3:.1f} ms off the common "
+            f"instants (camera {worst!r}): what moves fast is seen elsewhere there. Cameras that start by one signal "
+            "have no such rest.",
         )
     vague = [name for name in stamps if uncertainties[name] > period_seconds(stamps[name]) / 4]
     if vague:
         warnings += (
-            f"The clocks of {_listed(vague)} are known to {max(uncertainties[name] for name in vague) * 1e3:.0f} ms "
+            f"The clocks of {listed(vague, 8)} are known to {max(uncertainties[name] for name in vague) * 1e3:.0f} ms "
             "only, so a frame may be wrong by one.",
         )
     return Synchronization(estimates, method, reason, warnings)
@@ -128,12 +128,3 @@ def _require_overlap(common: Mapping[str, Floats]) -> None:
                 f"no instant in common: their clocks are {abs(one[0] - other[0]):.2f} s apart, more than the shorter "
                 "video is long. Give videos of one take, all running before it begins."
             )
-
-
-def _listed(names: list[str]) -> str:
-    shown = ", ".join(repr(name) for name in names[:8])
-    return (
-        ("camera " if len(names) == 1 else "cameras ")
-        + shown
-        + (f" and {len(names) - 8} more" if len(names) > 8 else "")
-    )

@@ -7,13 +7,14 @@ Wrong ties do not agree around loops of cameras: a start is chosen among spannin
 many ties it explains, and the weights are those of Tukey's biweight (iteratively reweighted least squares).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
+from structgstream.data.matching import Pair
 
 TREES = 200
 ITERATIONS = 30
@@ -82,18 +83,9 @@ class _Graph:
     cameras: int
 
 
-def connected(cameras: Sequence[str], matches: Sequence[TimeCorrespondence]) -> tuple[tuple[str, ...], ...]:
-    """Groups of cameras that ties connect, the largest first."""
-    group = {name: {name} for name in cameras}
-    for match in matches:
-        one, other = group[match.first], group[match.second]
-        if one is not other:
-            one |= other
-            for name in other:
-                group[name] = one
-    unique = {id(members): members for members in group.values()}
-    groups = [tuple(name for name in cameras if name in members) for members in unique.values()]
-    return tuple(sorted(groups, key=len, reverse=True))
+def camera_pairs(matches: Iterable[TimeCorrespondence]) -> list[Pair]:
+    """The cameras of each correspondence."""
+    return [(match.first, match.second) for match in matches]
 
 
 def solve_clocks(
@@ -107,7 +99,7 @@ def solve_clocks(
 
     Args:
         takes: camera to the first and last second of its take, by its own clock.
-        ties: instants of pairs; they must connect all cameras (:func:`connected`).
+        ties: instants of pairs; they must connect all cameras.
         drift: whether rates other than 1 are considered.
         slack_seconds: how far right ties may be off before rates are known.
     """

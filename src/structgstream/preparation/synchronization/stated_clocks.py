@@ -1,9 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``timestamps.csv``: when frames were taken, by a clock that all cameras share.
+"""Clocks that files state: a table of times, timecode, the time of creation, or stamps of one transmission.
 
-A header ``camera,frame,seconds`` and a row for each frame that is known: the camera's name, the frame's number in its
-video counted from 0, and the second. One row a camera is enough (the frame of a clap, seconds 0); two or more that
-are apart give its rate, too.
+``timestamps.csv`` says when frames were taken, by a clock that all cameras share: a header ``camera,frame,seconds`` and
+a row for each frame that is known: the camera's name, the frame's number in its video counted from 0, and the second.
+One row a camera is enough (the frame of a clap, seconds 0); two or more that are apart give its rate, too.
+
+Most files' stamps start at 0 when a camera starts and share no clock, so stamps are trusted only on request. Timecode
+counts frames, so it is good to a frame; it starts again at midnight, so cameras lie within half a day of the first. A
+time of creation counts when it has a fraction of a second that is not 0 in some file: whole seconds are 30 frames.
+Stamps that start far from 0 are of a transmission (MPEG-TS, RTP) and hold as they are.
 """
 
 import csv
@@ -17,9 +22,8 @@ import numpy as np
 
 from structgstream.data.arrays import Floats
 from structgstream.data.text_files import Unreadable, number, read_text, reason, whole
-from structgstream.data.timeline import Clock
+from structgstream.data.timeline import Clock, period_seconds
 from structgstream.errors import CaptureError
-from structgstream.preparation.synchronization.streams import period_seconds
 
 COLUMNS = ("camera", "frame", "seconds")
 MAX_DEVIATION = 0.5  # of a row from a steady clock, in frame periods
@@ -29,10 +33,17 @@ MAX_DRIFT = 0.01
 
 @dataclass(frozen=True)
 class StatedClock:
-    """A camera's clock by the rows of the table, and the spread of these around it, in seconds."""
+    """A camera's clock as files state it.
+
+    Args:
+        clock: the clock.
+        sigma_seconds: how exact it is; of a table, the spread of its rows.
+        kind: ``table``, ``timecode``, ``creation time`` or ``stamps``.
+    """
 
     clock: Clock
-    spread_seconds: float
+    sigma_seconds: float
+    kind: str
 
 
 def read_timestamps(file: Path, stamps: Mapping[str, Floats]) -> dict[str, StatedClock]:
@@ -122,7 +133,7 @@ def _clock(file: Path, name: str, rows: Mapping[int, float], stamps: Floats) -> 
             "more than half a "
             f"frame period ({period / 2:.4f} s); frames lack in the video, or numbers in the table are wrong."
         )
-    return StatedClock(Clock(offset, rate), float(np.std(off)))
+    return StatedClock(Clock(offset, rate), float(np.std(off)), "table")
 
 
 FAR_FROM_ZERO_SECONDS = 10.0
@@ -130,22 +141,7 @@ CREATION_SIGMA_SECONDS = 0.05  # writing a file begins some frames before or aft
 _TIMECODE = re.compile(r"(\d{2}):(\d{2}):(\d{2})([:;.])(\d{2,3})")
 
 
-@dataclass(frozen=True)
-class WallClock:
-    """A camera's clock by its file's stamps.
-
-    Args:
-        clock: the clock.
-        sigma_seconds: how exact it is.
-        kind: ``timecode``, ``creation time`` or ``stamps``.
-    """
-
-    clock: Clock
-    sigma_seconds: float
-    kind: str
-
-
-def wall_clocks(stamps: Mapping[str, Floats], metadata: Mapping[str, Mapping[str, str]]) -> dict[str, WallClock]:
+def wall_clocks(stamps: Mapping[str, Floats], metadata: Mapping[str, Mapping[str, str]]) -> dict[str, StatedClock]:
     """The clocks of all cameras by the best stamps that all their files have.
 
     Args:
@@ -166,7 +162,7 @@ def wall_clocks(stamps: Mapping[str, Floats], metadata: Mapping[str, Mapping[str
     if all(seconds is not None for seconds in created.values()) and any((s or 0.0) % 1 for s in created.values()):
         return _started(created, stamps, dict.fromkeys(stamps, CREATION_SIGMA_SECONDS), "creation time")
     if all(own[0] > FAR_FROM_ZERO_SECONDS for own in stamps.values()):
-        return {name: WallClock(Clock(), 0.5e-3, "stamps") for name in stamps}
+        return {name: StatedClock(Clock(), 0.5e-3, "stamps") for name in stamps}
     lacking = next((name for name in stamps if codes[name] is None), "")
     raise CaptureError(
         f"The time stamps of the files share no clock: that of camera {lacking!r} has no timecode and not all state "
@@ -227,11 +223,11 @@ def creation_seconds(text: str) -> float | None:
 
 def _started(
     starts: Mapping[str, float | None], stamps: Mapping[str, Floats], sigmas: Mapping[str, float], kind: str
-) -> dict[str, WallClock]:
+) -> dict[str, StatedClock]:
     """Clocks from the moments of the first frames; the earliest is the common second 0."""
     known = {name: seconds for name, seconds in starts.items() if seconds is not None}
     origin = min(known.values())
     return {
-        name: WallClock(Clock(seconds - origin - float(stamps[name][0])), sigmas[name], kind)
+        name: StatedClock(Clock(seconds - origin - float(stamps[name][0])), sigmas[name], kind)
         for name, seconds in known.items()
     }
