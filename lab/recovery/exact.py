@@ -32,7 +32,7 @@ from structgstream.data.open import open_capture
 from structgstream.data.points import initial_points
 from structgstream.data.prepared import PreparedCamera, open_prepared, read_prepared, write_prepared
 from structgstream.data.timeline import Clock
-from structgstream.preparation.calibration.comparison import rig_alignment
+from structgstream.preparation.calibration.solved import rig_alignment
 from structgstream.preparation.footage import find_footage
 from structgstream.session.presets import PRESETS, StreamConfig
 

@@ -121,14 +121,14 @@ class Footage:
                 )
 
     def _decoded(self, name: str, track: VideoTrack, indices: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
-        def tell(lost: int, following: int | None, reason: str) -> None:
+        def refuse(lost: int, following: int | None, reason: str) -> None:
             raise CaptureError(
                 f"The video {track.path} of camera {name!r} cannot be decoded at {lost * track.tick_seconds:.3f} s "
                 f"({reason}): truncated or damaged; copy or record it again, or leave it out with --without {name}."
             )
 
         stamps = [track.stamps[index] for index in indices]
-        with closing(pictures_at(track, stamps, size=(track.width, track.height), on_damage=tell)) as pictures:
+        with closing(pictures_at(track, stamps, size=(track.width, track.height), on_damage=refuse)) as pictures:
             for shown in pictures:
                 assert shown is not None, "what is lost was told"
                 yield shown[0]
@@ -183,7 +183,7 @@ def find_footage(where: Path, *, picture_fps: float | None = None) -> Footage:
         raise CaptureError(f"{where} is {kind}; give the folder that holds the cameras' videos ({LAYOUTS}).")
     found = {root: _found(root) for root in dict.fromkeys(filmed_roots(where)) if root.is_dir()}
     # A stray picture or preview beside the folder of the videos is no take: two cameras come before one.
-    root = next((root for least in (2, 1) for root, files in found.items() if len(files) >= least), None)
+    root = next((root for count in (2, 1) for root, files in found.items() if len(files) >= count), None)
     if root is None or len(found[root]) < 2:
         root = next(other_roots(where), None) or next(other_roots(where, pictures=True), root)
     if root is not None:

@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Epipolar geometry of pairs of cameras, from a calibration or from what stands still in the pictures, and events under
-it: what changes on an epipolar line at an instant changes on the corresponding line of the other view at the same
-instant, whatever the depth.
+"""Signals of motion: changes of a still camera's pictures, summed over corresponding epipolar lines of two views.
 
-The changes of each view are summed over bundles of corresponding epipolar lines, which gives a signal for each bundle
-that both views see at the same time, without matching a point. (Motion barcodes of lines: Ben-Artzi, Kasten, Peleg
-and Werman, CVPR 2016; frontier points of silhouettes, which both views see on the same line: Hartley and Zisserman,
-chapter 9.)
+What changes on an epipolar line at an instant changes on the corresponding line of the other view at the same instant,
+whatever the depth. So the changes of each view are summed over bundles of corresponding lines, which gives a signal for
+each bundle that both views see at the same time, without matching a point. (Motion barcodes of lines: Ben-Artzi,
+Kasten, Peleg and Werman, CVPR 2016; frontier points of silhouettes, which both views see on the same line: Hartley and
+Zisserman, chapter 9.) The geometry comes from a calibration, or from what stands still in the pictures.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -18,10 +17,91 @@ from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
 from structgstream.data.descriptor_matches import mutual_matches
-from structgstream.data.images import opencv
+from structgstream.data.images import opencv, reduced_picture
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Features, sift_features
-from structgstream.preparation.synchronization.changes import Changes
+
+CHANGES_SIDE = 160  # of reduced pictures, pixels: events are compared along lines, so positions need not be finer
+SMOOTHING = 1.0  # standard deviation, reduced pixels
+SAMPLED = 100  # frames whose noise is measured
+NOISE_FACTOR, MIN_NOISE = 4.0, 0.5  # changes below this many times the median change are noise
+MOST = 30.0  # larger changes count as this one: a bright shirt is not more of an event than a dark one
+UNITS = 4  # of stored changes in a grey level
+STILL = 5e-4  # share of MOST of a mean change below which nothing moves
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Changes of a camera's pictures.
+
+    Args:
+        amounts: ``[T - 1, h, w]`` uint8: change from a frame to the next one above noise, in quarters of a grey level.
+        times: ``[T - 1]`` seconds by the camera's clock, halfway between both frames.
+        size: width and height of the camera's pictures, pixels.
+    """
+
+    amounts: NDArray[np.uint8]
+    times: Floats
+    size: tuple[int, int]
+
+    @property
+    def activity(self) -> Floats:
+        """``[T - 1, 1]``: sum over the picture of the square roots of changes."""
+        return np.sqrt(self.amounts, dtype=np.float32).mean((1, 2), dtype=np.float64)[:, None]
+
+    @property
+    def moving(self) -> bool:
+        """Whether anything moves."""
+        return len(self.amounts) > 1 and float(self.amounts.mean()) > STILL * MOST * UNITS
+
+
+def picture_changes(pictures: Iterable[NDArray[np.uint8]], stamps: Floats) -> Changes:
+    """Changes of pictures ``[H, W, 3]`` that follow each other at ``stamps`` ``[T]``; only reduced ones are kept.
+
+    Raises:
+        MissingExtraError: cv2 is not installed.
+    """
+    reduced: list[NDArray[np.uint8]] = []
+    size = (0, 0)
+    for picture in pictures:
+        size = (picture.shape[1], picture.shape[0])
+        reduced.append(reduced_grey(picture))
+    return reduced_changes(reduced, stamps[: len(reduced)], size)
+
+
+def reduced_grey(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A picture ``[H, W, 3]`` as grey ``[h, w]`` whose longer side is at most :data:`CHANGES_SIDE`."""
+    cv2 = opencv()
+    # Reduced first: grey of a large picture would take longer than all else.
+    return cv2.cvtColor(reduced_picture(picture, CHANGES_SIDE), cv2.COLOR_RGB2GRAY)
+
+
+def reduced_changes(reduced: Sequence[NDArray[np.uint8]], stamps: Floats, size: tuple[int, int]) -> Changes:
+    """Changes of reduced pictures ``[h, w]`` at ``stamps`` ``[T]`` of a camera of this width and height."""
+    if len(reduced) < 2:
+        return Changes(np.zeros((0, 1, 1), np.uint8), np.zeros(0), size)
+    cv2 = opencv()
+    noise = _noise(reduced)
+    amounts = np.empty((len(reduced) - 1, *reduced[0].shape), np.uint8)
+    before = cv2.GaussianBlur(reduced[0].astype(np.float32), (0, 0), SMOOTHING)
+    for index, grey in enumerate(reduced[1:]):
+        smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SMOOTHING)
+        above = np.clip(np.abs(smooth - before) - noise, 0, MOST)
+        amounts[index] = np.rint(above * UNITS)
+        before = smooth
+    return Changes(amounts, (stamps[1:] + stamps[:-1]) / 2, size)
+
+
+def _noise(reduced: Sequence[NDArray[np.uint8]]) -> float:
+    """The change that counts as noise: a multiple of the median one, of some of the frames."""
+    cv2 = opencv()
+    firsts = np.unique(np.linspace(0, len(reduced) - 2, min(len(reduced) - 1, SAMPLED)).astype(int))
+    steps = []
+    for first in firsts.tolist():
+        pair = [cv2.GaussianBlur(grey.astype(np.float32), (0, 0), SMOOTHING) for grey in reduced[first : first + 2]]
+        steps.append(np.abs(pair[1] - pair[0]))
+    return NOISE_FACTOR * max(float(np.median(np.stack(steps))), MIN_NOISE)
+
 
 Straighten = Callable[[Floats], Floats]
 """From pixels ``[S, 2]`` as filmed to points that obey the fundamental matrix; NaN where the lens has no inverse."""
@@ -30,7 +110,7 @@ BUNDLES = 64
 MIN_SHARE = 0.25  # of the pixels of the view that sees less of the common lines
 SAME_PLACE = 1e-6  # distance of cameras at one place, as a share of theirs to the origin
 FEATURES = 3000
-LONGER_SIDE = 960  # of pictures in which static features are looked for, pixels
+FEATURES_SIDE = 960  # of pictures in which static features are looked for, pixels
 RATIO = 0.8
 INLIER_SHARE = 1 / 640  # of the picture's longer side
 MIN_INLIERS = 16
@@ -185,14 +265,10 @@ class StaticGeometry:
 
 def static_features(pictures: list[NDArray[np.uint8]]) -> Features:
     """Features of the median of pictures ``[H, W, 3]`` of one camera, in pixels of these."""
-    cv2 = opencv()
     height, width = pictures[0].shape[:2]
-    factor = min(LONGER_SIDE / max(width, height), 1.0)
-    size = (max(round(width * factor), 1), max(round(height * factor), 1))
-    reduced = [cv2.resize(picture, size, interpolation=cv2.INTER_AREA) for picture in pictures]
-    still = np.median(np.stack(reduced), axis=0).astype(np.uint8)
+    still = np.median([reduced_picture(picture, FEATURES_SIDE) for picture in pictures], axis=0).astype(np.uint8)
     found = sift_features(still, count=FEATURES, contrast=0.005)
-    return Features(found.pixels * [width / size[0], height / size[1]], found.descriptors)
+    return Features(found.pixels * [width / still.shape[1], height / still.shape[0]], found.descriptors)
 
 
 def _same(pixels: Floats) -> Floats:

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.alignment import Alignment, alignment
 from structgstream.data.lenses import LensCamera
-from structgstream.errors import CalibrationError
+from structgstream.preparation.calibration.solved import rig_alignment
 
 GRID = 33
 
@@ -31,23 +30,6 @@ class CameraError:
     position_percent: float
     focal_percent: float
     lens_pixels: float
-
-
-def rig_alignment(estimated: Mapping[str, LensCamera], reference: Mapping[str, LensCamera]) -> Alignment:
-    """The similarity from ``estimated`` to ``reference``, by the cameras that both have.
-
-    Raises:
-        CalibrationError: fewer than two cameras in common.
-    """
-    common = [name for name in estimated if name in reference]
-    if len(common) < 2:
-        raise CalibrationError(
-            f"Two calibrations need two cameras in common to be compared; they have {', '.join(common) or 'none'}."
-        )
-    return alignment(
-        {name: estimated[name].camera.viewmat.numpy() for name in common},
-        {name: reference[name].camera.viewmat.numpy() for name in common},
-    )
 
 
 def calibration_errors(
