@@ -95,10 +95,12 @@ def choose_tables(counts: NDArray[np.integer], previous: FrequencyTables) -> tup
         _EXPLICIT_BITS + COUNT_BITS << COST_BITS
     )
     tried = np.flatnonzero(least < cost)
-    for geometric_reference, precision, order in product((False, True), range(1 << PRECISION_BITS), (0, 1)):
+    choices = product((False, True), range(1 << PRECISION_BITS), (0, 1)) if len(tried) else ()
+    of_levels = [_level_costs(counts[tried], precision) for precision in range(1 << PRECISION_BITS)]
+    for geometric_reference, precision, order in choices:
         references = family[number[tried]] if geometric_reference else kept[tried]
         its_number = number[tried] if geometric_reference else None
-        for entry in _explicit(counts[tried], references, its_number, precision, order):
+        for entry in _explicit(counts[tried], references, its_number, of_levels[precision], precision, order):
             for place in np.flatnonzero(entry.cost < cost[tried]):
                 context = tried[place]
                 rows[context], cost[context], pieces[context] = entry.rows[place], entry.cost[place], entry.bits(place)
@@ -106,10 +108,18 @@ def choose_tables(counts: NDArray[np.integer], previous: FrequencyTables) -> tup
     return FrequencyTables(rows.astype(np.uint16)), pack_bits(pieces) if changes else b""
 
 
+def _level_costs(counts: NDArray[np.int64], precision: int) -> NDArray[np.int64]:
+    """``[C, A, L]``: what each level of each symbol costs all symbols of its row, without the bits of the level."""
+    weights = weights_of(np.arange(1, top_level(precision) + 1), precision=precision)
+    total = counts.sum(1)[:, None, None]
+    return (total * weights * _PER_LN2 >> 12 + precision) - counts[..., None] * logs()[weights >> precision]
+
+
 def _explicit(
     counts: NDArray[np.int64],
     reference_rows: NDArray[np.int64],
     number: NDArray[np.int64] | None,
+    level_costs: NDArray[np.int64],
     precision: int,
     order: int,
 ) -> list[_Explicit]:
@@ -119,12 +129,8 @@ def _explicit(
     balances ``count log2(weight)``, the share that the weight takes from all others, and the bits of the level.
     """
     references = levels_of(reference_rows, precision=precision)
-    every = np.arange(1, top_level(precision) + 1)
-    weights = weights_of(every, precision=precision)
     steps = _step_bits(precision, order)
-    total = counts.sum(1)[:, None, None]
-    cost = (total * weights * _PER_LN2 >> 12 + precision) - counts[..., None] * logs()[weights >> precision]
-    levels = 1 + (cost + (steps[references - 1] << COST_BITS)).argmin(2)
+    levels = 1 + (level_costs + (steps[references - 1] << COST_BITS)).argmin(2)
     bits = steps[references - 1, levels - 1]
     occurs = counts > 0
     alphabet = counts.shape[1]
