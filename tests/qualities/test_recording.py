@@ -27,8 +27,7 @@ from structgstream.qualities.ladder import configured, qualities_in
 from structgstream.qualities.recording import QualitiesRun, QualityReport, record_qualities
 from structgstream.recorder import record, segments_at, segments_folder
 from structgstream.run_metrics import RunMetrics
-from structgstream.session.loop import loop, struct_gstream
-from structgstream.session.loop import Session
+from structgstream.session.loop import Session, loop, struct_gstream
 from structgstream.session.presets import StreamConfig
 from structgstream.session.struct_gstream import stream_pipeline
 from tests.support.backends import quickest_backend

@@ -16,8 +16,8 @@ from structgstream.errors import ConfigError
 from structgstream.scene.order import morton_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, parameters_of, state_of
-from structgstream.session.loop import struct_gstream as method
 from structgstream.session.loop import FrameReport, Session
+from structgstream.session.loop import struct_gstream as method
 from structgstream.session.presets import COMPACT, PRESETS, StreamConfig
 from structgstream.session.rate_control import RateConfig
 from structgstream.session.struct_gstream import stream_pipeline
