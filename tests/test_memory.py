@@ -21,8 +21,8 @@ from structgstream.codec.sinks import FileSink
 from structgstream.data.prefetch import Prefetch
 from structgstream.frames import MultiViewFrame
 from structgstream.memory import PeakKind, PeakMeter, resident_bytes
-from structgstream.session import Session
-from structgstream.struct_gstream import stream_pipeline
+from structgstream.session.loop import Session
+from structgstream.session.struct_gstream import stream_pipeline
 from tests.support.backends import quickest_backend
 from tests.support.small_presets import TINY_RIG
 from tests.support.worlds import World, moving_world

@@ -25,16 +25,16 @@ from structgstream.evaluation.run_log import read_log
 from structgstream.exporters.formats import Format, PageFormat
 from structgstream.exporters.frames import write_frames
 from structgstream.exporters.request import check_degree, check_low_pass, check_page, choose_frames, destination
-from structgstream.frame_report import FrameReport
 from structgstream.kernels.backend import Backend, BackendName, select_backend
 from structgstream.preparation.checking.findings import CheckReport
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.prepare import Preparation, check_folder, prepare_capture
 from structgstream.preparation.steps import Listener
-from structgstream.presets import DEFAULT_PRESET, StreamConfig, preset_named, with_budget
 from structgstream.recorder import check_output, record, segments_at, segments_folder
 from structgstream.serve.stream_file import StreamFile, write_page, write_site
-from structgstream.struct_gstream import stream_pipeline
+from structgstream.session.frame_report import FrameReport
+from structgstream.session.presets import DEFAULT_PRESET, StreamConfig, preset_named, with_budget
+from structgstream.session.struct_gstream import stream_pipeline
 
 
 def example_clip() -> Path:

@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "src" / "structgstream"
 NAMES = {row.name for row in STATE_TABLE} | {parameter.name for parameter in PARAMETERS}
 LISTS_ELSEWHERE = {
-    "presets.py": "what a preset adds to the paper's dynamic set is that preset's choice",
+    "session/presets.py": "what a preset adds to the paper's dynamic set is that preset's choice",
     "cli/stream_tables.py": "short titles of two columns, so that a line has 80 characters",
 }
 

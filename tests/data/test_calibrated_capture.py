@@ -16,7 +16,7 @@ from structgstream.data.open import LAYOUTS, open_capture
 from structgstream.data.undistortion import UndistortedSource, Undistortion
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.pose_check.check import check_poses
-from structgstream.presets import PAPER_DATA
+from structgstream.session.presets import PAPER_DATA
 from tests.support.calibrations import (
     WRITERS,
     Floats,

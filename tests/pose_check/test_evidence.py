@@ -7,8 +7,8 @@ import torch
 
 from structgstream.cameras import Camera
 from structgstream.data.pair_matches import pair_error
-from structgstream.pose_check import evidence
-from structgstream.pose_check.evidence import gather, pair_errors
+from structgstream.pose_check import tracks as evidence
+from structgstream.pose_check.tracks import gather, pair_errors
 from tests.support.evidence_made import evidence_of, scattered, wide_ring
 from tests.support.planes import room_frame, room_rig
 

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from structgstream.cameras import Camera
-from structgstream.pose_check.explanations import explain
-from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.findings import Finding, explain
 from structgstream.pose_check.verdicts import judge
 from tests.support.evidence_made import Cameras, evidence_of, scattered, turned, wide_ring
 
@@ -70,12 +69,12 @@ def test_cameras_of_different_sizes_are_not_exchanged() -> None:
         ),
     ],
 )
-def test_the_mistake_of_one_camera_is_found_among_all(stated: object, told: str) -> None:
+def test_the_mistake_of_one_camera_is_found_among_all(stated: object, description: str) -> None:
     true = wide_ring(6, degrees=90)
     (found,) = explained({**true, "cam3": stated(true["cam3"])}, true=true)  # type: ignore[operator]
     assert found.cameras == ("cam3",)
     assert found.severity == "error"
-    assert told in found.sentence
+    assert description in found.sentence
 
 
 def test_poses_of_another_rig_are_told_as_such() -> None:

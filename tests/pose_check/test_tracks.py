@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from structgstream.data.matching import project
-from structgstream.pose_check.evidence import Evidence
-from structgstream.pose_check.tracks import Tracks, build_tracks
+from structgstream.pose_check.tracks import Evidence, Tracks, build_tracks
 from tests.support.evidence_made import evidence_of, scattered, turned, wide_ring
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.errors import CaptureError, StorageError
-from structgstream.preparation.claiming import LOCK, SOURCE, alone, claim
+from structgstream.preparation.output_folder import LOCK, SOURCE, lock_output, mark_output
 from structgstream.preparation.steps import FOLDER
 from tests.support.killed import folders_of_the_killed
 
@@ -26,24 +26,24 @@ def test_a_new_or_an_empty_folder_is_claimed_for_good(tmp_path: Path, videos: Pa
     capture = tmp_path / "out" / "capture"
     if there:
         capture.mkdir(parents=True)
-    claim(capture, videos)
+    mark_output(capture, videos)
     marker = capture / FOLDER / SOURCE
     written = marker.read_bytes()
     (capture / "capture.json").write_text("{}")
-    claim(capture, videos)
-    claim(tmp_path / "out" / ".." / "out" / "capture", tmp_path / "take" / ".." / "take")
+    mark_output(capture, videos)
+    mark_output(tmp_path / "out" / ".." / "out" / "capture", tmp_path / "take" / ".." / "take")
     assert marker.read_bytes() == written
 
 
 @pytest.mark.parametrize("broken", ["{", "[]", '{"other": 1}'])
 def test_a_capture_of_other_videos_is_left_alone(tmp_path: Path, videos: Path, broken: str) -> None:
-    claim(tmp_path / "capture", videos)
+    mark_output(tmp_path / "capture", videos)
     (tmp_path / "other").mkdir()
     with pytest.raises(CaptureError, match=rf"was prepared from {videos}, not from {tmp_path / 'other'}"):
-        claim(tmp_path / "capture", tmp_path / "other")
+        mark_output(tmp_path / "capture", tmp_path / "other")
     (tmp_path / "capture" / FOLDER / SOURCE).write_text(broken)
     with pytest.raises(CaptureError, match="was prepared from None"):
-        claim(tmp_path / "capture", videos)
+        mark_output(tmp_path / "capture", videos)
 
 
 @pytest.mark.parametrize(
@@ -59,19 +59,19 @@ def test_what_was_made_by_hand_is_left_alone(
     make(tmp_path / "capture")
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(CaptureError, match=told):
-        claim(tmp_path / "capture", videos)
+        mark_output(tmp_path / "capture", videos)
     assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_the_videos_own_folder_is_no_capture(videos: Path) -> None:
     with pytest.raises(CaptureError, match="cannot be the folder of the videos itself"):
-        claim(videos / ".." / "take", videos)
+        mark_output(videos / ".." / "take", videos)
 
 
 def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, videos: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError, match="cannot be written"):
-        claim(tmp_path / "file" / "capture", videos)
+        mark_output(tmp_path / "file" / "capture", videos)
 
 
 def test_a_full_disk_leaves_the_folder_free_for_the_next_time(
@@ -83,38 +83,40 @@ def test_a_full_disk_leaves_the_folder_free_for_the_next_time(
     with monkeypatch.context() as patch:
         patch.setattr("os.fsync", full)
         with pytest.raises(StorageError, match=r"cannot be written \(No space left on device\)"):
-            claim(tmp_path / "capture", videos)
-    claim(tmp_path / "capture", videos)
+            mark_output(tmp_path / "capture", videos)
+    mark_output(tmp_path / "capture", videos)
 
 
 def test_killed_at_any_step_it_leaves_the_folder_free_for_the_next_time(tmp_path: Path, videos: Path) -> None:
     killed = folders_of_the_killed(
-        tmp_path, lambda folder: claim(folder / "capture", videos), begin=lambda folder: (folder / "capture").mkdir()
+        tmp_path,
+        lambda folder: mark_output(folder / "capture", videos),
+        begin=lambda folder: (folder / "capture").mkdir(),
     )
     for folder in killed:
-        claim(folder / "capture", videos)
+        mark_output(folder / "capture", videos)
         assert [path.name for path in (folder / "capture").rglob("*")] == [FOLDER, SOURCE]
 
 
 def test_one_process_at_a_time(tmp_path: Path, videos: Path) -> None:
-    claim(tmp_path / "capture", videos)
-    claim(tmp_path / "other", videos)
-    with alone(tmp_path / "capture"), alone(tmp_path / "other"):
+    mark_output(tmp_path / "capture", videos)
+    mark_output(tmp_path / "other", videos)
+    with lock_output(tmp_path / "capture"), lock_output(tmp_path / "other"):
         with pytest.raises(StorageError, match="Another process prepares .*capture now; wait for its end"):
-            alone(tmp_path / "capture").__enter__()
-        code = "import sys, pathlib; from structgstream.preparation.claiming import alone\n"
-        code += "with alone(pathlib.Path(sys.argv[1])): pass"
+            lock_output(tmp_path / "capture").__enter__()
+        code = "import sys, pathlib; from structgstream.preparation.output_folder import lock_output\n"
+        code += "with lock_output(pathlib.Path(sys.argv[1])): pass"
         command = [sys.executable, "-c", code, str(tmp_path / "capture")]
         assert "Another process prepares" in subprocess.run(command, capture_output=True, text=True, check=False).stderr
-    with alone(tmp_path / "capture"):
+    with lock_output(tmp_path / "capture"):
         pass
 
 
 def test_who_fails_leaves_the_capture_free(tmp_path: Path, videos: Path) -> None:
-    claim(tmp_path / "capture", videos)
-    with pytest.raises(KeyError), alone(tmp_path / "capture"):
+    mark_output(tmp_path / "capture", videos)
+    with pytest.raises(KeyError), lock_output(tmp_path / "capture"):
         raise KeyError
-    with alone(tmp_path / "capture"):
+    with lock_output(tmp_path / "capture"):
         assert (tmp_path / "capture" / FOLDER / LOCK).exists()
 
 
@@ -122,12 +124,12 @@ def test_a_file_system_without_locks_has_none(tmp_path: Path, videos: Path, monk
     def unknown(file: object, how: int) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
 
-    claim(tmp_path / "capture", videos)
+    mark_output(tmp_path / "capture", videos)
     monkeypatch.setattr("fcntl.flock", unknown)
-    with alone(tmp_path / "capture"), alone(tmp_path / "capture"):
+    with lock_output(tmp_path / "capture"), lock_output(tmp_path / "capture"):
         pass
 
 
 def test_a_folder_that_was_not_claimed_cannot_be_held(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="cannot be written"):
-        alone(tmp_path / "capture").__enter__()
+        lock_output(tmp_path / "capture").__enter__()

@@ -12,7 +12,7 @@ from structgstream.data.lenses import LensCamera, Pinhole, RadialTangential
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
 from structgstream.data.rectilinear import rectilinear
 from structgstream.errors import CalibrationError
-from structgstream.preparation.calibrating import demand_calibration, find_calibration
+from structgstream.preparation.given_calibration import find_calibration, require_calibration
 from tests.support.calibrations import WRITERS, truths, write_anipose, write_transforms
 from tests.support.captures import small_rig, write_immersive, write_text_model
 
@@ -43,7 +43,7 @@ def write_colmap(folder: Path) -> Path:
 @pytest.mark.parametrize("by_file", [False, True])
 def test_another_capture_gives_its_cameras_as_filmed(tmp_path: Path, by_file: bool) -> None:
     file = write_capture(tmp_path)
-    found = demand_calibration(file if by_file else tmp_path)
+    found = require_calibration(file if by_file else tmp_path)
     assert [camera.name for camera in found.cameras] == list(RIG)
     assert list(found.held_out) == ["cam01"]
     for camera in found.cameras:
@@ -54,7 +54,7 @@ def test_another_capture_gives_its_cameras_as_filmed(tmp_path: Path, by_file: bo
 
 
 def test_a_file_of_cameras_is_of_pinholes(tmp_path: Path) -> None:
-    found = demand_calibration(write_cameras(tmp_path))
+    found = require_calibration(write_cameras(tmp_path))
     assert list(found.held_out) == ["cam02"]
     assert {camera.lens for camera in found.cameras} == {Pinhole()}
     np.testing.assert_allclose(
@@ -67,17 +67,17 @@ def test_the_file_that_is_named_is_taken_and_of_a_folder_the_first(tmp_path: Pat
     tool = truths(names=("a", "b", "c"))
     files = [write_capture(tmp_path), write_cameras(tmp_path), write_colmap(tmp_path)]
     files += [write_transforms(tmp_path, tool), write_anipose(tmp_path, tool)]
-    named = [demand_calibration(file).where for file in files]
+    named = [require_calibration(file).where for file in files]
     assert named == [*files[:2], files[2].parent, *files[3:]]
     for file, where in zip(files, named, strict=True):
-        assert demand_calibration(tmp_path).where == where
+        assert require_calibration(tmp_path).where == where
         shutil.rmtree(tmp_path / "sparse") if file == files[2] else file.unlink()
     assert find_calibration(tmp_path) is None
 
 
 def test_models_of_fisheyes(tmp_path: Path) -> None:
     write_immersive(tmp_path, cameras=3, frames=1)
-    assert len(demand_calibration(tmp_path).cameras) == 3
+    assert len(require_calibration(tmp_path).cameras) == 3
 
 
 def test_where_there_is_none(tmp_path: Path) -> None:
@@ -85,9 +85,9 @@ def test_where_there_is_none(tmp_path: Path) -> None:
     write_cameras(tmp_path)
     assert find_calibration(tmp_path / "notes.txt") is None
     with pytest.raises(CalibrationError, match=r"notes\.txt is no calibration that is known"):
-        demand_calibration(tmp_path / "notes.txt")
+        require_calibration(tmp_path / "notes.txt")
     with pytest.raises(CalibrationError, match=r"nothing\.json does not exist"):
-        demand_calibration(tmp_path / "nothing.json")
+        require_calibration(tmp_path / "nothing.json")
 
 
 def test_a_pickle_is_refused(tmp_path: Path) -> None:
@@ -105,5 +105,5 @@ def test_the_named_one_of_several_files_of_a_tool_is_taken(tool: str, tmp_path: 
         file = WRITERS[tool](tmp_path / name, truths())
         files.append(file.rename(tmp_path / f"{name}-{file.name}"))
     for file in files:
-        found = demand_calibration(file)
+        found = require_calibration(file)
         assert found.where == file

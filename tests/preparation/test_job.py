@@ -9,16 +9,16 @@ class Heard:
     """A listener that remembers all."""
 
     def __init__(self) -> None:
-        self.told: list[tuple[object, ...]] = []
+        self.calls: list[tuple[object, ...]] = []
 
     def begin(self, step: str, *, skipped: bool) -> None:
-        self.told.append(("begin", step, skipped))
+        self.calls.append(("begin", step, skipped))
 
     def progress(self, done: int, total: int, what: str) -> None:
-        self.told.append(("progress", done, total, what))
+        self.calls.append(("progress", done, total, what))
 
     def end(self, step: str, summary: str) -> None:
-        self.told.append(("end", step, summary))
+        self.calls.append(("end", step, summary))
 
 
 def test_what_steps_found_is_told_and_noted(tmp_path: Path) -> None:
@@ -27,8 +27,8 @@ def test_what_steps_found_is_told_and_noted(tmp_path: Path) -> None:
     job.listener.begin("scale", skipped=True)
     job.listener.progress(1, 3, "cam00")
     job.listener.end("scale", "metres")
-    assert heard.told == [("begin", "scale", True), ("progress", 1, 3, "cam00"), ("end", "scale", "metres")]
-    assert job.told == {"scale": "metres"}
+    assert heard.calls == [("begin", "scale", True), ("progress", 1, 3, "cam00"), ("end", "scale", "metres")]
+    assert job.summaries == {"scale": "metres"}
 
 
 def test_steps_tell_the_same_listener_and_jobs_note_for_themselves(tmp_path: Path) -> None:
@@ -44,6 +44,6 @@ def test_steps_tell_the_same_listener_and_jobs_note_for_themselves(tmp_path: Pat
         summary={4: "four"}.__getitem__,
     )
     assert found == 4
-    assert first.told == {"count": "four"}
-    assert ("end", "count", "four") in heard.told
-    assert other.told == {}
+    assert first.summaries == {"count": "four"}
+    assert ("end", "count", "four") in heard.calls
+    assert other.summaries == {}

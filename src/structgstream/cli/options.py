@@ -13,7 +13,7 @@ from structgstream.cli.app import UsageError, usage_errors
 
 if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
-    from structgstream.presets import StreamConfig
+    from structgstream.session.presets import StreamConfig
 
 Options = TypeVar("Options")
 Device = Literal["auto", "cpu", "cuda", "reference"]
@@ -153,7 +153,7 @@ def resolve_config(
             a constant now.
     """
     from structgstream.config_fields import constant_at
-    from structgstream.presets import DEFAULT_PRESET, StreamConfig, preset_named, renamed
+    from structgstream.session.presets import DEFAULT_PRESET, StreamConfig, preset_named, renamed
 
     for option in (override.partition("=")[0] for override in overrides if override.startswith("--")):
         path = option.removeprefix("--").replace("-", "_")

@@ -22,9 +22,8 @@ from structgstream.data.calibration import listed
 from structgstream.data.pair_matches import PAIR_SHARE, PairError, PairMatcher, neighbor_errors
 from structgstream.errors import CalibrationError
 from structgstream.frames import MultiViewFrame
-from structgstream.pose_check.evidence import ALL_PAIRS, Evidence, gather, pair_errors
-from structgstream.pose_check.explanations import explain, readings_of
-from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.findings import Finding, explain, readings_of
+from structgstream.pose_check.tracks import ALL_PAIRS, Evidence, gather, pair_errors
 from structgstream.pose_check.verdicts import Verdict, find_suspects, judge
 
 MIN_MATCHES = 100  # of a rig, for a verdict
@@ -88,7 +87,7 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig) -> PoseCheck:
     matcher = PairMatcher(frame.images, masks=frame.masks)
     near = neighbor_errors(cameras, matcher)
     check = _summed({pair: error for pair, error in near.items() if error is not None}, cameras)
-    if check.conclusive and not check.unmatched and not _accused(near, cameras):
+    if check.conclusive and not check.unmatched and not _contradicted(near, cameras):
         return check
     evidence, verdict = examine_poses(frame, cameras, matcher=matcher)
     check = _summed(pair_errors(evidence, cameras), cameras)
@@ -110,7 +109,7 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig) -> PoseCheck:
     return PoseCheck(check.matches, check.share_violating, off, check.unmatched, tuple(findings))
 
 
-def _accused(errors: Mapping[tuple[str, str], PairError | None], cameras: Mapping[str, Camera]) -> bool:
+def _contradicted(errors: Mapping[tuple[str, str], PairError | None], cameras: Mapping[str, Camera]) -> bool:
     """Whether a pair of neighbours contradicts the poses."""
     found = {pair: error for pair, error in errors.items() if error is not None}
     return bool(find_suspects(found, cameras).bad) or any(error.share > PAIR_SHARE for error in found.values())

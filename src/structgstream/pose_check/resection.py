@@ -47,7 +47,7 @@ class Resection:
     """
 
     points: int
-    kept: int
+    given_points: int
     seen: int
     given_pixels: float
     corrected_pixels: float
@@ -67,10 +67,12 @@ class Resection:
     @property
     def as_given(self) -> bool:
         """Whether no other camera explains more than the given one, so that what contradicts it are wrong matches."""
-        return not self.better and self.kept >= max(MIN_SEEN // 2, MIN_SHARE * self.seen, self.points - BY_CHANCE)
+        return not self.better and self.given_points >= max(
+            MIN_SEEN // 2, MIN_SHARE * self.seen, self.points - BY_CHANCE
+        )
 
     @property
-    def told(self) -> str:
+    def description(self) -> str:
         """By how much the camera is off, as far as that is beyond chance; empty if nothing is."""
         away = []
         if self.degrees > SIGMAS * self.degrees_error:
@@ -106,7 +108,7 @@ class _View:
         return flat * self.focal * np.exp(change[FOCAL]) + self.principal
 
 
-def resected(tracks: Tracks, camera: Camera, name: str) -> Resection | None:
+def resect(tracks: Tracks, camera: Camera, name: str) -> Resection | None:
     """What corrects a camera to the points that others agree on; None if too few of them are in its picture.
 
     Args:
@@ -126,9 +128,9 @@ def resected(tracks: Tracks, camera: Camera, name: str) -> Resection | None:
     starts = [start for start in (np.zeros(7), _by_points(camera, points, pixels, limit)) if start is not None]
     best = max((_adjusted(view, start, points, pixels, limit) for start in starts), key=lambda found: found[1].sum())
     change, fits = best
-    kept = np.linalg.norm(project(camera, points)[0] - pixels, axis=1) < limit
-    if fits.sum() < max(MIN_SEEN, kept.sum()):  # nothing explains more than the given camera
-        change, fits = np.zeros(7), kept
+    given_points = np.linalg.norm(project(camera, points)[0] - pixels, axis=1) < limit
+    if fits.sum() < max(MIN_SEEN, given_points.sum()):  # nothing explains more than the given camera
+        change, fits = np.zeros(7), given_points
     if fits.sum() < MIN_SEEN // 2:
         return None
     change, errors = _simplest(view, change, points[fits], pixels[fits], limit)
@@ -138,7 +140,7 @@ def resected(tracks: Tracks, camera: Camera, name: str) -> Resection | None:
     turned, moved = float(np.linalg.norm(change[TURN])), float(np.linalg.norm(change[MOVE]))
     return Resection(
         points=int(fits.sum()),
-        kept=int(kept.sum()),
+        given_points=int(given_points.sum()),
         seen=int(own.sum()),
         given_pixels=float(np.median(given)),
         corrected_pixels=float(np.median(corrected)),
@@ -201,8 +203,8 @@ def _simplest(
         for cause in causes:
             start[cause] = change[cause]
         solved.append(_solved(view, start, points, pixels, causes, limit))
-    least = solved[-1][1]
-    found, _, covariance = next(one for one in solved if one[1] <= SIMPLE_ENOUGH * least)
+    min_error = solved[-1][1]
+    found, _, covariance = next(one for one in solved if one[1] <= SIMPLE_ENOUGH * min_error)
     return found, tuple(_error(found[cause], covariance[cause, cause]) for cause in (TURN, MOVE, FOCAL))  # pyright: ignore[reportReturnType]
 
 

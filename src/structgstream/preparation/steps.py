@@ -170,7 +170,7 @@ class Job:
         options: what is asked for.
         listener: receives the steps.
         steps: runs them, or takes their results from the disk.
-        told: what each step found, in words.
+        summaries: of each step that ran, for users.
     """
 
     videos: Path
@@ -178,21 +178,21 @@ class Job:
     options: PrepareOptions
     listener: Listener
     steps: Steps
-    told: dict[str, str] = field(default_factory=dict)
+    summaries: dict[str, str] = field(default_factory=dict)
 
 
 def new_job(videos: Path, capture: Path, *, options: PrepareOptions, listener: Listener) -> Job:
     """A preparation that has not begun."""
-    told: dict[str, str] = {}
-    noting = _Noting(listener, told)
-    return Job(videos, capture, options, noting, Steps(capture, noting), told)
+    summaries: dict[str, str] = {}
+    noting = _Noting(listener, summaries)
+    return Job(videos, capture, options, noting, Steps(capture, noting), summaries)
 
 
 class _Noting:
     """Passes everything on, and notes what steps found."""
 
-    def __init__(self, listener: Listener, told: dict[str, str]) -> None:
-        self._listener, self._told = listener, told
+    def __init__(self, listener: Listener, summaries: dict[str, str]) -> None:
+        self._listener, self._summaries = listener, summaries
 
     def begin(self, step: str, *, skipped: bool) -> None:
         self._listener.begin(step, skipped=skipped)
@@ -201,5 +201,5 @@ class _Noting:
         self._listener.progress(done, total, what)
 
     def end(self, step: str, summary: str) -> None:
-        self._told[step] = summary
+        self._summaries[step] = summary
         self._listener.end(step, summary)

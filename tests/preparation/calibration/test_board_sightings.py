@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from structgstream.data.lenses import LensCamera
 from structgstream.errors import CalibrationError
-from structgstream.preparation.calibration.board import Board
-from structgstream.preparation.calibration.board_sightings import board_sightings
+from structgstream.preparation.calibration.board import Board, board_sightings
 from tests.support.filmed import Film, board_plane, ring, turned
 
 BOARD = Board(9, 5, 0.09)

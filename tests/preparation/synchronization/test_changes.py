@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from structgstream.preparation.synchronization.changes import picture_changes
+from structgstream.preparation.synchronization.motion_signals import picture_changes
 
 STAMPS = np.array([0.0, 0.1, 0.25, 0.3])
 

@@ -4,8 +4,13 @@
 import numpy as np
 import pytest
 
-from structgstream.preparation.synchronization.changes import Changes
-from structgstream.preparation.synchronization.epipolar import BUNDLES, CalibratedGeometry, PairGeometry, line_signals
+from structgstream.preparation.synchronization.motion_signals import (
+    BUNDLES,
+    CalibratedGeometry,
+    Changes,
+    PairGeometry,
+    line_signals,
+)
 from tests.support.takes import HEIGHT, WIDTH, lenses, ring
 
 CAMERAS = lenses(ring(3))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.alignment import Alignment
+from structgstream.data.alignment import Alignment, alignment
 from structgstream.data.arrays import Floats
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import level_normal
@@ -87,6 +87,23 @@ def normalized(solved: SolvedCalibration) -> SolvedCalibration:
     centers = _centers(solved)
     scale = 1 / max(float(np.linalg.norm(centers - centers.mean(0), axis=1).max()), 1e-300)
     return solved.aligned(Alignment(scale, rotation, -scale * rotation @ centers.mean(0)))
+
+
+def rig_alignment(estimated: Mapping[str, LensCamera], reference: Mapping[str, LensCamera]) -> Alignment:
+    """The similarity from ``estimated`` to ``reference``, by the cameras that both have.
+
+    Raises:
+        CalibrationError: fewer than two cameras in common.
+    """
+    common = [name for name in estimated if name in reference]
+    if len(common) < 2:
+        raise CalibrationError(
+            f"Two calibrations need two cameras in common to be compared; they have {', '.join(common) or 'none'}."
+        )
+    return alignment(
+        {name: estimated[name].camera.viewmat.numpy() for name in common},
+        {name: reference[name].camera.viewmat.numpy() for name in common},
+    )
 
 
 def with_distance(solved: SolvedCalibration, first: str, second: str, *, metres: float) -> SolvedCalibration:

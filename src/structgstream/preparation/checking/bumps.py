@@ -18,10 +18,10 @@ from structgstream.data.calibration import listed
 from structgstream.data.descriptor_matches import mutual_matches
 from structgstream.data.images import opencv
 from structgstream.data.matching import epipolar_errors, fundamental_matrix, sift_features
+from structgstream.data.pair_matches import KEYPOINT_SIDE
 from structgstream.frames import MultiViewFrame
-from structgstream.pose_check.evidence import Evidence, gather
 from structgstream.pose_check.findings import Finding
-from structgstream.pose_check.tracks import AGREE_PIXELS
+from structgstream.pose_check.tracks import AGREE_PIXELS, Evidence, gather
 
 KEYPOINTS = 1200
 RATIO = 0.8
@@ -64,7 +64,7 @@ def picture_movement(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Moveme
     Raises:
         MissingExtraError: cv2 is not installed.
     """
-    before, after = (sift_features(picture, count=KEYPOINTS) for picture in (one, other))
+    before, after = (sift_features(picture, count=KEYPOINTS, longest_side=KEYPOINT_SIDE) for picture in (one, other))
     if min(len(before.pixels), len(after.pixels)) < MIN_MATCHES:
         return None
     rows, columns = mutual_matches(before.descriptors, after.descriptors, ratio=RATIO).T
@@ -112,7 +112,7 @@ def bump_findings(
             findings.append(_bumped(name, movement, (first.index, last.index)))
         elif judged == "unknown":
             unknown.append(name)
-    return findings + ([_untold(unknown, (first.index, last.index))] if unknown else [])
+    return findings + ([_undecided(unknown, (first.index, last.index))] if unknown else [])
 
 
 def _judged(
@@ -162,7 +162,7 @@ def _bumped(name: str, movement: Movement, frames: tuple[int, int]) -> Finding:
     )
 
 
-def _untold(names: list[str], frames: tuple[int, int]) -> Finding:
+def _undecided(names: list[str], frames: tuple[int, int]) -> Finding:
     return Finding(
         "note",
         f"Whether {listed(names)} stood still between frame {frames[0]} and frame {frames[1]} cannot be told: nearly "

@@ -106,17 +106,17 @@ def presence_findings(
     lacking = {name: np.setdiff1d(gaps, passed.get(name, [])) for name, gaps in lacking.items()}
     dropping = {name: gaps for name, gaps in lacking.items() if len(gaps)}
     for name, present in presence.items():
-        told = []
+        sentences = []
         if not present.any():
-            told.append(
+            sentences.append(
                 f"Camera {name!r} has no picture of any frame that can be read; leave it out, or restore its files."
             )
         if name in dropping and len(dropping) <= MAX_SINGLE:
-            told.append(_dropped(name, dropping[name], len(present), fps))
+            sentences.append(_dropped(name, dropping[name], len(present), fps))
         if 0 < ends.get(name, 0) < len(present):
-            told.append(_ended(name, ends[name], len(present), fps))
-        if told:
-            findings.append(Finding("warning", " ".join(told), (name,)))
+            sentences.append(_ended(name, ends[name], len(present), fps))
+        if sentences:
+            findings.append(Finding("warning", " ".join(sentences), (name,)))
     if len(dropping) > MAX_SINGLE:
         findings.append(_all_dropped(dropping, max(map(len, presence.values()))))
     if late := tuple(name for name, own in presence.items() if own.any() and not own[0]):

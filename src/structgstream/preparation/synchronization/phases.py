@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from structgstream.data.arrays import Floats
+from structgstream.preparation.synchronization.correlation import parabola_top
 
 WINDOW_SECONDS = 2
 LOW_HERTZ, HIGH_HERTZ = 150.0, 8000.0
@@ -67,8 +68,7 @@ def phase_window(one: Recording, other: Recording, middle: float, lag: float) ->
     best = int(near.argmax())
     if not 0 < best < len(near) - 1 or near[best] < MIN_STANDING_OUT:
         return None
-    left, top, right = near[best - 1 : best + 2]
-    vertex = (left - right) / (2 * (left - 2 * top + right))
+    vertex = float(parabola_top(*near[best - 1 : best + 2], flat=0.0))
     seconds = lag + (best - reach + vertex) / GRID_HERTZ + shift_second - shift_first
     moved = np.zeros_like(near)
     low, high = max(0, best - reach), min(len(near), best + reach + 1)

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the tests find mistakes: each of ``mutants.toml`` is made in a copy of the sources and its tests are run.
+
+``python -m lab.robustness.mutants`` from the repository's folder, with the names of some or without for all; the status
+is 1 if one was not found. The native library must be built in place.
+"""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).parents[3]
+MUTANTS = Path(__file__).with_name("mutants.toml")
+
+
+def is_found(mutant: dict[str, object], sources: Path, tests: list[str]) -> bool:
+    """Whether ``tests`` fail with this mistake in the package in ``sources``, which is left as it was.
+
+    Raises:
+        ValueError: the place of the mistake is not there exactly once.
+        RuntimeError: the tests could not be run.
+    """
+    file = sources / "structgstream" / str(mutant["file"])
+    original = file.read_text()
+    if original.count(str(mutant["before"])) != 1:
+        raise ValueError(f"{mutant['file']} has {mutant['before']!r} {original.count(str(mutant['before']))} times")
+    file.write_text(original.replace(str(mutant["before"]), str(mutant["after"])))
+    try:
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
+        environment = {**os.environ, "PYTHONPATH": str(sources), "PYTHONDONTWRITEBYTECODE": "1"}
+        result = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    finally:
+        file.write_text(original)
+    if result.returncode not in (0, 1):
+        raise RuntimeError(result.stdout[-2000:] + result.stderr[-2000:])
+    return result.returncode == 1
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*")
+    mutants = tomllib.loads(MUTANTS.read_text())
+    names, missed = parser.parse_args().names or list(mutants), 0
+    with tempfile.TemporaryDirectory() as folder:
+        sources = Path(folder, "src")
+        shutil.copytree(ROOT / "src", sources, ignore=shutil.ignore_patterns("__pycache__"))
+        for name in names:
+            start = time.monotonic()
+            found = is_found(mutants[name], sources, mutants[name]["tests"])
+            missed += not found
+            print(f"{name}: {'found' if found else 'NOT FOUND'} in {time.monotonic() - start:.0f} s", flush=True)
+    print(f"{len(names) - missed} of {len(names)} found")
+    return int(missed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

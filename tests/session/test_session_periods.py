@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sessions that begin other periods: by time, and where the scene is another one; resumed, the bytes are the same."""
+
+from dataclasses import replace
+from functools import cache
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from structgstream.codec.container.records import RecordType, scan_records
+from structgstream.codec.reader import StreamReader
+from structgstream.codec.segments.stored_bytes import write_archive
+from structgstream.codec.sinks import FileSink, MemorySink, resume_segments
+from structgstream.frames import MultiViewFrame
+from structgstream.session.loop import FrameReport, Session
+from structgstream.session.periods import PeriodConfig
+from structgstream.session.presets import StreamConfig, to_json
+from structgstream.session.rate_control import RateConfig
+from structgstream.session.struct_gstream import stream_pipeline
+from tests.session.test_session_compact import CONFIG as COMPACT_CONFIG
+from tests.session.test_session_compact import WORLD
+from tests.support.backends import quickest_backend
+from tests.support.memory_captures import MemoryCapture
+from tests.support.segment_streams import Hands, Killed, KilledStore, folder
+from tests.support.streams import same
+
+FRAMES = 8
+CHANGE = 3
+"""From this frame on the cameras see other colours."""
+INITIAL = replace(COMPACT_CONFIG.initial, iterations=60, schedule_iterations=60, coarse_iterations=20)
+BASE = replace(COMPACT_CONFIG, initial=INITIAL)
+SCHEDULED = replace(
+    BASE, period=PeriodConfig(seconds=4 / 30, start="scene", share=0.3), rate=RateConfig(target_mbits=0.5)
+)
+BY_RESIDUAL = replace(BASE, period=PeriodConfig(residual=1.3, frames=2, start="scene", share=0.5))
+ANEW = replace(BASE, period=PeriodConfig(residual=1.3, frames=2))
+CONFIGS = {"scheduled": (SCHEDULED, [0, 4]), "residual": (BY_RESIDUAL, [0, 6]), "points": (ANEW, [0, 6])}
+
+
+def frames() -> list[MultiViewFrame]:
+    """The moving world, there and back, whose colours are inverted from frame :data:`CHANGE` on."""
+    found = []
+    for index in range(FRAMES):
+        shown = WORLD.frames[[0, 1, 2, 3, 2, 1, 0, 1][index]]
+        images = shown.images if index < CHANGE else {name: 255 - image for name, image in shown.images.items()}
+        found.append(MultiViewFrame(index, index / 30.0, images))
+    return found
+
+
+def capture(length: int = FRAMES) -> MemoryCapture:
+    return MemoryCapture(WORLD.rig, frames()[:length], points=WORLD.scene.anchors.positions.numpy())
+
+
+def run(sink, config: StreamConfig, *, resumed=None, length: int = FRAMES) -> list[FrameReport]:
+    session = Session(capture(length), sink, stream_pipeline(config), quickest_backend(), resumed=resumed)
+    return list(session.run())
+
+
+@cache
+def whole(case: str) -> tuple[bytes, list[FrameReport]]:
+    reports = run(sink := MemorySink(), CONFIGS[case][0])
+    return sink.data, reports
+
+
+@pytest.mark.parametrize("case", CONFIGS)
+def test_periods_begin_where_they_should_and_say_why(case: str) -> None:
+    data, reports = whole(case)
+    reader = StreamReader(data)
+    firsts = CONFIGS[case][1]
+    assert [period.first_frame for period in reader.periods] == firsts
+    assert [report.index for report in reports if report.begins] == firsts[1:]
+    why = reports[firsts[1]].begins or ""
+    assert why.startswith("after 0.133 s" if case == "scheduled" else "residual ")
+    assert reader.header.periods
+    assert reader.header_of(FRAMES - 1).config == reader.header.config == to_json(CONFIGS[case][0])
+
+
+@pytest.mark.parametrize("case", CONFIGS)
+def test_stopped_after_any_frame_it_goes_on_to_the_same_bytes(case: str, tmp_path: Path) -> None:
+    data, _ = whole(case)
+    records = [record for record in scan_records(data) if record.type != RecordType.INDEX]
+    ends = {record.end for record in records}
+    (second,) = (record for record in records[1:] if record.type == RecordType.INIT)
+    path = tmp_path / "a.sgs"
+    near = [end for end in ends if second.offset <= end] if case == "points" else sorted(ends)[1::2]
+    for cut in sorted({*near, second.offset, second.offset + 100, second.end, second.end + 40}):
+        if cut <= records[0].end:
+            continue
+        path.write_bytes(data[:cut])
+        sink, resumed = FileSink.resume(path)
+        run(sink, CONFIGS[case][0], resumed=resumed)
+        assert path.read_bytes() == data, cut
+
+
+def test_a_killed_writer_of_segments_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+    """Killed before each of the operations with which the second period begins."""
+    data, _ = whole("residual")
+    counted = KilledStore(folder(tmp_path / "counted"), at=10**6, done=True)
+    run(resume_segments(counted)[0], BY_RESIDUAL)
+    begins = next(at for at, what in enumerate(counted.operations) if "init-0001" in what)
+    # After an operation is before the next one.
+    for at in range(begins, begins + 3):
+        store = folder(tmp_path / f"{at}")
+        with pytest.raises(Killed):
+            run(resume_segments(KilledStore(store, at=at, done=False), clocks=Hands().clocks())[0], BY_RESIDUAL)
+        sink, resumed = resume_segments(store)
+        run(sink, BY_RESIDUAL, resumed=resumed)
+        write_archive(store, tmp_path / "out.sgs")
+        assert (tmp_path / "out.sgs").read_bytes() == data, counted.operations[at]
+
+
+def test_each_frame_starts_from_what_a_reader_sees(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next frame after a period has begun starts from that period's scene, and the period from the one before."""
+    from structgstream.session.loop import struct_gstream as method
+
+    started = {}
+    fit, again, number = method.fit_next_frame, method.fit_first_frame_again, count(1)
+
+    def following(scene, *arguments, **options):
+        started[next(number)] = scene
+        return fit(scene, *arguments, **options)
+
+    def anew(frame, rig, scene, **options):
+        started[next(number)] = scene
+        return again(frame, rig, scene, **options)
+
+    monkeypatch.setattr(method, "fit_next_frame", following)
+    monkeypatch.setattr(method, "fit_first_frame_again", anew)
+    run(sink := MemorySink(), SCHEDULED)
+    assert sink.data == whole("scheduled")[0]
+    reader = StreamReader(sink.data)
+    assert all(same(started[index], reader.scene(index - 1)) for index in range(1, FRAMES))
+
+
+def test_without_periods_nothing_is_measured_and_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    from structgstream.session.loop import struct_gstream as method
+
+    monkeypatch.setattr(method, "mean_residual", lambda *_, **__: pytest.fail("measured"))
+    run(sink := MemorySink(), COMPACT_CONFIG, length=3)
+    data = sink.data
+    assert {record.period for record in scan_records(data)} == {0}
+    assert "period" not in StreamReader(data).header.config
+
+
+def test_a_new_period_shows_the_changed_scene_better() -> None:
+    """The mean error of the last frame, with and without: the reason that there are periods."""
+    with_period, _ = whole("residual")
+    run(sink := MemorySink(), BASE)
+    errors = [error_of(StreamReader(data)) for data in (sink.data, with_period)]
+    assert errors[1] < 0.8 * errors[0]
+
+
+def error_of(reader: StreamReader) -> float:
+    frame = frames()[FRAMES - 1]
+    pictures = {name: reader.render(FRAMES - 1, name, backend=quickest_backend()) for name in WORLD.rig.training}
+    return float(np.mean([np.abs(image.astype(float) - frame.images[name]).mean() for name, image in pictures.items()]))
