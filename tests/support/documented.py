@@ -188,14 +188,14 @@ def residuals(packet: Packet, name: str, last: list[Row], others: Row) -> list[R
             if not any(last[a]):
                 led = 8 * (above + below)
             expected = size_class((abs(led) + 4) // 8) * (-1 if led < 0 else 1)
-            told = sum(map(abs, found[a][:k]))
+            within = sum(map(abs, found[a][:k]))
             left = found[a][k - 1] if k else 0
             off = left - last[a][k - 1] if k else 0
             contexts = [
                 (lim(own, 8) + 8) * c + k,
                 (lim(above, 4) + 4) * 9 + lim(below, 4) + 4,
                 (expected + 15) * 5 + level,
-                (min(told, 9) * 6 + min(beside, 5)) * c + k,
+                (min(within, 9) * 6 + min(beside, 5)) * c + k,
                 (bits(others[a], 5) * c + k) * 16 + size_class(2 * abs(own) + beside),
                 ((lim(left, 3) + 3) * 7 + lim(off, 3) + 3) * 7 + lim(own, 3) + 3,
             ]

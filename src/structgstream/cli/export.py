@@ -37,7 +37,7 @@ class Export:
     stream: tyro.conf.Positional[StreamFile]
     """The stream file."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
-    """Output file or folder. Default: a file (with --frame) or a folder beside the stream."""
+    """Output file or folder. Default: a file (with --frame) or a folder next to the stream."""
     format: Annotated[Format | PageFormat | None, tyro.conf.arg(help_behavior_hint="")] = None
     """Format of the files. Default: the suffix of OUT, else ply."""
     frame: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
