@@ -44,7 +44,7 @@ def worst_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     return tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
 
 
-EXPLAINED, UNEXPLAINED = 0.25, 0.5  # largest share of violating matches after, and least before
+EXPLAINED, UNEXPLAINED = 0.25, 0.5  # largest share of violating matches after, and smallest before
 SLIGHT_PIXELS = 1.5  # of pictures up to 1000 pixels wide: blurs, but does not spoil
 LENGTHS = {
     1000.0: "millimetres among metres",
@@ -187,7 +187,7 @@ def _single(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdic
 
 
 def _moved(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> str:
-    """How far a camera stands from where its pictures say that it does, as far as they do say so."""
+    """How far a camera is from the pose of its pictures, as far as they determine it."""
     found = verdict.resections.get(name)
     if found is not None:
         sentence = (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the pictures of one camera say of its pose and focal length, given points that the other cameras agree on.
+"""Resection of one camera: the pose and focal length that fit points that the other cameras agree on.
 
 Matches that contradict a pose may be wrong matches: of a court or a facade they even fit some epipolar geometry. A
 camera that is off has another pose, or another focal length, which explains what the given one does not; wrong matches
@@ -21,7 +21,7 @@ MIN_SEEN = 8
 MIN_POINTS = 12
 MIN_SHARE = 0.4  # of a camera's points that a corrected camera must explain
 MIN_GAIN = 0.5  # largest share of the error that a correction leaves, if the camera is to be off
-SIMPLE_ENOUGH = 1.1  # of the least error, up to which the correction with fewer causes is taken
+SIMPLE_ENOUGH = 1.1  # of the smallest error, up to which the correction with fewer causes is taken
 SIGMAS = 3.0
 TURN, MOVE, FOCAL = slice(0, 3), slice(3, 6), slice(6, 7)
 BY_CHANCE = 3  # points that a pose may explain beyond those that another one does, as it has six degrees of freedom
@@ -34,7 +34,7 @@ class Resection:
 
     Args:
         points: number of points that it explains.
-        kept: number of points that the given camera explains.
+        given_points: number of points that the given camera explains.
         seen: number of points that have a keypoint in its picture.
         given_pixels: median distance of the keypoints of ``points`` to where the given camera sees these.
         corrected_pixels: the same of the corrected one.

@@ -135,7 +135,7 @@ class _Table:
 
 
 def build_tracks(evidence: Evidence, cameras: Mapping[str, Camera], *, off: Collection[str] = ()) -> Tracks:
-    """Points from the matches of cameras that are not ``off``; observations of those that are are kept, too.
+    """Points from the matches of cameras that are not ``off``; those of ``off`` cameras are included.
 
     Keypoints that matches connect are one point; a point with two keypoints in one picture is left out. Points lie
     where the rays of their keypoints pass closest, in the sense of least squares; of a point whose keypoints disagree

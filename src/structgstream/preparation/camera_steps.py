@@ -206,7 +206,7 @@ def chosen_method(footage: Footage, options: PrepareOptions) -> str | Calibratio
     """``sfm``, ``board``, or the calibration to use.
 
     Raises:
-        CalibrationError: the calibration that was asked for is missing or broken.
+        CalibrationError: the requested calibration is missing or broken.
     """
     if str(options.calibration) not in METHODS:
         return require_calibration(Path(options.calibration))
@@ -220,7 +220,7 @@ def chosen_method(footage: Footage, options: PrepareOptions) -> str | Calibratio
 def check_used(method: str | Calibration, footage: Footage, options: PrepareOptions) -> None:
     """
     Raises:
-        ConfigError: something is asked for that has no effect, so that its user expects another capture.
+        ConfigError: an option has no effect, so that its user expects another capture.
     """
     if options.fps is not None and footage.tracks:
         raise ConfigError(

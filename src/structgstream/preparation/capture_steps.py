@@ -157,7 +157,7 @@ class CaptureSteps:
         return inputs
 
     def _source(self, content: PreparedCapture) -> FrameSource:
-        """The capture, opened once: indexing videos takes time, and what is to be said of them is said once."""
+        """The capture, opened once: indexing videos takes time, and its warnings should come once."""
         if self._opened is None:
             self._opened = open_capture(self.capture)
         points = None

@@ -18,7 +18,7 @@ STILL_PICTURES = 9
 
 @dataclass(frozen=True)
 class Shots(Sequence[Picture]):
-    """Pictures of one camera, decoded when they are asked for, so that a long take does not fill the memory."""
+    """Pictures of one camera, decoded on access, so that a long take does not fill the memory."""
 
     footage: Footage
     camera: str

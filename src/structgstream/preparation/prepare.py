@@ -29,8 +29,8 @@ class Preparation:
 
     Args:
         path: its folder, for ``open_capture`` and ``reconstruct``.
-        findings: what the check says, errors first.
-        steps: what each step found, in words.
+        findings: of the check, errors first.
+        steps: summaries of the steps.
         skipped: steps whose results were there already.
         report: the page of the report.
     """
@@ -50,7 +50,7 @@ def prepare_capture(
     Args:
         videos: the folder of the cameras' videos or pictures, see ``preparation.footage``.
         capture: the folder to make; the same call again does only what has changed.
-        options: what is asked for.
+        options: of the preparation.
         listener: receives steps and progress.
 
     Raises:

@@ -35,7 +35,7 @@ class Stored:
 
 
 class Listener(Protocol):
-    """Is told of steps as they go."""
+    """Receives steps as they run."""
 
     def begin(self, step: str, *, skipped: bool) -> None:
         """A step begins; ``skipped`` when its result is there already."""
@@ -46,21 +46,21 @@ class Listener(Protocol):
         ...
 
     def end(self, step: str, summary: str) -> None:
-        """A step is done; ``summary`` says what came of it."""
+        """A step is done; ``summary`` describes its result."""
         ...
 
 
 class Silent:
-    """A listener that says nothing."""
+    """A listener that does nothing."""
 
     def begin(self, step: str, *, skipped: bool) -> None:
-        """Says nothing."""
+        """Does nothing."""
 
     def progress(self, done: int, total: int, what: str) -> None:
-        """Says nothing."""
+        """Does nothing."""
 
     def end(self, step: str, summary: str) -> None:
-        """Says nothing."""
+        """Does nothing."""
 
 
 class Steps:
@@ -68,7 +68,7 @@ class Steps:
 
     Args:
         capture: the capture's folder; results go to ``work`` in it.
-        listener: is told of them.
+        listener: receives them.
     """
 
     def __init__(self, capture: Path, listener: Listener) -> None:
@@ -96,7 +96,7 @@ class Steps:
 
         Args:
             step: its name.
-            inputs: what it depends on beside other steps, as JSON can hold it.
+            inputs: what it depends on apart from other steps, as JSON can hold it.
             compute: makes the result.
             pack: the result as numbers and arrays.
             unpack: the reverse.
@@ -148,8 +148,8 @@ class Steps:
 
 
 def fingerprint(files: Mapping[str, Path]) -> list[tuple[str, str, int, int]]:
-    """What tells that files, and those of folders, are the same without reading them: name, file, size and time of
-    change of each."""
+    """Identifies the contents of files and folders without reading them: name, file, size and modification time of
+    each."""
     found = []
     for name, path in files.items():
         inside = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
@@ -167,7 +167,7 @@ class Job:
     Args:
         videos: the folder of what was filmed.
         capture: the folder to make.
-        options: what is asked for.
+        options: of the preparation.
         listener: receives the steps.
         steps: runs them, or takes their results from the disk.
         summaries: of each step that ran, for users.

@@ -91,7 +91,7 @@ def board_model(
 
 
 def _repeated(sightings: Sightings) -> list[int]:
-    """The corners that are seen at least twice: COLMAP adjusts no others."""
+    """The corners that have two observations or more: COLMAP adjusts no others."""
     seen = [sight.corners for sights in sightings.values() for sight in sights]
     corners, counts = np.unique(np.concatenate(seen), return_counts=True)
     return [int(corner) for corner in corners[counts > 1]]
@@ -156,7 +156,7 @@ def solve_board(
 
     Raises:
         CalibrationError: a camera that does not show the board well enough, or at no instant at which it connects to
-            the others; another board than said.
+            the others; another board than given.
         MissingExtraError: pycolmap or cv2 is not installed.
     """
     pycolmap_module()

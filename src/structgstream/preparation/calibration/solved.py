@@ -115,7 +115,7 @@ def with_distance(solved: SolvedCalibration, first: str, second: str, *, metres:
     for name in (first, second):
         if name not in solved.cameras:
             raise CalibrationError(
-                f"The distance is said from camera {name!r}, which is not among the placed ones "
+                f"The distance is given from camera {name!r}, which is not among the placed ones "
                 f"({', '.join(solved.cameras)})."
             )
     apart = float(np.linalg.norm(np.diff([_center(solved, first), _center(solved, second)], axis=0)))

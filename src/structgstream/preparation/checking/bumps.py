@@ -118,7 +118,7 @@ def bump_findings(
 def _judged(
     name: str, movement: Movement, instants: tuple[Evidence, Evidence], cameras: Mapping[str, Camera]
 ) -> Judgement:
-    """What matches with other cameras say at both instants."""
+    """The judgement by matches with other cameras at both instants."""
     back = np.asarray(np.linalg.inv(movement.homography), np.float64)
     votes = [
         _votes(name, change, evidence, cameras)

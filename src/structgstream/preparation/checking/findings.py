@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a check says."""
+"""The numbers and sentences of a check."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -85,8 +85,8 @@ class CheckReport:
         rig_radius: in the capture's units.
         near: near plane, in the capture's units.
         nearest: depth that 0.5 % of the points fall below, in the capture's units; None without points.
-        unit: of length, where the capture says.
-        steps: of the preparation, where there was one: what each found, in words.
+        unit: of length, where the capture states it.
+        steps: summaries of the preparation's steps, where there was one.
     """
 
     capture: str

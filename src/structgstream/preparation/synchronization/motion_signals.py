@@ -56,7 +56,7 @@ class Changes:
 
 
 def picture_changes(pictures: Iterable[NDArray[np.uint8]], stamps: Floats) -> Changes:
-    """Changes of pictures ``[H, W, 3]`` that follow each other at ``stamps`` ``[T]``; only reduced ones are kept.
+    """Changes of pictures ``[H, W, 3]`` that follow each other at ``stamps`` ``[T]``; only reduced ones stay in memory.
 
     Raises:
         MissingExtraError: cv2 is not installed.
@@ -134,7 +134,7 @@ class PairGeometry:
 def line_signals(first: Changes, second: Changes, geometry: PairGeometry) -> tuple[Floats, Floats] | None:
     """Signals ``[T1, B]`` and ``[T2, B]`` of the bundles that both views see; None if these are too few.
 
-    Square roots are taken, so that a signal says rather where something moves than how much.
+    Square roots are taken, so that a signal shows where something moves rather than how much.
     """
     angles = _angles(first, second, geometry)
     cut = _gap(np.concatenate(angles))

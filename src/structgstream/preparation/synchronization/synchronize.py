@@ -85,15 +85,14 @@ def synchronize(
 
     Args:
         streams: the files of each camera.
-        method: ``csv`` (``timestamps``), ``stamps`` (of the files, which the caller says share a clock), ``audio``,
-        ``motion``,
+        method: ``csv`` (``timestamps``), ``stamps`` (of the files, which share a clock), ``audio``, ``motion``,
             ``none`` (the cameras were started by one signal: stamps hold as they are), or ``auto``: csv if given,
             else audio if all cameras have sound in which something is common, else motion.
         timestamps: a table of times (``timestamps.py``).
         cameras: the calibration, if it is known; motion is exact with it and coarse without.
 
     Raises:
-        CaptureError: the cameras cannot be synchronised so; says which camera and why.
+        CaptureError: the cameras cannot be synchronised so; the message names camera and reason.
         ConfigError: ``method`` is unknown, or csv without a table.
         MissingExtraError: scipy or cv2 is not installed.
     """
