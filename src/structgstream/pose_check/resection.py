@@ -15,7 +15,7 @@ from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv
 from structgstream.data.matching import project
-from structgstream.pose_check.tracks import AGREE_PIXELS, Tracks
+from structgstream.pose_check.tracks import AGREE_PIXELS, Tracks, pixel_scale
 
 MIN_SEEN = 8
 MIN_POINTS = 12
@@ -123,7 +123,7 @@ def resect(tracks: Tracks, camera: Camera, name: str) -> Resection | None:
     if own.sum() < MIN_SEEN:
         return None
     points, pixels = tracks.points[tracks.point[own]], tracks.pixels[own]
-    limit = AGREE_PIXELS * max(camera.width / 1000, 1)
+    limit = AGREE_PIXELS * pixel_scale(camera.width)
     view = _view(camera)
     starts = [start for start in (np.zeros(7), _by_points(camera, points, pixels, limit)) if start is not None]
     best = max((_adjusted(view, start, points, pixels, limit) for start in starts), key=lambda found: found[1].sum())
@@ -158,7 +158,7 @@ def explained(tracks: Tracks, camera: Camera, name: str) -> int:
     own = tracks.of(name)
     seen, depths = project(camera, tracks.points[tracks.point[own]])
     apart = np.linalg.norm(seen - tracks.pixels[own], axis=1)
-    return int(((depths > 0) & (apart < 2 * AGREE_PIXELS * max(camera.width / 1000, 1))).sum())
+    return int(((depths > 0) & (apart < 2 * AGREE_PIXELS * pixel_scale(camera.width))).sum())
 
 
 def _view(camera: Camera) -> _View:

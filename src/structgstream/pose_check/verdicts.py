@@ -13,10 +13,10 @@ from structgstream.cameras import Camera
 from structgstream.data.matching import Pair
 from structgstream.data.pair_matches import PairError
 from structgstream.pose_check.resection import Resection, resect
-from structgstream.pose_check.tracks import MIN_VIEWS, Evidence, Tracks, build_tracks, pair_errors
+from structgstream.pose_check.tracks import MIN_VIEWS, Evidence, Tracks, build_tracks, pair_errors, pixel_scale
 
 TIMES_TYPICAL = 4.0
-FLOOR_PIXELS = 0.75  # of pictures up to 1000 pixels wide, in proportion above
+FLOOR_PIXELS = 0.75  # times pixel_scale
 MAX_WEIGHT = 100  # matches above which a pair is not trusted more
 OFF_SHARE = 0.5
 VIOLATING_SHARE = 0.5
@@ -103,7 +103,7 @@ def _limit(errors: Mapping[Pair, PairError], cameras: Mapping[str, Camera]) -> f
     """Pixels; relative to the better pairs, because soft pictures have large errors in any calibration."""
     width = max((camera.width for camera in cameras.values()), default=0)
     typical = float(np.percentile([error.pixels for error in errors.values()], 25)) if errors else 0.0
-    floor = FLOOR_PIXELS * max(width / 1000, 1)
+    floor = FLOOR_PIXELS * pixel_scale(width)
     return max(floor, min(TIMES_TYPICAL * typical, 4 * floor))
 
 

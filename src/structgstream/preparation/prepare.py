@@ -20,7 +20,7 @@ from structgstream.preparation.footage import Footage
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.output_folder import lock_output
 from structgstream.preparation.report.page import write_report
-from structgstream.preparation.steps import Job, Listener, Silent, new_job
+from structgstream.preparation.steps import Job, Listener, Silent, Steps
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def prepare_capture(
         MissingExtraError: a package is missing that a step needs.
     """
     options = options or PrepareOptions()
-    job = new_job(videos, capture, options=options, listener=listener or Silent())
+    job = Job(videos, capture, options, Steps(capture, listener or Silent()))
     find = CameraSteps(job)
     footage = find.find()
     method = chosen_method(footage, options)
@@ -83,7 +83,7 @@ def _made(job: Job, find: CameraSteps, footage: Footage, method: str | Calibrati
     content = make.points(make.near(content))
     findings = make.check(content)
     return Preparation(
-        job.capture, findings, job.summaries, tuple(job.steps.skipped), job.capture / REPORT / "index.html"
+        job.capture, findings, job.steps.summaries, tuple(job.steps.skipped), job.capture / REPORT / "index.html"
     )
 
 

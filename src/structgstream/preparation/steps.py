@@ -64,11 +64,15 @@ class Silent:
 
 
 class Steps:
-    """Runs the steps of one capture.
+    """Runs the steps of one capture, reports them, and records their summaries.
 
     Args:
         capture: the capture's folder; results go to ``work`` in it.
         listener: receives them.
+
+    Attributes:
+        skipped: steps whose results were there already.
+        summaries: of each step, for users.
     """
 
     def __init__(self, capture: Path, listener: Listener) -> None:
@@ -76,10 +80,20 @@ class Steps:
         self._listener = listener
         self._keys: dict[str, str] = {}
         self.skipped: list[str] = []
+        self.summaries: dict[str, str] = {}
 
-    def key(self, step: str) -> str:
-        """The key of a step that was run."""
-        return self._keys[step]
+    def begin(self, step: str, *, skipped: bool = False) -> None:
+        """Reports that a step begins."""
+        self._listener.begin(step, skipped=skipped)
+
+    def progress(self, done: int, total: int, what: str) -> None:
+        """Reports that a part of the running step is done."""
+        self._listener.progress(done, total, what)
+
+    def end(self, step: str, summary: str) -> None:
+        """Records and reports the summary of a step."""
+        self.summaries[step] = summary
+        self._listener.end(step, summary)
 
     def run(
         self,
@@ -110,14 +124,14 @@ class Steps:
         key = hashlib.sha256(json.dumps(described, sort_keys=True, default=str).encode()).hexdigest()
         self._keys[step] = key
         stored = self._read(step, key)
-        self._listener.begin(step, skipped=stored is not None)
+        self.begin(step, skipped=stored is not None)
         if stored is not None:
             self.skipped.append(step)
             value = unpack(stored)
         else:
             value = compute()
             self._write(step, key, pack(value))
-        self._listener.end(step, summary(value))
+        self.end(step, summary(value))
         return value
 
     def _read(self, step: str, key: str) -> Stored | None:
@@ -168,38 +182,10 @@ class Job:
         videos: the folder of what was filmed.
         capture: the folder to make.
         options: of the preparation.
-        listener: receives the steps.
-        steps: runs them, or takes their results from the disk.
-        summaries: of each step that ran, for users.
+        steps: runs them, or takes their results from the disk, and reports them.
     """
 
     videos: Path
     capture: Path
     options: PrepareOptions
-    listener: Listener
     steps: Steps
-    summaries: dict[str, str] = field(default_factory=dict)
-
-
-def new_job(videos: Path, capture: Path, *, options: PrepareOptions, listener: Listener) -> Job:
-    """A preparation that has not begun."""
-    summaries: dict[str, str] = {}
-    noting = _Noting(listener, summaries)
-    return Job(videos, capture, options, noting, Steps(capture, noting), summaries)
-
-
-class _Noting:
-    """Passes everything on, and notes what steps found."""
-
-    def __init__(self, listener: Listener, summaries: dict[str, str]) -> None:
-        self._listener, self._summaries = listener, summaries
-
-    def begin(self, step: str, *, skipped: bool) -> None:
-        self._listener.begin(step, skipped=skipped)
-
-    def progress(self, done: int, total: int, what: str) -> None:
-        self._listener.progress(done, total, what)
-
-    def end(self, step: str, summary: str) -> None:
-        self._summaries[step] = summary
-        self._listener.end(step, summary)

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from structgstream.pose_check.findings import Finding
+from structgstream.preparation.checking.overlap import Coverage
 
 
 @dataclass(frozen=True)
@@ -54,21 +55,6 @@ class CameraCheck:
     offset_ms: float | None = None
     offset_uncertainty_ms: float | None = None
     frames_lacking: int = 0
-
-
-@dataclass(frozen=True)
-class Coverage:
-    """How much of the scene how many cameras see.
-
-    Args:
-        points: number of points that were triangulated.
-        seen_by_three: share of them that at least three cameras see.
-        median_cameras: median number of cameras that see a point.
-    """
-
-    points: int
-    seen_by_three: float
-    median_cameras: float
 
 
 @dataclass(frozen=True)
