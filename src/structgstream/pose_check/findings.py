@@ -194,7 +194,7 @@ def _moved(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict
             f"Camera {name!r} is off: {found.points} points that other cameras agree on lie {found.given_pixels:.1f} "
             "pixels (median) from where its picture shows them"
         )
-        sentence += f"; its pictures {found.sentence}" if found.sentence else ""
+        sentence += f"; its pictures {found.description}" if found.description else ""
     else:
         sentence = (
             f"Camera {name!r} is off: its matches with {_bad_pairs(evidence, cameras, name, verdict)}, which agree "

@@ -165,7 +165,10 @@ def solve_board(
     views = {}
     for number, (name, shots) in enumerate(pictures.items(), 1):
         size = shots[0].shape[1], shots[0].shape[0]
-        starts = [colmap_camera(known[name], number)] if name in known else _guesses(lens, number, size)
+        if name in known:
+            starts = [colmap_camera(known[name], number)]
+        else:
+            starts = [guessed_camera(lens, number, size, degrees) for degrees in FIELDS_OF_VIEW[lens]]
         views[name] = _own_view(name, sightings[name], board, starts, fixed=name in known)
     sensors = _connected_sensors(views)
     poses = _rig_poses(views, sensors, sightings)
@@ -191,10 +194,6 @@ class _View:
 
     camera: Any
     poses: Mapping[int, Floats]
-
-
-def _guesses(lens: LensModel, number: int, size: tuple[int, int]) -> list[Any]:
-    return [guessed_camera(lens, number, size, degrees) for degrees in FIELDS_OF_VIEW[lens]]
 
 
 def _own_view(name: str, sights: Sequence[Sighting], board: Board, starts: Sequence[Any], *, fixed: bool) -> _View:

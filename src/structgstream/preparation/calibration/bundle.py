@@ -149,8 +149,9 @@ class System:
         from scipy.sparse import bsr_array
 
         diagonal = np.einsum("bii->bi", self.V)
-        inverse: Floats = np.asarray(np.linalg.inv(self.V + _diagonals(damping * diagonal + 1e-12)), np.float64)
-        count, size = len(inverse), inverse.shape[1]
+        count, size = diagonal.shape
+        damped = self.V + (damping * diagonal + 1e-12)[:, :, None] * np.eye(size)
+        inverse: Floats = np.asarray(np.linalg.inv(damped), np.float64)
         blocks = bsr_array((inverse, np.arange(count), np.arange(count + 1)), shape=(count * size, count * size))
         weighed = self.W @ blocks.tocsr()
         own = np.diag(self.A)
@@ -251,7 +252,3 @@ def _crosses(vectors: Floats) -> Floats:
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3)
-
-
-def _diagonals(values: Floats) -> Floats:
-    return values[:, :, None] * np.eye(values.shape[1])
