@@ -270,18 +270,18 @@ def test_the_window_and_what_has_left_it(tmp_path: Path) -> None:
 
 
 def test_a_stream_with_a_window_is_continued_with_all_its_sizes(tmp_path: Path) -> None:
-    sent = packets(300)
+    sent = packets(180)
     whole, stopped = folder(tmp_path / "whole"), folder(tmp_path / "stopped")
     options = SegmentsOptions(window_seconds=1.0, grace_seconds=5.0)
     written(whole, sent, options=options)
     hands = Hands()
-    written(stopped, sent[:160], options=options, hands=hands)
+    written(stopped, sent[:130], options=options, hands=hands)
     _, resumed = resume_segments(stopped)
     assert resumed is not None
-    records = [len(packet.payload) + 12 for packet in sent[:160]]
+    records = [len(packet.payload) + 12 for packet in sent[:130]]
     assert [info.bytes for info in resumed.packets] == records
-    assert [info.kind for info in resumed.packets] == [packet.kind for packet in sent[:160]]
-    assert [packet.index for packet in resumed.group(159)] == [159]  # Codec raw; the sizes give the rest.
+    assert [info.kind for info in resumed.packets] == [packet.kind for packet in sent[:130]]
+    assert [packet.index for packet in resumed.group(129)] == [129]  # Codec raw; the sizes give the rest.
     assert resumed.scene(0) is not None
     written(stopped, sent, options=options, hands=hands)
     one, other = read_manifest(whole), read_manifest(stopped)
