@@ -463,8 +463,7 @@ describe("qualities", () => {
     const [high, low] = [run(3000).finish(), run(3000).finish()];
     const host = new Host({ high, low });
     host.instead.set("/qualities.json", listed([{ ...ENTRIES[0], bits_per_second: 5e5 }, ENTRIES[1]]));
-    // Little is read ahead, so that a slow connection is felt soon.
-    const play = opened(host, 0, LIST, true, { budgetBytes: 40_000 });
+    const play = opened(host, 0, LIST);
     await play.settled();
     play.engine.play();
     const began = performance.now();

@@ -471,26 +471,26 @@ describe.skipIf(!executable)("the player in a browser", () => {
     });
 
     // Which addresses and numbers are refused: view.test.ts. Here, that what is refused has no effect on a page.
-    test.each([
-      ["src=https://example.org/x.sgs"],
-      ["view=<img src=x onerror=alert(1)>&t=0x10&embed=2&__proto__=1"],
-    ])("that are hostile do nothing: %s", async (query) => {
-      const page = await open('src="clip.sgs"', `?${query.replaceAll("<", "%3C")}`);
-      const others: string[] = [];
-      page.on("request", (request) => {
-        if (!request.url().startsWith(stage.server.origin) && /^https?:/.test(request.url()))
-          others.push(request.url());
-      });
-      await shows(page, 0);
-      const matrix = await ask(page, (player) => [...player.camera!.viewmat]);
-      expect(matrix.every(Number.isFinite)).toBe(true);
-      expect(others).toEqual([]);
-      await page
-        .getByText(/was not taken/)
-        .first()
-        .waitFor();
-      expectQuiet();
-    });
+    test.each([["src=https://example.org/x.sgs"], ["view=<img src=x onerror=alert(1)>&t=0x10&embed=2&__proto__=1"]])(
+      "that are hostile do nothing: %s",
+      async (query) => {
+        const page = await open('src="clip.sgs"', `?${query.replaceAll("<", "%3C")}`);
+        const others: string[] = [];
+        page.on("request", (request) => {
+          if (!request.url().startsWith(stage.server.origin) && /^https?:/.test(request.url()))
+            others.push(request.url());
+        });
+        await shows(page, 0);
+        const matrix = await ask(page, (player) => [...player.camera!.viewmat]);
+        expect(matrix.every(Number.isFinite)).toBe(true);
+        expect(others).toEqual([]);
+        await page
+          .getByText(/was not taken/)
+          .first()
+          .waitFor();
+        expectQuiet();
+      },
+    );
 
     test("cannot be led away by a redirection", async () => {
       const elsewhere = await TestServer.started();
