@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Segments are the bytes of the file sink in pieces, a reader of late finds everything, and a kill loses nothing."""
 
-import json
 import os
-import re
 import shutil
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
-from structgstream.codec.container.records import prefix
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.manifest import MANIFEST, Manifest
@@ -315,19 +312,3 @@ def test_a_disk_that_is_nearly_full_closes_the_stream(tmp_path: Path, monkeypatc
     monkeypatch.undo()
     written(store, SENT)
     assert archived(store) == as_file(SENT)
-
-
-def test_manifests_are_plain_json_with_the_keys_of_the_document(tmp_path: Path) -> None:
-    """docs/segments.md lists them."""
-    store = folder(tmp_path)
-    sink = SegmentsSink(store)
-    sink.open(header())
-    for packet in packets(40, group=1)[:33]:
-        sink.write(packet)
-    text = (Path(__file__).parents[3] / "docs" / "segments.md").read_text()
-    plain = json.loads(store.get(MANIFEST))
-    keys = {*plain, *plain["edge"], *plain["window"]}
-    for name in ("periods", "segments", "parts", "history"):
-        keys |= {key for entry in plain[name] for key in entry}
-    assert not {key for key in keys if not re.search(rf"[`.]{key}\b", text)}
-    assert store.get(plain["periods"][0]["file"]).startswith(prefix())
