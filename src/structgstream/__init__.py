@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
     from structgstream.errors import StructGStreamError
     from structgstream.evaluation.report import FrameScores, Report, Scores
+    from structgstream.exporters.formats import FrameOptions
     from structgstream.frames import MultiViewFrame
     from structgstream.kernels.backend import Backend, select_backend
     from structgstream.memory import PeakKind
@@ -47,6 +48,7 @@ _HOMES = {
     "CheckReport": "preparation.checking.findings",
     "FileSink": "codec.sinks",
     "Finding": "preparation.checking.findings",
+    "FrameOptions": "exporters.formats",
     "FrameReport": "session.frame_report",
     "FrameScores": "evaluation.report",
     "FrameSource": "data.source",
@@ -91,6 +93,7 @@ __all__ = [
     "CheckReport",
     "FileSink",
     "Finding",
+    "FrameOptions",
     "FrameReport",
     "FrameScores",
     "FrameSource",

@@ -14,11 +14,15 @@ from structgstream.cli.app import main
 from structgstream.preparation.calibration.board import Board
 from structgstream.preparation.options import Distance, PrepareOptions
 from structgstream.preparation.output_folder import lock_output, mark_output
+from tests.support.quick_preparation import quicken
 from tests.support.quick_streams import error_of
 from tests.support.rooms import write_room
 
 
-def test_prepare_then_check_and_a_mistake(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_prepare_then_check_and_a_mistake(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    quicken(monkeypatch)
     write_room(tmp_path / "videos")
     out = tmp_path / "out"
     command = ["prepare", str(tmp_path / "videos"), "-o", str(out), "--synchronize", "none", "--held-out", "cam02"]

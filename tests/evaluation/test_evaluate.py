@@ -329,10 +329,8 @@ def test_the_basic_scores_are_those_of_before(world: World) -> None:
     assert basic.mean.flip is basic.mean.e_warp is basic.mean.ms_ssim is None
 
 
-def test_keys_of_the_stream_are_documented(world: World) -> None:
+def test_frames_a_second_of_drawing_alone_are_more_than_with_decoding(world: World) -> None:
     report = run(in_the_stream(world, similarity=Similarity(), follow=True), MemoryCapture(world.rig, world.frames))
-    text = (Path(__file__).parents[2] / "docs" / "evaluation.md").read_text()
-    assert not [key for key in as_json(report)["stream"] if f"`{key}`" not in text]
     assert report.stream["render_fps"] > report.stream["decode_and_render_fps"] > 0
 
 

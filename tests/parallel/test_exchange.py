@@ -15,11 +15,13 @@ from tests.support.flaky_store import flaky_store
 from tests.support.stand_ins import job, sha256, workers
 
 
-def plain(folder: Path) -> Path:
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The stream of a run without a store."""
+    folder = tmp_path_factory.mktemp("plain")
     with Parts(folder / "plain").held(), workers() as executor:
-        drive(job(folder / "a"), Parts(folder / "plain"), executor)
-    return folder / "a" / "out.sgs"
+        drive(job(folder), Parts(folder / "plain"), executor)
+    return folder / "out.sgs"
 
 
 def stored(folder: Path, url: str) -> Path:
@@ -32,30 +34,26 @@ def stored(folder: Path, url: str) -> Path:
     return folder / "b" / "out.sgs"
 
 
-def test_a_run_by_a_store_gives_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "a").mkdir()
+def test_a_run_by_a_store_gives_the_same_bytes(plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRUCTGSTREAM_SCRATCH", str(tmp_path / "scratch"))
     url = f"file://{tmp_path / 'store'}"
-    first = plain(tmp_path)
-    assert sha256(stored(tmp_path, url)) == sha256(first)
+    assert sha256(stored(tmp_path, url)) == sha256(plain)
     assert (tmp_path / "store" / "segments" / "group-000004-000008.sgs").exists()
     assert not any((tmp_path / "scratch").iterdir())
     # A driver on another machine, with nothing but the store, goes on there.
     (tmp_path / "store" / "segments" / "group-000004-000008.sgs").unlink()
     (tmp_path / "parts").rename(tmp_path / "lost")
-    first.rename(tmp_path / "first")
-    assert sha256(stored(tmp_path, url)) == sha256(tmp_path / "first")
+    assert sha256(stored(tmp_path, url)) == sha256(plain)
 
 
 def test_a_store_that_refuses_every_third_request_costs_only_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("s3fs", reason="s3fs, of the extra cloud, is not installed")
     pytest.importorskip("moto.server", reason="moto, of the extra dev, is not installed")
-    (tmp_path / "a").mkdir()
     monkeypatch.setenv("STRUCTGSTREAM_SCRATCH", str(tmp_path / "scratch"))
     with flaky_store(3) as (url, application):
-        assert sha256(stored(tmp_path, url)) == sha256(plain(tmp_path))
+        assert sha256(stored(tmp_path, url)) == sha256(plain)
         assert application.refused >= 10
 
 

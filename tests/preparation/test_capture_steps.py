@@ -19,7 +19,7 @@ from structgstream.preparation.capture_steps import POINTS, CaptureSteps, assemb
 from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.given_calibration import given_cameras
 from structgstream.preparation.options import PrepareOptions
-from structgstream.preparation.steps import FOLDER, Job, Silent, new_job
+from structgstream.preparation.steps import FOLDER, Job, Silent, Steps
 from tests.support.rooms import write_room
 
 NONE = PrepareOptions(synchronize="none", near=0.25)
@@ -36,7 +36,7 @@ def made(where: Path, options: PrepareOptions = NONE) -> tuple[Footage, SolvedCa
 
 
 def job(videos: Path, capture: Path, options: PrepareOptions = NONE) -> Job:
-    found = new_job(videos, capture, options=options, listener=Silent())
+    found = Job(videos, capture, options, Steps(capture, Silent()))
     found.steps._keys["synchronize"] = "a key"
     return found
 
@@ -77,7 +77,7 @@ def test_files_are_brought_with_their_masks(tmp_path: Path) -> None:
         assert (tmp_path / "out" / "videos" / f"{name}.mp4").samefile(tmp_path / "videos" / f"{name}.mp4")
     assert (tmp_path / "out" / "masks" / "cam00" / "0.png").read_bytes() == b"mask"
     assert read_prepared(tmp_path / "out").near == 0.25
-    assert one.summaries["link"] == "4 cameras by hard link or copy"
+    assert one.steps.summaries["link"] == "4 cameras by hard link or copy"
 
 
 def test_masks_of_cameras_that_are_left_out_stay_behind(tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_a_near_plane_that_is_given_is_not_looked_for(tmp_path: Path) -> None:
     _, _, content = made(tmp_path / "videos")
     one = job(tmp_path / "videos", tmp_path / "out")
     assert CaptureSteps(one).near(content) is content
-    assert "near" not in one.summaries
+    assert "near" not in one.steps.summaries
 
 
 def brought(tmp_path: Path, options: PrepareOptions = NONE) -> tuple[Job, CaptureSteps, PreparedCapture]:
@@ -140,7 +140,7 @@ def test_near_plane_and_points_are_kept(tmp_path: Path) -> None:
     points = np.load(tmp_path / "out" / POINTS)
     assert points.shape[1] == 3
     assert np.isfinite(points).all()
-    assert one.summaries["points"] == f"{len(points):,} points of frame 0"
+    assert one.steps.summaries["points"] == f"{len(points):,} points of frame 0"
     written = read_prepared(tmp_path / "out")
     assert (written.near, written.points) == (near.near, POINTS) == (pointed.near, pointed.points)
     again, steps, content = brought(tmp_path, options)
@@ -173,7 +173,7 @@ def test_the_check_is_done_again_when_its_report_is_gone(tmp_path: Path) -> None
     assert again.steps.skipped == ["points"]
     assert report.is_file()
     count = f"{len(findings)} finding{'s' * (len(findings) != 1)}"
-    assert one.summaries["check"] == f"{count}; report/index.html"
+    assert one.steps.summaries["check"] == f"{count}; report/index.html"
 
 
 def test_a_size_that_cannot_be(tmp_path: Path) -> None:

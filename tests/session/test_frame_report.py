@@ -11,8 +11,8 @@ from structgstream.codec.encoder import Encoded
 from structgstream.codec.packets import Packet, PacketKind
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
+from structgstream.session import frame_report
 from structgstream.session.frame_report import counts, metered
-from structgstream.session.loop import frame_report
 from structgstream.training.result import FitResult
 from tests.support.streams import small_scene
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from structgstream.data.points import PointsConfig
+from structgstream.session import initialization
 from structgstream.session.initialization import frame_seed, initial_points_of
-from structgstream.session.loop import initialization
 from structgstream.similarity import Similarity
 from tests.support.memory_captures import MemoryCapture
 from tests.support.worlds import moving_world

@@ -79,6 +79,13 @@ def run(source: FrameSource, path: Path, *, config: StreamConfig = CONFIG, resum
     return list(Session(source, sink, stream_pipeline(config), quickest_backend(), resumed=resumed).run())
 
 
+def begun(whole: Path, path: Path, *, frames: int) -> Path:
+    """A file that ends after as many frames of another."""
+    last = open_stream(whole).packets[frames - 1]
+    path.write_bytes(whole.read_bytes()[: last.offset + last.bytes])
+    return path
+
+
 def decoded(path: Path) -> list[Scene]:
     with open_stream(path) as reader:
         assert isinstance(reader, StreamReader)
@@ -86,34 +93,42 @@ def decoded(path: Path) -> list[Scene]:
 
 
 LACKING = {
-    "a dropped frame and a return": {2: "cam02"},
     "a camera that dies": {1: "cam03", 2: "cam03", 3: "cam03"},
-    "absent from frame 0": {0: "cam01"},
-    "the held-out camera": {1: "cam00"},
-    "two cameras in turn": {1: ("cam01", "cam02"), 2: ("cam03", "cam04")},
+    "absent from frame 0, and the held-out one": {0: "cam01", 1: "cam00"},
 }
+IN_TURN = {1: "cam02", 2: ("cam02", "cam04")}
 
 
-@pytest.mark.parametrize("case", LACKING)
-def test_training_goes_on_with_the_cameras_that_are_there(world: World, tmp_path: Path, case: str) -> None:
-    lacking = LACKING[case]
-    reports = run(capture(world, lacking), tmp_path / "a.sgs")
+@pytest.fixture(scope="module")
+def in_turn(world: World, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[FrameReport]]:
+    """A stream from which one camera is absent, then two; all return."""
+    path = tmp_path_factory.mktemp("absent") / "a.sgs"
+    return path, run(capture(world, IN_TURN), path)
+
+
+def check_absent(reports: list[FrameReport], lacking: Mapping[int, str | tuple[str, ...]]) -> None:
     assert len(reports) == 4
     for report in reports:
         names = lacking.get(report.index, ())
         assert report.absent == ((names,) if isinstance(names, str) else names)
-        assert np.isfinite(report.train_psnr)
         assert report.train_psnr > 15
 
 
-def test_a_resumed_stream_is_the_uninterrupted_one_also_around_absences(world: World, tmp_path: Path) -> None:
+@pytest.mark.parametrize("case", LACKING)
+def test_training_goes_on_with_the_cameras_that_are_there(world: World, tmp_path: Path, case: str) -> None:
+    check_absent(run(capture(world, LACKING[case]), tmp_path / "a.sgs"), LACKING[case])
+
+
+def test_a_resumed_stream_is_the_uninterrupted_one_also_around_absences(
+    world: World, in_turn: tuple[Path, list[FrameReport]], tmp_path: Path
+) -> None:
     """A camera that returns is compared with nothing older than the frame before, which alone is read again."""
-    lacking = {1: "cam02", 2: ("cam02", "cam04")}
-    run(capture(world, lacking), tmp_path / "whole.sgs")
-    for count in (1, 2, 3):
-        run(section(capture(world, lacking), frames=count), tmp_path / f"{count}.sgs")
-        run(capture(world, lacking), tmp_path / f"{count}.sgs", resume=True)
-        assert (tmp_path / f"{count}.sgs").read_bytes() == (tmp_path / "whole.sgs").read_bytes()
+    whole, reports = in_turn
+    check_absent(reports, IN_TURN)
+    for count in (2, 3):
+        path = begun(whole, tmp_path / f"{count}.sgs", frames=count)
+        run(capture(world, IN_TURN), path, resume=True)
+        assert path.read_bytes() == whole.read_bytes()
 
 
 def test_a_frame_that_too_few_cameras_have_is_refused_by_number(world: World, tmp_path: Path) -> None:
@@ -125,8 +140,8 @@ def test_a_frame_that_too_few_cameras_have_is_refused_by_number(world: World, tm
     assert len(decoded(tmp_path / "a.sgs")) == 2  # whole frames stay
 
 
-def test_absences_are_in_the_line_and_in_the_log(world: World, tmp_path: Path) -> None:
-    reports = run(capture(world, {1: "cam02", 2: ("cam02", "cam04")}), tmp_path / "a.sgs")
+def test_absences_are_in_the_line_and_in_the_log(in_turn: tuple[Path, list[FrameReport]]) -> None:
+    _, reports = in_turn
     assert ["absent" in log_entry(report) for report in reports] == [False, True, True, False]
     assert log_entry(reports[2])["absent"] == ("cam02", "cam04")
     assert "absent" not in summary(reports[0], 4)
@@ -140,13 +155,21 @@ def test_colors_stay_with_their_cameras(world: World, tmp_path: Path) -> None:
         replace(frame, images={**frame.images, "cam03": (frame.images["cam03"] * 0.6).astype(np.uint8)})
         for frame in capture(world, {0: "cam01"}).pictures
     ]
-    source = MemoryCapture(world.rig, frames[:2], points=world.scene.anchors.positions.numpy())
+    source = MemoryCapture(world.rig, frames[:1], points=world.scene.anchors.positions.numpy())
     longer = replace(CONFIG, initial=replace(CONFIG.initial, iterations=300, schedule_iterations=300))
     run(source, tmp_path / "a.sgs", config=longer)
     gains = decoded(tmp_path / "a.sgs")[0].camera_color.gains.mean(1)
     assert gains.shape == (4,)
     assert int(gains.argmin()) == world.rig.training.index("cam03")
     assert abs(float(gains[0]) - float(gains[[1, 3]].mean())) < 0.15  # about neutral
+
+
+@pytest.fixture(scope="module")
+def plain(world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A stream from which nothing is absent."""
+    path = tmp_path_factory.mktemp("plain") / "a.sgs"
+    run(capture(world, {}), path)
+    return path
 
 
 def masked(world: World, masks: Mapping[str, np.ndarray], garbage: int | None) -> MemoryCapture:
@@ -171,11 +194,11 @@ def test_what_masks_leave_out_has_no_influence_on_a_single_byte(world: World, tm
     masks["cam02"][20:45, 30:70] = False
     masks["cam03"] = rng.random((64, 96)) > 0.02
     streams = []
-    for number, garbage in enumerate((None, 1, 100)):
-        reports = run(masked(world, masks, garbage), tmp_path / f"{number}.sgs")
+    for number, garbage in enumerate((None, 1)):
+        reports = run(section(masked(world, masks, garbage), frames=3), tmp_path / f"{number}.sgs")
         streams.append((tmp_path / f"{number}.sgs").read_bytes())
         assert all(report.moving > 0 for report in reports[1:])
-    assert streams[0] == streams[1] == streams[2]
+    assert streams[0] == streams[1]
 
 
 def test_what_masks_leave_out_is_not_learned(world: World, tmp_path: Path) -> None:
@@ -192,9 +215,8 @@ def test_what_masks_leave_out_is_not_learned(world: World, tmp_path: Path) -> No
     assert quality[0] > quality[1] + 0.5
 
 
-def test_a_held_out_camera_is_scored_where_it_has_pictures(world: World, tmp_path: Path) -> None:
-    path = tmp_path / "a.sgs"
-    run(capture(world, {}), path)
+def test_a_held_out_camera_is_scored_where_it_has_pictures(world: World, plain: Path, tmp_path: Path) -> None:
+    path = plain
     lacking = capture(world, {0: "cam00", 2: "cam00"})
     with open_stream(path) as reader:
         report = evaluate(reader, lacking, backend=quickest_backend())
@@ -218,10 +240,9 @@ def test_a_held_out_camera_is_scored_where_it_has_pictures(world: World, tmp_pat
         evaluate(reader, nowhere, backend=quickest_backend())
 
 
-def test_scores_are_of_the_pixels_that_count(world: World, tmp_path: Path) -> None:
+def test_scores_are_of_the_pixels_that_count(world: World, plain: Path) -> None:
     """Noise in masked pixels changes no score, and without the mask every one."""
-    path = tmp_path / "a.sgs"
-    run(capture(world, {}), path)
+    path = plain
     masks = {"cam00": np.broadcast_to(np.arange(96) >= 30, (64, 96)).copy()}
     found = []
     for garbage, with_masks in ((None, True), (1, True), (1, False)):
@@ -267,13 +288,7 @@ def test_a_scene_that_no_picture_shows_is_held_and_found_again(world: World, tmp
     scenes = decoded(whole)
     assert torch.equal(scenes[2].anchors.positions, scenes[1].anchors.positions)
     assert not torch.equal(scenes[3].anchors.positions, scenes[2].anchors.positions)
-    without = replace(config, online=replace(config.online, motion_prior=0.0))
-    run(source, tmp_path / "without.sgs", config=without)
-    after = decoded(tmp_path / "without.sgs")
-    assert torch.equal(after[1].anchors.positions, scenes[1].anchors.positions)
-    assert not torch.equal(after[3].anchors.positions, scenes[3].anchors.positions), "frames 0 and 1 predict motion"
     for done in (2, 3):
-        begun = tmp_path / f"begun{done}.sgs"
-        run(section(source, frames=done), begun, config=config)
-        run(source, begun, config=config, resume=True)
-        assert begun.read_bytes() == whole.read_bytes()
+        path = begun(whole, tmp_path / f"begun{done}.sgs", frames=done)
+        run(source, path, config=config, resume=True)
+        assert path.read_bytes() == whole.read_bytes()

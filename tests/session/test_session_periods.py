@@ -14,6 +14,8 @@ from structgstream.codec.reader import StreamReader
 from structgstream.codec.segments.stored_bytes import write_archive
 from structgstream.codec.sinks import FileSink, MemorySink, resume_segments
 from structgstream.frames import MultiViewFrame
+from structgstream.scene.scene import Scene
+from structgstream.session import struct_gstream as method
 from structgstream.session.loop import FrameReport, Session
 from structgstream.session.periods import PeriodConfig
 from structgstream.session.presets import StreamConfig, to_json
@@ -59,14 +61,29 @@ def run(sink, config: StreamConfig, *, resumed=None, length: int = FRAMES) -> li
 
 
 @cache
-def whole(case: str) -> tuple[bytes, list[FrameReport]]:
-    reports = run(sink := MemorySink(), CONFIGS[case][0])
-    return sink.data, reports
+def whole(case: str) -> tuple[bytes, list[FrameReport], dict[int, Scene]]:
+    """The stream, the reports, and by frame the scene from which its fit started."""
+    started: dict[int, Scene] = {}
+    fit, again, number = method.fit_next_frame, method.fit_first_frame_again, count(1)
+
+    def following(scene, *arguments, **options):
+        started[next(number)] = scene
+        return fit(scene, *arguments, **options)
+
+    def anew(frame, rig, scene, **options):
+        started[next(number)] = scene
+        return again(frame, rig, scene, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(method, "fit_next_frame", following)
+        patch.setattr(method, "fit_first_frame_again", anew)
+        reports = run(sink := MemorySink(), CONFIGS[case][0])
+    return sink.data, reports, started
 
 
 @pytest.mark.parametrize("case", CONFIGS)
 def test_periods_begin_where_they_should_and_say_why(case: str) -> None:
-    data, reports = whole(case)
+    data, reports, _ = whole(case)
     reader = StreamReader(data)
     firsts = CONFIGS[case][1]
     assert [period.first_frame for period in reader.periods] == firsts
@@ -78,16 +95,13 @@ def test_periods_begin_where_they_should_and_say_why(case: str) -> None:
 
 
 @pytest.mark.parametrize("case", CONFIGS)
-def test_stopped_after_any_frame_it_goes_on_to_the_same_bytes(case: str, tmp_path: Path) -> None:
-    data, _ = whole(case)
+def test_stopped_it_goes_on_to_the_same_bytes(case: str, tmp_path: Path) -> None:
+    """Stopped before the second period, in its init record, and after its first frame."""
+    data = whole(case)[0]
     records = [record for record in scan_records(data) if record.type != RecordType.INDEX]
-    ends = {record.end for record in records}
-    (second,) = (record for record in records[1:] if record.type == RecordType.INIT)
+    (second,) = (number for number, record in enumerate(records) if number and record.type == RecordType.INIT)
     path = tmp_path / "a.sgs"
-    near = [end for end in ends if second.offset <= end] if case == "points" else sorted(ends)[1::2]
-    for cut in sorted({*near, second.offset, second.offset + 100, second.end, second.end + 40}):
-        if cut <= records[0].end:
-            continue
+    for cut in (records[second - 1].offset, records[second].offset + 100, records[second + 1].end):
         path.write_bytes(data[:cut])
         sink, resumed = FileSink.resume(path)
         run(sink, CONFIGS[case][0], resumed=resumed)
@@ -95,50 +109,29 @@ def test_stopped_after_any_frame_it_goes_on_to_the_same_bytes(case: str, tmp_pat
 
 
 def test_a_killed_writer_of_segments_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
-    """Killed before each of the operations with which the second period begins."""
-    data, _ = whole("residual")
-    counted = KilledStore(folder(tmp_path / "counted"), at=10**6, done=True)
-    run(resume_segments(counted)[0], BY_RESIDUAL)
-    begins = next(at for at, what in enumerate(counted.operations) if "init-0001" in what)
-    # After an operation is before the next one.
-    for at in range(begins, begins + 3):
-        store = folder(tmp_path / f"{at}")
-        with pytest.raises(Killed):
-            run(resume_segments(KilledStore(store, at=at, done=False), clocks=Hands().clocks())[0], BY_RESIDUAL)
-        sink, resumed = resume_segments(store)
-        run(sink, BY_RESIDUAL, resumed=resumed)
-        write_archive(store, tmp_path / "out.sgs")
-        assert (tmp_path / "out.sgs").read_bytes() == data, counted.operations[at]
+    """Killed when the second period is named and has no frame; other operations: codec/segments/test_periods.py."""
+    store = folder(tmp_path / "store")
+    with pytest.raises(Killed):
+        run(
+            resume_segments(KilledStore(store, at="put part-00000006", done=False), clocks=Hands().clocks())[0],
+            BY_RESIDUAL,
+        )
+    sink, resumed = resume_segments(store)
+    run(sink, BY_RESIDUAL, resumed=resumed)
+    write_archive(store, tmp_path / "out.sgs")
+    assert (tmp_path / "out.sgs").read_bytes() == whole("residual")[0]
 
 
-def test_each_frame_starts_from_what_a_reader_sees(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_frame_starts_from_what_a_reader_sees() -> None:
     """The next frame after a period has begun starts from that period's scene, and the period from the one before."""
-    from structgstream.session.loop import struct_gstream as method
-
-    started = {}
-    fit, again, number = method.fit_next_frame, method.fit_first_frame_again, count(1)
-
-    def following(scene, *arguments, **options):
-        started[next(number)] = scene
-        return fit(scene, *arguments, **options)
-
-    def anew(frame, rig, scene, **options):
-        started[next(number)] = scene
-        return again(frame, rig, scene, **options)
-
-    monkeypatch.setattr(method, "fit_next_frame", following)
-    monkeypatch.setattr(method, "fit_first_frame_again", anew)
-    run(sink := MemorySink(), SCHEDULED)
-    assert sink.data == whole("scheduled")[0]
-    reader = StreamReader(sink.data)
+    data, _, started = whole("scheduled")
+    reader = StreamReader(data)
     assert all(same(started[index], reader.scene(index - 1)) for index in range(1, FRAMES))
 
 
 def test_without_periods_nothing_is_measured_and_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
-    from structgstream.session.loop import struct_gstream as method
-
     monkeypatch.setattr(method, "mean_residual", lambda *_, **__: pytest.fail("measured"))
-    run(sink := MemorySink(), COMPACT_CONFIG, length=3)
+    run(sink := MemorySink(), COMPACT_CONFIG, length=2)
     data = sink.data
     assert {record.period for record in scan_records(data)} == {0}
     assert "period" not in StreamReader(data).header.config
@@ -146,7 +139,7 @@ def test_without_periods_nothing_is_measured_and_nothing_changes(monkeypatch: py
 
 def test_a_new_period_shows_the_changed_scene_better() -> None:
     """The mean error of the last frame, with and without: the reason that there are periods."""
-    with_period, _ = whole("residual")
+    with_period = whole("residual")[0]
     run(sink := MemorySink(), BASE)
     errors = [error_of(StreamReader(data)) for data in (sink.data, with_period)]
     assert errors[1] < 0.8 * errors[0]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What examples a property is tried on.
 
-An ordinary run takes a quarter of them, the same ones every time, so that it fails for what has changed and for nothing
+An ordinary run takes a tenth of them, the same ones every time, so that it fails for what has changed and for nothing
 else. With ``STRUCTGSTREAM_THOROUGH`` set all are taken, and others in every run, which finds what nobody thought of.
 """
 
@@ -18,7 +18,7 @@ THOROUGH = bool(os.environ.get("STRUCTGSTREAM_THOROUGH"))
 
 def examples(count: int) -> settings:
     """``count`` of them in a thorough run, and never fewer than eight; no single one is timed."""
-    return settings(deadline=None, max_examples=count if THOROUGH else max(count // 4, 8), derandomize=not THOROUGH)
+    return settings(deadline=None, max_examples=count if THOROUGH else max(count // 10, 8), derandomize=not THOROUGH)
 
 
 def use_for_all() -> None:

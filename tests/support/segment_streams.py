@@ -106,13 +106,13 @@ class KilledStore:
 
     Args:
         store: what is really written.
-        at: number of the operation.
+        at: number of the operation, or how it begins.
         done: whether that operation is still done.
         left: name of the file of which a killed writer leaves a torn temporary one.
     """
 
     store: FolderStore
-    at: int
+    at: int | str
     done: bool
     operations: list[str] = field(default_factory=list)
 
@@ -143,7 +143,7 @@ class KilledStore:
 
     def _count(self, what: str, do: Callable[[], None]) -> None:
         self.operations.append(what)
-        killed = len(self.operations) > self.at
+        killed = what.startswith(self.at) if isinstance(self.at, str) else len(self.operations) > self.at
         if not killed or self.done:
             do()
         if killed:

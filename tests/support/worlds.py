@@ -3,6 +3,7 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import torch
@@ -43,6 +44,7 @@ def emerging_ball(opacity: float) -> Gaussians:
     )
 
 
+@cache
 def moving_world(
     frames: int = 3,
     *,
@@ -53,7 +55,10 @@ def moving_world(
     width: int = 48,
     height: int = 32,
 ) -> World:
-    """The first ``movers`` of 60 anchors drift to the right; from frame ``emerges_at`` on a ball is there too."""
+    """The first ``movers`` of 60 anchors drift to the right; from frame ``emerges_at`` on a ball is there too.
+
+    Drawn once a process; nobody changes it.
+    """
     rig = arc_rig(cameras, width=width, height=height)
     scene = random_scene(60, cameras=cameras - 1, seed=4)
     backend = reference_backend()

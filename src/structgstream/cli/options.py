@@ -10,6 +10,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import UsageError, usage_errors
+from structgstream.exporters.formats import SUFFIXES
 
 if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
@@ -48,7 +49,8 @@ class CaptureOptions:
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif")
 VIDEOS = (".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".mpg", ".ts")
-KNOWN_ENDINGS = frozenset({*PICTURES, *VIDEOS, ".html", ".json", ".pdf", ".ply", ".sgs", ".splat", ".spz"})
+EXPORTS = tuple(f".{name}" for name in SUFFIXES)
+KNOWN_ENDINGS = frozenset({*PICTURES, *VIDEOS, *EXPORTS, ".html", ".json", ".pdf", ".sgs", ".zip"})
 """Endings of pictures, videos, exports and streams, of which a command writes some."""
 RENAMED = {"--quiet": "--split-at-low-motion", "--odd": "--allow-unaligned"}
 """Options of before, and what they are called now."""

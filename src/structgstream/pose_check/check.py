@@ -5,12 +5,11 @@ Inverted or flipped pose matrices are valid rigid motions, so only the pictures 
 without the poses, and are inliers of some epipolar geometry, are tested against the epipolar geometry of the poses
 (Hartley and Zisserman, Multiple View Geometry, chapter 11).
 
-Note [Wrong matches]
-~~~~~~~~~~~~~~~~~~~~
-Of repeated texture, or between cameras far apart, wrong matches fit an epipolar geometry of their own, and a pair of
-right poses is contradicted by up to two thirds of its matches (`examples/throw`, cameras 29 degrees apart). So a pair
-only accuses: points that the other cameras agree on decide (`verdicts.judge`). Pairs of neighbours, which seldom match
-wrongly, are looked at first, and no others where all of them agree.
+Note [Wrong matches] ~~~~~~~~~~~~~~~~~~~~ Of repeated texture, or between cameras far apart, wrong matches fit an
+epipolar geometry of their own, and a pair of right poses is contradicted by up to two thirds of its matches
+(`examples/throw`, cameras 29 degrees apart). So a pair only raises a suspicion: points that the other cameras agree on
+decide (`verdicts.judge`). Pairs of neighbours, which seldom match wrongly, are looked at first, and no others where all
+of them agree.
 """
 
 import logging
@@ -59,7 +58,7 @@ class PoseCheck:
 def examine_poses(
     frame: MultiViewFrame, cameras: Mapping[str, Camera], *, matcher: PairMatcher | None = None
 ) -> tuple[Evidence, Verdict]:
-    """Matches of one instant's pictures, and which cameras they say are off.
+    """Matches of one instant's pictures, and which cameras are off by them.
 
     Raises:
         MissingExtraError: cv2 or scipy is not installed.

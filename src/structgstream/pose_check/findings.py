@@ -16,7 +16,7 @@ from structgstream.data.matching import Pair
 from structgstream.data.pair_matches import pair_error
 from structgstream.data.timeline import natural
 from structgstream.pose_check.resection import explained
-from structgstream.pose_check.tracks import Evidence
+from structgstream.pose_check.tracks import Evidence, pixel_scale
 from structgstream.pose_check.verdicts import Verdict
 
 Severity = Literal["error", "warning", "note"]
@@ -44,8 +44,8 @@ def worst_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     return tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
 
 
-EXPLAINED, UNEXPLAINED = 0.25, 0.5  # largest share of violating matches after, and least before
-SLIGHT_PIXELS = 1.5  # of pictures up to 1000 pixels wide: blurs, but does not spoil
+EXPLAINED, UNEXPLAINED = 0.25, 0.5  # largest share of violating matches after, and smallest before
+SLIGHT_PIXELS = 1.5  # times pixel_scale: blurs, but does not spoil
 LENGTHS = {
     1000.0: "millimetres among metres",
     100.0: "centimetres among metres",
@@ -90,7 +90,7 @@ def explain(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Verdict)
     for name in left:
         sentence = _single(evidence, cameras, name, verdict) or _moved(evidence, cameras, name, verdict)
         found = verdict.resections.get(name)
-        slight = found is not None and found.given_pixels < SLIGHT_PIXELS * max(cameras[name].width / 1000, 1)
+        slight = found is not None and found.given_pixels < SLIGHT_PIXELS * pixel_scale(cameras[name].width)
         findings.append(Finding("warning" if slight else "error", sentence, (name,)))
     findings += [_doubtful(evidence, cameras, name, verdict) for name in verdict.doubtful]
     return findings + [_unchecked(evidence, cameras, name, verdict) for name in verdict.unchecked]
@@ -187,14 +187,14 @@ def _single(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdic
 
 
 def _moved(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> str:
-    """How far a camera stands from where its pictures say that it does, as far as they do say so."""
+    """How far a camera is from the pose of its pictures, as far as they determine it."""
     found = verdict.resections.get(name)
     if found is not None:
         sentence = (
             f"Camera {name!r} is off: {found.points} points that other cameras agree on lie {found.given_pixels:.1f} "
             "pixels (median) from where its picture shows them"
         )
-        sentence += f"; its pictures {found.sentence}" if found.sentence else ""
+        sentence += f"; its pictures {found.description}" if found.description else ""
     else:
         sentence = (
             f"Camera {name!r} is off: its matches with {_bad_pairs(evidence, cameras, name, verdict)}, which agree "

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the pictures of one camera say of its pose and focal length, given points that the other cameras agree on.
+"""Resection of one camera: the pose and focal length that fit points that the other cameras agree on.
 
 Matches that contradict a pose may be wrong matches: of a court or a facade they even fit some epipolar geometry. A
 camera that is off has another pose, or another focal length, which explains what the given one does not; wrong matches
@@ -15,13 +15,13 @@ from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv
 from structgstream.data.matching import project
-from structgstream.pose_check.tracks import AGREE_PIXELS, Tracks
+from structgstream.pose_check.tracks import AGREE_PIXELS, Tracks, pixel_scale
 
 MIN_SEEN = 8
 MIN_POINTS = 12
 MIN_SHARE = 0.4  # of a camera's points that a corrected camera must explain
 MIN_GAIN = 0.5  # largest share of the error that a correction leaves, if the camera is to be off
-SIMPLE_ENOUGH = 1.1  # of the least error, up to which the correction with fewer causes is taken
+SIMPLE_ENOUGH = 1.1  # of the smallest error, up to which the correction with fewer causes is taken
 SIGMAS = 3.0
 TURN, MOVE, FOCAL = slice(0, 3), slice(3, 6), slice(6, 7)
 BY_CHANCE = 3  # points that a pose may explain beyond those that another one does, as it has six degrees of freedom
@@ -34,7 +34,7 @@ class Resection:
 
     Args:
         points: number of points that it explains.
-        kept: number of points that the given camera explains.
+        given_points: number of points that the given camera explains.
         seen: number of points that have a keypoint in its picture.
         given_pixels: median distance of the keypoints of ``points`` to where the given camera sees these.
         corrected_pixels: the same of the corrected one.
@@ -123,7 +123,7 @@ def resect(tracks: Tracks, camera: Camera, name: str) -> Resection | None:
     if own.sum() < MIN_SEEN:
         return None
     points, pixels = tracks.points[tracks.point[own]], tracks.pixels[own]
-    limit = AGREE_PIXELS * max(camera.width / 1000, 1)
+    limit = AGREE_PIXELS * pixel_scale(camera.width)
     view = _view(camera)
     starts = [start for start in (np.zeros(7), _by_points(camera, points, pixels, limit)) if start is not None]
     best = max((_adjusted(view, start, points, pixels, limit) for start in starts), key=lambda found: found[1].sum())
@@ -158,7 +158,7 @@ def explained(tracks: Tracks, camera: Camera, name: str) -> int:
     own = tracks.of(name)
     seen, depths = project(camera, tracks.points[tracks.point[own]])
     apart = np.linalg.norm(seen - tracks.pixels[own], axis=1)
-    return int(((depths > 0) & (apart < 2 * AGREE_PIXELS * max(camera.width / 1000, 1))).sum())
+    return int(((depths > 0) & (apart < 2 * AGREE_PIXELS * pixel_scale(camera.width))).sum())
 
 
 def _view(camera: Camera) -> _View:

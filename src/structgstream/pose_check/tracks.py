@@ -79,10 +79,15 @@ def pair_errors(evidence: Evidence, cameras: Mapping[str, Camera]) -> dict[Pair,
     }
 
 
-AGREE_PIXELS = 3.0  # of pictures up to 1000 pixels wide, in proportion above
+AGREE_PIXELS = 3.0  # times pixel_scale
 MIN_VIEWS = 3
 MAX_PAIRS = 45  # of a point's observations, from which it is looked for: all pairs of ten
 ROUNDS = 2
+
+
+def pixel_scale(width: float) -> float:
+    """The factor of thresholds in pixels for pictures of this width: 1 up to 1000 pixels, in proportion above."""
+    return max(width / 1000, 1)
 
 
 @dataclass(frozen=True)
@@ -135,14 +140,14 @@ class _Table:
 
 
 def build_tracks(evidence: Evidence, cameras: Mapping[str, Camera], *, off: Collection[str] = ()) -> Tracks:
-    """Points from the matches of cameras that are not ``off``; observations of those that are are kept, too.
+    """Points from the matches of cameras that are not ``off``; those of ``off`` cameras are included.
 
     Keypoints that matches connect are one point; a point with two keypoints in one picture is left out. Points lie
     where the rays of their keypoints pass closest, in the sense of least squares; of a point whose keypoints disagree
     those count on which most of them agree.
     """
     names = tuple(name for name in cameras if name in evidence.keypoints)
-    limit = AGREE_PIXELS * max(max((cameras[name].width for name in names), default=0) / 1000, 1)
+    limit = AGREE_PIXELS * pixel_scale(max((cameras[name].width for name in names), default=0))
     nodes, edges = _edges(evidence, cameras, names, off=off, limit=limit)
     point, camera, keypoint = _components(nodes, edges, names, evidence)
     pixels = np.empty((len(point), 2))

@@ -52,10 +52,10 @@ class CameraSteps:
 
     def __init__(self, job: Job) -> None:
         self.videos, self.capture, self.options = job.videos, job.capture, job.options
-        self.steps, self.listener = job.steps, job.listener
+        self.steps = job.steps
 
     def find(self) -> Footage:
-        self.listener.begin("find", skipped=False)
+        self.steps.begin("find")
         footage = find_footage(self.videos, picture_fps=self.options.fps)
         self._check_names(self.options.without, footage, purpose="leave out")
         footage = footage.only([name for name in footage.cameras if name not in self.options.without])
@@ -68,7 +68,7 @@ class CameraSteps:
         self._check_trained(footage)
         mark_output(self.capture, self.videos)
         turns = describe_turns(footage)
-        self.listener.end("find", _described(footage) + (f"; {turns}" if turns else ""))
+        self.steps.end("find", _described(footage) + (f"; {turns}" if turns else ""))
         return footage
 
     def _check_names(self, names: Collection[str], footage: Footage, *, purpose: str) -> None:
@@ -206,7 +206,7 @@ def chosen_method(footage: Footage, options: PrepareOptions) -> str | Calibratio
     """``sfm``, ``board``, or the calibration to use.
 
     Raises:
-        CalibrationError: the calibration that was asked for is missing or broken.
+        CalibrationError: the requested calibration is missing or broken.
     """
     if str(options.calibration) not in METHODS:
         return require_calibration(Path(options.calibration))
@@ -220,7 +220,7 @@ def chosen_method(footage: Footage, options: PrepareOptions) -> str | Calibratio
 def check_used(method: str | Calibration, footage: Footage, options: PrepareOptions) -> None:
     """
     Raises:
-        ConfigError: something is asked for that has no effect, so that its user expects another capture.
+        ConfigError: an option has no effect, so that its user expects another capture.
     """
     if options.fps is not None and footage.tracks:
         raise ConfigError(

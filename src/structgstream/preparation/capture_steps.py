@@ -51,14 +51,14 @@ class CaptureSteps:
 
     def __init__(self, job: Job) -> None:
         self.videos, self.capture, self.options = job.videos, job.capture, job.options
-        self.steps, self.listener, self.summaries = job.steps, job.listener, job.summaries
+        self.steps = job.steps
         self.examination: Examination | None = None  # which two steps look at
         self._opened: FrameSource | None = None
 
     def link(self, footage: Footage, content: PreparedCapture) -> None:
-        self.listener.begin("link", skipped=False)
+        self.steps.begin("link")
         for number, (name, camera) in enumerate(content.cameras.items()):
-            self.listener.progress(number, len(content.cameras), name)
+            self.steps.progress(number, len(content.cameras), name)
             target = self.capture / camera.files
             source = footage.path(name)
             if not footage.tracks and source.is_file():
@@ -69,7 +69,7 @@ class CaptureSteps:
         self._link_masks()
         write_prepared(self.capture, content)
         how = {"hard": "hard link or copy", "symlink": "symlink", "copy": "copy"}[self.options.link]
-        self.listener.end("link", f"{len(content.cameras)} cameras by {how}")
+        self.steps.end("link", f"{len(content.cameras)} cameras by {how}")
 
     def _link_masks(self) -> None:
         """All masks but those of cameras that are left out; these are removed where an earlier run linked them."""
@@ -129,9 +129,9 @@ class CaptureSteps:
 
         def look() -> tuple[Finding, ...]:
             source = self._source(content)
-            checked = check_capture(source, unit=content.unit, listener=self.listener, examination=self.examination)
-            checked = replace(checked, report=replace(checked.report, steps=dict(self.summaries)))
-            write_report(self.capture / REPORT, checked, listener=self.listener)
+            checked = check_capture(source, unit=content.unit, listener=self.steps, examination=self.examination)
+            checked = replace(checked, report=replace(checked.report, steps=dict(self.steps.summaries)))
+            write_report(self.capture / REPORT, checked, listener=self.steps)
             return checked.report.findings
 
         if not (self.capture / REPORT / "index.html").is_file():
@@ -157,7 +157,7 @@ class CaptureSteps:
         return inputs
 
     def _source(self, content: PreparedCapture) -> FrameSource:
-        """The capture, opened once: indexing videos takes time, and what is to be said of them is said once."""
+        """The capture, opened once: indexing videos takes time, and its warnings should come once."""
         if self._opened is None:
             self._opened = open_capture(self.capture)
         points = None

@@ -47,7 +47,7 @@ def synchronized(
 
     Args:
         footage: what they filmed.
-        options: ``synchronize`` says how.
+        options: ``synchronize`` is the method.
         cameras: their calibration, where it is known.
 
     Raises:

@@ -130,7 +130,7 @@ class Footage:
         stamps = [track.stamps[index] for index in indices]
         with closing(pictures_at(track, stamps, size=(track.width, track.height), on_damage=refuse)) as pictures:
             for shown in pictures:
-                assert shown is not None, "what is lost was told"
+                assert shown is not None, "a lost picture raises"
                 yield shown[0]
 
     def audio(self, name: str) -> tuple[NDArray[np.float32], float] | None:
@@ -182,7 +182,7 @@ def find_footage(where: Path, *, picture_fps: float | None = None) -> Footage:
         kind = "a file" if where.exists() else "missing"
         raise CaptureError(f"{where} is {kind}; give the folder that holds the cameras' videos ({LAYOUTS}).")
     found = {root: _found(root) for root in dict.fromkeys(filmed_roots(where)) if root.is_dir()}
-    # A stray picture or preview beside the folder of the videos is no take: two cameras come before one.
+    # A stray picture or preview next to the folder of the videos is no take: two cameras come before one.
     root = next((root for count in (2, 1) for root, files in found.items() if len(files) >= count), None)
     if root is None or len(found[root]) < 2:
         root = next(other_roots(where), None) or next(other_roots(where, pictures=True), root)
@@ -285,10 +285,10 @@ def _found(root: Path) -> dict[str, Path]:
 
 
 def _check_left(root: Path, found: Mapping[str, Path]) -> None:
-    """What is no camera, told, so that none is lost unnoticed.
+    """Warns of files and folders that are no camera, so that none is lost unnoticed.
 
     Raises:
-        CaptureError: an empty folder beside those of cameras.
+        CaptureError: an empty folder among those of cameras.
     """
     taken = next(iter(found.values()))
     for entry in sorted(entry for entry in root.iterdir() if not is_hidden(entry)):

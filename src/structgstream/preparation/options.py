@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a user may ask of a preparation."""
+"""The options of a preparation, and how they are written on the command line."""
 
 import math
 import re
@@ -32,7 +32,7 @@ class PrepareOptions:
     """How a capture is made.
 
     Args:
-        calibration: ``sfm``, ``board``, ``auto`` (a file of another tool beside the videos, else ``sfm``), or a
+        calibration: ``sfm``, ``board``, ``auto`` (a file of another tool next to the videos, else ``sfm``), or a
             calibration file or the folder that holds one.
         lens: distortion that is estimated: ``pinhole``, ``radial``, ``opencv``, ``brown`` or ``fisheye``; None for
             ``radial`` by structure from motion and ``opencv`` by a board.

@@ -21,7 +21,7 @@ from structgstream.preparation.steps import FOLDER
 SOURCE = "source.json"
 LOCK = ".preparing"
 _MARKS = (Path(FOLDER), partial_path(Path(FOLDER, SOURCE)))
-"""What a claim that was killed or met a full disk leaves in a folder, which is as free as before."""
+"""What a mark that was interrupted or met a full disk leaves in a folder, which is as free as before."""
 
 
 def mark_output(capture: Path, videos: Path) -> None:
@@ -59,7 +59,7 @@ def lock_output(capture: Path) -> Iterator[None]:
     """No other process prepares the same capture within the block.
 
     Args:
-        capture: its folder, which was claimed.
+        capture: its folder, which was marked.
 
     Raises:
         StorageError: another one does, or the folder cannot be written.

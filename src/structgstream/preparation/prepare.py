@@ -20,7 +20,7 @@ from structgstream.preparation.footage import Footage
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.output_folder import lock_output
 from structgstream.preparation.report.page import write_report
-from structgstream.preparation.steps import Job, Listener, Silent, new_job
+from structgstream.preparation.steps import Job, Listener, Silent, Steps
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class Preparation:
 
     Args:
         path: its folder, for ``open_capture`` and ``reconstruct``.
-        findings: what the check says, errors first.
-        steps: what each step found, in words.
+        findings: of the check, errors first.
+        steps: summaries of the steps.
         skipped: steps whose results were there already.
         report: the page of the report.
     """
@@ -50,7 +50,7 @@ def prepare_capture(
     Args:
         videos: the folder of the cameras' videos or pictures, see ``preparation.footage``.
         capture: the folder to make; the same call again does only what has changed.
-        options: what is asked for.
+        options: of the preparation.
         listener: receives steps and progress.
 
     Raises:
@@ -60,7 +60,7 @@ def prepare_capture(
         MissingExtraError: a package is missing that a step needs.
     """
     options = options or PrepareOptions()
-    job = new_job(videos, capture, options=options, listener=listener or Silent())
+    job = Job(videos, capture, options, Steps(capture, listener or Silent()))
     find = CameraSteps(job)
     footage = find.find()
     method = chosen_method(footage, options)
@@ -83,7 +83,7 @@ def _made(job: Job, find: CameraSteps, footage: Footage, method: str | Calibrati
     content = make.points(make.near(content))
     findings = make.check(content)
     return Preparation(
-        job.capture, findings, job.summaries, tuple(job.steps.skipped), job.capture / REPORT / "index.html"
+        job.capture, findings, job.steps.summaries, tuple(job.steps.skipped), job.capture / REPORT / "index.html"
     )
 
 

@@ -49,7 +49,7 @@ def solve_cameras(
         method: either.
         footage: what the cameras filmed.
         clocks: of the cameras.
-        options: what is asked for.
+        options: of the preparation.
         focals: focal lengths in pixels that cameras state, with which structure from motion begins.
 
     Raises:

@@ -55,7 +55,7 @@ def shaken(truth: Scene) -> Scene:
     )
 
 
-@pytest.mark.parametrize("turning", [False, True], ids=["points", "boards"])
+@pytest.mark.parametrize("rotating", [False, True], ids=["points", "boards"])
 def test_cameras_and_lenses_are_found_again(rotating: bool) -> None:
     bundle, truth = scene(rotating=rotating)
     found = solved(bundle, shaken(truth), max_steps=40)
@@ -63,7 +63,7 @@ def test_cameras_and_lenses_are_found_again(rotating: bool) -> None:
     np.testing.assert_allclose(found.rows, truth.rows, atol=2e-3)
 
 
-@pytest.mark.parametrize("turning", [False, True], ids=["points", "boards"])
+@pytest.mark.parametrize("rotating", [False, True], ids=["points", "boards"])
 def test_the_gradient_is_that_of_the_cost(rotating: bool) -> None:
     bundle, truth = scene(rotating=rotating)
     start = shaken(truth)

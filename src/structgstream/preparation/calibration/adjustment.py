@@ -29,7 +29,7 @@ class Limits:
 
     Args:
         pixels: largest reprojection error.
-        degrees: least angle between the rays of a point.
+        degrees: smallest angle between the rays of a point.
     """
 
     pixels: float
@@ -54,7 +54,7 @@ def adjust_together(
     Args:
         lens: number of the lens of each camera; cameras with shared intrinsics have one.
         free: the terms of ``lens_terms.py`` that are estimated.
-        held: by lens, whether it stays.
+        fixed: by lens, whether it stays.
     """
     bundle, scene = _problem(found, np.asarray(lens, np.intp), tuple(free), fixed)
     bundle, scene = estimated(bundle, scene)

@@ -66,7 +66,7 @@ class Board:
 
     @property
     def text(self) -> str:
-        """One line that says everything that is needed to use the print."""
+        """One line with all that is needed to use the print."""
         return (
             f"{self.columns} x {self.rows} squares of {1000 * self.square_metres:g} mm, "
             f"markers {1000 * self.square_metres * self.marker_share:g} mm, {self.dictionary}"
@@ -128,7 +128,7 @@ def board_sightings(
     """The sightings with enough corners of every camera.
 
     Raises:
-        CalibrationError: a camera that shows the board too rarely, or another board than said.
+        CalibrationError: a camera that shows the board too rarely, or another board than given.
     """
     found: dict[str, list[Sighting]] = {name: [] for name in pictures}
     markers = {name: set[int]() for name in pictures}
@@ -210,7 +210,7 @@ def _check_markers(
     other = _other_dictionary(pictures, board)
     if other is not None:
         raise CalibrationError(
-            f"The board was said to be of {board.dictionary}, but the pictures show markers of {other}; give the "
+            f"The board was given as of {board.dictionary}, but the pictures show markers of {other}; give the "
             "board as printed on its page."
         )
 

@@ -91,7 +91,7 @@ def board_model(
 
 
 def _repeated(sightings: Sightings) -> list[int]:
-    """The corners that are seen at least twice: COLMAP adjusts no others."""
+    """The corners that have two observations or more: COLMAP adjusts no others."""
     seen = [sight.corners for sights in sightings.values() for sight in sights]
     corners, counts = np.unique(np.concatenate(seen), return_counts=True)
     return [int(corner) for corner in corners[counts > 1]]
@@ -156,7 +156,7 @@ def solve_board(
 
     Raises:
         CalibrationError: a camera that does not show the board well enough, or at no instant at which it connects to
-            the others; another board than said.
+            the others; another board than given.
         MissingExtraError: pycolmap or cv2 is not installed.
     """
     pycolmap_module()
@@ -165,7 +165,10 @@ def solve_board(
     views = {}
     for number, (name, shots) in enumerate(pictures.items(), 1):
         size = shots[0].shape[1], shots[0].shape[0]
-        starts = [colmap_camera(known[name], number)] if name in known else _guesses(lens, number, size)
+        if name in known:
+            starts = [colmap_camera(known[name], number)]
+        else:
+            starts = [guessed_camera(lens, number, size, degrees) for degrees in FIELDS_OF_VIEW[lens]]
         views[name] = _own_view(name, sightings[name], board, starts, fixed=name in known)
     sensors = _connected_sensors(views)
     poses = _rig_poses(views, sensors, sightings)
@@ -191,10 +194,6 @@ class _View:
 
     camera: Any
     poses: Mapping[int, Floats]
-
-
-def _guesses(lens: LensModel, number: int, size: tuple[int, int]) -> list[Any]:
-    return [guessed_camera(lens, number, size, degrees) for degrees in FIELDS_OF_VIEW[lens]]
 
 
 def _own_view(name: str, sights: Sequence[Sighting], board: Board, starts: Sequence[Any], *, fixed: bool) -> _View:

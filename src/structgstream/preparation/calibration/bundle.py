@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bundle adjustment of cameras that are alike, which COLMAP's has no terms for.
 
-What is adjusted beside cameras are bodies: points, or poses of a board whose corners are known. They are eliminated
+Apart from cameras, bodies are adjusted: points, or poses of a board whose corners are known. They are eliminated
 from the normal equations (Brown, 1958; Triggs et al., Bundle adjustment: a modern synthesis, 2000), which are solved by
 Levenberg's and Marquardt's method with Huber's loss. Terms of intrinsics may have a prior that cameras share
 (``lens_prior.py``).
@@ -67,13 +67,13 @@ class Bundle:
     """A problem of bundle adjustment.
 
     Args:
-        sights: what was observed.
+        observations: of the bodies.
         lens: ``[C]``, which row of lenses a camera has.
         sizes: ``[C, 2]``, width and height of the pictures.
         fisheye: ``[C]``, whether a camera's terms are a fisheye's.
         free: the terms of the rows that are estimated.
-        held: ``[L]``, lenses that stay.
-        turning: whether bodies have rotations.
+        fixed: ``[L]``, lenses that stay.
+        rotating: whether bodies have rotations.
         prior: of the terms.
         noise: standard deviation of the pixels.
     """
@@ -116,7 +116,7 @@ class Bundle:
 
 
 def solved(bundle: Bundle, scene: Scene, *, max_steps: int = MAX_STEPS) -> Scene:
-    """The scene of least cost near ``scene``, or after ``most`` steps."""
+    """The scene of least cost near ``scene``, or after ``max_steps`` steps."""
     damping, cost = 1e-4, bundle.cost(scene)
     for _ in range(max_steps):
         system = linearized(bundle, scene)
@@ -149,8 +149,9 @@ class System:
         from scipy.sparse import bsr_array
 
         diagonal = np.einsum("bii->bi", self.V)
-        inverse: Floats = np.asarray(np.linalg.inv(self.V + _diagonals(damping * diagonal + 1e-12)), np.float64)
-        count, size = len(inverse), inverse.shape[1]
+        count, size = diagonal.shape
+        damped = self.V + (damping * diagonal + 1e-12)[:, :, None] * np.eye(size)
+        inverse: Floats = np.asarray(np.linalg.inv(damped), np.float64)
         blocks = bsr_array((inverse, np.arange(count), np.arange(count + 1)), shape=(count * size, count * size))
         weighed = self.W @ blocks.tocsr()
         own = np.diag(self.A)
@@ -188,7 +189,7 @@ def linearized(bundle: Bundle, scene: Scene) -> System:
             A[np.ix_(where, where)] += np.einsum("m,mai,maj->ij", w, J, J, optimize=True)
             gradient[where] += np.einsum("m,mai,ma->i", w, J, residuals[own])
     bundle.prior.add(A, gradient, scene.rows, start=poses, free=bundle.free)
-    stuck = np.diag(A) == 0  # what is held, or seen by nobody
+    stuck = np.diag(A) == 0  # what is fixed, or observed by no camera
     A[stuck, stuck] = 1.0
     count = len(scene.places)
     V, body_gradient = np.zeros((count, size, size)), np.zeros((count, size))
@@ -251,7 +252,3 @@ def _crosses(vectors: Floats) -> Floats:
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3)
-
-
-def _diagonals(values: Floats) -> Floats:
-    return values[:, :, None] * np.eye(values.shape[1])

@@ -2,8 +2,8 @@
 """Keypoints of a still camera over several instants, as one list.
 
 A camera that stands still has one pose at all instants, so its pictures give one set of observations. What stands
-still is found again at every instant and is kept once; what moves adds keypoints. Each keypoint remembers at which
-instants it was seen, because keypoints of two cameras can only be of one point if they share an instant.
+still is found again at every instant and counts once; what moves adds keypoints. Each keypoint has a mask of the
+instants at which it was seen, because keypoints of two cameras can only be of one point if they share an instant.
 """
 
 from collections.abc import Mapping, Sequence

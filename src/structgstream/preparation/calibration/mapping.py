@@ -24,7 +24,7 @@ class Freedom:
 
     Args:
         focal: focal lengths.
-        center: principal points, in :func:`adjust` only and held near the pictures' centres (Note [Principal points]).
+        center: principal points, in :func:`adjust` only, and kept near the pictures' centres (Note [Principal points]).
         lens: distortion.
     """
 
@@ -127,10 +127,10 @@ def adjust(
 def _held_centers(model: Any, config: Any, *, hold: bool) -> Iterator[None]:
     """Holds the principal points of a model near the centres of their pictures while it is adjusted.
 
-    Note [Principal points]: cameras that surround a scene hardly tell a principal point from a rotation, so freed ones
-    wander off, and focal lengths with them. A point on the optical axis is seen in the principal point whatever focal
-    length and lens are. So each camera gets another picture, of a fixed pose, in which such a point is seen in the
-    picture's centre: one observation more, which hundreds of others overrule where they know better.
+    Note [Principal points]: cameras that surround a scene hardly distinguish a principal point from a rotation, so
+    freed ones wander off, and focal lengths with them. A point on the optical axis is seen in the principal point
+    whatever focal length and lens are. So each camera gets another picture, of a fixed pose, in which such a point is
+    seen in the picture's centre: one observation more, which hundreds of others overrule where they know better.
     """
     free = sorted(set(model.cameras) - set(config.constant_cam_intrinsics))
     if not hold or not free:
@@ -164,7 +164,7 @@ def _held_centers(model: Any, config: Any, *, hold: bool) -> Iterator[None]:
 
 
 def filtered(model: Any, *, pixels: float, degrees: float) -> int:
-    """Removes observations with a larger reprojection error and points with a smaller angle; says how many."""
+    """Removes observations with a larger reprojection error and points with a smaller angle; returns how many."""
     pycolmap = pycolmap_module()
     return pycolmap.ObservationManager(model).filter_all_points3D(pixels, degrees)
 

@@ -77,12 +77,8 @@ def agreeing_matches(
     degrees: float,
 ) -> dict[Pair, NDArray[np.uint32]]:
     """The matches whose rays pass within ``degrees`` of their epipolar plane."""
-    rays = {name: camera_rays(cameras[name], keypoints[name].pixels) for name in cameras}
-    found = {}
-    for (one, two), pairs in matches.items():
-        angles = epipolar_angles((cameras[one], cameras[two]), (rays[one][pairs[:, 0]], rays[two][pairs[:, 1]]))
-        found[one, two] = pairs[angles < np.radians(degrees)]
-    return found
+    found = _plane_angles(keypoints, matches, cameras)
+    return {pair: matches[pair][angles < np.radians(degrees)] for pair, angles in found.items()}
 
 
 def epipolar_pixels(
@@ -91,14 +87,22 @@ def epipolar_pixels(
     cameras: Mapping[str, LensCamera],
 ) -> dict[Pair, Floats]:
     """Distance of each match to its epipolar plane, in pixels of the longer of the two focal lengths."""
+    focal = {name: float(filmed.camera.K[0, 0]) for name, filmed in cameras.items()}
+    found = _plane_angles(keypoints, matches, cameras)
+    return {(one, two): max(focal[one], focal[two]) * angles for (one, two), angles in found.items()}
+
+
+def _plane_angles(
+    keypoints: Mapping[str, Keypoints],
+    matches: Mapping[Pair, NDArray[np.uint32]],
+    cameras: Mapping[str, LensCamera],
+) -> dict[Pair, Floats]:
+    """:func:`epipolar_angles` ``[S]`` of the matches of each pair."""
     rays = {name: camera_rays(cameras[name], keypoints[name].pixels) for name in cameras}
-    found = {}
-    for (one, two), pairs in matches.items():
-        focal = max(float(cameras[name].camera.K[0, 0]) for name in (one, two))
-        found[one, two] = focal * epipolar_angles(
-            (cameras[one], cameras[two]), (rays[one][pairs[:, 0]], rays[two][pairs[:, 1]])
-        )
-    return found
+    return {
+        (one, two): epipolar_angles((cameras[one], cameras[two]), (rays[one][rows[:, 0]], rays[two][rows[:, 1]]))
+        for (one, two), rows in matches.items()
+    }
 
 
 def guided_matches(

@@ -29,7 +29,7 @@ from structgstream.preparation.calibration.triangulation import (
 _log = logging.getLogger(__name__)
 
 Free = Literal["poses", "focal", "lens", "all"]
-"""What moves beside poses: nothing; focal lengths; these and distortion; these and principal points."""
+"""What moves in addition to poses: nothing; focal lengths; these and distortion; these and principal points."""
 
 SLACK_DEGREES = 1.5  # of matches to the epipolar planes of the given poses, so how wrong these may be
 ROUNDS = (1.0, 0.4, 0.2)  # shares of the slack
@@ -71,7 +71,7 @@ def refine(
     to the given ones as they can.
 
     Args:
-        free: what moves beside poses.
+        free: what moves in addition to poses.
         lens: the model of the refined lenses; by default the given one's.
         metres: whether the given cameras are in metres.
 
@@ -121,7 +121,7 @@ def refine(
         return Refinement(result, before, after, count, True)
     _log.warning(
         "Refining does not help: matches that were held out are %.2f pixels off with the given cameras and %.2f with "
-        "refined ones; the given ones are kept.", before, after,
+        "refined ones; the given ones stay.", before, after,
     )  # fmt: skip
     given = triangulated(graph, cameras, limits=limits)
     return Refinement(replace(given, metres=metres), before, after, count, False)

@@ -84,7 +84,7 @@ class SolvedCalibration:
 def normalized(solved: SolvedCalibration) -> SolvedCalibration:
     """With the axes of the first camera, the mean camera at the origin and the farthest one unit away from it."""
     rotation = next(iter(solved.cameras.values())).camera.viewmat[:3, :3].numpy()
-    centers = _centers(solved)
+    centers = np.stack([filmed.camera.center.numpy() for filmed in solved.cameras.values()])
     scale = 1 / max(float(np.linalg.norm(centers - centers.mean(0), axis=1).max()), 1e-300)
     return solved.aligned(Alignment(scale, rotation, -scale * rotation @ centers.mean(0)))
 
@@ -115,10 +115,11 @@ def with_distance(solved: SolvedCalibration, first: str, second: str, *, metres:
     for name in (first, second):
         if name not in solved.cameras:
             raise CalibrationError(
-                f"The distance is said from camera {name!r}, which is not among the placed ones "
+                f"The distance is given from camera {name!r}, which is not among the placed ones "
                 f"({', '.join(solved.cameras)})."
             )
-    apart = float(np.linalg.norm(np.diff([_center(solved, first), _center(solved, second)], axis=0)))
+    one, other = (solved.cameras[name].camera.center.numpy() for name in (first, second))
+    apart = float(np.linalg.norm(other - one))
     if not metres > 0 or first == second or apart == 0:
         raise CalibrationError(f"A distance of {metres:g} m between {first!r} and {second!r} gives no scale.")
     return solved.aligned(Alignment(metres / apart, np.eye(3), np.zeros(3)), metres=True)
@@ -140,11 +141,3 @@ def _turn(start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.fl
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + cross + cross @ cross / (1 + cosine)
-
-
-def _centers(solved: SolvedCalibration) -> NDArray[np.float64]:
-    return np.stack([filmed.camera.center.numpy() for filmed in solved.cameras.values()])
-
-
-def _center(solved: SolvedCalibration, name: str) -> NDArray[np.float64]:
-    return solved.cameras[name].camera.center.numpy()

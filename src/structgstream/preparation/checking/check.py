@@ -106,7 +106,7 @@ def check_capture(
     listener: Listener | None = None,
     examination: Examination | None = None,
 ) -> Checked:
-    """Checks the first frame that all cameras have and the last; held-out cameras are looked at, too.
+    """Checks the first frame that all cameras have and the last; held-out cameras are checked, too.
 
     Args:
         source: the opened capture.
@@ -158,7 +158,7 @@ def check_capture(
 
 
 def _measured_times(source: FrameSource, suspects: Suspects) -> SynchronizationCheck | None:
-    """Of the cameras whose poses hold: epipolar lines of a wrong pose tell nothing of time."""
+    """Of the cameras whose poses are right: epipolar lines of a wrong pose give no times."""
     good = tuple(name for name in source.rig if name not in suspects.off)
     if suspects.everything or len(good) < MIN_TIMED or len(source) < MIN_FRAMES:
         return None

@@ -90,7 +90,7 @@ def color_findings(colors: Mapping[str, Color]) -> list[Finding]:
 
 
 def _worst(stops: Mapping[str, float], most: int = 6) -> str:
-    """The largest differences, in words."""
+    """The largest differences, for messages."""
     worst = sorted(stops, key=lambda name: -abs(stops[name]))
     rest = f" and {len(worst) - most} more" if len(worst) > most else ""
     return ", ".join(f"{name!r} {stops[name]:+.2f}" for name in worst[:most]) + rest

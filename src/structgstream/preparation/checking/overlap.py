@@ -2,6 +2,7 @@
 """Which cameras see the same things, and how much of the scene how many of them see."""
 
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +11,24 @@ from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.calibration import listed
 from structgstream.data.matching import Pair, connected_groups, inside, project
-from structgstream.preparation.checking.findings import Coverage, Finding
+from structgstream.pose_check.findings import Finding
 
 MIN_OVERLAPS = 2
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How much of the scene how many cameras see.
+
+    Args:
+        points: number of points that were triangulated.
+        seen_by_three: share of them that at least three cameras see.
+        median_cameras: median number of cameras that see a point.
+    """
+
+    points: int
+    seen_by_three: float
+    median_cameras: float
 
 
 def cameras_per_point(points: Floats, cameras: Mapping[str, Camera]) -> NDArray[np.intp]:

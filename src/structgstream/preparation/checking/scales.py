@@ -59,7 +59,7 @@ def scale_findings(
         points: ``[P, 3]`` that came with the capture, or None.
         cameras: of the rig.
         radius: of the rig.
-        unit: of length, where the capture says.
+        unit: of length, where the capture states it.
     """
     findings = []
     near = float(np.median([camera.near for camera in cameras.values()]))

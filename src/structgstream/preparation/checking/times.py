@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether pictures of one frame are of one moment: motion under the epipolar geometry of the calibration tells by how
-much each camera is late."""
+"""Whether pictures of one frame are of one moment: motion under the epipolar geometry of the calibration shows by
+how much each camera is late."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -68,8 +68,8 @@ class SynchronizationCheck:
 
     @property
     def late_against_others(self) -> dict[str, float]:
-        """How much later than those of most cameras pictures of a frame were taken: what time stamps say, and what they
-        do not; of the cameras that can be judged."""
+        """How much later than those of most cameras pictures of a frame were taken: what time stamps state, and what
+        they do not; of the cameras that can be judged."""
         return {name: late + self.apart_seconds.get(name, 0.0) for name, late in self.late_seconds.items()}
 
     @property
@@ -81,7 +81,7 @@ class SynchronizationCheck:
 def check_synchronization(source: FrameSource) -> SynchronizationCheck:
     """By how much each camera of a calibrated capture is late, from its first frames.
 
-    All cameras are looked at, those that are held out, too: nothing is fitted to their pictures.
+    Held-out cameras are checked, too: nothing is fitted to their pictures.
 
     Raises:
         CaptureError: the pictures cannot be read.
@@ -100,7 +100,7 @@ def check_synchronization(source: FrameSource) -> SynchronizationCheck:
         return SynchronizationCheck({}, {}, (), tuple(source.rig), period, apart)
     solution = solve_by_motion({name: takes[name] for name in group}, good, slack_seconds=period / 2, drift=False)
     middle = float(np.median(list(solution.offsets.values())))
-    # A clock that is unsure by a good part of a frame tells nothing, however far it is from the others.
+    # A clock that is uncertain by a good part of a frame is not judged, however far it is from the others.
     judged = tuple(name for name in group if solution.sigmas[name] <= MAX_SIGMA_PERIODS * period)
     late = {name: solution.offsets[name] - middle for name in judged}
     errors = {name: solution.sigmas[name] for name in judged}
@@ -136,7 +136,7 @@ def _apart(source: FrameSource) -> dict[str, float]:
 def time_findings(measured: SynchronizationCheck | None) -> list[Finding]:
     """An error for cameras that are off by a good part of a frame, a warning above 5 ms; a note if none can be judged.
 
-    Cameras are off whose pictures show another instant than their time stamps say. Pictures that by their stamps lie
+    Cameras are off whose pictures show another instant than their time stamps state. Pictures that by their stamps lie
     between those of the others get one warning.
     """
     if measured is None:

@@ -52,7 +52,7 @@ def page(report: CheckReport, *, off: Sequence[str], sections: Mapping[str, Sequ
     Args:
         report: the numbers.
         off: cameras to mark.
-        sections: heading to file names of pictures beside the page.
+        sections: heading to file names of pictures in the folder.
     """
     parts = [
         f"<!doctype html>\n<html lang=en><meta charset=utf-8><title>{escape(report.capture)}: check</title>",

@@ -164,7 +164,7 @@ def draw_times(path: Path, report: CheckReport) -> None:
     names = list(known)
     values = np.array([camera.offset_ms for camera in known.values()], float)
     spread = np.array([camera.offset_uncertainty_ms or 0.0 for camera in known.values()], float)
-    late = (np.abs(values) > LIMIT_MS) & (np.abs(values) >= SIGMAS * spread)  # as what is told of times
+    late = (np.abs(values) > LIMIT_MS) & (np.abs(values) >= SIGMAS * spread)  # as in time_findings
     figure = figure_of(max(6.0, 0.36 * len(names) + 2.4), 3.6)
     axis = figure.subplots()
     axis.axhspan(-LIMIT_MS, LIMIT_MS, color="#e8f4ec", zorder=0)
@@ -307,7 +307,7 @@ def chosen_pairs(examined: Examination) -> list[Pair]:
 
 
 def draw_epipolar(path: Path, examined: Examination, pair: Pair) -> None:
-    """Both pictures of a pair: matched keypoints, and in the second the lines on which the poses say that they lie.
+    """Both pictures of a pair: matched keypoints, and in the second the lines on which they lie by the poses.
 
     Raises:
         MissingExtraError: matplotlib is not installed.

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Instants that pairs of cameras share, from what their microphones hear.
 
-Coarse: increases of energy in a few bands (onsets) are correlated over all lags; levels and tone of microphones do
-not matter. Onsets are smoothed, so that sounds from several places agree on one lag although their ways differ. Fine:
-in windows with many onsets phases are compared (``phases.py``), at the same frequencies in hertz, so that sample rates
-may differ. Windows that agree give the lag; where they do not, because each hears another place, the coarse one holds.
+Coarse: increases of energy in a few bands (onsets) are correlated over all lags; levels and tone of microphones do not
+matter. Onsets are smoothed, so that sounds from several places agree on one lag although their ways differ. Fine: in
+windows with many onsets phases are compared (``phases.py``), at the same frequencies in hertz, so that sample rates may
+differ. Windows that agree give the lag; where they do not, because each picks up another source, the coarse one is
+taken.
 
 Sound needs 2.9 ms a metre: a camera that stands a metre farther from it seems that much late. Rooms may be louder than
 the direct sound: what the other peaks of a pair leave open is part of its error, less so where lags close loops of
@@ -65,7 +66,7 @@ class PairLag:
         sigma_seconds: standard error of each lag.
         ambiguity_seconds: standard error that all of them share, because another peak may be the right one.
         confidence: how distinct it is.
-        fine: whether phases tell the lag, so that loops close.
+        fine: whether the lag comes from phases, so that loops close.
     """
 
     first: str
@@ -182,7 +183,7 @@ def solve_by_audio(
         lags: what :func:`audio_lags` gives; they must connect all cameras (:func:`connected_by`).
         drift: whether rates other than 1 are considered.
     """
-    # A wrong peak is off by as much in all windows of a pair, so windows tell drift, and pairs tell offsets.
+    # A wrong peak is off by as much in all windows of a pair: drift is estimated from windows, offsets from pairs.
     sharp = solve_clocks(takes, _matches(lags, [0.0] * len(lags)), drift=drift, slack_seconds=SLACK_SECONDS)
     rates = sharp.rates
     matches = [

@@ -89,8 +89,8 @@ def best_lag(
     Args:
         first: a signal.
         second: another, of the same step and channels.
-        within: least and largest lag in seconds; None for all.
-        min_overlap: least number of samples in common.
+        within: smallest and largest lag in seconds; None for all.
+        min_overlap: smallest number of samples in common.
     """
     score, numerators, energy, counts, lags = _scores(first, second, min_overlap)
     seconds = second.start - first.start + lags * first.step
@@ -101,7 +101,7 @@ def best_lag(
     # A short overlap agrees by chance; correlations are judged by their significance.
     judged = score * np.sqrt(counts / counts.max())
     best = int(judged.argmax())
-    # A best lag beside those that are not considered is no peak.
+    # A best lag next to those that are not considered is no peak.
     if score[best] <= 0 or not 0 < best < len(score) - 1 or not np.isfinite(score[best - 1 : best + 2]).all():
         return None
     shift = float(np.clip(parabola_top(*score[best - 1 : best + 2], flat=0.0), -0.5, 0.5))
@@ -123,7 +123,7 @@ def best_lag(
 def lag_changes(first: Signal, second: Signal, lag_seconds: float, edges: Floats) -> Floats:
     """By how much the lag of the largest correlation grows without each block of the take, ``[K]`` seconds.
 
-    Blocks that all pairs of cameras share tell errors that all pairs of a camera share: of things that move for less
+    Blocks that all pairs of cameras share show errors that all pairs of a camera share: of things that move for less
     than a frame one camera's frames see other parts than another's. Leaving out channels does not show these.
 
     Args:

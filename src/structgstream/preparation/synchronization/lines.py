@@ -3,10 +3,10 @@
 
 A take is cut into blocks of time that all pairs of cameras share. In each block the cross-correlation near the expected
 lag is compared with what the signals' own autocorrelation, moved by a lag, would give; the lag changes in proportion to
-time, and all blocks are fitted together by least squares. So a block in which little happens says little, and a block
-whose best lag alone would be off by half a frame (sharp events between two frames) does not decide.
+time, and all blocks are fitted together by least squares. So a block in which little happens has little weight, and a
+block whose best lag alone would be off by half a frame (sharp events between two frames) does not decide.
 
-What the fit becomes without each of the blocks tells its error (jackknife), even one that all pairs of a camera share.
+What the fit becomes without each of the blocks gives its error (jackknife), even one that all pairs of a camera share.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class Line:
     Args:
         middle: second by the first signal's time at which the lag is ``lag_seconds``.
         lag_seconds: time in the second signal minus time in the first.
-        rate: change of the lag a second; None where the signals do not tell.
+        rate: change of the lag a second; None where the signals do not determine it.
         spread_seconds: standard deviation of the blocks' times.
         lag_changes: ``[K]`` seconds, change of the lag without each of the blocks.
         rate_changes: ``[K]``, that of the rate.

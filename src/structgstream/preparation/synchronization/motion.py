@@ -38,7 +38,10 @@ RIVAL_RATIO = 0.9  # another lag that is nearly as good makes a pair ambiguous
 MIN_SUPPORT = 0.3  # share of a camera's pairs that agree with its clock
 MIN_DRIFT_SECONDS = 6.0  # of the take, from which on drift is looked for
 BLOCK_SECONDS, MAX_BLOCKS = 1.0, 12
-NEAR_BLOCKS, NEAR_SAMPLES = 6, 8  # most blocks of shorter takes, left out one by one, and least samples of each
+NEAR_BLOCKS, NEAR_SAMPLES = (
+    6,
+    8,
+)  # largest number of blocks of shorter takes, left out one by one, and smallest number of samples of each
 NEAR_PERIODS = 2.0
 MIN_LINE_SIGMA = 0.02  # periods: few blocks may agree by chance
 # Standard deviation of a camera's own error, that all its pairs share because views see different parts of what moves;
@@ -81,7 +84,7 @@ def pair_signals(changes: Mapping[str, Changes], geometry: Geometry | None) -> l
 
 
 def motion_correspondences(pairs: Sequence[PairSignals], *, near: Solution | None = None) -> list[TimeCorrespondence]:
-    """Ties from signals of pairs.
+    """Time correspondences from signals of pairs.
 
     Args:
         pairs: what :func:`pair_signals` gives.
@@ -209,9 +212,9 @@ def _control(pair: PairSignals, min_overlap: int) -> float:
 
 
 def _near(pair: PairSignals, near: Solution, edges: NDArray[np.float64] | None) -> list[TimeCorrespondence]:
-    """The tie of a whole take near known clocks.
+    """The correspondence of a whole take near known clocks.
 
-    Where there are blocks it says how it changes without each of them and with the shapes of ``lines.py``: an event
+    Where there are blocks it has its changes without each of them and with the shapes of ``lines.py``: an event
     that is shorter than a frame lies on one of two frames, so that the peak of few such events is that of the majority,
     whichever block is left out.
     """
@@ -236,8 +239,8 @@ def _near(pair: PairSignals, near: Solution, edges: NDArray[np.float64] | None) 
 
 
 def _along(pair: PairSignals, near: Solution, edges: NDArray[np.float64]) -> list[TimeCorrespondence]:
-    """Two ties that say what a line of lags over the take says: they are apart by as much as its blocks, so that their
-    errors are independent; one where the take does not tell the drift."""
+    """Two correspondences for a line of lags over the take: they are apart by as much as its blocks, so that their
+    errors are independent; one where the take does not determine the drift."""
     one, other = pair.signals
     line = fitted_line(one, other, expected_seconds=_expected(pair, near), edges=edges - near.offsets[pair.first])
     if line is None:

@@ -56,7 +56,7 @@ class Changes:
 
 
 def picture_changes(pictures: Iterable[NDArray[np.uint8]], stamps: Floats) -> Changes:
-    """Changes of pictures ``[H, W, 3]`` that follow each other at ``stamps`` ``[T]``; only reduced ones are kept.
+    """Changes of pictures ``[H, W, 3]`` that follow each other at ``stamps`` ``[T]``; only reduced ones stay in memory.
 
     Raises:
         MissingExtraError: cv2 is not installed.
@@ -134,13 +134,13 @@ class PairGeometry:
 def line_signals(first: Changes, second: Changes, geometry: PairGeometry) -> tuple[Floats, Floats] | None:
     """Signals ``[T1, B]`` and ``[T2, B]`` of the bundles that both views see; None if these are too few.
 
-    Square roots are taken, so that a signal says rather where something moves than how much.
+    Square roots are taken, so that a signal shows where something moves rather than how much.
     """
     angles = _angles(first, second, geometry)
     cut = _gap(np.concatenate(angles))
     one, other = ((angle - cut) % np.pi for angle in angles)
-    low = max(_low(one), _low(other))
-    high = min(_high(one), _high(other))
+    ranges = [np.nanquantile(each, (0.005, 0.995)) for each in (one, other)]
+    low, high = max(low for low, _ in ranges), min(high for _, high in ranges)
     if not high > low:
         return None
     if min(((each >= low) & (each <= high)).mean() for each in (one, other)) < MIN_SHARE:
@@ -180,14 +180,6 @@ def _gap(angles: Floats) -> float:
     gaps = np.diff(ordered, append=ordered[0] + np.pi)
     widest = int(gaps.argmax())
     return float(ordered[widest] + gaps[widest] / 2) % np.pi
-
-
-def _low(angles: Floats) -> float:
-    return float(np.nanquantile(angles, 0.005))
-
-
-def _high(angles: Floats) -> float:
-    return float(np.nanquantile(angles, 0.995))
 
 
 def _summed(view: Changes, angles: Floats, edges: Floats) -> Floats:

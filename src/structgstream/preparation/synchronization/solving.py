@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Clocks of all cameras from instants that pairs of cameras share.
 
-A tie says that the second ``first_seconds`` of one camera's clock was the second ``second_seconds`` of another's. With
-``common = offset + rate * stamp`` it is linear in both clocks, so all ties are solved by one weighted least squares.
-Wrong ties do not agree around loops of cameras: a start is chosen among spanning trees of the graph of cameras by how
-many ties it explains, and the weights are those of Tukey's biweight (iteratively reweighted least squares).
+A time correspondence states that second ``first_seconds`` of one camera's clock was second ``second_seconds`` of
+another's. With ``common = offset + rate * stamp`` it is linear in both clocks, so all of them are solved by one
+weighted least squares. Wrong ones do not agree around loops of cameras: a start is chosen among spanning trees of the
+graph of cameras by how many correspondences it explains, and the weights are those of Tukey's biweight (iteratively
+reweighted least squares).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,8 +21,8 @@ TREES = 200
 ITERATIONS = 30
 # Standard deviation of rates: quartz clocks are within 1e-4, but 29.97 and 30 frames a second are 1e-3 apart.
 RATE_PRIOR = 5e-4
-RATE_SIGMAS, RATE_EFFECT_SECONDS = 3.0, 1e-3  # a rate other than 1 is kept if it exceeds both
-SIGMAS = 5.0  # ties further off than this many standard deviations are wrong
+RATE_SIGMAS, RATE_EFFECT_SECONDS = 3.0, 1e-3  # a rate other than 1 is taken if it exceeds both
+SIGMAS = 5.0  # correspondences further off than this many standard deviations are wrong
 
 
 @dataclass(frozen=True)
@@ -34,9 +35,9 @@ class TimeCorrespondence:
         first_seconds: the instant by the first camera's clock.
         second_seconds: the same instant by the second camera's.
         sigma_seconds: standard error of their difference.
-        confidence: how distinct the match is, larger is better; only orders ties.
+        confidence: how distinct the match is, larger is better; only orders correspondences.
         changes: by how much the second camera's second grows without each block of the take, the same blocks for all
-            ties; empty where it is not known. They tell errors that ties of a camera share.
+            correspondences; empty where it is not known. They show errors that those of a camera share.
     """
 
     first: str
@@ -50,15 +51,15 @@ class TimeCorrespondence:
 
 @dataclass(frozen=True)
 class Solution:
-    """Clocks that agree with most ties.
+    """Clocks that agree with most correspondences.
 
     Args:
         offsets: camera to seconds; the first camera's is 0.
         rates: camera to rate; the first camera's is 1.
         sigmas: camera to the standard error of its common time at the ends of its take, relative to the mean of all
             cameras.
-        agreeing: for each tie whether it agrees.
-        residuals: for each tie the difference of its two common times, seconds.
+        agreeing: for each correspondence whether it agrees.
+        residuals: for each correspondence the difference of its two common times, seconds.
     """
 
     offsets: Mapping[str, float]
@@ -70,8 +71,8 @@ class Solution:
 
 @dataclass(frozen=True)
 class _Graph:
-    """Ties as arrays; ``times`` are relative to the middle of each camera's take, ``changes`` ``[K, ties]`` are those
-    of the differences without each block."""
+    """Correspondences as arrays; ``times`` are relative to the middle of each camera's take, ``changes`` ``[K, M]`` are
+    those of the differences without each block."""
 
     first: NDArray[np.intp]
     second: NDArray[np.intp]
@@ -99,9 +100,9 @@ def solve_clocks(
 
     Args:
         takes: camera to the first and last second of its take, by its own clock.
-        ties: instants of pairs; they must connect all cameras.
+        matches: instants of pairs; they must connect all cameras.
         drift: whether rates other than 1 are considered.
-        slack_seconds: how far right ties may be off before rates are known.
+        slack_seconds: how far right correspondences may be off before rates are known.
     """
     names = list(takes)
     middles = np.array([(start + end) / 2 for start, end in takes.values()])
@@ -152,16 +153,16 @@ def _graph(names: list[str], matches: Sequence[TimeCorrespondence], middles: Flo
 
 
 def _residuals(graph: _Graph, offsets: Floats, corrections: Floats) -> Floats:
-    """Common time by the first camera minus that by the second, for each tie."""
+    """Common time by the first camera minus that by the second, for each correspondence."""
     one = offsets[graph.first] + corrections[graph.first] * graph.first_times
     other = offsets[graph.second] + corrections[graph.second] * graph.second_times
     return one - other + graph.differences
 
 
 def _consensus(graph: _Graph, confidences: Sequence[float], slack_seconds: float) -> Floats:
-    """Offsets along the spanning tree that leaves the least truncated residuals.
+    """Offsets along the spanning tree that leaves the smallest truncated residuals.
 
-    The first tree takes ties by confidence, the others by confidence times a random factor.
+    The first tree takes correspondences by confidence, the others by confidence times a random factor.
     """
     generator = np.random.default_rng(0)
     reach = SIGMAS * np.hypot(graph.sigmas, slack_seconds / 2)
@@ -178,7 +179,7 @@ def _consensus(graph: _Graph, confidences: Sequence[float], slack_seconds: float
 
 
 def _along_tree(graph: _Graph, order: NDArray[np.intp]) -> Floats:
-    """Offsets that satisfy the ties of a spanning tree, taken greedily in ``order`` (Kruskal)."""
+    """Offsets that satisfy the correspondences of a spanning tree, taken greedily in ``order`` (Kruskal)."""
     group = np.arange(graph.cameras)
     offsets = np.zeros(graph.cameras)
     for match in order:
@@ -186,7 +187,7 @@ def _along_tree(graph: _Graph, order: NDArray[np.intp]) -> Floats:
         if group[one] == group[other]:
             continue
         moved = group == group[other]
-        # The whole group of the second camera moves, so that ties that joined it stay satisfied.
+        # The whole group of the second camera moves, so that correspondences that joined it stay satisfied.
         offsets[moved] += offsets[one] + graph.differences[match] - offsets[other]
         group[moved] = group[one]
     return offsets
@@ -195,9 +196,10 @@ def _along_tree(graph: _Graph, order: NDArray[np.intp]) -> Floats:
 def _reweighted(
     graph: _Graph, offsets: Floats, corrections: Floats, free: NDArray[np.bool_], slack_seconds: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Offsets, rate corrections of the cameras that are ``free``, weights of ties, and the covariance of both.
+    """Offsets, rate corrections of the cameras that are ``free``, weights of correspondences, and the covariance of
+    both.
 
-    The slack shrinks to the spread that the ties show.
+    The slack shrinks to the spread that the correspondences show.
     """
     slack = slack_seconds
     weights = np.ones(len(graph.first))
@@ -259,11 +261,11 @@ def _shared(changes: Floats) -> Floats:
 
 
 def _inflation(graph: _Graph, off: Floats, weights: Floats, scale: Floats) -> float:
-    """How much larger variances are than stated: the larger one of the reduced chi-squares of ties and of pairs, at
-    least 1.
+    """How much larger variances are than stated: the larger one of the reduced chi-squares of correspondences and of
+    pairs, at least 1.
 
-    Ties of one pair share its error (sound reaches both microphones by the same ways), so pairs are judged by their
-    means.
+    Correspondences of one pair share its error (sound reaches both microphones by the same ways), so pairs are judged
+    by their means.
     """
     inliers = weights > 0
     matches, pairs = int(inliers.sum()), np.unique(_pair_numbers(graph)[inliers])

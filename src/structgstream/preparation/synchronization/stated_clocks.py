@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Clocks that files state: a table of times, timecode, the time of creation, or stamps of one transmission.
 
-``timestamps.csv`` says when frames were taken, by a clock that all cameras share: a header ``camera,frame,seconds`` and
-a row for each frame that is known: the camera's name, the frame's number in its video counted from 0, and the second.
-One row a camera is enough (the frame of a clap, seconds 0); two or more that are apart give its rate, too.
+``timestamps.csv`` states when frames were taken, by a clock that all cameras share: a header ``camera,frame,seconds``
+and a row for each frame that is known: the camera's name, the frame's number in its video counted from 0, and the
+second. One row a camera is enough (the frame of a clap, seconds 0); two or more that are apart give its rate, too.
 
 Most files' stamps start at 0 when a camera starts and share no clock, so stamps are trusted only on request. Timecode
 counts frames, so it is good to a frame; it starts again at midnight, so cameras lie within half a day of the first. A

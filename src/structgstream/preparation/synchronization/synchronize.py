@@ -85,15 +85,14 @@ def synchronize(
 
     Args:
         streams: the files of each camera.
-        method: ``csv`` (``timestamps``), ``stamps`` (of the files, which the caller says share a clock), ``audio``,
-        ``motion``,
+        method: ``csv`` (``timestamps``), ``stamps`` (of the files, which share a clock), ``audio``, ``motion``,
             ``none`` (the cameras were started by one signal: stamps hold as they are), or ``auto``: csv if given,
             else audio if all cameras have sound in which something is common, else motion.
         timestamps: a table of times (``timestamps.py``).
         cameras: the calibration, if it is known; motion is exact with it and coarse without.
 
     Raises:
-        CaptureError: the cameras cannot be synchronised so; says which camera and why.
+        CaptureError: the cameras cannot be synchronised so; the message names camera and reason.
         ConfigError: ``method`` is unknown, or csv without a table.
         MissingExtraError: scipy or cv2 is not installed.
     """
@@ -204,7 +203,7 @@ def _by_motion(
     if len(stamps) < 2:
         return _unchanged(stamps)
     used = {name: own[own <= own[0] + MOTION_SECONDS] for name, own in stamps.items()}
-    changes = {name: picture_changes(_pictures(streams, name, len(own)), own) for name, own in used.items()}
+    changes = {name: picture_changes(streams.pictures(name, np.arange(len(own))), own) for name, own in used.items()}
     require_motion(changes)
     geometry: Geometry = CalibratedGeometry(cameras) if cameras else _static_geometry(streams, used)
     period = max(period_seconds(own) for own in stamps.values())
@@ -232,10 +231,6 @@ def require_motion(changes: Mapping[str, Changes]) -> None:
             "motion; film people "
             "who move, a clap for audio, or give timestamps.csv."
         )
-
-
-def _pictures(streams: Streams, name: str, count: int) -> Iterator[NDArray[np.uint8]]:
-    return streams.pictures(name, np.arange(count))
 
 
 def _static_geometry(streams: Streams, stamps: Mapping[str, NDArray[np.float64]]) -> StaticGeometry:

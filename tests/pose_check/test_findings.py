@@ -56,7 +56,7 @@ def test_cameras_of_different_sizes_are_not_exchanged() -> None:
 
 
 @pytest.mark.parametrize(
-    ("stated", "told"),
+    ("stated", "description"),
     [
         (lambda camera: replace(camera, viewmat=FLIP @ camera.viewmat), "in OpenGL axes in place of OpenCV's"),
         (lambda camera: replace(camera, viewmat=torch.linalg.inv(FLIP @ camera.viewmat)), "inverted and in OpenGL"),
