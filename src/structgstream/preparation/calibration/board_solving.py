@@ -20,7 +20,7 @@ from structgstream.data.lenses import LensCamera
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.adjustment import cameras_in, estimated, posed_problem
 from structgstream.preparation.calibration.board import Board, Sighting, board_sightings
-from structgstream.preparation.calibration.bundle import BodyObservations, Scene
+from structgstream.preparation.calibration.bundle import BodyObservations, Parameters
 from structgstream.preparation.calibration.colmap import (
     LensModel,
     colmap_camera,
@@ -61,8 +61,8 @@ def board_model(
             rig.add_sensor(camera.sensor_id, colmap_pose(sensors[name]))
     model.add_rig(rig)
     black = np.zeros(3, np.uint8)
-    places = board.corners
-    corners = {index: model.add_point3D(places[index], pycolmap.Track(), black) for index in _repeated(sightings)}
+    known = board.corners
+    corners = {index: model.add_point3D(known[index], pycolmap.Track(), black) for index in _repeated(sightings)}
     images: list[tuple[int, str, Sighting]] = []
     for instant, pose in rig_poses.items():
         frame = pycolmap.Frame(frame_id=instant + 1, rig_id=1)
@@ -363,7 +363,7 @@ def adjust_board(
         np.concatenate([sight.pixels for _, sight in seen]),
     )
     stack = np.stack(list(poses.values()))
-    bundle, scene = posed_problem(
+    bundle, parameters = posed_problem(
         list(cameras.values()),
         sights,
         (stack[:, :3, :3], stack[:, :3, 3]),
@@ -372,27 +372,29 @@ def adjust_board(
         fixed=np.array([name in known for name in cameras]),
         rotating=True,
     )
-    bundle, scene = estimated(bundle, scene)
-    scene = _from_first(scene)
-    return cameras_in(scene, cameras, bundle.lens), dict(zip(poses, _matrices(scene.turns, scene.places), strict=True))
-
-
-def _from_first(scene: Scene) -> Scene:
-    """In the axes of the first camera."""
-    turn, move = scene.rotations[0], scene.translations[0]
-    rotations = scene.rotations @ turn.T
-    translations = scene.translations - rotations @ move
-    rotations[0], translations[0] = np.eye(3), 0.0  # exactly
-    return replace(
-        scene,
-        rotations=rotations,
-        translations=translations,
-        turns=turn @ scene.turns,
-        places=scene.places @ turn.T + move,
+    bundle, parameters = estimated(bundle, parameters)
+    parameters = _from_first(parameters)
+    return cameras_in(parameters, cameras, bundle.lens), dict(
+        zip(poses, _matrices(parameters.body_rotations, parameters.body_positions), strict=True)
     )
 
 
-def _matrices(turns: Floats, places: Floats) -> Floats:
-    found = np.tile(np.eye(4), (len(turns), 1, 1))
-    found[:, :3, :3], found[:, :3, 3] = turns, places
+def _from_first(parameters: Parameters) -> Parameters:
+    """In the axes of the first camera."""
+    turn, move = parameters.rotations[0], parameters.translations[0]
+    rotations = parameters.rotations @ turn.T
+    translations = parameters.translations - rotations @ move
+    rotations[0], translations[0] = np.eye(3), 0.0  # exactly
+    return replace(
+        parameters,
+        rotations=rotations,
+        translations=translations,
+        body_rotations=turn @ parameters.body_rotations,
+        body_positions=parameters.body_positions @ turn.T + move,
+    )
+
+
+def _matrices(body_rotations: Floats, body_positions: Floats) -> Floats:
+    found = np.tile(np.eye(4), (len(body_rotations), 1, 1))
+    found[:, :3, :3], found[:, :3, 3] = body_rotations, body_positions
     return found
