@@ -169,11 +169,11 @@ def _angles(found: SolvedCalibration, good: NDArray[np.bool_]) -> Floats:
     order = np.argsort(seen.point[good], kind="stable")
     rays, points = rays[order], seen.point[good][order]
     widest = np.zeros(len(found.points))
-    for apart in range(1, int(np.bincount(points).max(initial=0))):
-        same = points[apart:] == points[:-apart]
-        sine = np.linalg.norm(np.cross(rays[apart:], rays[:-apart]), axis=1)
-        angle = np.arctan2(sine, (rays[apart:] * rays[:-apart]).sum(1))
-        np.maximum.at(widest, points[apart:][same], angle[same])
+    for step in range(1, int(np.bincount(points).max(initial=0))):
+        same = points[step:] == points[:-step]
+        sine = np.linalg.norm(np.cross(rays[step:], rays[:-step]), axis=1)
+        angle = np.arctan2(sine, (rays[step:] * rays[:-step]).sum(1))
+        np.maximum.at(widest, points[step:][same], angle[same])
     return widest
 
 
