@@ -94,8 +94,8 @@ def check_names(calibrated: Collection[str], pictured: Collection[str], *, calib
         )
 
 
-def listed(names: Collection[str], most: int = 5) -> str:
+def listed(names: Collection[str], limit: int = 5) -> str:
     """``camera 'a'`` or ``cameras 'a', 'b' and 3 more``, for messages."""
-    shown = ", ".join(repr(name) for name in list(names)[:most])
-    rest = f" and {len(names) - most} more" if len(names) > most else ""
+    shown = ", ".join(repr(name) for name in list(names)[:limit])
+    rest = f" and {len(names) - limit} more" if len(names) > limit else ""
     return f"camera{'s' if len(names) > 1 else ''} {shown}{rest}"

@@ -195,8 +195,8 @@ def find_footage(where: Path, *, picture_fps: float | None = None) -> Footage:
         _check_left(root, files)
         ordered = {name: files[name] for name in sorted(files, key=natural)}
         return _footage(where, ordered, picture_fps or PICTURE_FPS)
-    held = ", ".join(sorted(entry.name for entry in where.iterdir())[:6])
-    found = f"holds no videos and no pictures, but {held}" if held else "is empty"
+    contents = ", ".join(sorted(entry.name for entry in where.iterdir())[:6])
+    found = f"holds no videos and no pictures, but {contents}" if contents else "is empty"
     raise NoFootage(f"{where} {found}; expected {LAYOUTS}.")
 
 

@@ -81,7 +81,6 @@ def refined(
     found = refine(
         matched_pictures(footage, clocks, options),
         solved.cameras,
-        free="lens" if options.lens else "focal",
         lens=options.lens,
         metres=solved.metres,
     )

@@ -72,12 +72,12 @@ def picture_movement(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Moveme
         return None
     start, end = before.pixels[rows], after.pixels[columns]
     still = STILL_PIXELS * pixel_scale(one.shape[1])
-    apart = np.linalg.norm(end - start, axis=1)
-    if (apart < still).mean() > STILL_SHARE:
+    distances = np.linalg.norm(end - start, axis=1)
+    if (distances < still).mean() > STILL_SHARE:
         return STAYED
     homography, mask = opencv().findHomography(start, end, opencv().RANSAC, 2 * still)
     follows = np.zeros(len(rows), bool) if mask is None else mask.ravel().astype(bool)
-    shift = float(np.median(apart[follows])) if follows.any() else 0.0
+    shift = float(np.median(distances[follows])) if follows.any() else 0.0
     if follows.mean() <= MOVED_SHARE or shift <= still:
         return None
     return Movement(shift, np.asarray(homography, np.float64))
