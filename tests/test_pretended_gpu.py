@@ -11,7 +11,7 @@ import torch
 import structgstream
 from structgstream.kernels import cpu_raster, cuda, cuda_library, reference_raster
 from structgstream.kernels.native import native_reason
-from structgstream.presets import PRESETS
+from structgstream.session.presets import PRESETS
 from tests.support.pretended_gpu import DEVICE, pretended_device, pretended_gpu, rasterize
 from tests.support.small_clip import small_clip_path
 from tests.support.small_presets import FEW_POINTS

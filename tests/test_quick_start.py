@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.presets import PRESETS
+from structgstream.session.presets import PRESETS
 from tests.support.small_presets import QUICK
 
 README = Path(__file__).parents[1] / "README.md"

@@ -24,7 +24,7 @@ from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.open import open_capture
 from structgstream.data.posed import rotation_matrix
 from structgstream.data.prepared import read_prepared, write_prepared
-from structgstream.preparation.calibration.comparison import rig_alignment
+from structgstream.preparation.calibration.solved import rig_alignment
 
 Rig = Mapping[str, LensCamera]
 Floats = NDArray[np.float64]

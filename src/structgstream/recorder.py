@@ -20,11 +20,11 @@ from structgstream.data.source import FrameStream, frame_count
 from structgstream.errors import StorageError, StreamError
 from structgstream.evaluation.preview import PreviewSink
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry
-from structgstream.frame_report import FrameReport
 from structgstream.kernels.backend import Backend
-from structgstream.pipeline import Memory, Pipeline, State, StoredStream
 from structgstream.scene.scene import Scene
-from structgstream.session import Session
+from structgstream.session.frame_report import FrameReport
+from structgstream.session.loop import Session
+from structgstream.session.pipeline import Memory, Pipeline, State, StoredStream
 from structgstream.training.result import StepListener
 
 Storage = Callable[[bool], tuple[PacketSink, StoredStream[State] | None]]

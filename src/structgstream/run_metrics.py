@@ -22,8 +22,8 @@ from typing import Any
 from structgstream.atomic_files import atomic_write, side_path
 from structgstream.data.live.status import LiveStatus
 from structgstream.errors import StorageError
-from structgstream.frame_report import FrameReport
 from structgstream.memory import resident_bytes
+from structgstream.session.frame_report import FrameReport
 
 FORMAT, VERSION = "structgstream-metrics", 1
 BEAT_SECONDS = 2.0

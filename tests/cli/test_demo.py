@@ -10,7 +10,7 @@ import pytest
 from structgstream.cli import main, render
 from structgstream.cli.progress import Lines
 from structgstream.data.clip import bundled_clip_path
-from structgstream.session import FrameReport
+from structgstream.session.loop import FrameReport
 from tests.support.quick_streams import QUICK, error_of
 
 pytestmark = pytest.mark.usefixtures("quick_presets")

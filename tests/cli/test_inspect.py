@@ -197,3 +197,16 @@ def test_a_capture_is_described_without_training(tmp_path: Path) -> None:
     (tmp_path / "clip" / "cam03.mp4").unlink()
     with pytest.raises(CaptureError, match="cam03"):
         describe_capture(tmp_path / "clip")
+
+
+def test_videos_without_calibration_are_described_as_prepare_reads_them(tmp_path: Path) -> None:
+    for name in ("cam00", "cam03"):
+        shutil.copy(CLIP / f"{name}.mp4", tmp_path)
+    content = describe_capture(tmp_path)
+    assert (content["layout"], content["frames"]) == ("videos or pictures without calibration", 12)
+    assert content["cameras"]["cam03"]["size"] == (320, 240)
+    assert "structgstream prepare" in content["remarks"][-1]
+    (tmp_path / "cam03.mp4").unlink()
+    (tmp_path / "cam00.mp4").rename(tmp_path / "notes.txt")
+    with pytest.raises(CaptureError, match="no supported layout"):
+        describe_capture(tmp_path)

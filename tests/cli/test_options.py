@@ -19,7 +19,7 @@ from structgstream.cli.options import (
 )
 from structgstream.data.clip import bundled_clip_path
 from structgstream.errors import ConfigError
-from structgstream.presets import DEFAULT_PRESET, PRESETS
+from structgstream.session.presets import DEFAULT_PRESET, PRESETS
 
 
 def test_no_option_is_the_whole_capture() -> None:

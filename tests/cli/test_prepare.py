@@ -12,8 +12,8 @@ import pytest
 
 from structgstream.cli.app import main
 from structgstream.preparation.calibration.board import Board
-from structgstream.preparation.claiming import alone, claim
 from structgstream.preparation.options import Distance, PrepareOptions
+from structgstream.preparation.output_folder import lock_output, mark_output
 from tests.support.quick_preparation import quicken
 from tests.support.quick_streams import error_of
 from tests.support.rooms import write_room
@@ -131,7 +131,7 @@ def test_what_may_not_be_read_or_written(
     for folder in ("videos/masks", "out"):
         (tmp_path / folder).mkdir()
     if place == "out/work":
-        claim(tmp_path / "out", tmp_path / "videos")
+        mark_output(tmp_path / "out", tmp_path / "videos")
     before = {path: path.read_bytes() for path in (tmp_path / "videos").iterdir() if path.is_file()}
     path = tmp_path / place
     mode = path.stat().st_mode
@@ -169,6 +169,6 @@ def test_a_board_that_cannot_be_is_told_before_anything_takes_time(
 def test_two_at_once_on_one_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_room(tmp_path / "videos")
     command = ["prepare", str(tmp_path / "videos"), "-o", str(tmp_path / "out"), "--synchronize", "none"]
-    claim(tmp_path / "out", tmp_path / "videos")
-    with alone(tmp_path / "out"):
+    mark_output(tmp_path / "out", tmp_path / "videos")
+    with lock_output(tmp_path / "out"):
         assert f"Another process prepares {tmp_path / 'out'} now; wait" in error_of(command, capsys, status=1)

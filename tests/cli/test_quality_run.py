@@ -14,7 +14,7 @@ from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.quality_list import QUALITIES, read_list
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest
-from structgstream.frame_report import FrameReport
+from structgstream.session.frame_report import FrameReport
 from tests.data.live.test_live_source import files
 from tests.support.quick_streams import CLIP, QUARTER, error_of
 

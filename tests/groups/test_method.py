@@ -19,9 +19,9 @@ from structgstream.groups.method import (
     lowered_budget,
     lowered_start,
 )
-from structgstream.pipeline import Past
-from structgstream.presets import TINY
-from structgstream.struct_gstream import FrameZeroContext
+from structgstream.session.pipeline import Past
+from structgstream.session.presets import TINY
+from structgstream.session.struct_gstream import FrameZeroContext
 from structgstream.training.result import FitResult
 from tests.support.rigs import random_scene
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from structgstream.presets import PAPER_DATA, PRESETS, PaperData, departures
 from structgstream.scene.state import PAPER_DYNAMIC
+from structgstream.session.presets import PAPER_DATA, PRESETS, PaperData, departures
 from tests.support.rigs import arc_rig
 
 PAPER, PAPERS = PRESETS["paper-n3dv"], ["paper-n3dv", "paper-meetroom", "paper-immersive"]

@@ -25,11 +25,11 @@ _EXTRACTOR = keypoints._extractor
 class _Remembering:
     """An extractor that no process of the run lets look at a picture twice."""
 
-    def __init__(self, config: keypoints.KeypointConfig) -> None:
-        self._config, self._extractor = config, _EXTRACTOR(config)
+    def __init__(self) -> None:
+        self._extractor = _EXTRACTOR()
 
     def extract_from_uint8_array(self, grey: NDArray[np.uint8]) -> Any:
-        key = hashlib.sha256(repr((self._config, grey.shape)).encode() + grey.tobytes()).hexdigest()
+        key = hashlib.sha256(repr(grey.shape).encode() + grey.tobytes()).hexdigest()
         if key not in _FOUND:
 
             def extract(folder: Path) -> None:

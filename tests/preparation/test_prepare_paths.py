@@ -12,12 +12,13 @@ import pytest
 from structgstream.data.prepared import PreparedCapture, read_prepared
 from structgstream.data.timeline import Clock
 from structgstream.errors import CalibrationError, CaptureError
-from structgstream.preparation.calibration.comparison import calibration_errors
 from structgstream.preparation.capture_steps import CaptureSteps
+from structgstream.preparation.clocks import first_clocks
 from structgstream.preparation.footage import find_footage
 from structgstream.preparation.options import Distance, PrepareOptions
 from structgstream.preparation.prepare import Preparation, prepare_capture
-from structgstream.preparation.solvers import first_clocks, matched_pictures
+from structgstream.preparation.solvers import matched_pictures
+from tests.support.calibration_errors import calibration_errors
 from tests.support.captures import write_video, write_videos
 from tests.support.filmed import Film, noise_texture, ring, room
 from tests.support.footage_made import BOARD, FPS, add_sound, centred, write_board_take, write_take
@@ -51,7 +52,7 @@ def starts_in_frames(capture: PreparedCapture, fps: float) -> np.ndarray:
 
 def test_motion_and_structure_without_any_calibration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As where motion alone tells no clocks: the calibration comes from what stands still."""
-    monkeypatch.setattr("structgstream.preparation.solvers.SURE_PERIODS", 0.0)
+    monkeypatch.setattr("structgstream.preparation.clocks.SURE_PERIODS", 0.0)
     starts = [0, 7, 3, 12]
     truth = write_take(tmp_path / "videos", starts=starts, frames=45)
     made = prepare_capture(tmp_path / "videos", tmp_path / "out", options=PrepareOptions(lens="pinhole", instants=1))
@@ -79,7 +80,7 @@ def test_pictures_of_what_stands_still_need_no_clocks(tmp_path: Path) -> None:
     footage = find_footage(tmp_path)
     clocks = first_clocks(footage, PrepareOptions(synchronize="motion"))
     assert not clocks.sure
-    assert "Too little moves in the pictures of 'b', 'c'" in clocks.told
+    assert "Too little moves in the pictures of 'b', 'c'" in clocks.summary
     for name, pictures in matched_pictures(footage, clocks, PrepareOptions()).items():
         assert len(pictures) == 1
         assert np.abs(pictures[0].astype(int) - still[name]).max() <= 4

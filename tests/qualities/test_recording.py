@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import torch
 
-from structgstream import session, struct_gstream
 from structgstream.cameras import CameraRig
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.quality_list import read_list
@@ -24,13 +23,13 @@ from structgstream.data.live.kept import KeptFrames, kept_folder
 from structgstream.errors import ConfigError, StorageError
 from structgstream.evaluation.run_log import read_log
 from structgstream.frames import MultiViewFrame
-from structgstream.presets import StreamConfig
 from structgstream.qualities.ladder import configured, qualities_in
 from structgstream.qualities.recording import QualitiesRun, QualityReport, record_qualities
 from structgstream.recorder import record, segments_at, segments_folder
 from structgstream.run_metrics import RunMetrics
-from structgstream.session import Session
-from structgstream.struct_gstream import stream_pipeline
+from structgstream.session.loop import Session, loop, struct_gstream
+from structgstream.session.presets import StreamConfig
+from structgstream.session.struct_gstream import stream_pipeline
 from tests.support.backends import quickest_backend
 from tests.support.moving_block import PERIODS, RIG, filmed
 from tests.support.small_presets import QUICK
@@ -157,7 +156,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
 def test_a_period_that_begins_from_points_is_fitted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     points = torch.from_numpy(Recorded().points)
-    monkeypatch.setattr(session, "initial_points_of", lambda *args, **further: points)
+    monkeypatch.setattr(loop, "initial_points_of", lambda *args, **further: points)
     config = replace(PERIODS, period=replace(PERIODS.period, start="points"))
     found = alone(tmp_path / "high.sgs", "high", config)
     counts = counted(monkeypatch)

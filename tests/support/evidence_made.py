@@ -11,7 +11,7 @@ import torch
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.matching import inside, project
-from structgstream.pose_check.evidence import Evidence
+from structgstream.pose_check.tracks import Evidence
 from tests.support.takes import ring
 
 Cameras = dict[str, Camera]

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from structgstream.periods import PeriodConfig
+from structgstream.session.periods import PeriodConfig
 from tests.support.rigs import arc_rig
 from tests.support.small_presets import QUICK
 

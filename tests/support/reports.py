@@ -5,7 +5,7 @@ from typing import Any
 
 from structgstream.codec.packets import PacketKind
 from structgstream.evaluation.report import FrameScores, Scores
-from structgstream.session import FrameReport
+from structgstream.session.loop import FrameReport
 
 
 def frame_report(index: int, **known: Any) -> FrameReport:

@@ -9,7 +9,7 @@ import pytest
 
 from structgstream.data.plane_sweep import SweepConfig
 from structgstream.data.points import PointsConfig
-from structgstream.presets import PRESETS, RIG, TINY
+from structgstream.session.presets import PRESETS, RIG, TINY
 
 TINY_RIG = replace(
     RIG,

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from structgstream.errors import ConfigError
 from structgstream.kernels.values import HeadWeights
-from structgstream.presets import COMPACT
 from structgstream.scene.scene import Scene
+from structgstream.session.presets import COMPACT
 from structgstream.training.online.config import ExposureConfig, OnlineConfig
 from structgstream.training.online.exposure import exposure_reference, with_exposure_of
 from structgstream.training.views import View, training_views

@@ -7,8 +7,8 @@ import torch
 
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
-from structgstream.presets import PRESETS
 from structgstream.scene.state import state_of
+from structgstream.session.presets import PRESETS
 from structgstream.training.frame0.densify import GrowthConfig
 from structgstream.training.frame0.fit import InitialConfig, InitialRates, fit_first_frame, rates_at
 from structgstream.training.frame0.regularizers import (

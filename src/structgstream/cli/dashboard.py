@@ -16,7 +16,7 @@ from rich.text import Text
 from structgstream.cli.progress import Display, Lines, human_bytes, summary
 
 if TYPE_CHECKING:
-    from structgstream.frame_report import FrameReport
+    from structgstream.session.frame_report import FrameReport
     from structgstream.training.result import Step
 
 REFRESH = 4  # a second

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
     from structgstream.evaluation.report import Report
     from structgstream.kernels.backend import Backend
-    from structgstream.presets import StreamConfig
+    from structgstream.session.presets import StreamConfig
 
 PLAYER = "player.html"
 SLOWED = 0.2  # twelve frames at full speed take only 0.4 s
@@ -54,8 +54,8 @@ def main(arguments: list[str]) -> None:
     from structgstream.data.clip import bundled_clip_path
     from structgstream.data.open import open_capture
     from structgstream.kernels.backend import select_backend
-    from structgstream.presets import DEMO_PRESET
     from structgstream.recorder import check_output
+    from structgstream.session.presets import DEMO_PRESET
 
     began = time.perf_counter()
     console = Console()

@@ -26,7 +26,7 @@ class FitGroup:
     """Fits one group of frames from a header and a track into a segment (docs/cluster.md).
 
     Configuration, picture size, first frame and held-out cameras are the header's. The same command may be given at any
-    time: it goes on where it was interrupted, repairs what is damaged, and leaves a finished segment as it is.
+    time: it resumes after interruption, repairs what is damaged, and does not change a finished segment.
 
     Example: structgstream fit-group basketball --init header.sgs --track ball.track --frames 60:120 -o g60.sgs
     """

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from structgstream.parallel.driver import Job
     from structgstream.parallel.exchange import ObjectStore
     from structgstream.parallel.parts import Parts
-    from structgstream.presets import StreamConfig
+    from structgstream.session.presets import StreamConfig
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def main(arguments: list[str]) -> None:
     """Runs with a display of all groups."""
     options, rest = parse_known_options(Parallel, "parallel", arguments=arguments)
     check_ending(options.output, ".sgs", command="parallel")
-    from structgstream.presets import with_budget  # after --help, which needs no torch
+    from structgstream.session.presets import with_budget  # after --help, which needs no torch
 
     config, preset = resolve_config(options.preset, rest, command="parallel", seed=options.seed)
     with usage_errors():
@@ -148,7 +148,7 @@ def _check(options: Parallel, config: "StreamConfig", parts: "Parts") -> None:
     """
     from structgstream.groups.boundaries import check_length
     from structgstream.recorder import check_output
-    from structgstream.struct_gstream import stream_pipeline
+    from structgstream.session.struct_gstream import stream_pipeline
 
     source = open_selected_capture(options.scene, options.capture)
     if options.groups is not None and not options.allow_unaligned:

@@ -16,7 +16,7 @@ from rich.text import Text
 from structgstream.cli.plain_text import say
 
 if TYPE_CHECKING:
-    from structgstream.frame_report import FrameReport
+    from structgstream.session.frame_report import FrameReport
     from structgstream.training.result import Step
 
 MAX_NAMES = 5

@@ -14,10 +14,10 @@ from structgstream.cli.reconstruct import OpenedScene, Reconstruct, open_scene
 from structgstream.cli.termination import Terminated, Termination
 
 if TYPE_CHECKING:
-    from structgstream.presets import StreamConfig
     from structgstream.qualities.ladder import Quality
     from structgstream.recorder import Storage
     from structgstream.scene.scene import Scene
+    from structgstream.session.presets import StreamConfig
 
 
 class _Asked:

@@ -35,10 +35,10 @@ if TYPE_CHECKING:
     from structgstream.cli.segment_options import Captured, SegmentsStorage
     from structgstream.data.source import FrameStream
     from structgstream.kernels.backend import Backend
-    from structgstream.presets import StreamConfig
     from structgstream.recorder import Storage
     from structgstream.run_metrics import RunMetrics
     from structgstream.scene.scene import Scene
+    from structgstream.session.presets import StreamConfig
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def main(arguments: list[str]) -> None:
 
         quality_run.reconstruct(options, config, preset=preset)
         return
-    from structgstream.presets import with_budget
+    from structgstream.session.presets import with_budget
 
     with usage_errors():
         config = with_budget(config, name=preset, quality=options.quality, mbits=options.mbits)
@@ -176,7 +176,7 @@ def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, con
     """
     from structgstream.evaluation.capture import part_metadata
     from structgstream.kernels.backend import select_backend
-    from structgstream.presets import departures
+    from structgstream.session.presets import departures
     from structgstream.training.online.select import unrecognized_faults
 
     if options.live.live:
@@ -241,7 +241,7 @@ def run_reconstruction(
     """
     from structgstream.data.source import frame_count
     from structgstream.recorder import record
-    from structgstream.struct_gstream import stream_pipeline
+    from structgstream.session.struct_gstream import stream_pipeline
 
     total = frame_count(source)
     run = record(

@@ -44,7 +44,7 @@ class Render:
     scene: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[FOLDER]", help_behavior_hint="")] = None
     """The capture, for --compare."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
-    """Output file or folder. Default: a video beside the stream, named after the camera or the path."""
+    """Output file or folder. Default: a video next to the stream, named after the camera or the path."""
     camera: Annotated[str | None, tyro.conf.arg(metavar="CAMERA", help_behavior_hint="")] = None
     """A camera of the rig; with --path orbit, the one to circle. Default: the first held-out one."""
     path: Annotated[Literal["orbit", "arc"] | None, tyro.conf.arg(help_behavior_hint="")] = None

@@ -29,7 +29,7 @@ class Track:
     (docs/cluster.md).
 
     TRACK holds where things are when a group begins, TRACK.groups a line a:b for each group. After Ctrl-C or a kill the
-    same command goes on; a finished track is left as it is.
+    same command continues; a finished track is not changed.
 
     Example: structgstream track basketball --init header.sgs -o ball.track --groups 60
 

@@ -151,6 +151,10 @@ def _opener(path: Path) -> Callable[[Path], FrameSource] | None:
     return next((opens for recognises, opens in FORMATS if recognises(path)), None)
 
 
+class Uncalibrated(CaptureError):
+    """A folder without any file that could be a calibration: at best what cameras filmed, for ``prepare``."""
+
+
 def _opened(folder: Path, opens: Callable[[Path], FrameSource]) -> FrameSource:
     try:
         return with_masks(opens(folder), folder / FOLDER)
@@ -197,9 +201,14 @@ def _located(path: Path) -> tuple[Path, Callable[[Path], FrameSource]]:
     if any(Path(name).suffix.lower() in CALIBRATION_SUFFIXES for name in content):
         why = f"no calibration that is known here; it holds {shown}{unread_files(path)}"
     elif any(videos_in(root) or pictures_in(root) for root in roots_of(path)):
-        why = f"no calibration; it holds {shown}. structgstream prepare calibrates videos and pictures"
+        raise Uncalibrated(
+            f"The folder {path} has no calibration; it holds {shown}. structgstream prepare calibrates videos and "
+            f"pictures.\n{LAYOUTS}"
+        )
     else:
-        why = f"no supported layout; it holds {shown}{unread_files(path)}"
+        raise Uncalibrated(
+            f"The folder {path} has no supported layout; it holds {shown}{unread_files(path)}.\n{LAYOUTS}"
+        )
     raise CaptureError(f"The folder {path} has {why}.\n{LAYOUTS}")
 
 

@@ -27,6 +27,10 @@ from structgstream.data.matching import (
     viewing_distance,
 )
 
+KEYPOINT_SIDE = 2000
+"""Longest side in pixels at which keypoints are found, for the time that larger pictures take. SIFT places a keypoint
+within a third of a pixel, here 1/6000 of the side; the smallest error that the checks count is 1/1300 of the width
+(``pose_check.verdicts.FLOOR_PIXELS``)."""
 MIN_PARALLAX_DEGREES = 0.3  # between the rays of a match, from which a point behind a camera counts
 VIOLATION_SHARE = 0.01  # of the picture's width
 PAIR_SHARE = 0.3  # of a pair's matches that violate the poses: of right poses mostly 0 to 0.14, of wrong ones most
@@ -105,7 +109,8 @@ class PairMatcher:
         return self._features[name].pixels
 
     def _extract(self, name: str) -> Features:
-        return sift_features(self._images[name], count=self._config.features, mask=self._masks.get(name))
+        mask = self._masks.get(name)
+        return sift_features(self._images[name], count=self._config.features, mask=mask, longest_side=KEYPOINT_SIDE)
 
     def _match(self, pair: Pair) -> NDArray[np.intp]:
         config, empty = self._config, np.empty((0, 2), np.intp)

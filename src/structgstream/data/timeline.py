@@ -21,6 +21,11 @@ MAX_SINGLE = 2
 """Cameras that lack frames and get a line each; of more one line tells."""
 
 
+def period_seconds(stamps: NDArray[np.float64]) -> float:
+    """The usual time in seconds between two frames at ``stamps`` ``[T]``; 1/30 s for a single one."""
+    return float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1 / 30
+
+
 @dataclass(frozen=True)
 class Clock:
     """A camera's clock: common time = ``offset_seconds`` + ``rate`` * time stamp in seconds."""

@@ -42,10 +42,10 @@ from structgstream.evaluation.report import FrameScores, Report, Scores, drawing
 from structgstream.evaluation.scoring import Mask, Picture, counting, score
 from structgstream.evaluation.sizes import StoredSize, half_scores, halved, stored_size
 from structgstream.evaluation.worst import worst_facts
-from structgstream.frame_report import counts
 from structgstream.kernels.backend import Backend
 from structgstream.memory import PeakMeter
 from structgstream.scene.render import render, to_8bit_image
+from structgstream.session.frame_report import counts
 
 
 @dataclass(frozen=True)

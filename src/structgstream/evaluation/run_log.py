@@ -18,7 +18,7 @@ from structgstream.atomic_files import atomic_write, side_path
 from structgstream.errors import StorageError
 
 if TYPE_CHECKING:
-    from structgstream.frame_report import FrameReport
+    from structgstream.session.frame_report import FrameReport
 
 
 RENAMED_COUNTS = {

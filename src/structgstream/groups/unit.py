@@ -20,10 +20,10 @@ from structgstream.groups.segment_sink import GroupSoFar, SegmentSink, resume_se
 from structgstream.groups.track_file import TrackStart, open_track
 from structgstream.groups.track_pass import dense
 from structgstream.kernels.backend import Backend
-from structgstream.pipeline import Pipeline
 from structgstream.recorder import LogExtras, Run, record
 from structgstream.scene.scene import Scene
-from structgstream.struct_gstream import FrameZeroContext, stream_pipeline
+from structgstream.session.pipeline import Pipeline
+from structgstream.session.struct_gstream import FrameZeroContext, stream_pipeline
 from structgstream.training.result import StepListener
 
 MIN_PIXELS = 0.5

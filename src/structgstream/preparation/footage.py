@@ -43,6 +43,10 @@ CHAPTER = re.compile(r"(G[HLPSX]\d\d|GOPR)", re.IGNORECASE)  # of a GoPro, GX010
 LAYOUTS = "CAMERA.mp4, CAMERA/anything.mp4, CAMERA/FRAME.jpg or CAMERA.jpg"
 
 
+class NoFootage(CaptureError):
+    """A folder without a video or a picture."""
+
+
 @dataclass(frozen=True)
 class Footage:
     """What the cameras filmed.
@@ -117,16 +121,16 @@ class Footage:
                 )
 
     def _decoded(self, name: str, track: VideoTrack, indices: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
-        def tell(lost: int, following: int | None, reason: str) -> None:
+        def refuse(lost: int, following: int | None, reason: str) -> None:
             raise CaptureError(
                 f"The video {track.path} of camera {name!r} cannot be decoded at {lost * track.tick_seconds:.3f} s "
                 f"({reason}): truncated or damaged; copy or record it again, or leave it out with --without {name}."
             )
 
         stamps = [track.stamps[index] for index in indices]
-        with closing(pictures_at(track, stamps, size=(track.width, track.height), on_damage=tell)) as pictures:
+        with closing(pictures_at(track, stamps, size=(track.width, track.height), on_damage=refuse)) as pictures:
             for shown in pictures:
-                assert shown is not None, "what is lost was told"
+                assert shown is not None, "a lost picture raises"
                 yield shown[0]
 
     def audio(self, name: str) -> tuple[NDArray[np.float32], float] | None:
@@ -178,8 +182,8 @@ def find_footage(where: Path, *, picture_fps: float | None = None) -> Footage:
         kind = "a file" if where.exists() else "missing"
         raise CaptureError(f"{where} is {kind}; give the folder that holds the cameras' videos ({LAYOUTS}).")
     found = {root: _found(root) for root in dict.fromkeys(filmed_roots(where)) if root.is_dir()}
-    # A stray picture or preview beside the folder of the videos is no take: two cameras come before one.
-    root = next((root for least in (2, 1) for root, files in found.items() if len(files) >= least), None)
+    # A stray picture or preview next to the folder of the videos is no take: two cameras come before one.
+    root = next((root for count in (2, 1) for root, files in found.items() if len(files) >= count), None)
     if root is None or len(found[root]) < 2:
         root = next(other_roots(where), None) or next(other_roots(where, pictures=True), root)
     if root is not None:
@@ -193,7 +197,7 @@ def find_footage(where: Path, *, picture_fps: float | None = None) -> Footage:
         return _footage(where, ordered, picture_fps or PICTURE_FPS)
     held = ", ".join(sorted(entry.name for entry in where.iterdir())[:6])
     found = f"holds no videos and no pictures, but {held}" if held else "is empty"
-    raise CaptureError(f"{where} {found}; expected {LAYOUTS}.")
+    raise NoFootage(f"{where} {found}; expected {LAYOUTS}.")
 
 
 def _of_size(picture: NDArray[np.uint8], size: tuple[int, int], name: str, file: Path) -> NDArray[np.uint8]:
@@ -281,10 +285,10 @@ def _found(root: Path) -> dict[str, Path]:
 
 
 def _check_left(root: Path, found: Mapping[str, Path]) -> None:
-    """What is no camera, told, so that none is lost unnoticed.
+    """Warns of files and folders that are no camera, so that none is lost unnoticed.
 
     Raises:
-        CaptureError: an empty folder beside those of cameras.
+        CaptureError: an empty folder among those of cameras.
     """
     taken = next(iter(found.values()))
     for entry in sorted(entry for entry in root.iterdir() if not is_hidden(entry)):

@@ -8,8 +8,8 @@ from pathlib import Path
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.quality_list import ListedQuality, read_list, write_list
 from structgstream.errors import StreamError
-from structgstream.frame_report import FrameReport
 from structgstream.qualities.ladder import Quality
+from structgstream.session.frame_report import FrameReport
 
 EXPECTED_BITS = 2e6
 """Estimated bits per second of quality 0, from 1.9 and 2.9 Mbit/s in lab/notes/compact-measured.md. Each further unit

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from structgstream.frame_report import FrameReport
+from structgstream.session.frame_report import FrameReport
 
 FIGURES = ("kind", "bytes", "train_psnr", "total_seconds", "cpu_seconds", "anchors", "free", "begins")
 """Keys that a line of the joint log contains for each quality, copied from that quality's own log."""

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 from structgstream.codec.segments.quality_list import MAX_QUALITIES, is_quality_name
 from structgstream.errors import ConfigError
-from structgstream.presets import MAX_QUALITY, StreamConfig, with_budget
+from structgstream.session.presets import MAX_QUALITY, StreamConfig, with_budget
 
 _GIVEN = re.compile(r"([^=]*)=([^=]*)")
 

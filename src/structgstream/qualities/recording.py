@@ -22,10 +22,7 @@ from structgstream.data.shared_frames import SharedFrames
 from structgstream.data.source import FrameStream
 from structgstream.errors import StorageError
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry, read_log
-from structgstream.frame_report import FrameReport
 from structgstream.kernels.backend import Backend
-from structgstream.pipeline import Pipeline, StoredStream
-from structgstream.presets import StreamConfig
 from structgstream.qualities.bit_rates import BitRates
 from structgstream.qualities.joint_frame import joint_entry, joint_report
 from structgstream.qualities.ladder import Quality, configured
@@ -33,7 +30,10 @@ from structgstream.qualities.shared_work import SharedWork, shared_pipeline
 from structgstream.recorder import Storage, log_reports
 from structgstream.run_metrics import RunMetrics
 from structgstream.scene.scene import Scene
-from structgstream.session import Session
+from structgstream.session.frame_report import FrameReport
+from structgstream.session.loop import Session
+from structgstream.session.pipeline import Pipeline, StoredStream
+from structgstream.session.presets import StreamConfig
 from structgstream.training.result import StepListener
 
 

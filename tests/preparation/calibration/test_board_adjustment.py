@@ -9,11 +9,9 @@ import torch
 from numpy.typing import NDArray
 
 from structgstream.data.lenses import LensCamera, RadialTangential
-from structgstream.preparation.calibration.board import Board
-from structgstream.preparation.calibration.board_model import Sightings
-from structgstream.preparation.calibration.board_sightings import Sighting
-from structgstream.preparation.calibration.board_solving import adjust_board
-from structgstream.preparation.calibration.comparison import calibration_errors
+from structgstream.preparation.calibration.board import Board, Sighting
+from structgstream.preparation.calibration.board_solving import Sightings, adjust_board
+from tests.support.calibration_errors import calibration_errors
 from tests.support.filmed import ring, turned
 
 BOARD = Board(7, 5, 0.12)

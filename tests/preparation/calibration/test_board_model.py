@@ -8,9 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from structgstream.data.lenses import LensCamera
-from structgstream.preparation.calibration.board import Board
-from structgstream.preparation.calibration.board_model import Sightings, board_model, rig_poses, sensor_poses
-from structgstream.preparation.calibration.board_sightings import Sighting
+from structgstream.preparation.calibration.board import Board, Sighting
+from structgstream.preparation.calibration.board_solving import Sightings, board_model, rig_poses, sensor_poses
 from structgstream.preparation.calibration.colmap import colmap_camera
 from structgstream.preparation.calibration.mapping import Freedom, adjust
 from tests.support.filmed import ring, turned

@@ -12,8 +12,8 @@ from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.board import Board
 from structgstream.preparation.calibration.board_solving import solve_board
 from structgstream.preparation.calibration.colmap import LensModel
-from structgstream.preparation.calibration.comparison import calibration_errors
 from structgstream.preparation.calibration.solved import SolvedCalibration
+from tests.support.calibration_errors import calibration_errors
 from tests.support.filmed import Film, board_plane, ring, turned
 
 BOARD = Board(7, 5, 0.12)

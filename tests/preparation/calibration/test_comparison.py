@@ -9,7 +9,7 @@ from structgstream.data.alignment import Alignment
 from structgstream.data.lenses import Fisheye, LensCamera, RadialTangential
 from structgstream.data.posed import rotation_matrix
 from structgstream.errors import CalibrationError
-from structgstream.preparation.calibration.comparison import calibration_errors, lens_difference
+from tests.support.calibration_errors import calibration_errors, lens_difference
 from tests.support.filmed import ring
 
 RIG = ring(6, radius=2.0, arc_degrees=120)

@@ -8,8 +8,8 @@ import torch
 from structgstream.data.lenses import LensCamera, RadialTangential
 from structgstream.data.posed import rotation_matrix
 from structgstream.errors import CalibrationError, ConfigError
-from structgstream.preparation.calibration.comparison import calibration_errors
 from structgstream.preparation.calibration.refinement import refine
+from tests.support.calibration_errors import calibration_errors
 from tests.support.filmed import filmed_room
 
 
@@ -35,7 +35,7 @@ def test_perturbed_poses_come_back_where_they_were() -> None:
     assert found.changed
     assert found.before_pixels > 0.8
     assert found.after_pixels < 0.3
-    assert found.held_back > 100
+    assert found.held_out > 100
     errors = {
         key: calibration_errors(cameras, rig) for key, cameras in (("given", given), ("ours", found.solved.cameras))
     }
@@ -61,7 +61,7 @@ def test_tracks_that_judged_are_adjusted_to_as_well(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(refinement, "_completed", lambda graph, refined, terms, **options: refined)
     judged = refine(pictures, given)
     assert found.changed
-    assert (found.after_pixels, found.held_back) == (judged.after_pixels, judged.held_back)
+    assert (found.after_pixels, found.held_out) == (judged.after_pixels, judged.held_out)
     assert len(found.solved.observations) > 1.15 * len(judged.solved.observations)
 
 

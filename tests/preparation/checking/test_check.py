@@ -11,8 +11,8 @@ import torch
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.frames import MultiViewFrame
-from structgstream.pose_check.evidence import gather
-from structgstream.pose_check.explanations import explain
+from structgstream.pose_check.findings import explain
+from structgstream.pose_check.tracks import gather
 from structgstream.pose_check.verdicts import judge
 from structgstream.preparation.checking.check import Checked, check_capture
 from tests.support.memory_captures import MemoryCapture

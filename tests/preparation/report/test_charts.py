@@ -12,7 +12,7 @@ from matplotlib.colors import to_hex
 from structgstream.figure import COLORS
 from structgstream.preparation.checking.check import Examination, examine
 from structgstream.preparation.checking.findings import CameraCheck, CheckReport, Coverage, PairCheck
-from structgstream.preparation.report import charts
+from structgstream.preparation.report import pictures as charts
 from tests.support.planes import room_frame, room_rig
 
 

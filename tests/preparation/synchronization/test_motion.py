@@ -10,15 +10,14 @@ import pytest
 
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
-from structgstream.preparation.synchronization.changes import Changes, picture_changes
 from structgstream.preparation.synchronization.correlation import Signal
-from structgstream.preparation.synchronization.epipolar import CalibratedGeometry
 from structgstream.preparation.synchronization.motion import (
     PairSignals,
     agreeing_cameras,
     pair_signals,
     solve_by_motion,
 )
+from structgstream.preparation.synchronization.motion_signals import CalibratedGeometry, Changes, picture_changes
 from tests.support.takes import MadeStreams, lenses, ring
 
 VIEWS = ring(4)

@@ -39,12 +39,6 @@ def test_sound_comes_before_motion() -> None:
     assert any("ms a metre" in warning for warning in found.warnings)
 
 
-def test_known_distances_make_sound_exact() -> None:
-    found = synchronize(heard_streams(), sound_distances=dict.fromkeys(VIEWS, 2.0))
-    assert max(estimate.uncertainty_seconds for estimate in found.clocks.values()) < 2e-4
-    assert not any("ms a metre" in warning for warning in found.warnings)
-
-
 def test_without_sound_motion_decides_and_says_why() -> None:
     found = synchronize(MOVING, cameras=lenses(VIEWS))
     assert found.method == "motion"

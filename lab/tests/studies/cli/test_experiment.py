@@ -15,7 +15,7 @@ from structgstream.cli.options import CaptureOptions, resolve_config
 from structgstream.data.clip import bundled_clip
 from structgstream.data.wrappers import WithRig
 from structgstream.kernels.backend import select_backend
-from structgstream.presets import PRESETS, StreamConfig
+from structgstream.session.presets import PRESETS, StreamConfig
 from structgstream_studies.cli.experiment import Display, ExperimentOptions, capture_part, print_sheet
 from structgstream_studies.experiments.captures import CapturePart
 from structgstream_studies.experiments.results import read_results

@@ -4,7 +4,7 @@
 import pytest
 
 from outcomes import outcome, outcomes
-from structgstream.presets import PAPER, RIG, StreamConfig, to_json
+from structgstream.session.presets import PAPER, RIG, StreamConfig, to_json
 from structgstream_studies.experiments.readings import BASE, READINGS, readings_sheet
 from tests.support.small_presets import TINY_RIG
 

@@ -15,7 +15,7 @@ from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError, StreamError
 from structgstream.recorder import record
 from structgstream.scene.render import render
-from structgstream.session import FrameReport
+from structgstream.session.loop import FrameReport
 from structgstream_studies.peers.codec import peer_pipeline
 from structgstream_studies.peers.methods import METHODS, TINY_METHODS, AnyMethod, open_peer
 from structgstream_studies.peers.threedgstream import ThreeDGStream, ThreeDGStreamConfig

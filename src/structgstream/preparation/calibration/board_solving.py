@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras, lenses and their poses in metres from a ChArUco board that is shown around."""
+"""Cameras, lenses and their poses in metres from a ChArUco board that is shown around.
+
+Views of the board are a model of COLMAP's in which the board is the world and the rig moves before it. The cameras are
+the sensors of one rig, an instant is a frame of it: a picture's pose is the camera's in the rig times the rig's before
+the board. So the poses that still cameras share over all instants are shared in the adjustment, and the board's
+corners, which are known, fix its scale.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,27 +19,107 @@ from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.adjustment import cameras_in, estimated, posed_problem
-from structgstream.preparation.calibration.board import Board
-from structgstream.preparation.calibration.board_model import (
-    Sightings,
-    board_model,
-    matrix,
-    rig_poses,
-    sensor_poses,
-)
-from structgstream.preparation.calibration.board_sightings import Sighting, board_sightings
-from structgstream.preparation.calibration.bundle import Scene, Sights
+from structgstream.preparation.calibration.board import Board, Sighting, board_sightings
+from structgstream.preparation.calibration.bundle import BodyObservations, Scene
 from structgstream.preparation.calibration.colmap import (
     LensModel,
     colmap_camera,
+    colmap_pose,
     filmed_camera,
     guessed_camera,
     pycolmap_module,
 )
 from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL
 from structgstream.preparation.calibration.mapping import Freedom, adjust
-from structgstream.preparation.calibration.pictures import checked_pictures
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
+
+Sightings = Mapping[str, Sequence[Sighting]]
+
+
+def board_model(
+    board: Board,
+    sightings: Sightings,
+    cameras: Mapping[str, Any],
+    sensors: Mapping[str, Floats],
+    rig_poses: Mapping[int, Floats],
+) -> Any:
+    """The model of all sightings.
+
+    Args:
+        cameras: of pycolmap, with the ids 1, 2, ... in the order of the names.
+        sensors: rig-to-camera matrices ``[4, 4]``; the first camera is the rig's reference, its matrix the identity.
+        rig_poses: instant to the board-to-rig matrix ``[4, 4]``.
+    """
+    pycolmap = pycolmap_module()
+    model = pycolmap.Reconstruction()
+    rig = pycolmap.Rig(rig_id=1)
+    for name, camera in cameras.items():
+        model.add_camera(camera)
+        if rig.num_sensors() == 0:
+            rig.add_ref_sensor(camera.sensor_id)
+        else:
+            rig.add_sensor(camera.sensor_id, colmap_pose(sensors[name]))
+    model.add_rig(rig)
+    black = np.zeros(3, np.uint8)
+    places = board.corners
+    corners = {index: model.add_point3D(places[index], pycolmap.Track(), black) for index in _repeated(sightings)}
+    images: list[tuple[int, str, Sighting]] = []
+    for instant, pose in rig_poses.items():
+        frame = pycolmap.Frame(frame_id=instant + 1, rig_id=1)
+        for name, sights in sightings.items():
+            for sight in (sight for sight in sights if sight.instant == instant):
+                images.append((len(images) + 1, name, sight))
+                frame.add_data_id(pycolmap.data_t(cameras[name].sensor_id, len(images)))
+        frame.rig_from_world = colmap_pose(pose)
+        model.add_frame(frame)
+    for number, name, sight in images:
+        image = pycolmap.Image(
+            name=f"{name}/{sight.instant}",
+            camera_id=cameras[name].camera_id,
+            image_id=number,
+            frame_id=sight.instant + 1,
+        )
+        seen = [(pixel, corners[corner]) for pixel, corner in _of_points(sight, corners)]
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel, point) for pixel, point in seen])
+        model.add_image(image)
+    for instant in rig_poses:
+        model.register_frame(instant + 1)
+    for number, _, sight in images:
+        for index, (_, corner) in enumerate(_of_points(sight, corners)):
+            model.point3D(corners[corner]).track.add_element(number, index)
+    return model
+
+
+def _repeated(sightings: Sightings) -> list[int]:
+    """The corners that have two observations or more: COLMAP adjusts no others."""
+    seen = [sight.corners for sights in sightings.values() for sight in sights]
+    corners, counts = np.unique(np.concatenate(seen), return_counts=True)
+    return [int(corner) for corner in corners[counts > 1]]
+
+
+def _of_points(sight: Sighting, points: Mapping[int, int]) -> list[tuple[Floats, int]]:
+    pairs = zip(sight.pixels, sight.corners.tolist(), strict=True)
+    return [(pixel, corner) for pixel, corner in pairs if corner in points]
+
+
+def sensor_poses(model: Any, cameras: Mapping[str, Any]) -> dict[str, Floats]:
+    """Rig-to-camera matrices ``[4, 4]``."""
+    rig = model.rig(1)
+    return {
+        name: np.eye(4) if rig.is_ref_sensor(camera.sensor_id) else matrix(rig.sensor_from_rig(camera.sensor_id))
+        for name, camera in cameras.items()
+    }
+
+
+def rig_poses(model: Any) -> dict[int, Floats]:
+    """Board-to-rig matrices ``[4, 4]`` by instant."""
+    return {number - 1: matrix(model.frame(number).rig_from_world) for number in sorted(model.reg_frame_ids())}
+
+
+def matrix(pose: Any) -> Floats:
+    """A rigid motion of pycolmap as ``[4, 4]``."""
+    return np.vstack([np.array(pose.matrix()), [0.0, 0.0, 0.0, 1.0]])
+
 
 FIELDS_OF_VIEW: Mapping[LensModel, tuple[float, ...]] = {
     "pinhole": (30.0, 50.0, 70.0, 90.0),
@@ -53,7 +139,6 @@ def solve_board(
     *,
     lens: LensModel = "opencv",
     known: Mapping[str, LensCamera] | None = None,
-    seed: int = 0,
 ) -> SolvedCalibration:
     """Poses, intrinsics and lenses from pictures of ``board`` at many instants.
 
@@ -71,34 +156,36 @@ def solve_board(
 
     Raises:
         CalibrationError: a camera that does not show the board well enough, or at no instant at which it connects to
-            the others; another board than said.
+            the others; another board than given.
         MissingExtraError: pycolmap or cv2 is not installed.
     """
     pycolmap_module()
-    checked_pictures(pictures)
     sightings = board_sightings(pictures, board)
     known = known or {}
     views = {}
     for number, (name, shots) in enumerate(pictures.items(), 1):
         size = shots[0].shape[1], shots[0].shape[0]
-        starts = [colmap_camera(known[name], number)] if name in known else _guesses(lens, number, size)
-        views[name] = _own_view(name, sightings[name], board, starts, fixed=name in known, seed=seed)
+        if name in known:
+            starts = [colmap_camera(known[name], number)]
+        else:
+            starts = [guessed_camera(lens, number, size, degrees) for degrees in FIELDS_OF_VIEW[lens]]
+        views[name] = _own_view(name, sightings[name], board, starts, fixed=name in known)
     sensors = _connected_sensors(views)
     poses = _rig_poses(views, sensors, sightings)
     cameras = {name: view.camera for name, view in views.items()}
     fixed = frozenset(cameras[name].camera_id for name in known)
     free = Freedom(*[len(known) < len(pictures)] * 3)
     filmed = _filmed(cameras, sensors)
-    kept: Sightings = {name: [s for s in sightings[name] if s.instant in view.poses] for name, view in views.items()}
+    inliers: Sightings = {name: [s for s in sightings[name] if s.instant in view.poses] for name, view in views.items()}
     for _ in range(2):
-        model = board_model(board, kept, cameras, sensors, poses)
+        model = board_model(board, inliers, cameras, sensors, poses)
         adjust(model, freedom=free, fixed=fixed, constant_points=True)
         cameras = {name: model.camera(camera.camera_id) for name, camera in cameras.items()}
         sensors, poses = sensor_poses(model, cameras), rig_poses(model)
         filmed = _filmed(cameras, sensors)
-        kept = _without_outliers(kept, _solved(board, kept, filmed, poses))
-    filmed, poses = adjust_board(board, kept, filmed, poses, lens=lens, known=frozenset(known))
-    return _solved(board, kept, filmed, poses)
+        inliers = _without_outliers(inliers, _solved(board, inliers, filmed, poses))
+    filmed, poses = adjust_board(board, inliers, filmed, poses, lens=lens, known=frozenset(known))
+    return _solved(board, inliers, filmed, poses)
 
 
 @dataclass(frozen=True)
@@ -109,13 +196,7 @@ class _View:
     poses: Mapping[int, Floats]
 
 
-def _guesses(lens: LensModel, number: int, size: tuple[int, int]) -> list[Any]:
-    return [guessed_camera(lens, number, size, degrees) for degrees in FIELDS_OF_VIEW[lens]]
-
-
-def _own_view(
-    name: str, sights: Sequence[Sighting], board: Board, starts: Sequence[Any], *, fixed: bool, seed: int
-) -> _View:
+def _own_view(name: str, sights: Sequence[Sighting], board: Board, starts: Sequence[Any], *, fixed: bool) -> _View:
     """Intrinsics from the best start, and a pose for each sighting that agrees with them."""
     chosen = sorted(sights, key=lambda sight: (-len(sight.corners), sight.instant))[: 2 * MAX_SIGHTINGS_ALONE]
     chosen = sorted(chosen, key=lambda sight: sight.instant)
@@ -123,7 +204,7 @@ def _own_view(
     sample = [chosen[index] for index in picks]
     best: tuple[float, Any] | None = None
     for camera in starts:
-        poses = _poses(camera, sample, board, seed=seed)
+        poses = _poses(camera, sample, board)
         if len(poses) < max(3, len(sample) // 2):
             continue
         if not fixed:
@@ -132,11 +213,11 @@ def _own_view(
             adjust(model, freedom=Freedom(), constant_points=True)
             camera = model.camera(camera.camera_id)
             model.update_point_3d_errors()
-        error = _misfit(camera, sample, board, seed=seed)
+        error = _misfit(camera, sample, board)
         if best is None or error < best[0]:
             best = error, camera
     if best is not None:
-        poses = _poses(best[1], sights, board, seed=seed, share=0.005)
+        poses = _poses(best[1], sights, board, share=0.005)
         if len(poses) >= 3:
             return _View(best[1], poses)
     raise CalibrationError(
@@ -146,14 +227,12 @@ def _own_view(
     )
 
 
-def _poses(
-    camera: Any, sights: Sequence[Sighting], board: Board, *, seed: int, share: float = POSE_PIXELS
-) -> dict[int, Floats]:
+def _poses(camera: Any, sights: Sequence[Sighting], board: Board, *, share: float = POSE_PIXELS) -> dict[int, Floats]:
     """Board-to-camera matrices by instant, of the sightings of which most corners agree."""
     pycolmap = pycolmap_module()
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = max(2.0, share * max(camera.width, camera.height))
-    options.ransac.random_seed = seed
+    options.ransac.random_seed = 0
     found = {}
     for sight in sights:
         result = pycolmap.estimate_and_refine_absolute_pose(sight.pixels, board.corners[sight.corners], camera, options)
@@ -162,10 +241,10 @@ def _poses(
     return found
 
 
-def _misfit(camera: Any, sights: Sequence[Sighting], board: Board, *, seed: int) -> float:
+def _misfit(camera: Any, sights: Sequence[Sighting], board: Board) -> float:
     """Median over the sightings of the median reprojection error, pixels; infinite for one without a pose."""
     errors = []
-    poses = _poses(camera, sights, board, seed=seed)
+    poses = _poses(camera, sights, board)
     for sight in sights:
         if sight.instant not in poses:
             errors.append(np.inf)
@@ -249,14 +328,14 @@ def _without_outliers(sightings: Sightings, solved: SolvedCalibration) -> Sighti
     errors = solved.errors()
     limit = max(OUTLIER_PIXELS, 6 * float(np.nanmedian(errors)))
     good = iter((errors <= limit).tolist())
-    kept: dict[str, list[Sighting]] = {}
+    inliers: dict[str, list[Sighting]] = {}
     for name, sights in sightings.items():
-        kept[name] = []
+        inliers[name] = []
         for sight in sights:
             inside = np.array([next(good) for _ in sight.corners], bool)
             if inside.sum() >= 4:
-                kept[name].append(replace(sight, corners=sight.corners[inside], pixels=sight.pixels[inside]))
-    return kept
+                inliers[name].append(replace(sight, corners=sight.corners[inside], pixels=sight.pixels[inside]))
+    return inliers
 
 
 def adjust_board(
@@ -277,7 +356,7 @@ def adjust_board(
     number = {instant: index for index, instant in enumerate(poses)}
     seen = [(index, sight) for index, name in enumerate(cameras) for sight in sightings[name]]
     counts = [len(sight.corners) for _, sight in seen]
-    sights = Sights(
+    sights = BodyObservations(
         np.repeat([index for index, _ in seen], counts).astype(np.intp),
         np.repeat([number[sight.instant] for _, sight in seen], counts).astype(np.intp),
         np.concatenate([board.corners[sight.corners] for _, sight in seen]),
@@ -290,8 +369,8 @@ def adjust_board(
         (stack[:, :3, :3], stack[:, :3, 3]),
         lens=np.arange(len(cameras)),
         free=(FOCAL, ASPECT, ACROSS, DOWN, *DISTORTION[lens]),
-        held=np.array([name in known for name in cameras]),
-        turning=True,
+        fixed=np.array([name in known for name in cameras]),
+        rotating=True,
     )
     bundle, scene = estimated(bundle, scene)
     scene = _from_first(scene)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bundle adjustment of cameras that are alike, which COLMAP's has no terms for.
 
-What is adjusted beside cameras are bodies: points, or poses of a board whose corners are known. They are eliminated
+Apart from cameras, bodies are adjusted: points, or poses of a board whose corners are known. They are eliminated
 from the normal equations (Brown, 1958; Triggs et al., Bundle adjustment: a modern synthesis, 2000), which are solved by
 Levenberg's and Marquardt's method with Huber's loss. Terms of intrinsics may have a prior that cameras share
 (``lens_prior.py``).
@@ -27,7 +27,7 @@ SMALL = 1e-6
 
 
 @dataclass(frozen=True)
-class Sights:
+class BodyObservations:
     """What was observed.
 
     Args:
@@ -67,58 +67,58 @@ class Bundle:
     """A problem of bundle adjustment.
 
     Args:
-        sights: what was observed.
+        observations: of the bodies.
         lens: ``[C]``, which row of lenses a camera has.
         sizes: ``[C, 2]``, width and height of the pictures.
         fisheye: ``[C]``, whether a camera's terms are a fisheye's.
         free: the terms of the rows that are estimated.
-        held: ``[L]``, lenses that stay.
-        turning: whether bodies have rotations.
+        fixed: ``[L]``, lenses that stay.
+        rotating: whether bodies have rotations.
         prior: of the terms.
         noise: standard deviation of the pixels.
     """
 
-    sights: Sights
+    observations: BodyObservations
     lens: Indices
     sizes: Floats
     fisheye: NDArray[np.bool_]
     free: tuple[int, ...]
-    held: NDArray[np.bool_]
-    turning: bool
+    fixed: NDArray[np.bool_]
+    rotating: bool
     prior: LensPrior
     noise: float = 0.5
 
     @property
     def columns(self) -> tuple[int, int, int]:
         """Number of parameters of poses, of lenses, and of a body."""
-        return 6 * len(self.lens), len(self.held) * len(self.free), 6 if self.turning else 3
+        return 6 * len(self.lens), len(self.fixed) * len(self.free), 6 if self.rotating else 3
 
-    def misses(self, scene: Scene) -> Floats:
+    def residuals(self, scene: Scene) -> Floats:
         """Projected minus observed ``[M, 2]``, pixels; infinite behind a camera."""
-        own, local = self.sights.camera, self._local(scene)
+        own, local = self.observations.camera, self._local(scene)
         ahead = local[:, 2] > 0
         safe = np.where(ahead[:, None], local, [0.0, 0.0, 1.0])
         found = projected(safe, scene.rows[self.lens[own]], self.sizes[own], self.fisheye[own])
-        return np.where(ahead[:, None], found - self.sights.pixels, np.inf)
+        return np.where(ahead[:, None], found - self.observations.pixels, np.inf)
 
     def cost(self, scene: Scene) -> float:
         """Huber's loss of the misses, and what the prior adds."""
-        off = np.linalg.norm(self.misses(scene), axis=1) / self.noise
+        off = np.linalg.norm(self.residuals(scene), axis=1) / self.noise
         if not np.isfinite(off).all():
             return float("inf")
         loss = np.where(off <= HUBER, off**2 / 2, HUBER * off - HUBER**2 / 2)
         return float(loss.sum()) + self.prior.cost(scene.rows)
 
     def _local(self, scene: Scene) -> Floats:
-        seen = self.sights
+        seen = self.observations
         world = np.einsum("mab,mb->ma", scene.turns[seen.body], seen.place) + scene.places[seen.body]
         return np.einsum("mab,mb->ma", scene.rotations[seen.camera], world) + scene.translations[seen.camera]
 
 
-def solved(bundle: Bundle, scene: Scene, *, most: int = MAX_STEPS) -> Scene:
-    """The scene of least cost near ``scene``, or after ``most`` steps."""
+def solved(bundle: Bundle, scene: Scene, *, max_steps: int = MAX_STEPS) -> Scene:
+    """The scene of least cost near ``scene``, or after ``max_steps`` steps."""
     damping, cost = 1e-4, bundle.cost(scene)
-    for _ in range(most):
+    for _ in range(max_steps):
         system = linearized(bundle, scene)
         for _ in range(10):
             tried = system.stepped(bundle, scene, damping)
@@ -149,8 +149,9 @@ class System:
         from scipy.sparse import bsr_array
 
         diagonal = np.einsum("bii->bi", self.V)
-        inverse: Floats = np.asarray(np.linalg.inv(self.V + _diagonals(damping * diagonal + 1e-12)), np.float64)
-        count, size = len(inverse), inverse.shape[1]
+        count, size = diagonal.shape
+        damped = self.V + (damping * diagonal + 1e-12)[:, :, None] * np.eye(size)
+        inverse: Floats = np.asarray(np.linalg.inv(damped), np.float64)
         blocks = bsr_array((inverse, np.arange(count), np.arange(count + 1)), shape=(count * size, count * size))
         weighed = self.W @ blocks.tocsr()
         own = np.diag(self.A)
@@ -175,25 +176,25 @@ def linearized(bundle: Bundle, scene: Scene) -> System:
     """The normal equations at ``scene``."""
     poses, lenses, size = bundle.columns
     by_camera, by_body, columns = _derivatives(bundle, scene)
-    misses = bundle.misses(scene)
-    off = np.linalg.norm(misses, axis=1) / bundle.noise
+    residuals = bundle.residuals(scene)
+    off = np.linalg.norm(residuals, axis=1) / bundle.noise
     weight = np.where(off <= HUBER, 1.0, HUBER / np.maximum(off, HUBER)) / bundle.noise**2
     total = poses + lenses
     A, gradient = np.zeros((total, total)), np.zeros(total)
     for camera in range(len(bundle.lens)):
-        own = np.flatnonzero(bundle.sights.camera == camera)
+        own = np.flatnonzero(bundle.observations.camera == camera)
         if len(own):
             J, w = by_camera[own], weight[own]
             where = columns[own[0]]
             A[np.ix_(where, where)] += np.einsum("m,mai,maj->ij", w, J, J, optimize=True)
-            gradient[where] += np.einsum("m,mai,ma->i", w, J, misses[own])
+            gradient[where] += np.einsum("m,mai,ma->i", w, J, residuals[own])
     bundle.prior.add(A, gradient, scene.rows, start=poses, free=bundle.free)
-    stuck = np.diag(A) == 0  # what is held, or seen by nobody
+    stuck = np.diag(A) == 0  # what is fixed, or observed by no camera
     A[stuck, stuck] = 1.0
     count = len(scene.places)
     V, body_gradient = np.zeros((count, size, size)), np.zeros((count, size))
-    np.add.at(V, bundle.sights.body, np.einsum("m,mai,maj->mij", weight, by_body, by_body))
-    np.add.at(body_gradient, bundle.sights.body, np.einsum("m,mai,ma->mi", weight, by_body, misses))
+    np.add.at(V, bundle.observations.body, np.einsum("m,mai,maj->mij", weight, by_body, by_body))
+    np.add.at(body_gradient, bundle.observations.body, np.einsum("m,mai,ma->mi", weight, by_body, residuals))
     return System(
         A, V, _crossed(bundle, weight, by_camera, by_body, columns, (total, count * size)), gradient, body_gradient
     )
@@ -201,16 +202,16 @@ def linearized(bundle: Bundle, scene: Scene) -> System:
 
 def _derivatives(bundle: Bundle, scene: Scene) -> tuple[Floats, Floats, Indices]:
     """Of the misses by their camera's parameters ``[M, 2, 6 + F]`` and by their body's, and the former's unknowns."""
-    seen, (poses, _, _) = bundle.sights, bundle.columns
+    seen, (poses, _, _) = bundle.observations, bundle.columns
     own, lens = seen.camera, bundle.lens[seen.camera]
     on_body = np.einsum("mab,mb->ma", scene.turns[seen.body], seen.place)
     turned = np.einsum("mab,mb->ma", scene.rotations[own], on_body + scene.places[seen.body])
     local = turned + scene.translations[own]
     by_point, by_row = derivatives(local, scene.rows[lens], bundle.sizes[own], bundle.fisheye[own], bundle.free)
-    by_row[bundle.held[lens]] = 0.0
+    by_row[bundle.fixed[lens]] = 0.0
     by_camera = np.concatenate([by_point @ _crosses(-turned), by_point, by_row], 2)
     by_world = by_point @ scene.rotations[own]
-    by_body = np.concatenate([by_world @ _crosses(-on_body), by_world], 2) if bundle.turning else by_world
+    by_body = np.concatenate([by_world @ _crosses(-on_body), by_world], 2) if bundle.rotating else by_world
     free = len(bundle.free)
     columns = np.concatenate([6 * own[:, None] + np.arange(6), poses + free * lens[:, None] + np.arange(free)], 1)
     return by_camera, by_body, columns
@@ -224,7 +225,7 @@ def _crossed(
     size = bundle.columns[2]
     blocks = np.einsum("m,mai,maj->mij", weight, by_camera, by_body)
     rows = np.broadcast_to(columns[:, :, None], blocks.shape)
-    bodies = size * bundle.sights.body[:, None, None] + np.arange(size)
+    bodies = size * bundle.observations.body[:, None, None] + np.arange(size)
     return csr_array((blocks.ravel(), (rows.ravel(), np.broadcast_to(bodies, blocks.shape).ravel())), shape=shape)
 
 
@@ -234,7 +235,7 @@ def _moved(bundle: Bundle, scene: Scene, step: Floats, body_step: Floats) -> Sce
     rows = scene.rows.copy()
     rows[:, bundle.free] += step[poses : poses + lenses].reshape(len(rows), -1)
     turns = scene.turns
-    if bundle.turning:
+    if bundle.rotating:
         turns = np.stack([rotation_matrix(w) for w in body_step[:, :3]]) @ turns
     return replace(
         scene,
@@ -251,7 +252,3 @@ def _crosses(vectors: Floats) -> Floats:
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3)
-
-
-def _diagonals(values: Floats) -> Floats:
-    return values[:, :, None] * np.eye(values.shape[1])

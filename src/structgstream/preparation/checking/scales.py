@@ -28,12 +28,12 @@ MIN_EXTENT = 0.03  # of the points that a rig sees, as a share of their depth
 def observed_depths(tracks: Tracks, cameras: Mapping[str, Camera], *, off: Collection[str] = ()) -> Floats:
     """Depths of points in the cameras, of those not ``off``, that observed them; of three cameras, or else of two."""
     views = tracks.views
-    least = MIN_VIEWS if (views >= MIN_VIEWS).sum() >= MIN_POINTS else 2
+    min_views = MIN_VIEWS if (views >= MIN_VIEWS).sum() >= MIN_POINTS else 2
     depths = []
     for number, name in enumerate(tracks.names):
         if name in off:
             continue
-        rows = (tracks.camera == number) & (views[tracks.point] >= least) & np.isfinite(tracks.residuals)
+        rows = (tracks.camera == number) & (views[tracks.point] >= min_views) & np.isfinite(tracks.residuals)
         depths.append(project(cameras[name], tracks.points[tracks.point[rows]])[1])
     return np.concatenate(depths) if depths else np.empty(0)
 
@@ -59,7 +59,7 @@ def scale_findings(
         points: ``[P, 3]`` that came with the capture, or None.
         cameras: of the rig.
         radius: of the rig.
-        unit: of length, where the capture says.
+        unit: of length, where the capture states it.
     """
     findings = []
     near = float(np.median([camera.near for camera in cameras.values()]))
@@ -93,8 +93,8 @@ def scale_findings(
                 f"look like {like}; convert them, or give a distance between two cameras.",
             )
         )
-    if points is not None and len(points) >= MIN_POINTS and (told := _foreign(points, depths, cameras)):
-        findings.append(Finding("error", told))
+    if points is not None and len(points) >= MIN_POINTS and (sentence := _foreign(points, depths, cameras)):
+        findings.append(Finding("error", sentence))
     return findings
 
 

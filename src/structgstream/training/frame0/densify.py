@@ -63,7 +63,7 @@ class GrowthConfig:
         """The same for pictures whose sides are ``enlarged`` times those of the reference size (``View.enlargement``).
 
         Their detail has as many times the anchors: in proportion to the pictures' sides, since edges and not areas have
-        most of it, and at most :data:`MAX_ANCHORS` (docs/scaling.md).
+        most of it, and at most :data:`MAX_ANCHORS` (lab/notes/scaling.md).
         """
         most = min(round(self.max_anchors * enlarged), MAX_ANCHORS)
         return replace(self, max_anchors=max(self.max_anchors, most))

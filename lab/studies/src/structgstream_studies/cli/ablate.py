@@ -53,7 +53,7 @@ class Ablate(ExperimentOptions):
 def main(arguments: list[str]) -> None:
     """Runs, prints, draws."""
     options, rest = parse_known_options(Ablate, "ablate", arguments=arguments)
-    from structgstream.presets import DEFAULT_PRESET, PAPER_METHOD_PRESET
+    from structgstream.session.presets import DEFAULT_PRESET, PAPER_METHOD_PRESET
 
     full, _ = resolve_config(options.preset or PAPER_METHOD_PRESET, rest, command="ablate", seed=None)
     compact, _ = resolve_config(options.preset or DEFAULT_PRESET, rest, command="ablate", seed=None)

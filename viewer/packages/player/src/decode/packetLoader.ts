@@ -71,8 +71,7 @@ export class PacketLoader {
         // The packets before it are being fetched.
         if (!files || this.runs.length >= MAX_RUNS) return;
       } else if (urgent) this.cancel();
-      else if (files ? this.runs.length >= MAX_RUNS : this.runs.length || missing - first > (ahead - first) / 2)
-        return;
+      else if (files ? this.runs.length >= MAX_RUNS : this.runs.length || missing - first > (ahead - first) / 2) return;
       const end = this.runEnd(missing, first, files && !urgent ? Number.POSITIVE_INFINITY : Math.max(ahead, needed));
       if (end <= missing) return;
       this.begin(missing, end);

@@ -6,7 +6,7 @@ import { type ByteSource, SourceError } from "./byteSource.js";
 import type { ReadReply, ReadRequest, SourceDescription, StoredPlace } from "./description.js";
 import { HttpSource } from "./httpSource.js";
 import { joined } from "./joined.js";
-import { type Manifest, MAX_MANIFEST_BYTES, pageIn, type Quality } from "./manifest.js";
+import { MAX_MANIFEST_BYTES, type Manifest, pageIn, type Quality } from "./manifest.js";
 import { ManifestFeed } from "./manifestFeed.js";
 import { pause } from "./pause.js";
 import type { Port } from "./port.js";

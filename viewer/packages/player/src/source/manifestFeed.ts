@@ -9,7 +9,7 @@
 import { SourceError } from "./byteSource.js";
 import { answered, refusal } from "./httpSource.js";
 import { joined } from "./joined.js";
-import { type Manifest, MAX_MANIFEST_BYTES, manifestIn, type Quality } from "./manifest.js";
+import { MAX_MANIFEST_BYTES, type Manifest, manifestIn, type Quality } from "./manifest.js";
 import { pause } from "./pause.js";
 import type { RetryPolicy } from "./retryPolicy.js";
 

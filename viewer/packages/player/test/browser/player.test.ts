@@ -75,6 +75,58 @@ describe.skipIf(!executable)("the player in a browser", () => {
     expectQuiet();
   });
 
+  test("has the events, properties, poster, slots and parts of a video", async () => {
+    stage.server.put("/poster.svg", new TextEncoder().encode('<svg xmlns="http://www.w3.org/2000/svg"/>'), {
+      type: "image/svg+xml",
+    });
+    const page = await open('src="clip.sgs" poster="poster.svg"');
+    await page.addStyleTag({ content: "structgstream-player::part(controls) { opacity: 0.5; transition: none }" });
+    await page.evaluate(() => {
+      const names =
+        "loadstart durationchange loadedmetadata loadeddata canplay play playing pause seeking seeked ratechange ended";
+      const player = document.querySelector("structgstream-player")!;
+      const media: string[] = [];
+      Object.assign(window, { media });
+      for (const name of names.split(" ")) player.addEventListener(name, () => media.push(name));
+      player.insertAdjacentHTML("beforeend", '<p id="own">Own</p><button slot="controls" id="mine">Mine</button>');
+      player.src = "clip.sgs?again";
+    });
+    const media = () => page.evaluate(() => (window as unknown as { media: string[] }).media.splice(0));
+    const happened = (name: string) =>
+      page.waitForFunction((wanted) => (window as unknown as { media: string[] }).media.includes(wanted), name);
+    await happened("canplay");
+    expect(await media()).toEqual(["loadstart", "durationchange", "loadedmetadata", "loadeddata", "canplay"]);
+    expect(
+      await ask(page, (player) => [
+        player.readyState,
+        player.seekable.length,
+        player.seekable.end(0).toFixed(1),
+        player.ended,
+        player.error,
+        player.currentSrc.split("/").at(-1)!,
+        (player.shadowRoot!.querySelector(".poster") as HTMLElement).hidden,
+      ]),
+    ).toEqual([4, 1, "0.4", false, null, "clip.sgs?again", true]);
+    await ask(page, (player) => {
+      player.currentTime = 0.2;
+    });
+    await happened("seeked");
+    expect(await media()).toEqual(["seeking", "seeked"]);
+    await ask(page, async (player) => {
+      player.playbackRate = 0.5;
+      await player.play();
+    });
+    await happened("ended");
+    const ending = await media();
+    expect(ending.slice(0, 3)).toEqual(["ratechange", "play", "playing"]);
+    expect(ending.slice(-2)).toEqual(["pause", "ended"]);
+    for (const own of ["#own", "#mine"]) expect(await page.locator(own).isVisible()).toBe(true);
+    expect(await ask(page, (player) => getComputedStyle(player.shadowRoot!.querySelector(".bar")!).opacity)).toBe(
+      "0.5",
+    );
+    expectQuiet();
+  });
+
   test("seeks back and forth over groups, asking for what is missing only", async () => {
     const page = await open();
     await shows(page, 0);
