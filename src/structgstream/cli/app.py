@@ -33,6 +33,7 @@ COMMANDS = {
     "token": "make an access token for a served stream",
     "render": "render a camera or a camera path to mp4 or PNG",
     "export": "write a page with a player, or frames as plain 3D Gaussians: .ply, .spz, .sog, .glb, .usd ...",
+    "import": "make a stream of a numbered .ply sequence of another trainer",
     "archive": "turn a folder of segments into one stream file",
     "inspect": "show the content of a stream file",
     "doctor": "show available back-ends and packages, and how to install missing ones",
