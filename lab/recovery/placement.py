@@ -20,9 +20,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.open import open_capture
-from structgstream.data.posed import rotation_matrix
 from structgstream.data.prepared import read_prepared, write_prepared
 from structgstream.preparation.calibration.solved import rig_alignment
 

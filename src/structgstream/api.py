@@ -13,7 +13,7 @@ from typing import Literal
 
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.retention import SegmentsOptions
-from structgstream.data.clip import bundled_clip_path
+from structgstream.data.json_videos import bundled_clip_path
 from structgstream.data.open import open_capture
 from structgstream.data.source import FrameSource, FrameStream
 from structgstream.errors import ConfigError

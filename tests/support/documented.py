@@ -123,7 +123,7 @@ class Packet:
         return sign * size
 
     def is_whole(self) -> bool:
-        return all(code.is_whole() for code in self.codes.values())
+        return all(code.is_complete() for code in self.codes.values())
 
 
 def passes(n: int) -> Iterator[tuple[int, int, int]]:

@@ -123,7 +123,7 @@ def _prepare(options: Prepare, console: Console) -> "Sequence[Finding]":
 
 
 def _check(options: Prepare, console: Console) -> "Sequence[Finding]":
-    from structgstream.data.folder_files import REPORT
+    from structgstream.data.camera_files import REPORT
     from structgstream.preparation.prepare import check_folder
 
     folder = options.videos / REPORT if options.report is None else options.report

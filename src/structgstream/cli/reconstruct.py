@@ -15,7 +15,7 @@ from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError, usage_errors
 from structgstream.cli.config_help import config_lines
-from structgstream.cli.live_run import LiveChoice, ending_of, open_live, run_metrics, watched
+from structgstream.cli.live_run import LiveChoice, monitored, open_live, run_metrics, stop_of
 from structgstream.cli.options import (
     CaptureOptions,
     Device,
@@ -259,8 +259,8 @@ def run_reconstruction(
     peaks: dict[str, int] = {}
     try:
         with (
-            Termination(on_ask=ending_of(source)) as ending,
-            watched(source, metrics, done=done) as progress,
+            Termination(on_ask=stop_of(source)) as ending,
+            monitored(source, metrics, done=done) as progress,
             closing(run.reports) as reports,
         ):
             for report in reports:

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from structgstream.atomic_files import partial_path
-from structgstream.data.prefetch import read_ahead
 from structgstream.data.source import FrameSource
+from structgstream.data.wrappers import read_ahead
 from structgstream.errors import ConfigError, StreamError
 from structgstream.groups.base import GroupBase
 from structgstream.groups.boundaries import equal_groups, quiet_groups

@@ -17,9 +17,9 @@ from typing import Any
 
 from structgstream.codec.packets import PacketSink
 from structgstream.data.denoising import DenoisingConfig, denoised
-from structgstream.data.prefetch import read_ahead
 from structgstream.data.shared_frames import SharedFrames
 from structgstream.data.source import FrameStream
+from structgstream.data.wrappers import read_ahead
 from structgstream.errors import StorageError
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry, read_log
 from structgstream.kernels.backend import Backend
