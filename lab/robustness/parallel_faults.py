@@ -31,8 +31,7 @@ from structgstream.data.json_videos import bundled_clip_path
 from structgstream.errors import StorageError, TaskError
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.local import LocalEngine
-from structgstream.executors.task import PYTHON
-from structgstream.executors.worker_slots import WorkerSlot
+from structgstream.executors.task import PYTHON, WorkerSlot
 from structgstream.parallel.driver import Job, drive
 from structgstream.parallel.exchange import ObjectStore
 from structgstream.parallel.object_folder import ObjectFolder

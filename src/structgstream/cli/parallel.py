@@ -20,8 +20,7 @@ from structgstream.cli.options import (
     resolve_config,
 )
 from structgstream.cli.parallel_display import ParallelDisplay
-from structgstream.cli.plain_text import say
-from structgstream.cli.progress import human_bytes
+from structgstream.cli.progress import human_bytes, print_lines
 from structgstream.executors.opening import ExecutorName, ExecutorOptions
 
 if TYPE_CHECKING:
@@ -137,7 +136,7 @@ def main(arguments: list[str]) -> None:
                 parts.clear()
             _drive(job, parts, executor, store, console)
     size = human_bytes(options.output.stat().st_size)
-    say(console, f"Wrote {options.output}: {size}. Its parts in {parts.folder} are no longer needed.")
+    print_lines(console, f"Wrote {options.output}: {size}. Its parts in {parts.folder} are no longer needed.")
 
 
 def _check(options: Parallel, config: "StreamConfig", parts: "Parts") -> None:
@@ -187,7 +186,7 @@ def gpus_of(device: Device) -> int:
 def join_arguments(options: WorkerOptions, device: Device) -> tuple[str, ...]:
     """As many processes as the workers have threads; on a cluster and with GPUs the default of ``join``."""
     from structgstream.evaluation.environment import usable_cores
-    from structgstream.executors.worker_slots import allocate_slots
+    from structgstream.executors.task import allocate_slots
 
     if options.executor == "ray" or gpus_of(device):
         return ()

@@ -10,9 +10,8 @@ from structgstream.atomic_files import atomic_write
 from structgstream.errors import StorageError, TaskError
 from structgstream.executors.executor import Executor, TaskQueue
 from structgstream.executors.local import LocalEngine
-from structgstream.executors.task import Task, TaskResult
-from structgstream.executors.worker_slots import WorkerSlot
-from structgstream.groups.group_list import Groups, groups_path, read_groups
+from structgstream.executors.task import Task, TaskResult, WorkerSlot
+from structgstream.groups.boundaries import Groups, groups_path, read_groups
 from structgstream.parallel.exchange import SharedFolder
 from structgstream.parallel.parts import Parts, group_name, key_of, sha256_of
 from structgstream.parallel.unit import HEADER, JOIN, TRACK, Unit

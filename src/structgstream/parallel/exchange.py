@@ -10,7 +10,7 @@ from structgstream.atomic_files import atomic_write, partial_path
 from structgstream.errors import StorageError
 from structgstream.evaluation.run_log import log_path
 from structgstream.executors.task import PYTHON, Task
-from structgstream.groups.group_list import groups_path
+from structgstream.groups.boundaries import groups_path
 from structgstream.owned_folders import MARKER, Owner
 from structgstream.parallel.object_folder import ObjectFolder
 from structgstream.parallel.parts import PART_NAMES, Parts

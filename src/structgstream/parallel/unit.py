@@ -9,9 +9,8 @@ from typing import Protocol
 
 from structgstream.atomic_files import partial_path
 from structgstream.errors import StreamError
-from structgstream.executors.task import PYTHON, Task
-from structgstream.executors.worker_slots import thread_environment
-from structgstream.groups.group_list import Groups
+from structgstream.executors.task import PYTHON, Task, thread_environment
+from structgstream.groups.boundaries import Groups
 from structgstream.parallel.parts import Parts, group_name
 
 HEADER, TRACK, JOIN = "header", "track", "join"
