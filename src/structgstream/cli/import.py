@@ -11,8 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import Device, Flag, Folder, check_ending, parse_options
-from structgstream.cli.plain_text import say
-from structgstream.cli.progress import human_bytes
+from structgstream.cli.progress import human_bytes, print_lines
 
 UP = {"x": (-1.0, 0.0, 0.0), "y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, -1.0)}
 
@@ -89,12 +88,12 @@ def main(arguments: list[str]) -> None:
     what = "1 frame" if found.frames == 1 else f"{found.frames} frames"
     low, high = found.counts
     count = f"{high:,}" if low == high else f"{low:,} to {high:,}"
-    say(
+    print_lines(
         console,
         f"Wrote {output}: {what} of {count} Gaussians, {human_bytes(size_bytes)}, "
         f"{human_bytes(round(size_bytes / found.frames))} a frame",
     )
-    say(
+    print_lines(
         console,
         "All files have the same Gaussians; the stream contains their changes."
         if found.linked
@@ -108,4 +107,4 @@ def main(arguments: list[str]) -> None:
             f"{found.color_psnr:.1f} dB"
         )
     )
-    say(console, f"Pictures of frame 0 against those of the file: PSNR {found.psnr:.1f} dB{colors}.")
+    print_lines(console, f"Pictures of frame 0 against those of the file: PSNR {found.psnr:.1f} dB{colors}.")

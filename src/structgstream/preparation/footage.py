@@ -21,10 +21,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.audio import read_audio
-from structgstream.data.camera_files import NO_CAMERAS, UNREAD, filmed_folder, other_roots
-from structgstream.data.folder_files import check_link, files_of, is_hidden, name_of
+from structgstream.data.camera_files import (
+    NO_CAMERAS,
+    UNREAD,
+    check_link,
+    files_of,
+    filmed_folder,
+    is_hidden,
+    name_of,
+    other_roots,
+)
 from structgstream.data.images import PICTURE_SUFFIXES, read_picture, significant_bits
-from structgstream.data.picture_size import check_one_series, picture_size
+from structgstream.data.picture_headers import check_one_series, picture_size
 from structgstream.data.posed_capture import filmed_roots
 from structgstream.data.prepared import pictures_of
 from structgstream.data.timeline import natural, picture_slots

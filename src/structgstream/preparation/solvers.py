@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from structgstream.data.calibration import listed
-from structgstream.data.exif import read_exif
 from structgstream.data.lenses import LensCamera
+from structgstream.data.picture_headers import read_exif
 from structgstream.data.prepared import LENSES, camera_of, lens_model
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.calibration.board_solving import solve_board

@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from structgstream.data.posed import rotation_matrix
+from structgstream.data.calibration import rotation_matrix
 from structgstream.preparation.calibration.bundle import BodyObservations, Bundle, Parameters, linearized, solved
 from structgstream.preparation.calibration.lens_prior import usual_prior
 from structgstream.preparation.calibration.lens_terms import ACROSS, DOWN, FOCAL, K1, K2, K3, TERMS

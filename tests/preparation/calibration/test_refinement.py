@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 
+from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import LensCamera, RadialTangential
-from structgstream.data.posed import rotation_matrix
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.refinement import refine
 from tests.support.calibration_errors import calibration_errors

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
-from structgstream.data.posed import rotation_matrix
+from structgstream.data.calibration import rotation_matrix
 from structgstream.preparation.calibration.lens_prior import LensPrior
 from structgstream.preparation.calibration.lens_terms import derivatives, projected
 

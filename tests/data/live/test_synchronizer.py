@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.data.live.faults import Fault
-from structgstream.data.live.matching import LivePicture, PictureSet, SetMatcher
+from structgstream.data.live.status import Fault
+from structgstream.data.live.synchronizer import FrameSynchronizer, LivePicture, PictureSet
 from tests.support.properties import examples
 
 PERIOD = 1 / 30
@@ -21,7 +21,7 @@ class Rig:
 
     def __init__(self, *names: str, fps: float = 30.0, tolerance: float = PERIOD / 2, deadline: float = 0.5, most=32):
         self.counted: Counter[tuple[str, Fault]] = Counter()
-        self.matcher = SetMatcher(
+        self.synchronizer = FrameSynchronizer(
             names,
             fps=fps,
             tolerance_seconds=tolerance,
@@ -34,11 +34,11 @@ class Rig:
         self.counted[camera, fault] += times
 
     def send(self, camera: str, seconds: float, arrived: float | None = None) -> None:
-        self.matcher.add(camera, LivePicture(seconds, seconds if arrived is None else arrived, (camera, seconds)))
+        self.synchronizer.add(camera, LivePicture(seconds, seconds if arrived is None else arrived, (camera, seconds)))
 
     def sets(self, now: float) -> list[PictureSet]:
         found = []
-        while (one := self.matcher.next_set(now)) is not None:
+        while (one := self.synchronizer.next_set(now)) is not None:
             found.append(one)
         return found
 
@@ -79,7 +79,7 @@ def test_a_camera_known_to_be_gone_is_not_waited_for() -> None:
     for camera in "ab":
         rig.send(camera, 0.0)
     rig.sets(0.0)
-    rig.matcher.forget("b")
+    rig.synchronizer.mark_absent("b")
     rig.send("a", 0.1)
     assert contents(rig.sets(0.1)) == [{"a": 0.1}]
 
@@ -137,7 +137,7 @@ def test_the_oldest_is_dropped_and_counted() -> None:
     rig.send("b", 0.0)
     for number in range(1, 11):
         rig.send("b", number * PERIOD)
-    assert rig.matcher.lengths == {"a": 0, "b": 4}
+    assert rig.synchronizer.queue_lengths == {"a": 0, "b": 4}
     assert rig.counted["b", Fault.OVERFLOW] == 7
 
 
@@ -162,7 +162,7 @@ def test_a_camera_out_of_step_is_named_with_its_distance(off: float) -> None:
         rig.send("a", number * PERIOD)
         rig.send("b", number * PERIOD + off, arrived=number * PERIOD)
         rig.sets(number * PERIOD)
-    astray = rig.matcher.out_of_step(30)
+    astray = rig.synchronizer.out_of_step(30)
     assert [*astray] == ["b"]
     assert astray["b"] * off > 0
     assert abs(astray["b"]) > PERIOD / 2
@@ -183,4 +183,4 @@ def test_no_picture_is_used_twice_and_times_rise(events: list[tuple[str, float]]
     assert len(set(used)) == len(used)
     assert all(b - a >= 0.75 * PERIOD - 1e-9 for a, b in pairwise(times))
     lost = sum(count for count in rig.counted.values())
-    assert len(used) + lost + sum(rig.matcher.lengths.values()) == len(events)
+    assert len(used) + lost + sum(rig.synchronizer.queue_lengths.values()) == len(events)

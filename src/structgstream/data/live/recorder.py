@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keeps the cameras' own packets, so that a live run can be repeated from files.
+"""Records the cameras' packets, so that a live run can be repeated from files.
 
-Each camera has a file: MPEG-TS for codecs that it holds, Matroska for others; both can be read up to where a crash cut
-them. Stamps are those of the common clock, less its value at the beginning, so that a camera that was opened again or
-whose clock jumped stays in step; pictures are not coded again. ``capture.json`` beside them makes the folder a prepared
-capture of the cameras that sent something. Damaged packets, and pictures of another size, are not kept.
+Each camera has a file: MPEG-TS for codecs that it supports, Matroska for others; both can be read up to where a crash
+truncated them. Time stamps are those of the common clock, less its value at the start, so that a camera that
+reconnected or whose clock was reset stays synchronised; pictures are not encoded again. ``capture.json`` makes the
+folder a prepared capture of the cameras that sent something. Damaged packets, and pictures of another size, are not
+recorded.
 
-A file holds one coding, and MPEG-TS counts 26 hours. After :data:`PART_SECONDS`, and when a camera comes back with
-another codec, size or parameters, every camera goes on, at its next key frame, in the folder ``part-001``, then
-``part-002``, each a capture too.
+A file has one codec, and time stamps of MPEG-TS wrap after 26 hours. After :data:`PART_SECONDS`, and when a camera
+returns with another codec, size or parameters, every camera continues, at its next key frame, in the folder
+``part-001``, then ``part-002``, each a capture, too.
 """
 
 import json
@@ -22,8 +23,8 @@ from fractions import Fraction
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from structgstream.data.live.calibration import chosen_cameras
-from structgstream.data.live.faults import FaultLog
+from structgstream.data.live.calibration import select_cameras
+from structgstream.data.live.status import FaultLog
 from structgstream.data.prepared import FILE, PreparedCapture, write_prepared
 from structgstream.data.timeline import Clock
 from structgstream.data.video_index import load_av
@@ -36,8 +37,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 PART_SECONDS = 12 * 3600.0
-LEAD_SECONDS = 10.0  # at the beginning, for cameras whose first pictures lie before the first packet that came
-TRANSPORTED = frozenset({"h264", "hevc", "mpeg2video"})
+LEAD_SECONDS = 10.0  # for cameras whose first pictures were taken before those of the first packet
+MPEGTS_CODECS = frozenset({"h264", "hevc", "mpeg2video"})
 TICKS = 90_000
 STAMPS, FRAMES = "timestamps.csv", "frames.jsonl"
 
@@ -46,18 +47,17 @@ class Recording:
     """The folder of a recording.
 
     Args:
-        folder: is made; where it holds a recording, this one goes on in its next part.
+        folder: created; a recording in it is continued in its next part.
         calibration: of the cameras.
         fps: of the common timeline.
-        unit_name: of the stream, for messages.
 
     Raises:
         StorageError: the folder cannot be written.
     """
 
-    def __init__(self, folder: Path, calibration: PreparedCapture, *, fps: float, unit_name: str) -> None:
-        self._folder, self._calibration, self._fps, self.name = folder, calibration, fps, unit_name
-        self._begins: list[float] = []  # of the parts, on the common clock
+    def __init__(self, folder: Path, calibration: PreparedCapture, *, fps: float) -> None:
+        self._folder, self._calibration, self._fps = folder, calibration, fps
+        self._starts: list[float] = []  # of the parts, on the common clock
         self._lock = threading.Lock()
         self._first = 0
         while (_part(folder, self._first) / FILE).exists():
@@ -65,41 +65,41 @@ class Recording:
         self._files: dict[int, dict[str, str]] = {}
         self._cameras: list[CameraRecorder] = []
         self._texts: dict[Path, IO[str]] = {}
-        self.part(0, {})
+        self.folder(0, {})
 
     def camera(self, name: str, faults: FaultLog) -> "CameraRecorder":
         """The recorder of a camera."""
         self._cameras.append(CameraRecorder(self, name, faults))
         return self._cameras[-1]
 
-    def number(self, common_seconds: float) -> int:
-        """The part in which an instant of the common clock lies."""
+    def part_at(self, common_seconds: float) -> int:
+        """The number of the part of an instant of the common clock."""
         with self._lock:
-            return self._number(common_seconds)
+            return self._part_at(common_seconds)
 
-    def stamp(self, number: int, common_seconds: float) -> float:
-        """Seconds from the beginning of a part to an instant of the common clock; negative before it."""
+    def time_in_part(self, number: int, common_seconds: float) -> float:
+        """Seconds from the start of a part to an instant of the common clock."""
         with self._lock:
-            return common_seconds - self._begins[number]
+            return common_seconds - self._starts[number]
 
-    def number_after(self, part: int, common_seconds: float) -> int | None:
-        """The part in which a file may begin with an instant, after one in ``part``; None if a later one may."""
+    def next_part(self, part: int, common_seconds: float) -> int | None:
+        """The part in which a new file may start at an instant, after one in ``part``; None if none may yet."""
         with self._lock:
-            number = self._number(common_seconds)
-            if number == part == len(self._begins) - 1:
-                self._begins.append(common_seconds)
+            number = self._part_at(common_seconds)
+            if number == part == len(self._starts) - 1:
+                self._starts.append(common_seconds)
                 return number + 1
-            return number if number > part and common_seconds >= self._begins[number] else None
+            return number if number > part and common_seconds >= self._starts[number] else None
 
-    def _number(self, common_seconds: float) -> int:
-        if not self._begins:
-            self._begins = [common_seconds - LEAD_SECONDS]
-        while common_seconds - self._begins[-1] >= PART_SECONDS:
-            self._begins.append(self._begins[-1] + PART_SECONDS)
-        return max(bisect_right(self._begins, common_seconds) - 1, 0)
+    def _part_at(self, common_seconds: float) -> int:
+        if not self._starts:
+            self._starts = [common_seconds - LEAD_SECONDS]
+        while common_seconds - self._starts[-1] >= PART_SECONDS:
+            self._starts.append(self._starts[-1] + PART_SECONDS)
+        return max(bisect_right(self._starts, common_seconds) - 1, 0)
 
-    def part(self, number: int, files: Mapping[str, str]) -> Path:
-        """The folder of a part, whose ``capture.json`` names the files of cameras that sent something."""
+    def folder(self, number: int, files: Mapping[str, str]) -> Path:
+        """The folder of a part, whose ``capture.json`` then names these files of cameras, and those before."""
         with self._lock:
             folder = _part(self._folder, self._first + number)
             if number not in self._files:
@@ -115,29 +115,29 @@ class Recording:
                 for name, camera in self._calibration.cameras.items()
             }
             capture = replace(self._calibration, cameras=cameras, fps=self._fps, points=None)
-            write_prepared(folder, chosen_cameras(capture, [*known]) if known else capture)
+            write_prepared(folder, select_cameras(capture, [*known]) if known else capture)
             return folder
 
-    def frame(self, frame: MultiViewFrame, *, common_seconds: float) -> None:
-        """Notes which instant became which frame of the stream."""
-        number = self.number(common_seconds)
+    def add_frame(self, frame: MultiViewFrame, *, common_seconds: float) -> None:
+        """Records which instant became which frame of the stream."""
+        number = self.part_at(common_seconds)
         entry = {
             "index": frame.index,
             "pts_seconds": round(frame.pts_seconds, 6),
-            "recorded_seconds": round(self.stamp(number, common_seconds), 6),
+            "recorded_seconds": round(self.time_in_part(number, common_seconds), 6),
             "captured_unix_seconds": frame.captured_unix_seconds,
             "cameras": [*frame.images],
         }
-        self.note(number, FRAMES, json.dumps(entry) + "\n")
+        self.add_line(number, FRAMES, json.dumps(entry) + "\n")
 
-    def note(self, number: int, file: str, line: str) -> None:
-        """Adds a line to a text of a part.
+    def add_line(self, number: int, file: str, line: str) -> None:
+        """Appends a line to a text file of a part.
 
         Raises:
             StorageError: it cannot be written.
         """
         if number not in self._files:
-            self.part(number, {})
+            self.folder(number, {})
         path = _part(self._folder, self._first + number) / file
         try:
             with self._lock:
@@ -151,7 +151,7 @@ class Recording:
             raise StorageError(f"{path} cannot be written ({error.strerror}).") from None
 
     def close(self) -> None:
-        """Ends all files; what cannot be written any more is left out."""
+        """Closes all files; what cannot be written any more is left out."""
         for camera in self._cameras:
             camera.close()
         for text in self._texts.values():
@@ -160,62 +160,62 @@ class Recording:
 
 
 class CameraRecorder:
-    """Keeps the packets of one camera; called from its thread. A failure is told, and ends the recording of it."""
+    """Records the packets of one camera; called from its thread. A failure is logged and ends its recording."""
 
     def __init__(self, recording: Recording, name: str, faults: FaultLog) -> None:
         self._recording, self._name, self._faults = recording, name, faults
         self._output: Any = None
         self._stream: Any = None
-        self._coding: tuple[object, ...] | None = None
+        self._codec: tuple[object, ...] | None = None
         self._part = -1
         self._last = -1
         self._failed = False
         self._lock = threading.Lock()
 
-    def keep(self, packet: "Packet", *, shift_seconds: float) -> None:
-        """See ``camera.PacketKeeper``."""
+    def record(self, packet: "Packet", *, shift_seconds: float) -> None:
+        """See ``camera.PacketRecorder``."""
         if self._failed or packet.pts is None or packet.time_base is None:
             return
         try:
             with self._lock:
-                self._keep(packet, shift_seconds)
+                self._record(packet, shift_seconds)
         except (load_av().error.FFmpegError, OSError, ValueError, StorageError) as error:
             self._failed = True
-            self._tell(error)
+            self._report(error)
 
-    def _tell(self, error: Exception) -> None:
+    def _report(self, error: Exception) -> None:
         reason = getattr(error, "strerror", None) or error
-        self._faults.say(self._name, "recording", f"is no longer recorded ({reason}); the stream goes on")
+        self._faults.warn(self._name, "recording", f"is no longer recorded ({reason}); the stream goes on")
 
     def close(self) -> None:
-        """Ends the file."""
+        """Closes the file."""
         with self._lock:
             try:
-                self._finish()
+                self._close()
             except (load_av().error.FFmpegError, OSError, ValueError) as error:
-                self._tell(error)
+                self._report(error)
             self._failed = True
 
-    def _keep(self, packet: "Packet", shift_seconds: float) -> None:
+    def _record(self, packet: "Packet", shift_seconds: float) -> None:
         assert packet.pts is not None
         pts = float(packet.pts * packet.time_base)
         common = pts + shift_seconds
-        number = self._recording.number(common)
-        same = self._output is not None and _coding(packet.stream) == self._coding
-        begins = packet.is_keyframe and (number > self._part or not same)
-        if begins and (new := self._recording.number_after(self._part, common)) is not None:
-            self._begin(packet, new)
+        number = self._recording.part_at(common)
+        same = self._output is not None and _codec(packet.stream) == self._codec
+        starts = packet.is_keyframe and (number > self._part or not same)
+        if starts and (new := self._recording.next_part(self._part, common)) is not None:
+            self._open(packet, new)
             number, same = new, True
         if not same or number < self._part:
             return
-        stamp = self._recording.stamp(self._part, common)
+        stamp = self._recording.time_in_part(self._part, common)
         behind = 0.0 if packet.dts is None else pts - float(packet.dts * packet.time_base)
         self._write(packet, round(stamp * TICKS), round(behind * TICKS))
         line = f"{self._name},{stamp:.6f},{common:.6f},{int(packet.is_keyframe)}\n"
-        self._recording.note(self._part, STAMPS, line)
+        self._recording.add_line(self._part, STAMPS, line)
 
     def _write(self, packet: "Packet", pts: int, behind: int) -> None:
-        """A copy of the packet with other stamps; decoding stamps must rise."""
+        """Writes a copy of the packet with other time stamps; those of decoding must increase."""
         copy = load_av().Packet(bytes(packet))
         copy.stream = self._stream
         copy.time_base = Fraction(1, TICKS)
@@ -225,24 +225,24 @@ class CameraRecorder:
         self._last = copy.dts
         self._output.mux(copy)
 
-    def _begin(self, packet: "Packet", number: int) -> None:
-        self._finish()
+    def _open(self, packet: "Packet", number: int) -> None:
+        self._close()
         codec = packet.stream.codec_context.name
-        suffix, kind = ("ts", "mpegts") if codec in TRANSPORTED else ("mkv", "matroska")
+        suffix, kind = ("ts", "mpegts") if codec in MPEGTS_CODECS else ("mkv", "matroska")
         name = f"{self._name}.{suffix}"
-        folder = self._recording.part(number, {self._name: name})
+        folder = self._recording.folder(number, {self._name: name})
         self._output = load_av().open(str(folder / name), "w", format=kind, options={"flush_packets": "1"})
         self._stream = self._output.add_stream_from_template(packet.stream)
-        self._coding, self._part, self._last = _coding(packet.stream), number, -1
+        self._codec, self._part, self._last = _codec(packet.stream), number, -1
 
-    def _finish(self) -> None:
+    def _close(self) -> None:
         if self._output is not None:
             output, self._output = self._output, None
             output.close()
 
 
-def _coding(stream: Any) -> tuple[object, ...]:
-    """What a file states once for all of its packets."""
+def _codec(stream: Any) -> tuple[object, ...]:
+    """Codec, size and parameters, of which a file has one."""
     context = stream.codec_context
     return context.name, context.width, context.height, bytes(context.extradata or b"")
 
