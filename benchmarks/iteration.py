@@ -17,7 +17,7 @@ from benchmarks.contest import Contestant, Quantity, Results
 from benchmarks.stages import staged
 from benchmarks.world import World, wall_world
 from structgstream.kernels.backend import Backend, cpu_backend
-from structgstream.presets import PAPER
+from structgstream.session.presets import PAPER
 from structgstream.training.online.config import OnlineConfig
 from structgstream.training.online.fit import fit_next_frame
 

@@ -16,7 +16,7 @@ from benchmarks.contenders import torch_but_raster
 from benchmarks.contest import Contestant, Quantity, Results
 from benchmarks.world import World, held_out_psnr, wall_world
 from structgstream.kernels.backend import Backend, cpu_backend
-from structgstream.presets import MOTION, PAPER
+from structgstream.session.presets import MOTION, PAPER
 from structgstream.training.online.config import MotionConfig, OnlineConfig
 from structgstream.training.online.fit import fit_next_frame
 from structgstream.training.online.preprocess import preprocess

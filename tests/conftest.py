@@ -7,6 +7,12 @@ Pictures here are so small that a second thread costs more than it does, and whe
 threads that wait for each other in a loop take the processors from those that work. So there is one thread, threads
 that a test asks for sleep while they wait, and processes that a test starts do the same. OpenMP reads this when it is
 loaded, which is why nothing above the functions imports torch.
+
+Note [Syncing in tests]
+~~~~~~~~~~~~~~~~~~~~~~~
+No test takes the power away, and a killed process loses nothing that it has handed to the system. Waiting for the disk
+was a third of the time of tests of files, so ``os.fsync`` only checks its descriptor here; tests of what is synced, and
+when, put their own function in its place.
 """
 
 import os
@@ -16,13 +22,14 @@ from pathlib import Path
 
 import pytest
 
-from properties import use_for_all
-from shared_folder import open_shared_folder
+from tests.support.properties import use_for_all
+from tests.support.shared_folder import open_shared_folder
 
 SHARED = pytest.StashKey[Path | None]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    os.fsync = os.fstat  # type: ignore[assignment]  # Note [Syncing in tests]
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     use_for_all()

@@ -10,15 +10,15 @@ import pytest
 import torch
 
 import structgstream
-from backends import QUICKEST
-from small_presets import QUICK
 from structgstream.cli import main
-from structgstream.data.clip import bundled_clip_path
+from structgstream.data.json_videos import bundled_clip_path
 from structgstream.errors import CaptureError, ConfigError, StorageError, StreamError
 from structgstream.evaluation.evaluate import rendered
 from structgstream.evaluation.report import as_json
 from structgstream.evaluation.run_log import read_log
 from structgstream.kernels.backend import select_backend
+from tests.support.backends import QUICKEST
+from tests.support.small_presets import QUICK
 
 CLIP = bundled_clip_path()
 PART: dict[str, Any] = {"frames": 2, "scale": 0.25, "backend": QUICKEST}
@@ -138,8 +138,9 @@ def test_scores_are_those_of_the_command(stream: Path, tmp_path: Path) -> None:
 def test_exports(stream: Path, tmp_path: Path) -> None:
     page = structgstream.export(stream, tmp_path / "clip.html")
     assert "<structgstream-player" in page.read_text()
-    frame = structgstream.export(stream, tmp_path / "one.spz", frame=1, sh_degree=0, backend=QUICKEST)
-    folder = structgstream.export(stream, tmp_path / "all", format="spz", sh_degree=0, backend=QUICKEST)
+    flat = structgstream.FrameOptions(degree=0)
+    frame = structgstream.export(stream, tmp_path / "one.spz", frame=1, options=flat, backend=QUICKEST)
+    folder = structgstream.export(stream, tmp_path / "all", format="spz", options=flat, backend=QUICKEST)
     assert [entry.name for entry in sorted(folder.iterdir())] == ["frame_000000.spz", "frame_000001.spz"]
     assert frame.read_bytes() == (folder / "frame_000001.spz").read_bytes()
     with pytest.raises(ConfigError, match="contains one frame"):

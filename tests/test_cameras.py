@@ -4,9 +4,9 @@ import math
 import pytest
 import torch
 
-from rigs import arc_rig
 from structgstream.cameras import Camera, CameraRig
 from structgstream.errors import CalibrationError
+from tests.support.rigs import arc_rig
 
 
 def test_center_is_where_the_camera_stands() -> None:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from drawn import pixels_of
 from structgstream.errors import MissingExtraError, StorageError
 from structgstream.figure import COLORS, figure_of, save_figure, without_frame
+from tests.support.drawn import pixels_of
 
 
 def test_a_figure_has_its_size_and_makes_its_folder(tmp_path: Path) -> None:

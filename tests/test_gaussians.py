@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 import torch
 
-from rigs import arc_rig, random_scene
 from structgstream.gaussians import Gaussians, concatenate
 from structgstream.kernels.backend import reference_backend
+from tests.support.rigs import arc_rig, random_scene
 
 
 def test_concatenation_keeps_rows_and_ids_together() -> None:

@@ -10,10 +10,10 @@ import pytest
 import traitlets
 from nbclient import NotebookClient
 
-from streams import small_stream
 from structgstream.errors import MissingExtraError, StreamError
 from structgstream.notebook import Player
 from structgstream.serve.pages import bundle
+from tests.support.streams import small_stream
 
 ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "examples" / "player.ipynb"

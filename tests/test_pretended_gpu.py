@@ -9,12 +9,12 @@ import pytest
 import torch
 
 import structgstream
-from pretended_gpu import DEVICE, pretended_device, pretended_gpu, rasterize
-from small_presets import FEW_POINTS
-from structgstream.data.clip import bundled_clip_path
 from structgstream.kernels import cpu_raster, cuda, cuda_library, reference_raster
 from structgstream.kernels.native import native_reason
-from structgstream.presets import PRESETS
+from structgstream.session.presets import PRESETS
+from tests.support.pretended_gpu import DEVICE, pretended_device, pretended_gpu, rasterize
+from tests.support.small_clip import small_clip_path
+from tests.support.small_presets import FEW_POINTS
 
 FRAMES, SCALE = 2, 0.25
 DRAWN_BY = cpu_raster.rasterize if native_reason() is None else reference_raster.rasterize
@@ -32,20 +32,20 @@ def backend(monkeypatch: pytest.MonkeyPatch) -> Iterator[structgstream.Backend]:
 @pytest.mark.parametrize("preset", ["compact", "paper-n3dv"])
 def test_a_stream_on_another_device(preset: str, backend: structgstream.Backend, tmp_path: Path) -> None:
     config = PRESETS[preset]
-    growth = replace(config.initial.growth, collect_from=2, start=4, stop=8, interval=2)
+    growth = replace(config.initial.growth, collect_from=2, start=2, stop=6, interval=2)
     patching = replace(config.online.patching, iteration=2)
     config = replace(
         config,
         points=FEW_POINTS,
-        initial=replace(config.initial, iterations=10, coarse_iterations=0, medium_iterations=0, growth=growth),
-        online=replace(config.online, iterations=4, patching=patching),
+        initial=replace(config.initial, iterations=6, coarse_iterations=0, medium_iterations=0, growth=growth),
+        online=replace(config.online, iterations=3, patching=patching),
     )
     path = tmp_path / "out.sgs"
     reports = structgstream.reconstruct(
-        bundled_clip_path(), path, preset=config, scale=SCALE, frames=FRAMES, backend=backend
+        small_clip_path(), path, preset=config, scale=SCALE, frames=FRAMES, backend=backend
     )
     assert [report.moving > 0 for report in reports] == [False, True]
-    found = structgstream.evaluate(path, bundled_clip_path(), metrics="basic", backend=backend)
+    found = structgstream.evaluate(path, small_clip_path(), metrics="basic", backend=backend)
     assert 10.0 < found.mean.psnr < 40.0
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from small_presets import QUICK
-from structgstream.presets import PRESETS
+from structgstream.session.presets import PRESETS
+from tests.support.small_presets import QUICK
 
 README = Path(__file__).parents[1] / "README.md"
 SMALLER = {"frames=12": "frames=2, scale=0.25", "render(11,": "render(1,"}

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from reports import frame_report
 from structgstream.errors import StorageError
 from structgstream.evaluation.run_log import append_log, log_path, read_log
-from structgstream.frame_report import FrameReport
 from structgstream.recorder import check_output, log_reports
+from structgstream.session.frame_report import FrameReport
+from tests.support.reports import frame_report
 
 
 def run(closed: list[str], start: int = 0) -> Generator[FrameReport, None, None]:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from reports import frame_report
-from structgstream.cli.termination import Terminated
+from structgstream.cli.signals import Terminated
 from structgstream.data.live.status import CameraStatus, LiveStatus
 from structgstream.run_metrics import RunMetrics, free_bytes, metrics_path
+from tests.support.reports import frame_report
 
 CAMERAS = {"a": CameraStatus(True, 40, 1, {"jump": 1}), "b": CameraStatus()}
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 import torch
 
-from rigs import arc_rig
 from structgstream.similarity import Similarity, normalizing_similarity, rig_radius
+from tests.support.rigs import arc_rig
 
 
 def pixel(camera, point):

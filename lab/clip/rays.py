@@ -22,7 +22,6 @@ mi.set_variant("llvm_ad_rgb")
 import drjit as dr  # noqa: E402  (needs the variant)
 import mitsuba_oidn  # noqa: E402
 from materials import lights  # noqa: E402
-
 from scene import STAGES, shapes  # noqa: E402
 
 

@@ -27,8 +27,8 @@ Picture = NDArray[np.uint8]
 TIME_BASE = Fraction(1, 90_000)
 SAMPLE_RATE, BLOCK = 48_000, 1024
 SPEED_OF_SOUND = 343.0
-MOST_OFFSET_FRAMES = 6
-LEAST_SIDE = 64  # a block of x265, which corrupts its memory below that
+MAX_OFFSET_FRAMES = 6
+MIN_SIDE = 64  # a block of x265, which corrupts its memory below that
 JITTER_SECONDS, DROPPED = 0.0015, 0.04
 CLAP_SECONDS, ROOM_NOISE = 0.02, 0.003
 
@@ -68,7 +68,7 @@ def planned(
     g = np.random.default_rng(seed)
     found: dict[str, Phone] = {}
     for number, name in enumerate(source.rig):
-        first = int(g.integers(0, min(MOST_OFFSET_FRAMES, len(source) // 3) + 1))
+        first = int(g.integers(0, min(MAX_OFFSET_FRAMES, len(source) // 3) + 1))
         zero = (first - g.uniform(0.0, 0.9)) / source.fps  # a phone's clock starts before its first frame
         # The first and the last frame are there, so that a drop is never an early end.
         kept = [i for i in range(first, len(source)) if i in (first, len(source) - 1) or g.random() >= DROPPED]
@@ -119,8 +119,8 @@ class PhoneVideo:
     def __init__(
         self, path: Path, phone: Phone, *, size: tuple[int, int], fps: float, heard: NDArray[np.float32] | None
     ) -> None:
-        if min(size) < LEAST_SIDE or size[0] % 2 or size[1] % 2:
-            raise ValueError(f"pictures of {size[0]}x{size[1]}; x265 needs even sides of {LEAST_SIDE} or more")
+        if min(size) < MIN_SIDE or size[0] % 2 or size[1] % 2:
+            raise ValueError(f"pictures of {size[0]}x{size[1]}; x265 needs even sides of {MIN_SIDE} or more")
         self._phone, self._heard = phone, heard
         # In the usual timescale of 1000 a file's first frame would be rounded to a millisecond.
         self._container = av.open(str(path), "w", options={"movie_timescale": str(TIME_BASE.denominator)})

@@ -4,7 +4,7 @@
     python lab/recovery/calibration.py CAPTURE --instants 0 15 30 45
     python lab/recovery/calibration.py CAPTURE --instants 0 15 30 45 --refine
 
-Errors are those of ``preparation/calibration/comparison.py``: median and largest over the cameras.
+Errors are those of ``tests/support/calibration_errors.py``: median and largest over the cameras.
 """
 
 import argparse
@@ -19,11 +19,11 @@ import torch
 from numpy.typing import NDArray
 
 from structgstream.data import bundled_clip, open_capture
+from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import LensCamera, Pinhole
-from structgstream.data.posed import rotation_matrix
-from structgstream.preparation.calibration.comparison import CameraError, calibration_errors
 from structgstream.preparation.calibration.refinement import refine
 from structgstream.preparation.calibration.structure import solve_structure
+from tests.support.calibration_errors import CameraError, calibration_errors
 
 Rig = Mapping[str, LensCamera]
 
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         start = perturbed(given, degrees=options.degrees, percent=options.percent)
         _print("perturbed", calibration_errors(start, given).values())
         found = refine(pictures, start)
-        print(f"held back {found.held_back}: {found.before_pixels:.2f} to {found.after_pixels:.2f} pixels")
+        print(f"held back {found.held_out}: {found.before_pixels:.2f} to {found.after_pixels:.2f} pixels")
         solved = found.solved
     else:
         known = given if options.known else None

@@ -32,9 +32,9 @@ from structgstream.data.open import open_capture
 from structgstream.data.points import initial_points
 from structgstream.data.prepared import PreparedCamera, open_prepared, read_prepared, write_prepared
 from structgstream.data.timeline import Clock
-from structgstream.preparation.calibration.comparison import rig_alignment
+from structgstream.preparation.calibration.solved import rig_alignment
 from structgstream.preparation.footage import find_footage
-from structgstream.presets import PRESETS, StreamConfig
+from structgstream.session.presets import PRESETS, StreamConfig
 
 SEED_POINTS = "points.npy"
 

@@ -20,18 +20,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.open import open_capture
-from structgstream.data.posed import rotation_matrix
 from structgstream.data.prepared import read_prepared, write_prepared
-from structgstream.preparation.calibration.comparison import rig_alignment
+from structgstream.preparation.calibration.solved import rig_alignment
 
 Rig = Mapping[str, LensCamera]
 Floats = NDArray[np.float64]
 
 NEAR, ALL = (0.26, 0.53), (0.26, 1.7)  # depths, of the rig's radius
 BORDER = 0.06  # of the picture
-LEAST_DEPTH = 0.1  # of the radius
+MIN_DEPTH = 0.1  # of the radius
 ROUNDS = 4
 
 
@@ -113,7 +113,7 @@ def exactly_placed(name: str, estimate: Rig, truth: Rig) -> LensCamera:
 def _misses(found: Floats, points: Floats, estimate: Rig, truth: Rig) -> Floats:
     """Projections of ``found`` minus true ones of ``points``, ``[C, P, 2]``; NaN where a camera sees no point."""
     misses = np.full((len(estimate), len(points), 2), np.nan)
-    least = LEAST_DEPTH * _radius(truth)
+    least = MIN_DEPTH * _radius(truth)
     for index, (name, filmed) in enumerate(estimate.items()):
         camera = truth[name].camera
         viewmat, pixels = camera.viewmat.numpy(), truth[name].pixels(points)
@@ -139,9 +139,9 @@ def held_out_scores(stream: Path, capture: Path, rig: Rig, truth: Rig, *, work: 
         work: folder for the capture with exact held-out cameras; replaced.
     """
     from structgstream.codec.reader import open_stream
-    from structgstream.evaluation.capture import capture_of
     from structgstream.evaluation.evaluate import rendered
-    from structgstream.evaluation.masks import blackened
+    from structgstream.evaluation.metrics import blackened
+    from structgstream.evaluation.recording import capture_of
     from structgstream.kernels.backend import select_backend
 
     backend, reader = select_backend("auto"), open_stream(stream)

@@ -32,7 +32,7 @@ from structgstream.preparation.calibration.board import Board
 from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.prepare import prepare_capture
-from structgstream.presets import FAST, StreamConfig
+from structgstream.session.presets import FAST, StreamConfig
 
 FIELD_OF_VIEW_DEGREES, SIZE = 50.0, (320, 240)  # of both captures, so that their held-out pictures show the same
 SEED_POINTS = "points.npy"

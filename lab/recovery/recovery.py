@@ -10,7 +10,7 @@ import numpy as np
 
 from structgstream.data.lenses import LensCamera
 from structgstream.data.timeline import Clock
-from structgstream.preparation.calibration.comparison import calibration_errors
+from tests.support.calibration_errors import calibration_errors
 
 
 def camera_errors(

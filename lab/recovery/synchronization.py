@@ -24,10 +24,11 @@ from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.source import FrameSource
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
-from structgstream.preparation.synchronization import Synchronization, check_synchronization, synchronize
+from structgstream.preparation.checking.times import check_synchronization, time_findings
+from structgstream.preparation.synchronization import Synchronization, synchronize
 
 LATE_FRAMES = (1, 3)  # of two cameras, for the check
-MOST_FRAMES = 300
+MAX_FRAMES = 300
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,9 @@ class Shifted:
     def size(self, name: str) -> tuple[int, int]:
         return self.rig[name].width, self.rig[name].height
 
+    def metadata(self, name: str) -> dict[str, str]:
+        return {}
+
 
 @dataclass(frozen=True)
 class LateSource:
@@ -92,12 +96,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = _options(arguments)
     source = bundled_clip() if options.capture is None else open_capture(options.capture)
     names = options.cameras or list(source.rig)
-    images = [frame.images for _, frame in zip(range(MOST_FRAMES), source.frames(), strict=False)]
+    images = [frame.images for _, frame in zip(range(MAX_FRAMES), source.frames(), strict=False)]
     for title, shifted in cases(source, images, names, keep=options.keep).items():
         _measure(title, shifted, calibrated=not options.uncalibrated)
     late = dict(zip((names[1], names[-1]), LATE_FRAMES, strict=True)) if len(names) > 2 else {}
     for checked in (source, LateSource(source.rig, images, source.fps, late)) if late else (source,):
-        print(check_synchronization(checked).message)
+        print(*[finding.sentence for finding in time_findings(check_synchronization(checked))] or ["synchronous"])
     print(f"peak {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
 
 

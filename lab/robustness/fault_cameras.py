@@ -31,7 +31,7 @@ COUNTED = {
     "cut": "gone", "silent": "gone", "stuck": "stuck", "garbage": "garbage", "size": "other size",
     "shape": "other size", "jump": "jump", "back": "jump", "duplicate": "duplicate", "reorder": "reordered",
 }  # fmt: skip
-MOST_ERROR = 400.0
+MAX_ERROR = 400.0
 """Mean square of 255 levels from a picture as it was filmed, coded; a block elsewhere makes ten times as much."""
 STEADY_FRAMES = 5
 SAMPLED = 2  # every so many pixels are compared
@@ -110,7 +110,7 @@ class Viewer:
         """Its number; None if it is none of them."""
         errors = np.square(self._film - image[::SAMPLED, ::SAMPLED]).mean((1, 2, 3))
         best = int(errors.argmin())
-        return best if errors[best] < MOST_ERROR else None
+        return best if errors[best] < MAX_ERROR else None
 
     def states(self, frame: MultiViewFrame, cameras: Sequence[str]) -> dict[str, State]:
         """What the frame has of each camera."""

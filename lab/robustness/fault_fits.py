@@ -14,7 +14,7 @@ from lab.robustness.fault_viewers import NAME, NUMBER, Trainer, ViewerRow, finis
 from lab.robustness.stream_writers import content, edge_of, real_writer
 
 FRAMES = 12
-MOST_UNKILLED = 10
+MAX_UNKILLED = 10
 
 
 def killed_fits(*, kills: int, seed: int, folder: Path, players: int, page: bool) -> ViewerRow:
@@ -32,7 +32,7 @@ def killed_fits(*, kills: int, seed: int, folder: Path, players: int, page: bool
         added_up(row, one)
         # A stream may end before its first kill, on a busy machine even many in a row.
         unkilled = 0 if one.kills else unkilled + 1
-        if unkilled == MOST_UNKILLED:
+        if unkilled == MAX_UNKILLED:
             raise RuntimeError(
                 f"{unkilled} streams in a row ended before their first kill, after {row.kills} of {kills} kills; the "
                 "machine starts the viewers too slowly for streams this short: try --no-page or fewer --players."

@@ -128,7 +128,7 @@ def live(stream: Path, work: Path, options: argparse.Namespace) -> dict[str, Any
         "spans": [judged(one, frames, folder) for one in spans],
         "server": {
             "before_bytes": memory.samples[0][1],
-            "most_bytes": memory.most(),
+            "max_bytes": memory.most(),
             "processor_seconds": busy,
             "seconds": memory.samples[-1][0] - memory.samples[0][0],
         },

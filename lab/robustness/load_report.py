@@ -17,7 +17,7 @@ def table(result: dict[str, Any]) -> str:
         "",
         *_ratio(spans),
         *_players(spans),
-        f"Server: {live['server']['before_bytes'] / 1e6:.0f} MB before, {live['server']['most_bytes'] / 1e6:.0f} MB at "
+        f"Server: {live['server']['before_bytes'] / 1e6:.0f} MB before, {live['server']['max_bytes'] / 1e6:.0f} MB at "
         f"most; {live['server']['processor_seconds']:.1f} processor seconds in {live['server']['seconds']:.0f} s.",
         "",
         "| files | server | MB/s | answers a second | processor ms an answer | serve is times (MB/s) | exact |",

@@ -15,8 +15,8 @@ def senders() -> ModuleType:
 
 
 def chromium() -> ModuleType:
-    """``tests/chromium.py``, which needs pytest."""
-    return _from(ROOT / "tests", "chromium")
+    """``tests/support/chromium.py``, which needs pytest."""
+    return _from(ROOT, "tests.support.chromium")
 
 
 def _from(folder: Path, name: str) -> ModuleType:

@@ -23,20 +23,20 @@ import torch
 from benchmarks.machine import load_average, machine
 from structgstream.cameras import Camera
 from structgstream.codec.reader import open_stream
-from structgstream.data.clip import bundled_clip
+from structgstream.data.json_videos import bundled_clip
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import SourceWrapper, resized
 from structgstream.evaluation.evaluate import evaluate
 from structgstream.evaluation.run_log import read_log
 from structgstream.frames import MultiViewFrame
-from structgstream.initialization import frame_seed, initial_points_of
 from structgstream.kernels.backend import Backend, select_backend
-from structgstream.periods import PeriodConfig
-from structgstream.presets import FAST, StreamConfig
 from structgstream.recorder import record
 from structgstream.scene.scene import Scene
+from structgstream.session.initialization import frame_seed, initial_points_of
+from structgstream.session.periods import PeriodConfig
+from structgstream.session.presets import FAST, StreamConfig
+from structgstream.session.struct_gstream import stream_pipeline
 from structgstream.similarity import normalizing_similarity
-from structgstream.struct_gstream import stream_pipeline
 from structgstream.training.frame0.fit import fit_first_frame
 from structgstream.training.result import FitResult
 

@@ -118,14 +118,14 @@ def real_writer(frames: int) -> Writer:
     """Reconstructs the bundled clip with the preset tiny."""
 
     def write(path: Path, report: Report) -> None:
-        from structgstream.data.clip import bundled_clip_path
+        from structgstream.data.json_videos import bundled_clip_path
         from structgstream.data.open import open_capture
         from structgstream.data.plane_sweep import SweepConfig
         from structgstream.data.points import PointsConfig
         from structgstream.kernels.backend import select_backend
-        from structgstream.presets import TINY
         from structgstream.recorder import record, segments_at, segments_folder
-        from structgstream.struct_gstream import stream_pipeline
+        from structgstream.session.presets import TINY
+        from structgstream.session.struct_gstream import stream_pipeline
 
         class FewPoints(PointsConfig):
             SWEEP_LEVELS = (SweepConfig(width=60, planes=(8, 12)),)

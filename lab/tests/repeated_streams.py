@@ -2,8 +2,8 @@
 """Small streams for the benchmarks that send one again and again."""
 
 from lab.robustness.stream_writers import Sent, repeated
-from segment_streams import as_file, packets
 from structgstream.codec.reader import StreamReader
+from tests.support.segment_streams import as_file, packets
 
 
 def small_sent(frames: int, *, each_a_period: bool = False) -> Sent:

@@ -11,13 +11,13 @@ import av
 import numpy as np
 import pytest
 
-from captures import numbers, picture
-from rigs import arc_rig
 from structgstream.cameras import CameraRig
 from structgstream.data.timeline import Clock
 from structgstream.data.video import synchronised
 from structgstream.data.video_index import scan_videos
 from structgstream.frames import MultiViewFrame
+from tests.support.captures import numbers, picture
+from tests.support.rigs import arc_rig
 
 ROOT = Path(__file__).parents[2]
 WIDTH, HEIGHT, FRAMES = 128, 96, 8

@@ -25,20 +25,21 @@ if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
     from structgstream.errors import StructGStreamError
     from structgstream.evaluation.report import FrameScores, Report, Scores
-    from structgstream.frame_report import FrameReport
+    from structgstream.exporters.formats import FrameOptions
     from structgstream.frames import MultiViewFrame
     from structgstream.kernels.backend import Backend, select_backend
     from structgstream.memory import PeakKind
-    from structgstream.pipeline import Pipeline
     from structgstream.preparation.checking.findings import CheckReport, Finding
     from structgstream.preparation.options import PrepareOptions
     from structgstream.preparation.prepare import Preparation
-    from structgstream.presets import PRESETS, StreamConfig
     from structgstream.scene.render import Rendering, render
     from structgstream.scene.scene import Scene
-    from structgstream.session import Session
+    from structgstream.session.frame_report import FrameReport
+    from structgstream.session.loop import Session
+    from structgstream.session.pipeline import Pipeline
+    from structgstream.session.presets import PRESETS, StreamConfig
+    from structgstream.session.struct_gstream import stream_pipeline
     from structgstream.similarity import Similarity
-    from structgstream.struct_gstream import stream_pipeline
 
 _HOMES = {
     "Backend": "kernels.backend",
@@ -47,26 +48,27 @@ _HOMES = {
     "CheckReport": "preparation.checking.findings",
     "FileSink": "codec.sinks",
     "Finding": "preparation.checking.findings",
-    "FrameReport": "frame_report",
+    "FrameOptions": "exporters.formats",
+    "FrameReport": "session.frame_report",
     "FrameScores": "evaluation.report",
     "FrameSource": "data.source",
     "MemorySink": "codec.sinks",
     "MultiViewFrame": "frames",
-    "PRESETS": "presets",
+    "PRESETS": "session.presets",
     "Packet": "codec.packets",
     "PacketInfo": "codec.contents",
     "PacketKind": "codec.packets",
     "PeakKind": "memory",
-    "Pipeline": "pipeline",
+    "Pipeline": "session.pipeline",
     "Preparation": "preparation.prepare",
     "PrepareOptions": "preparation.options",
     "Rendering": "scene.render",
     "Report": "evaluation.report",
     "Scene": "scene.scene",
     "Scores": "evaluation.report",
-    "Session": "session",
+    "Session": "session.loop",
     "Similarity": "similarity",
-    "StreamConfig": "presets",
+    "StreamConfig": "session.presets",
     "StreamHeader": "codec.packets",
     "StreamReader": "codec.reader",
     "StructGStreamError": "errors",
@@ -80,7 +82,7 @@ _HOMES = {
     "reconstruct": "api",
     "render": "scene.render",
     "select_backend": "kernels.backend",
-    "stream_pipeline": "struct_gstream",
+    "stream_pipeline": "session.struct_gstream",
 }
 
 __all__ = [
@@ -91,6 +93,7 @@ __all__ = [
     "CheckReport",
     "FileSink",
     "Finding",
+    "FrameOptions",
     "FrameReport",
     "FrameScores",
     "FrameSource",

@@ -13,28 +13,28 @@ from typing import Literal
 
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.retention import SegmentsOptions
-from structgstream.data.clip import bundled_clip_path
+from structgstream.data.json_videos import bundled_clip_path
 from structgstream.data.open import open_capture
 from structgstream.data.source import FrameSource, FrameStream
 from structgstream.errors import ConfigError
-from structgstream.evaluation.capture import capture_of, part_metadata, stored_capture
 from structgstream.evaluation.evaluate import evaluate as evaluate_recording
 from structgstream.evaluation.optional_metrics import MetricSelection
+from structgstream.evaluation.recording import capture_of, part_metadata, stored_capture
 from structgstream.evaluation.report import Report
 from structgstream.evaluation.run_log import read_log
-from structgstream.exporters.formats import Format, PageFormat
+from structgstream.exporters.formats import Format, FrameOptions, PageFormat
 from structgstream.exporters.frames import write_frames
-from structgstream.exporters.request import check_degree, check_low_pass, check_page, choose_frames, destination
-from structgstream.frame_report import FrameReport
+from structgstream.exporters.request import check_page, choose_frames, destination
 from structgstream.kernels.backend import Backend, BackendName, select_backend
 from structgstream.preparation.checking.findings import CheckReport
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.prepare import Preparation, check_folder, prepare_capture
 from structgstream.preparation.steps import Listener
-from structgstream.presets import DEFAULT_PRESET, StreamConfig, preset_named, with_budget
 from structgstream.recorder import check_output, record, segments_at, segments_folder
 from structgstream.serve.stream_file import StreamFile, write_page, write_site
-from structgstream.struct_gstream import stream_pipeline
+from structgstream.session.frame_report import FrameReport
+from structgstream.session.presets import DEFAULT_PRESET, StreamConfig, preset_named, with_budget
+from structgstream.session.struct_gstream import stream_pipeline
 
 
 def example_clip() -> Path:
@@ -244,27 +244,27 @@ def export(
     format: Format | PageFormat | None = None,
     frame: int | None = None,
     frames: tuple[int, int] | None = None,
-    sh_degree: int | None = None,
-    low_pass: float = 0.0,
+    options: FrameOptions | None = None,
     backend: Backend | BackendName = "auto",
 ) -> Path:
     """Writes a stream as a page with a player, or its frames as plain 3D Gaussians for other programs.
 
     Args:
         path: the stream file.
-        output: where to write: ``NAME.html`` is one page that plays the stream; ``NAME.ply``, ``NAME.splat`` and
-            ``NAME.spz`` are one frame; any other name is a folder. None for a file or a folder next to the stream.
+        output: where to write: ``NAME.html`` is one page that plays the stream; ``NAME.ply``, ``.splat``, ``.spz``,
+            ``.sog`` and ``.glb`` are one frame; ``NAME.usd`` and ``.4dgs`` contain all frames; ``NAME.zip`` is a zip of
+            frames; any other name is a folder. None for a file or a folder next to the stream.
         format: format of the output; None for the suffix of ``output``, else ``ply``. ``site`` is a folder for a web
             server.
         frame: the only frame to write.
         frames: the first and the last frame to write; None for all.
-        sh_degree: degree of the spherical harmonics, 0 to 2; None for 1, or for 0 in a ``.splat``, which has none.
-        low_pass: variance by which plain Gaussians are widened, squared training pixels, for viewers without a low-pass
-            of their own or with larger pictures than the training pictures (docs/export.md).
+        options: degree of the spherical harmonics, which Gaussians are left out, details of a format; None for the
+            defaults (docs/export.md).
         backend: evaluates the MLPs.
 
     Returns:
-        the file or the folder. Units and axes of plain Gaussians are the capture's own (``.spz``: y up, z back).
+        the file or the folder. Units of plain Gaussians are the capture's own, axes, too (``.spz``, ``.glb``,
+            ``.usd`` and ``.4dgs``: y up, z back).
 
     Raises:
         ConfigError: arguments contradict each other, or a frame does not exist.
@@ -272,20 +272,22 @@ def export(
         StorageError: a file cannot be written.
         PlayerError: the stream is too long for a page.
         BackendError: the back-end is not available.
+        MissingExtraError: a package of the format is not installed.
     """
     path = Path(path)
     target, chosen = destination(
         path, None if output is None else Path(output), format=format, frame=frame, frames=frames
     )
+    options = options or FrameOptions()
     if chosen == "html" or chosen == "site":
-        check_page(frame=frame, frames=frames, sh_degree=sh_degree, low_pass=low_pass)
+        check_page(frame=frame, frames=frames, options=options)
         write = write_page if chosen == "html" else write_site
         write(target, StreamFile(path))
         return target
-    degree, low_pass = check_degree(sh_degree, chosen), check_low_pass(low_pass)
+    options.check(chosen)
     with open_stream(path, by_index=frame is not None) as reader:
         numbers = choose_frames(reader.runs, target, frame=frame, frames=frames)
         kind = select_backend(backend)
-        for _ in write_frames(reader, numbers, target, format=chosen, backend=kind, degree=degree, low_pass=low_pass):
+        for _ in write_frames(reader, numbers, target, format=chosen, backend=kind, options=options):
             pass
     return target

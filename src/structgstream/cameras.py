@@ -44,7 +44,7 @@ def enlargement(width: float, height: float) -> float:
     """Side of a pixel of the reference size, in pixels of a picture of ``width`` x ``height``; at least 1.
 
     Lengths in pixels of a configuration are multiplied by it, areas in pixels by its square. They are not scaled for
-    pictures below the reference size (docs/scaling.md).
+    pictures below the reference size (lab/notes/scaling.md).
     """
     return max(1.0, max(width, height) / REFERENCE_PIXELS)
 

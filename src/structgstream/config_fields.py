@@ -2,7 +2,7 @@
 """Fields of configurations, which are dataclasses of dataclasses: read from plain JSON, and checked."""
 
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import asdict, fields, is_dataclass
 from types import SimpleNamespace, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -105,10 +105,10 @@ def without_fields(values: Mapping[str, Any], paths: Collection[str], path: str 
     }
 
 
-def with_present_names(values: Mapping[str, Any], renamed: Mapping[str, str], path: str = "") -> dict[str, Any]:
-    """``values`` of an earlier version with the present name of each field; ``renamed`` has them by earlier path."""
+def with_present_names(values: Mapping[str, Any], present_name: Callable[[str], str], path: str = "") -> dict[str, Any]:
+    """``values`` of an earlier version with the present names of fields; ``present_name`` has them by earlier path."""
     return {
-        renamed.get(f"{path}{name}", name): with_present_names(item, renamed, f"{path}{name}.")
+        present_name(f"{path}{name}"): with_present_names(item, present_name, f"{path}{name}.")
         if isinstance(item, Mapping)
         else item
         for name, item in values.items()

@@ -6,8 +6,8 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from structgstream.atomic_files import atomic_write
 from structgstream.errors import MissingExtraError
-from structgstream.whole_files import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,4 +53,4 @@ def save_figure(figure: "Figure", path: Path) -> None:
         # The font may lack letters of camera names and then draws boxes.
         warnings.filterwarnings("ignore", message=r"Glyph \d+ .* missing from")
         figure.savefig(content, format=path.suffix.removeprefix(".") or "png")
-    write_whole(path, content.getvalue(), called="The picture", new_folder=True, sync=False)
+    atomic_write(path, content.getvalue(), called="The picture", new_folder=True, sync=False)

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-LEAST_CAMERAS = 2
+MIN_CAMERAS = 2
 """Training cameras that a frame needs, because a single picture does not determine depth."""
 BLANK_LEVELS = 2.0
 """Standard deviation, in levels of 255, below which a picture is blank: a covered lens, a camera that starts."""
-MOST_BLANK_SHARE = 0.25
+MAX_BLANK_SHARE = 0.25
 """Share of frame 0's pictures that may be blank while the others are not; if more are, the scene is dark or plain."""
 _EVERY_PIXELS = 8  # Every eighth row and column is sufficient to detect content.
 
@@ -52,7 +52,7 @@ class MultiViewFrame:
         """
         present = self.present(names)
         blank = [name for name in present if self._is_blank(name)]
-        if self.index == 0 and len(blank) > MOST_BLANK_SHARE * len(present):
+        if self.index == 0 and len(blank) > MAX_BLANK_SHARE * len(present):
             return present
         return tuple(name for name in present if name not in blank)
 

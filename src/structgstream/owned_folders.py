@@ -16,8 +16,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from structgstream.atomic_files import atomic_write, partial_path
 from structgstream.errors import StorageError
-from structgstream.whole_files import partial_path, write_whole
 
 MARKER = "structgstream-owner.json"
 """Name of the marker file."""
@@ -107,7 +107,7 @@ def own_folder(folder: Path, purpose: str, *, owner: Owner | None = None) -> Own
     found = check_owned(folder, purpose)
     if found is None:
         found = Owner.new(purpose) if owner is None else owner
-        write_whole(folder / MARKER, found.content, called=f"The folder for the {purpose}:", new_folder=True)
+        atomic_write(folder / MARKER, found.content, called=f"The folder for the {purpose}:", new_folder=True)
     return found
 
 

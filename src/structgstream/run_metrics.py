@@ -19,11 +19,11 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+from structgstream.atomic_files import atomic_write, side_path
 from structgstream.data.live.status import LiveStatus
 from structgstream.errors import StorageError
-from structgstream.frame_report import FrameReport
 from structgstream.memory import resident_bytes
-from structgstream.whole_files import side_path, write_whole
+from structgstream.session.frame_report import FrameReport
 
 FORMAT, VERSION = "structgstream-metrics", 1
 BEAT_SECONDS = 2.0
@@ -181,7 +181,7 @@ class RunMetrics:
         """Writes the file. A full disk is not reported here, because writing the stream will fail and report it."""
         content = f"{json.dumps(self.values(), allow_nan=False)}\n".encode()
         with self._writing, suppress(StorageError):
-            write_whole(metrics_path(self._stream), content, sync=False)
+            atomic_write(metrics_path(self._stream), content, sync=False)
 
     @contextmanager
     def running(self) -> Iterator[None]:

@@ -6,8 +6,6 @@ from typing import Any, cast
 import torch
 
 import structgstream
-from rigs import arc_rig, random_scene
-from streams import STEPS, compact_header, header_for, same, write_stream
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import MemorySink
 from structgstream.kernels.backend import reference_backend
@@ -18,6 +16,8 @@ from structgstream.training.online.config import OnlineConfig, online_rates
 from structgstream.training.online.select import changed_primitives
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import Parameters, RoundingConfig, detached, parameters_of_fields
+from tests.support.rigs import arc_rig, random_scene
+from tests.support.streams import STEPS, compact_header, header_for, same, write_stream
 
 NAME = cast(Any, "brightness")
 DYNAMIC = PAPER_DYNAMIC | {NAME}

@@ -3,7 +3,7 @@
 
 from hypothesis import settings
 
-from properties import THOROUGH, examples
+from tests.support.properties import THOROUGH, examples
 
 
 def test_no_property_is_timed_and_ordinary_runs_draw_nothing() -> None:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from quick_streams import CLIP, QUICK, SMALL
-from small_presets import few_points
 from structgstream.cli import main
+from tests.support.quick_streams import CLIP, QUICK, SMALL
+from tests.support.small_presets import few_points
 
 
 @pytest.fixture(scope="session")

@@ -10,10 +10,10 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 import structgstream
-from quick_streams import CLIP, error_of
 from structgstream.cli import app
 from structgstream.cli.app import COMMANDS, main
 from structgstream.errors import CaptureError, OutOfMemoryError
+from tests.support.quick_streams import CLIP, error_of
 
 
 @pytest.fixture

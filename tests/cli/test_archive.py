@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from quick_streams import error_of
-from segment_folders import GrowingFolder
-from streams import small_stream
 from structgstream.cli import main
+from tests.support.quick_streams import error_of
+from tests.support.segment_folders import GrowingFolder
+from tests.support.streams import small_stream
 
 STREAM = small_stream(4)
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from quick_streams import error_of
 from structgstream.cli import main
 from structgstream.preparation.calibration.board import Board
 from structgstream.preparation.options import parse_board
+from tests.support.quick_streams import error_of
 
 
 def test_board(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from quick_streams import QUICK, error_of
 from structgstream.cli import main, render
 from structgstream.cli.progress import Lines
-from structgstream.data.clip import bundled_clip_path
-from structgstream.session import FrameReport
+from structgstream.data.json_videos import bundled_clip_path
+from structgstream.session.loop import FrameReport
+from tests.support.quick_streams import QUICK, error_of
 
 pytestmark = pytest.mark.usefixtures("quick_presets")
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("quick_presets")
 def test_demo_leaves_everything_to_look_at(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(render, "LEAST_PATH_SECONDS", 0.1)
+    monkeypatch.setattr(render, "MIN_PATH_SECONDS", 0.1)
     out = tmp_path / "demo"
     assert main(["demo", "--output", str(out), "--frames", "2", "--scale", "0.25", *QUICK]) == 0
     made = {str(entry.relative_to(out)) for entry in out.rglob("*") if entry.is_file()}

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from backends import QUICKEST
-from quick_streams import CLIP, error_of
 from structgstream.cli import main
+from tests.support.backends import QUICKEST
+from tests.support.quick_streams import CLIP, error_of
 
 
 def test_evaluate_reads_the_file(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

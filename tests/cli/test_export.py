@@ -2,6 +2,8 @@
 """The command ``export``: which files it writes, in which units, and what it says to wrong requests."""
 
 import base64
+import re
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,14 +12,15 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from rigs import random_scene
-from streams import compact_header, header_for, write_stream
 from structgstream.cli import main
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
 from structgstream.exporters.bake import BakingConfig
+from structgstream.exporters.formats import FORMATS, PAGES
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.scene import Scene
+from tests.support.rigs import random_scene
+from tests.support.streams import compact_header, header_for, write_stream
 
 FRAMES = 3
 
@@ -83,6 +86,43 @@ def test_a_sequence_fills_a_folder(stream: Path, tmp_path: Path) -> None:
     assert (tmp_path / "one.ply").read_bytes() == (tmp_path / "all" / "frame_000002.ply").read_bytes()
 
 
+def test_a_zip_has_the_files_of_the_folder(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    common = ["export", str(stream), "--device", "reference", "--sh-degree", "0"]
+    assert main([*common, "-o", str(tmp_path / "all")]) == 0
+    assert main([*common, "-o", str(tmp_path / "all.zip")]) == 0
+    with zipfile.ZipFile(tmp_path / "all.zip") as archive:
+        assert {name: archive.read(name) for name in archive.namelist()} == {
+            path.name: path.read_bytes() for path in (tmp_path / "all").iterdir()
+        }
+    said = capsys.readouterr().out
+    assert "3 frames" in said
+    assert re.search(r"of frame 0, against the stream's own pictures: PSNR \d\d\.\d dB at", " ".join(said.split()))
+
+
+def test_parts_of_a_frame(stream: Path, tmp_path: Path) -> None:
+    common = ["export", str(stream), "--frame", "0", "--device", "reference", "--sh-degree", "0", "-o"]
+
+    def vertices(name: str, *options: str) -> np.ndarray:
+        assert main([*common, str(tmp_path / name), *options]) == 0
+        return PlyData.read(str(tmp_path / name))["vertex"].data
+
+    whole = vertices("whole.ply")
+    x = np.sort(whole["x"])[len(whole) // 2]
+    half = vertices("half.ply", "--crop", str(x), "-99", "-99", "99", "99", "99")
+    assert np.array_equal(half, whole[whole["x"] >= x])
+    solid = vertices("solid.ply", "--min-opacity", "0.5")
+    assert np.array_equal(solid, whole[whole["opacity"] >= 0])
+    few = vertices("few.ply", "--max-splats", "10")
+    volumes = whole["scale_0"] + whole["scale_1"] + whole["scale_2"] - np.log1p(np.exp(-whole["opacity"]))
+    assert np.array_equal(few, whole[np.sort(np.argsort(-volumes, kind="stable")[:10])])
+
+
+def test_the_list_of_formats(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", "--list"]) == 0
+    said = capsys.readouterr().out
+    assert all(name in said for name in (*FORMATS, *PAGES))
+
+
 def test_names_beside_the_stream(stream: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy.sgs"
     copy.write_bytes(stream.read_bytes())
@@ -96,7 +136,7 @@ def test_names_beside_the_stream(stream: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["-o", "x.obj"], "there is no format .obj; there are ply, splat, spz"),
+        (["-o", "x.obj"], "there is no format .obj; there are ply, splat, spz, sog, glb, usd, 4dgs"),
         (["-o", "x.ply"], "contains one frame"),
         (["-o", "x.ply", "--frame", "3"], "frames 0 to 2; there is no frame 3"),
         (["-o", "x.ply", "--frame", "-1"], "no frame -1"),
@@ -110,7 +150,9 @@ def test_names_beside_the_stream(stream: Path, tmp_path: Path) -> None:
         (["-o", "x", "--format", "html"], "a file whose name ends in .html, unlike x"),
         (["-o", "x.ply", "--format", "html"], "a file whose name ends in .html, unlike x.ply"),
         (["-o", "x.html", "--format", "ply"], "asks for .html, and --format for ply"),
-        (["-o", "x.ply", "--frame", "0", "--sh-degree", "3"], "not one of 0 to 2"),
+        (["-o", "x.zip", "--format", "usd"], "contains all frames"),
+        (["-o", "x.ply", "--frame", "0", "--pad-sh", "--format", "ply", "--max-splats", "0"], "leaves no Gaussian"),
+        (["-o", "x.ply", "--frame", "0", "--sh-degree", "4"], "not one of 0 to 3"),
     ],
 )
 def test_wrong_requests(
@@ -181,6 +223,8 @@ def test_problems_of_the_stream_and_of_the_disk(
     empty = tmp_path / "empty.sgs"
     scenes = frames_of_a_scene(anchors=0, free=0)
     write_stream(FileSink(empty), scenes, header=header_for(scenes[0]))
+    crop = ["--frame", "0", "--crop", "90", "90", "90", "99", "99", "99"]
+    assert "leave none of" in error_of([str(stream), *crop, "-o", str(tmp_path / "x.ply")], capsys, status=1)
     assert "nothing to export" in error_of([str(empty), "--frame", "0"], capsys, status=1)
     assert "no such" in error_of([str(tmp_path / "none.sgs")], capsys, status=1).lower()
     (tmp_path / "file").write_text("")

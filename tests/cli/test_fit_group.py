@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from quick_streams import CLIP, error_of
-from streams import small_stream
 from structgstream.cli import fit_group, main
 from structgstream.groups import unit
 from structgstream.groups.first_frame import GroupStartConfig
+from tests.support.quick_streams import CLIP, error_of
+from tests.support.streams import small_stream
 
 
 @pytest.fixture

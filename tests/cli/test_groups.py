@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from backends import QUICKEST
-from quick_streams import CLIP, QUARTER
 from structgstream.cli import main
 from structgstream.codec.reader import open_stream
+from tests.support.backends import QUICKEST
+from tests.support.quick_streams import CLIP, QUARTER
 
 pytestmark = pytest.mark.usefixtures("quick_tiny")
 

@@ -9,9 +9,6 @@ from pathlib import Path
 import pytest
 
 import structgstream
-from drawn import pixels_of
-from rigs import random_scene
-from streams import compact_header, header_for, moved, write_stream
 from structgstream.cli import main
 from structgstream.cli.capture_table import describe_capture
 from structgstream.codec.reader import open_stream
@@ -20,6 +17,9 @@ from structgstream.errors import CaptureError
 from structgstream.evaluation.run_log import append_log, begin_log
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName
+from tests.support.drawn import pixels_of
+from tests.support.rigs import random_scene
+from tests.support.streams import compact_header, header_for, moved, write_stream
 
 FRAMES = 31
 
@@ -197,3 +197,16 @@ def test_a_capture_is_described_without_training(tmp_path: Path) -> None:
     (tmp_path / "clip" / "cam03.mp4").unlink()
     with pytest.raises(CaptureError, match="cam03"):
         describe_capture(tmp_path / "clip")
+
+
+def test_videos_without_calibration_are_described_as_prepare_reads_them(tmp_path: Path) -> None:
+    for name in ("cam00", "cam03"):
+        shutil.copy(CLIP / f"{name}.mp4", tmp_path)
+    content = describe_capture(tmp_path)
+    assert (content["layout"], content["frames"]) == ("videos or pictures without calibration", 12)
+    assert content["cameras"]["cam03"]["size"] == (320, 240)
+    assert "structgstream prepare" in content["remarks"][-1]
+    (tmp_path / "cam03.mp4").unlink()
+    (tmp_path / "cam00.mp4").rename(tmp_path / "notes.txt")
+    with pytest.raises(CaptureError, match="no supported layout"):
+        describe_capture(tmp_path)

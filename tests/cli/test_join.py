@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from quick_streams import error_of
-from small_segments import FIRST, FROM_FRAME_0, encoded, write
 from structgstream.cli import main
 from structgstream.codec.reader import open_stream
 from structgstream.groups.join import join_segments
+from tests.support.quick_streams import error_of
+from tests.support.small_segments import FIRST, FROM_FRAME_0, encoded, write
 
 
 @pytest.fixture

@@ -17,9 +17,9 @@ from structgstream.cli.options import (
     parse_options,
     resolve_config,
 )
-from structgstream.data.clip import bundled_clip_path
+from structgstream.data.json_videos import bundled_clip_path
 from structgstream.errors import ConfigError
-from structgstream.presets import DEFAULT_PRESET, PRESETS
+from structgstream.session.presets import DEFAULT_PRESET, PRESETS
 
 
 def test_no_option_is_the_whole_capture() -> None:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from measured_runs import finished_run
-from quick_streams import CLIP, error_of
 from structgstream.cli import app, main, plan
+from tests.support.measured_runs import finished_run
+from tests.support.quick_streams import CLIP, error_of
 
 
 @pytest.fixture

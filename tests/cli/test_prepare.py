@@ -10,22 +10,26 @@ from pathlib import Path
 
 import pytest
 
-from quick_streams import error_of
-from rooms import write_room
 from structgstream.cli.app import main
 from structgstream.preparation.calibration.board import Board
-from structgstream.preparation.claiming import alone, claim
 from structgstream.preparation.options import Distance, PrepareOptions
+from structgstream.preparation.output_folder import lock_output, mark_output
+from tests.support.quick_preparation import quicken
+from tests.support.quick_streams import error_of
+from tests.support.rooms import write_room
 
 
-def test_prepare_then_check_and_a_mistake(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_prepare_then_check_and_a_mistake(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    quicken(monkeypatch)
     write_room(tmp_path / "videos")
     out = tmp_path / "out"
     command = ["prepare", str(tmp_path / "videos"), "-o", str(out), "--synchronize", "none", "--held-out", "cam02"]
     assert main(command) == 0
-    told = capsys.readouterr().out
-    assert "calibrate    cameras.json: 5 cameras" in told
-    assert "found nothing that would spoil a stream" in told
+    message = capsys.readouterr().out
+    assert "calibrate    cameras.json: 5 cameras" in message
+    assert "found nothing that would spoil a stream" in message
     file = out / "capture.json"
     content = json.loads(file.read_text())
     assert content["held_out"] == ["cam02"]
@@ -49,11 +53,11 @@ def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
 
 
 @pytest.mark.parametrize(
-    ("told", "arguments"),
+    ("message", "arguments"),
     [("prepare.prepare_capture", ["-o", "out"]), ("prepare.check_folder", ["--check"])],
 )
 def test_ctrl_c_that_a_library_loses(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: str, arguments: list[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: str, arguments: list[str]
 ) -> None:
     """It comes while one is loaded, which makes an error of its own of it."""
 
@@ -64,7 +68,7 @@ def test_ctrl_c_that_a_library_loses(
         except KeyboardInterrupt:
             raise ImportError("cannot be loaded") from None
 
-    monkeypatch.setattr(f"structgstream.preparation.{told}", lost)
+    monkeypatch.setattr(f"structgstream.preparation.{message}", lost)
     monkeypatch.chdir(tmp_path)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # Runs in the background may ignore it.
     try:
@@ -127,7 +131,7 @@ def test_what_may_not_be_read_or_written(
     for folder in ("videos/masks", "out"):
         (tmp_path / folder).mkdir()
     if place == "out/work":
-        claim(tmp_path / "out", tmp_path / "videos")
+        mark_output(tmp_path / "out", tmp_path / "videos")
     before = {path: path.read_bytes() for path in (tmp_path / "videos").iterdir() if path.is_file()}
     path = tmp_path / place
     mode = path.stat().st_mode
@@ -157,14 +161,14 @@ def test_a_board_that_cannot_be_is_told_before_anything_takes_time(
     command = ["prepare", str(tmp_path / "videos"), "-o", str(tmp_path / "out"), "--calibration", "board"]
     capsys.readouterr()
     assert main([*command, "--board", board]) in (1, 2)
-    told = capsys.readouterr()
-    assert said in told.err
-    assert "synchronize" not in told.out
+    message = capsys.readouterr()
+    assert said in message.err
+    assert "synchronize" not in message.out
 
 
 def test_two_at_once_on_one_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_room(tmp_path / "videos")
     command = ["prepare", str(tmp_path / "videos"), "-o", str(tmp_path / "out"), "--synchronize", "none"]
-    claim(tmp_path / "out", tmp_path / "videos")
-    with alone(tmp_path / "out"):
+    mark_output(tmp_path / "out", tmp_path / "videos")
+    with lock_output(tmp_path / "out"):
         assert f"Another process prepares {tmp_path / 'out'} now; wait" in error_of(command, capsys, status=1)

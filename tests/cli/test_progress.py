@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from reports import frame_report
 from structgstream.cli import progress
 from structgstream.cli.progress import Bars, Lines, display, human_bytes, summary
 from structgstream.training.result import Step
+from tests.support.reports import frame_report
 
 REPORT = frame_report(
     1,

@@ -10,13 +10,13 @@ from typing import Any
 import av
 import pytest
 
-from backends import QUICKEST
-from drawn import pixels_of
-from quick_streams import CLIP, error_of
 from structgstream.cli import main, render
 from structgstream.cli.options import parse_options
 from structgstream.codec.reader import open_stream
 from structgstream.evaluation.camera_path import central_camera
+from tests.support.backends import QUICKEST
+from tests.support.drawn import pixels_of
+from tests.support.quick_streams import CLIP, error_of
 
 
 def test_render_a_camera_to_video_and_pictures(stream: Path, tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from segment_streams import header, packets
 from structgstream.cli.app import UsageError
 from structgstream.cli.segment_options import SegmentOptions
 from structgstream.codec.segments.manifest import MANIFEST
@@ -14,6 +13,7 @@ from structgstream.codec.segments.quality_list import ListedQuality, write_list
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest
 from structgstream.errors import StorageError
+from tests.support.segment_streams import header, packets
 
 
 def test_what_is_there_says_how_it_is_written(tmp_path: Path) -> None:

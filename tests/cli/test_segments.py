@@ -2,18 +2,19 @@
 """A folder of segments goes through every command as a file does, and the two are the same bytes."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 
-from backends import QUICKEST
-from quick_streams import CLIP, QUARTER, stopped_by_sigterm
-from s3_emulator import BUCKET, emulator
 from structgstream.cli import main, segment_options
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.recovery import stale_files
 from structgstream.codec.segments.store import CloudStore, FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest, write_archive
+from tests.support.backends import QUICKEST
+from tests.support.quick_streams import CLIP, QUARTER, stopped_by_sigterm
+from tests.support.s3_emulator import BUCKET, emulator
 
 pytestmark = pytest.mark.usefixtures("quick_tiny")
 
@@ -104,6 +105,7 @@ def test_publishing_to_s3(
 ) -> None:
     """What is missing after a run is copied by the next, also if there is nothing to fit."""
     out = tmp_path / "out"
+    shutil.copytree(made / "segments", out)
     with emulator() as server:
         options = server.options
         monkeypatch.setenv("AWS_ENDPOINT_URL", options["endpoint_url"])
@@ -113,7 +115,7 @@ def test_publishing_to_s3(
         url = f"s3://{BUCKET}/out"
         command = ["reconstruct", CLIP, "-o", str(out), "--frames", "3", *QUARTER]
         command += ["--sink", "segments", "--publish", url]
-        assert main(command) == 0
+        assert main([*command, "--resume"]) == 0
         monkeypatch.setattr(segment_options, "FINISH_SECONDS", 120.0)
         assert main([*command, "--resume"]) == 0
         remote = CloudStore(url, **options)

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from segment_folders import GrowingFolder
-from streams import small_stream
 from structgstream.cli import main
+from tests.support.segment_folders import GrowingFolder
+from tests.support.streams import small_stream
 
 STREAM = small_stream()
 SECRET = "a secret of thirty-two characters\n"

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from quick_streams import error_of
 from structgstream.cli import main, token
 from structgstream.serve.tokens import EVERY_STREAM, Access, read_keys
+from tests.support.quick_streams import error_of
 
 NOW = 1.7e9
 

@@ -11,15 +11,15 @@ from typing import Any
 
 import pytest
 
-from quick_streams import CLIP, error_of
-from streams import header_for, small_scene, write_stream
+from structgstream.atomic_files import partial_path
 from structgstream.cli import main
 from structgstream.codec.sinks import FileSink
 from structgstream.groups import pictures, track_pass
-from structgstream.groups.group_list import groups_path
+from structgstream.groups.boundaries import groups_path
 from structgstream.groups.track_file import TrackHead, TrackWriter
-from structgstream.presets import TINY, to_json
-from structgstream.whole_files import partial_path
+from structgstream.session.presets import TINY, to_json
+from tests.support.quick_streams import CLIP, error_of
+from tests.support.streams import header_for, small_scene, write_stream
 
 FRAMES = 12
 

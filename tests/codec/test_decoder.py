@@ -7,14 +7,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
-from streams import header_for, same, small_scene
 from structgstream.codec.container.blocks import pack_raw_block
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, PacketKind, parse_packet
 from structgstream.errors import StreamError
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, state_of
+from tests.support.properties import examples
+from tests.support.streams import header_for, same, small_scene
 
 SCENE = small_scene(3, free=2)
 HEADER = header_for(SCENE)

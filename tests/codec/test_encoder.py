@@ -6,9 +6,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
-from rigs import random_scene
-from streams import header_for, moved, same, small_scene
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.header import pack_header, unpack_header
@@ -16,6 +13,9 @@ from structgstream.codec.packets import PacketKind, parse_packet
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, state_of
+from tests.support.properties import examples
+from tests.support.rigs import random_scene
+from tests.support.streams import header_for, moved, same, small_scene
 
 NAMES = [row.name for row in STATE_TABLE]
 

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigs import arc_rig
-from streams import moved, small_scene
 from structgstream.codec.reader import FrameRenderer
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.render import render, to_8bit_image
 from structgstream.scene.scene import Scene
+from tests.support.rigs import arc_rig
+from tests.support.streams import moved, small_scene
 
 RIG, BACKEND = arc_rig(), reference_backend()
 

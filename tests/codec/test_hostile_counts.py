@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from properties import thinned
-from streams import compact_header, small_scene
 from structgstream.codec.container.blocks import BLOCK, LENGTH, iterate_blocks, unpack_blocks
 from structgstream.codec.decoder import CompactDecoder
 from structgstream.codec.encoder import CompactEncoder
@@ -26,10 +24,12 @@ from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import FieldName, state_of
+from tests.support.properties import thinned
+from tests.support.streams import compact_header, small_scene
 
 Fields = Mapping[FieldName, bytes]
 HUGE = (2**20, 2**32 - 1)
-MOST_BYTES = 48 * 2**20
+MAX_BYTES = 48 * 2**20
 """What a decoder may take for a file of a few kilobytes: 2^20 numbers, in all that they are on the way."""
 VALUES = ("origin", "descends", "middle")
 """Numbers that are no counts: as large as these is as good as any."""
@@ -98,7 +98,7 @@ def check_all_refused(fields: Fields, counts: list[Count], decode: Callable[[Fie
             tracemalloc.reset_peak()
             with pytest.raises(StreamError):
                 print(count, value, decode(changed))
-            assert tracemalloc.get_traced_memory()[1] < MOST_BYTES, (count, value)
+            assert tracemalloc.get_traced_memory()[1] < MAX_BYTES, (count, value)
     finally:
         tracemalloc.stop()
 
@@ -129,7 +129,7 @@ def test_sizes_in_blocks() -> None:
                 tracemalloc.reset_peak()
                 with pytest.raises(StreamError, match="The init record"):
                     unpack_header(payload[:place] + value.to_bytes(4, "little") + payload[place + 4 :])
-                assert tracemalloc.get_traced_memory()[1] < MOST_BYTES
+                assert tracemalloc.get_traced_memory()[1] < MAX_BYTES
     tracemalloc.stop()
 
 

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
-from streams import small_stream
 from structgstream.codec.container.records import Record, RecordType, packed, scan_records
 from structgstream.codec.contents import LOST, Packets
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import StreamError
+from tests.support.properties import examples
+from tests.support.streams import small_stream
 
 FRAMES = 5
 

@@ -8,9 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from period_streams import FIRSTS, FRAMES, LENGTHS, period_header, period_of, period_stream
-from properties import examples
-from rigs import arc_rig
 from structgstream.codec.container.index import Period
 from structgstream.codec.container.records import Record, RecordType, packed, scan_records
 from structgstream.codec.contents import PeriodTable, differences
@@ -18,6 +15,9 @@ from structgstream.codec.header import pack_header
 from structgstream.codec.packets import StreamHeader
 from structgstream.errors import StreamError
 from structgstream.similarity import Similarity
+from tests.support.period_streams import FIRSTS, FRAMES, LENGTHS, period_header, period_of, period_stream
+from tests.support.properties import examples
+from tests.support.rigs import arc_rig
 
 CODEC = "raw"
 

@@ -6,8 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from properties import THOROUGH
-from streams import header_for, moved, same, small_scene, small_stream, write_stream
 from structgstream.codec.container.damage import readable_part
 from structgstream.codec.container.records import PREFIX, RecordType, packed, prefix, scan_records
 from structgstream.codec.encoder import SceneEncoder
@@ -16,6 +14,8 @@ from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.sinks import MemorySink
 from structgstream.errors import StreamError
+from tests.support.properties import THOROUGH
+from tests.support.streams import header_for, moved, same, small_scene, small_stream, write_stream
 
 
 def packet_record(index: int, kind: PacketKind, *, pts_seconds: float | None = None) -> bytes:

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from streams import small_stream
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink
 from structgstream.errors import StreamError
+from tests.support.streams import small_stream
 
 
 def test_frames_after_a_damaged_one_are_not_thrown_away(tmp_path: Path) -> None:

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from segment_streams import as_file, folder, header, packets, written
-from streams import same
 from structgstream.codec.contents import LOST
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.sinks import StoredSegments, resume_segments
+from tests.support.segment_streams import as_file, folder, header, packets, written
+from tests.support.streams import same
 
 SENT = packets(9)
 

@@ -20,7 +20,7 @@ from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.segments.manifest import manifest_from_json, manifest_to_json
 from structgstream.codec.segments.stored_bytes import open_segments
 from structgstream.scene.state import state_of
-from vectors.generate import (
+from tests.vectors.generate import (
     COMPACT_EXPECTED,
     COMPACT_STEPS,
     COMPACT_STREAM,

@@ -7,10 +7,10 @@ import av
 import numpy as np
 import pytest
 
-from captures import write_video
 from structgstream.data import audio
 from structgstream.data.audio import read_audio
 from structgstream.errors import CaptureError
+from tests.support.captures import write_video
 
 RATE = 48_000
 

@@ -12,8 +12,21 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrations import OF_PINHOLES, WRITERS, truths
-from captures import (
+from structgstream.data.colmap import read_model
+from structgstream.data.found_calibrations import read_calibration
+from structgstream.data.images import read_picture
+from structgstream.data.lenses import Fisheye, LensCamera, Pinhole, RadialTangential
+from structgstream.data.open import open_capture
+from structgstream.data.picture_headers import picture_size, read_exif
+from structgstream.data.posed_capture import filmed_by
+from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
+from structgstream.data.rectilinear import rectilinear
+from structgstream.data.timeline import Clock
+from structgstream.data.video_index import scan_videos
+from structgstream.data.video_pictures import pictures_at
+from structgstream.errors import StructGStreamError
+from tests.support.calibrations import OF_PINHOLES, WRITERS, truths
+from tests.support.captures import (
     HEIGHT,
     WIDTH,
     picture,
@@ -27,21 +40,7 @@ from captures import (
     write_text_model,
     write_video,
 )
-from properties import THOROUGH
-from structgstream.data.colmap import read_model
-from structgstream.data.exif import read_exif
-from structgstream.data.found_calibrations import read_calibration
-from structgstream.data.images import read_picture
-from structgstream.data.lenses import Fisheye, LensCamera, Pinhole, RadialTangential
-from structgstream.data.open import open_capture
-from structgstream.data.picture_size import picture_size
-from structgstream.data.posed_capture import filmed_by
-from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
-from structgstream.data.rectilinear import rectilinear
-from structgstream.data.timeline import Clock
-from structgstream.data.video_index import scan_videos
-from structgstream.data.video_pictures import pictures_at
-from structgstream.errors import StructGStreamError
+from tests.support.properties import THOROUGH
 
 PYTHONS_WORDS = re.compile(
     r"\b\w+Error\b|\b(NoneType|int|float|str|dict|tuple|object|dtype|literal|codec|subscript\w*|unpack|argument|"

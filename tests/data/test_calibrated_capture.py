@@ -9,16 +9,23 @@ import numpy as np
 import pytest
 import torch
 
-from calibrations import WRITERS, Floats, Truth, truths, write_anipose, write_cmu, write_easymocap, write_opencv
-from captures import HEIGHT, WIDTH, Picture, all_numbers, picture, write_picture, write_videos
-from structgstream.data.clip import bundled_clip
-from structgstream.data.colmap import PARAMETERS
+from structgstream.data.json_videos import bundled_clip
 from structgstream.data.lenses import LensCamera, Pinhole
-from structgstream.data.open import LAYOUTS, open_capture
+from structgstream.data.open import open_capture
 from structgstream.data.undistortion import UndistortedSource, Undistortion
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.pose_check.check import check_poses
-from structgstream.presets import PAPER_DATA
+from tests.support.calibrations import (
+    WRITERS,
+    Floats,
+    Truth,
+    truths,
+    write_anipose,
+    write_cmu,
+    write_easymocap,
+    write_opencv,
+)
+from tests.support.captures import HEIGHT, WIDTH, Picture, all_numbers, picture, write_picture, write_videos
 
 NAMES = ["cam00", "cam01", "cam02"]
 EXPECTED = [[(camera, frame) for camera in range(3)] for frame in range(3)]
@@ -162,21 +169,6 @@ def test_pickles_are_refused(tmp_path: Path) -> None:
         CalibrationError, match=r"cam0\.pickle is a pickle, and opening it could run any program; it is"
     ):
         open_capture(tmp_path)
-
-
-def test_what_can_be_read_is_listed() -> None:
-    page = (Path(__file__).parents[2] / "docs/captures.md").read_text()
-    for name in ("aniposelib", "EasyMocap", "multical", "Kalibr", "CMU Panoptic", "Qualisys", "ZJU-MoCap", "OpenCV"):
-        assert name in LAYOUTS
-        assert name in page
-    assert not [model for model in PARAMETERS if model not in page]
-    table = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("| ")]
-    rows = {first: cells for first, *cells in table}
-    assert rows["preset"] == [f"`{name}`" for name in PAPER_DATA]
-    assert rows["held out"] == [f"`{data.held_out_camera}`" for data in PAPER_DATA.values()]
-    for cell, data in zip(rows["size that the paper trains on"], PAPER_DATA.values(), strict=True):
-        assert cell.startswith(f"{data.width} x {data.height}")
-        assert (f"`--scale {data.scale:g}`" in cell) == (data.scale != 1)
 
 
 def through_a_lens(image: Picture, K: Floats, dist: tuple[float, ...]) -> Picture:

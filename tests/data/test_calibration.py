@@ -4,11 +4,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from captures import small_rig
 from structgstream.cameras import Camera
 from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_names, listed
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.similarity import rig_radius
+from tests.support.captures import small_rig
 
 WHERE = Path("take/cameras.json")
 K = np.array([[40.0, 0, 32], [0, 40, 24], [0, 0, 1]])
@@ -73,4 +73,4 @@ def test_pictures_and_calibration_must_be_of_the_same_cameras() -> None:
 
 
 def test_long_lists_are_cut() -> None:
-    assert listed("abcdefg", most=3) == "cameras 'a', 'b', 'c' and 4 more"
+    assert listed("abcdefg", limit=3) == "cameras 'a', 'b', 'c' and 4 more"

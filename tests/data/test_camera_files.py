@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from captures import picture, write_picture, write_videos
 from structgstream.data.camera_files import other_roots, pictures_in, videos_in
 from structgstream.errors import CaptureError
+from tests.support.captures import picture, write_picture, write_videos
 
 
 def test_videos_in_folders_of_cameras(tmp_path: Path) -> None:

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from captures import quaternion, small_rig, write_text_model
 from structgstream.data.colmap import find_model, read_model
 from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential
 from structgstream.errors import CalibrationError
+from tests.support.captures import quaternion, small_rig, write_text_model
 
 POINTS = np.array([[1.0, 2.0, 3.0], [-0.5, 0.25, 7.0]])
 RIG = small_rig(3)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from captures import all_numbers, picture, small_rig, write_picture, write_text_model, write_videos
 from structgstream.data.open import open_capture
 from structgstream.errors import CalibrationError, CaptureError
+from tests.support.captures import all_numbers, picture, small_rig, write_picture, write_text_model, write_videos
 
 RIG = small_rig(3)
 FRAMES = 4

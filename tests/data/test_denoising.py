@@ -7,16 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from memory_captures import MemoryCapture
-from rigs import arc_rig
 from structgstream import cameras
-from structgstream.data.denoising import MOST_FRAMES, Denoised, DenoisingConfig, denoised, mean_of_still
-from structgstream.data.prefetch import Prefetch
+from structgstream.data.denoising import MAX_FRAMES, Denoised, DenoisingConfig, denoised, mean_of_still
 from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import section
+from structgstream.data.wrappers import Prefetch, section
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MultiViewFrame
-from tests.varied import varied
+from tests.support.memory_captures import MemoryCapture
+from tests.support.rigs import arc_rig
+from tests.support.varied import varied
 
 HEIGHT, WIDTH, FRAMES = 48, 64, 12
 EIGHT = DenoisingConfig(frames=8)
@@ -217,13 +216,13 @@ def test_means_are_rounded_to_the_nearest() -> None:
 
 def test_the_largest_sums_fit() -> None:
     white = MultiViewFrame(0, 0.0, {"cam01": np.full((8, 8, 3), 255, np.uint8)})
-    config = DenoisingConfig(frames=MOST_FRAMES)
-    found = mean_of_still(white, [white] * MOST_FRAMES, names=("cam01",), config=config)
-    assert found.mean_of == MOST_FRAMES
+    config = DenoisingConfig(frames=MAX_FRAMES)
+    found = mean_of_still(white, [white] * MAX_FRAMES, names=("cam01",), config=config)
+    assert found.mean_of == MAX_FRAMES
     assert (found.images["cam01"] == 255).all()
 
 
-@pytest.mark.parametrize("frames", [0, MOST_FRAMES + 1])
+@pytest.mark.parametrize("frames", [0, MAX_FRAMES + 1])
 def test_what_cannot_be_is_refused(frames: int) -> None:
     with pytest.raises(ConfigError, match="Denoising takes"):
         DenoisingConfig(frames=frames)

@@ -12,7 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calibrations import (
+from structgstream.data.found_calibrations import read_calibrated
+from structgstream.data.lenses import from_integer_centers
+from structgstream.data.open import open_capture
+from structgstream.errors import CalibrationError, CaptureError
+from tests.support.calibrations import (
     NAMES,
     WRITERS,
     Truth,
@@ -24,11 +28,16 @@ from calibrations import (
     write_opencv,
     write_projections,
 )
-from captures import HEIGHT, WIDTH, numbers, picture, small_rig, write_picture, write_text_model, write_videos
-from structgstream.data.found_calibrations import read_calibrated
-from structgstream.data.lenses import from_integer_centers
-from structgstream.data.open import open_capture
-from structgstream.errors import CalibrationError, CaptureError
+from tests.support.captures import (
+    HEIGHT,
+    WIDTH,
+    numbers,
+    picture,
+    small_rig,
+    write_picture,
+    write_text_model,
+    write_videos,
+)
 
 RIG = small_rig(3)
 

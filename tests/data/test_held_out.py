@@ -9,14 +9,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from captures import small_rig, write_clip
-from properties import examples
-from rigs import look_at
 from structgstream.cameras import Camera, CameraRig
-from structgstream.data.clip import bundled_clip
 from structgstream.data.held_out import best_surrounded
+from structgstream.data.json_videos import bundled_clip
 from structgstream.data.open import open_capture
 from structgstream.errors import CalibrationError, ConfigError
+from tests.support.captures import small_rig, write_clip
+from tests.support.properties import examples
+from tests.support.rigs import look_at
 
 K = torch.tensor([[40.0, 0, 24], [0, 40.0, 16], [0, 0, 1]], dtype=torch.float64)
 

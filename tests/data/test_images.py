@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from captures import all_numbers, picture, small_rig, write_picture
-from drawn import pixels_of
 from structgstream.data.images import ImageSource, common_pictures
 from structgstream.errors import CalibrationError, CaptureError, MissingExtraError
+from tests.support.captures import all_numbers, picture, small_rig, write_picture
+from tests.support.drawn import pixels_of
 
 
 @pytest.fixture

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from calibrations import pixels
-from captures import all_numbers, write_immersive
 from structgstream.cameras import Camera
-from structgstream.data.immersive import open_immersive, read_models
+from structgstream.data.dataset_layouts import open_immersive, read_models
 from structgstream.data.lenses import Fisheye, LensCamera
 from structgstream.data.open import open_capture
 from structgstream.data.undistortion import UndistortedSource, Undistortion
 from structgstream.errors import CalibrationError
+from tests.support.calibrations import pixels
+from tests.support.captures import all_numbers, write_immersive
 
 
 def test_fisheye_videos_become_pinholes_of_half_the_focal_length(tmp_path: Path) -> None:

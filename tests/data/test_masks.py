@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from captures import HEIGHT, WIDTH, picture, small_rig, write_clip, write_panoptic, write_picture
 from structgstream.data.images import reduced_mask
 from structgstream.data.lenses import LensCamera, RadialTangential
 from structgstream.data.masks import with_masks
@@ -20,6 +19,7 @@ from structgstream.data.timeline import Clock
 from structgstream.data.undistortion import Undistortion, undistort
 from structgstream.data.wrappers import every_nth_frame
 from structgstream.errors import CaptureError
+from tests.support.captures import HEIGHT, WIDTH, picture, small_rig, write_clip, write_panoptic, write_picture
 
 Mask = NDArray[np.bool_]
 

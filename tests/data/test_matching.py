@@ -5,8 +5,6 @@ import numpy as np
 import pytest
 import torch
 
-from planes import distance_to_surface, room_frame, room_rig
-from rigs import arc_rig
 from structgstream.data.matching import (
     Features,
     back_project,
@@ -22,6 +20,8 @@ from structgstream.data.matching import (
     unique_pairs,
     viewing_distance,
 )
+from tests.support.planes import distance_to_surface, room_frame, room_rig
+from tests.support.rigs import arc_rig
 
 POINTS = np.random.default_rng(0).uniform(-0.4, 0.4, (40, 3))
 

@@ -7,11 +7,19 @@ import numpy as np
 import pytest
 import torch
 
-from captures import all_numbers, picture, small_rig, write_meet_room, write_n3dv, write_picture, write_text_model
-from structgstream.data import clip
-from structgstream.data.clip import bundled_clip
-from structgstream.data.n3dv import open_n3dv
+from structgstream.data import json_videos as clip
+from structgstream.data.dataset_layouts import open_n3dv
+from structgstream.data.json_videos import bundled_clip
 from structgstream.errors import CalibrationError
+from tests.support.captures import (
+    all_numbers,
+    picture,
+    small_rig,
+    write_meet_room,
+    write_n3dv,
+    write_picture,
+    write_text_model,
+)
 
 CLIP_FOLDER = Path(clip.__file__).parent / "clip"
 

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from captures import (
+from structgstream.cameras import CameraRig
+from structgstream.data.open import LAYOUTS, open_capture
+from structgstream.errors import CalibrationError, CaptureError, ConfigError
+from tests.support.captures import (
     all_numbers,
     picture,
     small_rig,
@@ -19,9 +22,6 @@ from captures import (
     write_text_model,
     write_videos,
 )
-from structgstream.cameras import CameraRig
-from structgstream.data.open import LAYOUTS, open_capture
-from structgstream.errors import CalibrationError, CaptureError, ConfigError
 
 
 def write_colmap(path: Path) -> CameraRig:

@@ -4,10 +4,10 @@
 import numpy as np
 import pytest
 
-from filmed import noise_texture
 from structgstream import cameras
 from structgstream.data.matching import Features
-from structgstream.data.pair_matches import MatchConfig, PairMatcher
+from structgstream.data.pair_matches import KEYPOINT_SIDE, MatchConfig, PairMatcher
+from tests.support.filmed import noise_texture
 
 SIDE, SHIFT = 256, 17
 
@@ -86,3 +86,17 @@ def test_inliers_lie_as_near_in_larger_pictures(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(cameras, "REFERENCE_PIXELS", SIDE)
     assert count(4) > 0.9 * count(1) > 200
+
+
+def test_keypoints_of_large_pictures_are_those_of_the_reduced_one() -> None:
+    """Found at ``KEYPOINT_SIDE``, in pixels of the large picture; its mask is reduced as well."""
+    strip = np.tile(np.asarray(noise_texture(1, size=250))[:200], (1, KEYPOINT_SIDE // 250, 1))
+    large = strip.repeat(3, axis=0).repeat(3, axis=1)
+    counts = np.ones(large.shape[:2], bool)
+    counts[:, : large.shape[1] // 2] = False
+    matcher = PairMatcher({"a": strip, "b": large}, masks={"a": counts[::3, ::3], "b": counts})
+    matcher.indices([("a", "b")])
+    small, reduced = matcher.keypoints("a"), matcher.keypoints("b")
+    assert len(small) > 100
+    np.testing.assert_allclose(reduced, 3 * small)
+    assert reduced[:, 0].min() > large.shape[1] / 2 - 3

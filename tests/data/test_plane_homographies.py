@@ -4,11 +4,10 @@
 import numpy as np
 import torch
 
-from planes import room_depth, room_frame, room_rig
 from structgstream.data.matching import back_project, project
-from structgstream.data.plane_homographies import plane_homographies
-from structgstream.data.plane_sweep import sweep_view
+from structgstream.data.plane_sweep import plane_homographies, sweep_view
 from structgstream.kernels.backend import processor_backend
+from tests.support.planes import room_depth, room_frame, room_rig
 
 
 def test_a_homography_is_the_projection_of_points_of_its_plane() -> None:

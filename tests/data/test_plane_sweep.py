@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from planes import WIDTH, distance_to_surface, room_depth, room_frame, room_rig
 from structgstream.data.matching import level_normal, neighbor_views
 from structgstream.data.plane_sweep import (
     DepthMap,
@@ -17,6 +16,7 @@ from structgstream.data.plane_sweep import (
     sweep_points,
     sweep_view,
 )
+from tests.support.planes import WIDTH, distance_to_surface, room_depth, room_frame, room_rig
 
 CONFIG = SweepConfig(width=WIDTH)
 BOUNDS = SweepBounds((1.0, 5.0))

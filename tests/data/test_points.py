@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from planes import distance_to_surface, room_frame, room_rig
 from structgstream import cameras
-from structgstream.data.clip import bundled_clip
+from structgstream.data.json_videos import bundled_clip
 from structgstream.data.matching import inside, project
 from structgstream.data.plane_sweep import DEFAULT_LEVELS, SweepConfig
 from structgstream.data.points import InitialPoints, PointsConfig, _has_neighbors, initial_points
 from structgstream.data.wrappers import resized
 from structgstream.frames import MultiViewFrame
-from tests.varied import varied
+from tests.support.planes import distance_to_surface, room_frame, room_rig
+from tests.support.varied import varied
 
 
 class Guarded(Mapping[str, np.ndarray]):

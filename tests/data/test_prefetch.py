@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from captures import picture, small_rig, write_clip
 from structgstream.cameras import CameraRig
 from structgstream.data.json_videos import open_json_videos
-from structgstream.data.prefetch import Prefetch
+from structgstream.data.wrappers import Prefetch
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MultiViewFrame
+from tests.support.captures import picture, small_rig, write_clip
 
 
 @dataclass

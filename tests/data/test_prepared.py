@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from captures import HEIGHT, WIDTH, all_numbers, numbers, picture, small_rig, write_picture, write_video, write_videos
 from structgstream.data.lenses import Fisheye, LensCamera, Pinhole, RadialTangential
 from structgstream.data.open import open_capture
 from structgstream.data.prepared import (
@@ -25,6 +24,17 @@ from structgstream.data.rectilinear import rectilinear
 from structgstream.data.timeline import Clock
 from structgstream.data.wrappers import apart_seconds
 from structgstream.errors import CalibrationError, CaptureError, StorageError
+from tests.support.captures import (
+    HEIGHT,
+    WIDTH,
+    all_numbers,
+    numbers,
+    picture,
+    small_rig,
+    write_picture,
+    write_video,
+    write_videos,
+)
 
 LENSES = (Pinhole(), RadialTangential(k1=-0.1, k2=0.02, p1=0.001), Fisheye(k1=0.02), Pinhole())
 

@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from captures import small_rig
-from structgstream.data.folder_files import files_of
+from structgstream.data.calibration import Calibration, PosedCamera
+from structgstream.data.camera_files import files_of
 from structgstream.data.images import ImageSource, common_pictures, read_picture, turned
-from structgstream.data.posed import Calibration, PosedCamera
 from structgstream.data.posed_capture import _orientation
 from structgstream.data.timeline import picture_slots
 from structgstream.data.transfer import HLG, PQ, high_range_to_srgb
@@ -24,15 +23,26 @@ from structgstream.data.video import synchronised
 from structgstream.data.video_index import scan_videos
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.footage import find_footage
+from tests.support.captures import small_rig
 
 RIG = small_rig(3)
 OPTIONS = {"g": "4", "sc_threshold": "0", "lag-in-frames": "0"}
 
 
 def encode(
-    path: Path, *, skip: int = 0, frames: int = 12, codec: str = "libx264", thumbnail: bool = False, bf: int = 0
+    path: Path,
+    *,
+    skip: int = 0,
+    frames: int = 12,
+    codec: str = "libx264",
+    thumbnail: bool = False,
+    bf: int = 0,
+    first: int = 0,
 ) -> None:
-    """Pictures whose grey is their number times 16, in groups of four, without the first ``skip`` packets."""
+    """Pictures whose grey is their number times 16, in groups of four, without the first ``skip`` packets.
+
+    ``first`` is the time stamp of the first picture, in frames.
+    """
     with av.open(str(path), "w") as container:
         small: Any = container.add_stream("mjpeg", rate=30) if thumbnail else None
         stream: Any = container.add_stream(codec, rate=30, options=OPTIONS | {"bf": str(bf)})
@@ -44,7 +54,7 @@ def encode(
         packets = []
         for number in range(frames):
             frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 16 * number, np.uint8), format="rgb24")
-            frame.pts, frame.time_base = number, Fraction(1, 30)
+            frame.pts, frame.time_base = first + number, Fraction(1, 30)
             packets += stream.encode(frame)
         for packet in [*packets, *stream.encode()][skip:]:
             container.mux(packet)
@@ -74,6 +84,20 @@ def test_a_video_that_begins_within_a_group_has_the_frames_that_decode(tmp_path:
     assert len(tracks["cam01"].stamps) == 8, "what counts is what decodes"
     assert numbers(source) == [4, 5, 6, 7, 8, 9, 10, 11]
     assert numbers(source, 5) == [9, 10, 11], "a resumed run has the same frames"
+
+
+@pytest.mark.parametrize("skip", [0, 2])
+def test_a_transport_stream_among_other_containers_begins_at_its_first_picture(tmp_path: Path, skip: int) -> None:
+    files = {name: tmp_path / f"{name}{'.ts' if name == 'cam01' else '.mp4'}" for name in RIG}
+    for name, file in files.items():  # at 1.4 s, as FFmpeg writes it
+        encode(file, first=42 if name == "cam01" else 0, skip=skip if name == "cam01" else 0)
+    source = synchronised(scan_videos(files), RIG, where=tmp_path)
+    assert numbers(source) == ([*range(12)] if not skip else [4, 5, 6, 7, 8, 9, 10, 11])
+
+
+def test_transport_streams_alone_keep_their_stamps(tmp_path: Path) -> None:
+    files = videos(tmp_path, ".ts", first=2)
+    assert numbers(synchronised(scan_videos(files), RIG, where=tmp_path)) == [*range(10)], "cam01 began 2 frames later"
 
 
 def test_lost_packets_of_a_transport_stream_are_an_absence_up_to_the_next_key_frame(tmp_path: Path) -> None:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from lens_cameras import MILD, WIDE, filmed
 from structgstream.data.lenses import Fisheye, Pinhole
 from structgstream.data.rectilinear import WIDEST_DEGREES, rectilinear, shows
 from structgstream.errors import CalibrationError, ConfigError
+from tests.support.lens_cameras import MILD, WIDE, filmed
 
 
 def test_a_wide_fisheye_stops_at_the_widest_that_a_plane_shows_well() -> None:

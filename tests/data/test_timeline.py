@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
-from structgstream.data.timeline import Clock, common_slots, natural, picture_slots
+from structgstream.data.timeline import Clock, common_slots, natural, period_seconds, picture_slots
 from structgstream.errors import CaptureError
+from tests.support.properties import examples
 
 
 def common(**slots: list[int]) -> range:
@@ -121,3 +121,8 @@ def test_pictures_are_of_one_instant_by_their_names() -> None:
 def test_pictures_are_counted_where_a_camera_names_them_its_own_way() -> None:
     assert slots(a="8 9 10", b="8 10", c="IMG1 IMG2") == {"a": [0, 1, 2], "b": [0, 1], "c": [0, 1]}
     assert slots(a="a", b="b") == {"a": [0], "b": [0]}
+
+
+def test_the_period_is_that_of_most_frames() -> None:
+    assert period_seconds(np.delete(np.arange(50) / 25, [3, 4, 20])) == pytest.approx(0.04)
+    assert period_seconds(np.zeros(1)) == pytest.approx(1 / 30)

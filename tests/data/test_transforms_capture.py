@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from calibrations import Truth, truths, write_transforms
-from captures import HEIGHT, WIDTH, all_numbers, picture, write_picture, write_videos
 from structgstream.data.open import open_capture
-from structgstream.data.transforms_capture import open_transforms
+from structgstream.data.transforms import open_transforms
 from structgstream.errors import CalibrationError, CaptureError
+from tests.support.calibrations import Truth, truths, write_transforms
+from tests.support.captures import HEIGHT, WIDTH, all_numbers, picture, write_picture, write_videos
 
 CAMERAS = truths(dist=())
 FRAMES = 3

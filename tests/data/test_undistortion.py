@@ -9,8 +9,6 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from captures import small_rig
-from lens_cameras import LENSES, MILD, PINCUSHION, WIDE, filmed
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole
 from structgstream.data.rectilinear import rectilinear
@@ -18,6 +16,8 @@ from structgstream.data.undistortion import UndistortedSource, Undistortion, und
 from structgstream.data.wrappers import resized, section, select_cameras
 from structgstream.errors import CalibrationError
 from structgstream.frames import MultiViewFrame
+from tests.support.captures import small_rig
+from tests.support.lens_cameras import LENSES, MILD, PINCUSHION, WIDE, filmed
 
 
 def pattern(normalised: NDArray[np.float64]) -> NDArray[np.uint8]:

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from captures import FULL, LIMITED, all_numbers, numbers, picture, small_rig, write_video, write_videos
 from structgstream.data.timeline import Clock
 from structgstream.data.video import VideoSource, measured_fps, synchronised
 from structgstream.data.video_index import VideoTrack, scan_videos
 from structgstream.errors import CalibrationError, CaptureError, MissingExtraError
+from tests.support.captures import FULL, LIMITED, all_numbers, numbers, picture, small_rig, write_video, write_videos
 
 RIG = small_rig(3)
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from av.codec.context import Flags
 
-from captures import Picture, picture, small_rig, write_videos
 from structgstream.data.video import synchronised
 from structgstream.data.video_index import scan_videos
 from structgstream.errors import CalibrationError, CaptureError
+from tests.support.captures import Picture, picture, small_rig, write_videos
 
 RIG = small_rig(3)
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from captures import HEIGHT, WIDTH, numbers, picture, write_video
 from structgstream.data.video_index import VideoTrack, scan_videos
 from structgstream.data.video_pictures import pictures_at
 from structgstream.errors import CaptureError
+from tests.support.captures import HEIGHT, WIDTH, numbers, picture, write_video
 
 SIZE = (WIDTH, HEIGHT)
 FRAMES = 16  # in groups of four

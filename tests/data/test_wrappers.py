@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from captures import all_numbers, numbers, write_clip, write_panoptic
+from structgstream.data.dataset_layouts import open_panoptic
 from structgstream.data.images import ImageSource
 from structgstream.data.json_videos import open_json_videos
-from structgstream.data.panoptic import open_panoptic
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import (
     SourceWrapper,
@@ -23,6 +22,7 @@ from structgstream.data.wrappers import (
     unwrapped,
 )
 from structgstream.errors import CaptureError, ConfigError
+from tests.support.captures import all_numbers, numbers, write_clip, write_panoptic
 
 
 @pytest.fixture(params=["pictures", "videos"])

@@ -5,8 +5,6 @@ from dataclasses import replace
 
 import pytest
 
-from rigs import random_scene
-from streams import compact_header, header_for, moved, small_scene, write_stream
 from structgstream.codec.container.records import PREFIX
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import MemorySink
@@ -21,6 +19,8 @@ from structgstream.evaluation.byte_count import (
     parts_of,
     with_rest,
 )
+from tests.support.rigs import random_scene
+from tests.support.streams import compact_header, header_for, moved, small_scene, write_stream
 
 
 def reader_of(*, frames: int, compact: bool) -> StreamReader:

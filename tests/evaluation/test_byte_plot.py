@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drawn import coloured, pixels_of
 from structgstream.errors import StorageError
 from structgstream.evaluation.byte_count import REST, Parts, Row, groups_of
 from structgstream.evaluation.byte_plot import field_colors, write_byte_plot
 from structgstream.figure import COLORS, OTHER
+from tests.support.drawn import coloured, pixels_of
 
 HEADER = {"anchor_features": 6e5, "anchor_positions": 3e5, REST: 4e3}
 

@@ -4,10 +4,10 @@
 import pytest
 import torch
 
-from rigs import arc_rig, look_at
 from structgstream.cameras import Camera, CameraRig
 from structgstream.errors import ConfigError
 from structgstream.evaluation.camera_path import arc, central_camera, focus_point, free_near, looking, orbit
+from tests.support.rigs import arc_rig, look_at
 
 
 def forward_rig() -> CameraRig:

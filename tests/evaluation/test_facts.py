@@ -8,8 +8,6 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from rigs import arc_rig
-from streams import header_for, small_scene
 from structgstream.cameras import CameraRig
 from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import PacketKind, StreamHeader
@@ -25,6 +23,8 @@ from structgstream.evaluation.facts import (
 )
 from structgstream.evaluation.recording import Recording
 from structgstream.frames import MultiViewFrame
+from tests.support.rigs import arc_rig
+from tests.support.streams import header_for, small_scene
 
 HEADER = header_for(small_scene())
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rigs import arc_rig
 from structgstream.cameras import CameraRig
 from structgstream.evaluation.ghosts import Ghosts, GhostSearch, backgrounds, sections
 from structgstream.frames import MultiViewFrame
+from tests.support.rigs import arc_rig
 
 Picture = NDArray[np.uint8]
 Drawing = Callable[[int], Picture]

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from rigs import arc_rig
 from structgstream.cameras import Camera
 from structgstream.errors import ConfigError
 from structgstream.evaluation.flip import features_of, flip_of
 from structgstream.evaluation.lpips import ALEX, ENVIRONMENT, VGG, Lpips, published_heads
 from structgstream.evaluation.optional_metrics import TEMPORAL, OptionalMetrics, load_optional_metrics, optional_scores
+from tests.support.rigs import arc_rig
 
 CPU = torch.device("cpu")
 

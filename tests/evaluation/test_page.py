@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from drawn import pixels_of
 from structgstream.evaluation.page import write_page
 from structgstream.evaluation.worst import Crop, Window
+from tests.support.drawn import pixels_of
 
 
 def test_every_crop_is_on_the_page_with_its_reason(tmp_path: Path) -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from drawn import pixels_of
 from structgstream.evaluation.pictures import contact_sheet, difference, side_by_side, spread_indices, thumbnail
+from tests.support.drawn import pixels_of
 
 
 def test_difference_is_four_times_the_error_and_clamped() -> None:

@@ -10,9 +10,9 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from reports import mean_of
 from structgstream.evaluation import plots
 from structgstream.evaluation.report import FrameScores, Report, Scores, mean_scores
+from tests.support.reports import mean_of
 
 
 def frame(index: int, psnrs: dict[str, float], *, log: dict[str, Any] | None = None, **sizes: int) -> FrameScores:

@@ -6,9 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pictures import decoded_picture
-from rigs import random_scene
-from streams import compact_header, moved, write_stream
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.mirror import MirroredStore
@@ -18,6 +15,9 @@ from structgstream.codec.sinks import MemorySink
 from structgstream.errors import StorageError
 from structgstream.evaluation import preview as module
 from structgstream.evaluation.preview import PREVIEW, PreviewSink, preview
+from tests.support.pictures import decoded_picture
+from tests.support.rigs import random_scene
+from tests.support.streams import compact_header, moved, write_stream
 
 SCENES = [moved(random_scene(60, seed=4), step) for step in range(5)]  # a key packet at every third frame
 

@@ -4,12 +4,12 @@
 import pytest
 import torch
 
-from streams import small_scene
 from structgstream.cameras import Camera
 from structgstream.errors import BackendError
 from structgstream.evaluation.recording import to_device
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
+from tests.support.streams import small_scene
 
 CPU, ELSEWHERE = torch.device("cpu"), torch.device("meta")
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from killed import folders_of_the_killed
 from structgstream.errors import StorageError
 from structgstream.evaluation.run_log import append_log, begin_log, log_path, read_log
+from tests.support.killed import folders_of_the_killed
 
 
 def test_lines_come_back_by_frame(tmp_path: Path) -> None:

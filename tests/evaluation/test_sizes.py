@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 import torch
 
-from memory_captures import MemoryCapture
-from rigs import arc_rig
 from structgstream.evaluation.metrics import PSNR_OF_EQUALS
 from structgstream.evaluation.sizes import block_mask, block_means, half_scores, halved, stored_size
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.render import render, to_8bit_image
-from worlds import World, moving_world
+from tests.support.memory_captures import MemoryCapture
+from tests.support.rigs import arc_rig
+from tests.support.worlds import World, moving_world
 
 
 @pytest.fixture(scope="module")

@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.errors import ConfigError
 from structgstream.executors.executor import TaskQueue
-from structgstream.executors.task import Ending, Task
+from structgstream.executors.task import Task, TaskResult
+from tests.support.properties import examples
 
 
 class Scripted:
-    """An engine of ``room`` places; tasks end in the order of a seed, with the statuses that are given for them."""
+    """An engine of ``room`` slots; tasks end in the order of a seed, with the statuses that are given for them."""
 
     name, repeats = "scripted", False
 
@@ -38,11 +38,11 @@ class Scripted:
         self._running.append((task.name, gpus))
         self.begun.append((task.name, attempt))
 
-    def ended(self, seconds: float) -> list[Ending]:
+    def ended(self, seconds: float) -> list[TaskResult]:
         name, gpus = self._running.pop(self._random.randrange(len(self._running)))
         self.gpus_left += gpus
         statuses = self._statuses.get(name, [])
-        return [Ending(name, statuses.pop(0) if statuses else 0)]
+        return [TaskResult(name, statuses.pop(0) if statuses else 0)]
 
     def stop(self) -> None:
         self.stopped = True
@@ -52,8 +52,8 @@ def task(name: str, retries: int = 2) -> Task:
     return Task(name, ("true",), retries=retries)
 
 
-def run(queue: TaskQueue) -> list[Ending]:
-    endings: list[Ending] = []
+def run(queue: TaskQueue) -> list[TaskResult]:
+    endings: list[TaskResult] = []
     while True:
         endings += queue.wait(1.0)
         if not queue.running:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from sleepers import all_endings, begun, writes
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.inline import InlineEngine
 from structgstream.executors.task import PYTHON, Task
+from tests.support.sleepers import all_endings, begun, writes
 
 PROGRAM = """
 import os, sys

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from sleepers import PATIENCE_SECONDS
 from structgstream.executors import launch
+from tests.support.sleepers import PATIENCE_SECONDS
 
 LAUNCH = [sys.executable, "-I", "-S", launch.__file__]
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")

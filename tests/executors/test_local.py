@@ -10,16 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from sleepers import PATIENCE_SECONDS, all_endings, begun, module, writes
 from structgstream.errors import ConfigError
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.local import LocalEngine
-from structgstream.executors.places import Place
-from structgstream.executors.task import Task
+from structgstream.executors.task import Task, WorkerSlot
+from tests.support.sleepers import PATIENCE_SECONDS, all_endings, begun, module, writes
 
 
 def local(count: int = 2, gpu: int | None = None) -> TaskQueue:
-    return TaskQueue(LocalEngine([Place(1, gpu)] * count))
+    return TaskQueue(LocalEngine([WorkerSlot(1, gpu)] * count))
 
 
 def test_two_run_at_a_time(tmp_path: Path) -> None:
@@ -64,7 +63,7 @@ def test_a_place_gives_threads_and_hides_other_gpus() -> None:
 
 def test_a_task_without_a_gpu_leaves_it_to_those_that_need_one(tmp_path: Path) -> None:
     meets = 'until [ "$(wc -l < "$0/begun")" = 2 ]; do sleep 0.02; done'
-    with TaskQueue(LocalEngine([Place(1, gpu=0), Place(1)])) as executor:
+    with TaskQueue(LocalEngine([WorkerSlot(1, gpu=0), WorkerSlot(1)])) as executor:
         executor.submit(writes("plain", tmp_path, then=meets))
         executor.submit(writes("needs", tmp_path, then=meets), gpus=1)
         assert all(ending.done for ending in all_endings(executor).values())
@@ -86,14 +85,14 @@ def test_closing_ends_what_runs_with_what_it_began(tmp_path: Path) -> None:
 
 def test_tasks_end_with_a_driver_that_is_killed(tmp_path: Path) -> None:
     code = f"""
-from sleepers import writes
-from test_local import local
+from tests.support.sleepers import writes
+from tests.executors.test_local import local
 from pathlib import Path
 with local() as executor:
     executor.submit(writes("long", Path({str(tmp_path)!r}), then='echo $$ > "$0/child"; exec sleep 60'))
     executor.wait(60)
 """
-    path = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
+    path = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)])
     driver = subprocess.Popen([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": path})
     wait_for(tmp_path / "child")
     driver.kill()

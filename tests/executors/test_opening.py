@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The executor that a caller names, with as many places as it asks for."""
+"""The executor that a caller names, with as many slots as it asks for."""
 
 import sys
 from typing import Any
 
 import pytest
 
-from sleepers import all_endings
 from structgstream.errors import ConfigError, MissingExtraError
 from structgstream.executors import opening, ray_cluster
 from structgstream.executors.opening import ExecutorName, ExecutorOptions, open_executor
-from structgstream.executors.places import Place
 from structgstream.executors.ray_cluster import RayOptions
-from structgstream.executors.task import Task
+from structgstream.executors.task import Task, WorkerSlot
+from tests.support.sleepers import all_endings
 
 
 @pytest.fixture
@@ -47,10 +46,10 @@ def test_local_has_a_place_for_each_core_or_gpu_or_as_asked(opened: list[Any]) -
     ):
         open_and_close(options, cores=4, gpus=gpus)
     cores, gpus, two, three = opened
-    assert cores == (Place(1),) * 4
-    assert gpus == (Place(2, 0), Place(2, 1))
-    assert two == (Place(2),) * 2
-    assert three == (Place(2, 0), Place(2, 1), Place(2, 0))
+    assert cores == (WorkerSlot(1),) * 4
+    assert gpus == (WorkerSlot(2, 0), WorkerSlot(2, 1))
+    assert two == (WorkerSlot(2),) * 2
+    assert three == (WorkerSlot(2, 0), WorkerSlot(2, 1), WorkerSlot(2, 0))
 
 
 def test_inline_has_none(opened: list[Any]) -> None:

@@ -12,19 +12,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
-from sleepers import PATIENCE_SECONDS
-from structgstream.executors import process
-from structgstream.executors.process import CommandProcess, opened_log, tail_of, waited_for
-from structgstream.executors.task import PYTHON, TAIL_BYTES, Ending, Task
+from structgstream.executors import local as process
+from structgstream.executors.local import CommandProcess, opened_log, tail_of, waited_for
+from structgstream.executors.task import PYTHON, TAIL_BYTES, Task, TaskResult
+from tests.support.properties import examples
+from tests.support.sleepers import PATIENCE_SECONDS
 
 
 def begun(*command: str, log: Path | None = None, **variables: str) -> CommandProcess:
-    """A running command whose place has ``variables``."""
+    """A running command whose slot has ``variables``."""
     return CommandProcess(Task("task", command, log=log, environment={"OURS": "task"}), environment=variables)
 
 
-def ending_of(running: CommandProcess, **given: int) -> Ending:
+def ending_of(running: CommandProcess, **given: int) -> TaskResult:
     assert waited_for([running], PATIENCE_SECONDS)
     ending = running.ended(**given)
     assert ending is not None
@@ -49,8 +49,8 @@ def test_its_ending_says_what_it_took() -> None:
 
 
 def test_nothing_comes_in_and_the_tasks_own_variables_come_last() -> None:
-    ending = ending_of(begun("sh", "-c", "cat; echo $OURS $THEIRS $HOME", OURS="place", THEIRS="place"))
-    assert ending.output == f"task place {os.environ['HOME']}\n"
+    ending = ending_of(begun("sh", "-c", "cat; echo $OURS $THEIRS $HOME", OURS="slot", THEIRS="slot"))
+    assert ending.output == f"task slot {os.environ['HOME']}\n"
 
 
 def test_python_is_the_interpreter_here() -> None:

@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
-from sleepers import all_endings
 from structgstream.errors import ConfigError, MissingExtraError
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.ray_cluster import RayEngine, RayOptions
 from structgstream.executors.ray_worker import CommandKilled, run_task
 from structgstream.executors.task import Task
+from tests.support.sleepers import all_endings
 
 
 class FakeRay:
@@ -169,7 +169,7 @@ import json, os
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.ray_cluster import RayEngine, RayOptions
 from structgstream.executors.task import PYTHON, Task
-from sleepers import all_endings
+from tests.support.sleepers import all_endings
 with TaskQueue(RayEngine(RayOptions(None, workers=2))) as executor:
     executor.submit(Task("first", ("sh", "-c", "echo $OMP_NUM_THREADS")))
     executor.submit(Task("python", (PYTHON, "-m", "this")), after=["first"])
@@ -184,7 +184,7 @@ print(json.dumps({{name: [ending.status, ending.output[:40]] for name, ending in
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="ray, of the extra cluster, is not installed")
 def test_tasks_on_a_real_cluster_of_this_machine(tmp_path: Path) -> None:
     code = REAL.replace("{0}", str(tmp_path)).replace(".format({1!r})", "").replace("{{", "{").replace("}}", "}")
-    path = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
+    path = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)])
     environment = {**os.environ, "PYTHONPATH": path}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == 0, done.stderr

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from structgstream.executors import ray_worker
-from structgstream.executors.process import CommandProcess
+from structgstream.executors.local import CommandProcess
 from structgstream.executors.ray_worker import CommandKilled, run_task
-from structgstream.executors.task import Ending, Task
+from structgstream.executors.task import Task, TaskResult
 
 
 def test_an_ending_comes_back_also_of_one_that_fails() -> None:
@@ -65,4 +65,4 @@ def test_cancelled_it_leaves_no_command(monkeypatch: pytest.MonkeyPatch, cancell
 
 def test_an_ending_can_be_carried() -> None:
     ending = run_task(Task("a", ("true",)), {})
-    assert isinstance(pickle.loads(pickle.dumps(ending)), Ending)
+    assert isinstance(pickle.loads(pickle.dumps(ending)), TaskResult)

@@ -6,17 +6,17 @@ import sys
 
 import pytest
 
-from structgstream.executors.task import PYTHON, Ending, Task, words
+from structgstream.executors.task import PYTHON, Task, TaskResult, argv_of
 
 
 def test_only_the_first_word_is_the_interpreter() -> None:
-    assert words((PYTHON, "-m", "this", PYTHON)) == [sys.executable, "-m", "this", PYTHON]
-    assert words(("true",)) == ["true"]
+    assert argv_of((PYTHON, "-m", "this", PYTHON)) == [sys.executable, "-m", "this", PYTHON]
+    assert argv_of(("true",)) == ["true"]
 
 
 @pytest.mark.parametrize(("status", "done", "killed"), [(0, True, False), (1, False, False), (-9, False, True)])
 def test_an_ending_says_what_came_of_it(status: int, done: bool, killed: bool) -> None:
-    ending = Ending("task", status)
+    ending = TaskResult("task", status)
     assert (ending.done, ending.killed) == (done, killed)
 
 

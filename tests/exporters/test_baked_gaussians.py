@@ -6,11 +6,13 @@ import math
 import pytest
 import torch
 
-from rigs import arc_rig
 from structgstream.exporters.baked_gaussians import BakedGaussians
+from structgstream.geometry import quaternion_matrices
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.harmonics import Y0
 from structgstream.similarity import Similarity
+from tests.support.plain import some
+from tests.support.rigs import arc_rig
 
 
 def two(sh: torch.Tensor) -> BakedGaussians:
@@ -48,6 +50,17 @@ def test_a_camera_sees_the_colours_of_its_place() -> None:
     seen = two(sh).gaussians(camera, reference_backend())
     assert torch.equal(seen.colors, two(sh).colors(camera.center.float()))
     assert seen.ids.tolist() == [0, 1]
+
+
+def test_y_up_shows_the_same_to_a_camera_that_is_turned_alike() -> None:
+    gaussians = some(20, degree=3)
+    center = torch.tensor([0.3, 2.0, -4.0])
+    turned = gaussians.y_up()
+    half_turn = torch.tensor([1.0, -1.0, -1.0])
+    torch.testing.assert_close(turned.colors(center * half_turn), gaussians.colors(center))
+    axes, wanted = (quaternion_matrices(g.quats) * g.scales[:, None] for g in (turned, gaussians))
+    turn = torch.diag(half_turn)
+    torch.testing.assert_close(axes @ axes.mT, turn @ wanted @ wanted.mT @ turn)
 
 
 def test_rows_are_chosen_in_the_order_asked_for() -> None:

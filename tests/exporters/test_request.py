@@ -2,15 +2,14 @@
 """Where an export goes and which frames it has, for every way to say it; refusals are in ``cli/test_export.py``."""
 
 import math
+import re
 from pathlib import Path
 
 import pytest
 
 from structgstream.errors import ConfigError
-from structgstream.exporters.formats import Format, PageFormat
+from structgstream.exporters.formats import Format, FrameOptions, PageFormat
 from structgstream.exporters.request import (
-    check_degree,
-    check_low_pass,
     check_page,
     choose_frames,
     destination,
@@ -33,6 +32,11 @@ STREAM = Path("/videos/ball.sgs")
         ("page.html", None, None, ("page.html", "html")),
         ("my.obj", "ply", None, ("my.obj", "ply")),
         ("my.site", "site", None, ("my.site", "site")),
+        (None, "usd", None, ("/videos/ball.usd", "usd")),
+        (None, "usd", 3, ("/videos/ball-3.usd", "usd")),
+        ("clip.usdc", None, None, ("clip.usdc", "usd")),
+        ("set.zip", None, None, ("set.zip", "ply")),
+        ("set.zip", "sog", None, ("set.zip", "sog")),
     ],
 )
 def test_the_place_and_the_format(
@@ -49,6 +53,9 @@ def test_a_folder_that_is_there_is_a_folder_whatever_its_name(tmp_path: Path) ->
     assert not is_one_file(folder)
     assert is_one_file(tmp_path / "other.PLY")
     assert not is_one_file(tmp_path / "page.html")
+    assert not is_one_file(tmp_path / "all.usd")
+    with pytest.raises(ConfigError, match="contains all frames"):
+        destination(STREAM, Path("x.zip"), format="usd", frame=None, frames=None)
 
 
 def test_frames_of_a_stream_with_a_gap() -> None:
@@ -64,23 +71,34 @@ def test_frames_of_a_stream_with_a_gap() -> None:
         choose_frames([], folder, frame=None, frames=None)
 
 
-def test_a_degree_is_what_the_format_can_hold() -> None:
-    assert [check_degree(degree, "ply") for degree in (None, 0, 2)] == [None, 0, 2]
-    assert [check_degree(degree, "splat") for degree in (None, 0)] == [0, 0]
-    for degree in (-1, 3):
-        with pytest.raises(ConfigError, match=f"--sh-degree {degree} is not one of 0 to 2"):
-            check_degree(degree, "spz")
+def test_degrees_that_a_format_supports() -> None:
+    degrees = [FrameOptions(degree).baked_degree("ply") for degree in (None, 0, 3)]
+    assert degrees == [1, 0, 3]
+    assert FrameOptions().baked_degree("splat") == 0
 
 
-def test_a_low_pass_is_a_share_of_a_training_pixel() -> None:
-    assert [check_low_pass(variance) for variance in (0.0, 0.3, 1.0)] == [0.0, 0.3, 1.0]
-    for variance in (-0.1, 1.1, math.nan):
-        with pytest.raises(ConfigError, match="expected 0 to 1"):
-            check_low_pass(variance)
+@pytest.mark.parametrize(
+    ("options", "format", "words"),
+    [
+        (FrameOptions(degree=-1), "spz", "--sh-degree -1 is not one of 0 to 3"),
+        (FrameOptions(degree=4), "spz", "--sh-degree 4 is not one of 0 to 3"),
+        (FrameOptions(degree=1), "splat", "one colour per Gaussian"),
+        (FrameOptions(low_pass=-0.1), "ply", "expected 0 to 1"),
+        (FrameOptions(low_pass=math.nan), "ply", "expected 0 to 1"),
+        (FrameOptions(min_opacity=1.0), "ply", "without 1"),
+        (FrameOptions(max_splats=0), "ply", "leaves no Gaussian"),
+        (FrameOptions(box=(0, 0, 0, 1, -1, 1)), "ply", "no volume"),
+        (FrameOptions(pad_sh=True), "spz", "--pad-sh is for .ply"),
+        (FrameOptions(spz_version=4), "ply", "--spz-version is for .spz"),
+    ],
+)
+def test_options_that_make_no_sense(options: FrameOptions, format: Format, words: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(words)):
+        options.check(format)
 
 
-def test_a_page_has_no_wishes() -> None:
-    check_page(frame=None, frames=None, sh_degree=None, low_pass=0.0)
-    for wish in ({"frame": 0}, {"frames": (0, 0)}, {"sh_degree": 0}, {"low_pass": 0.2}):
+def test_a_page_has_no_options() -> None:
+    check_page(frame=None, frames=None, options=FrameOptions())
+    for wish in ({"frame": 0}, {"frames": (0, 0)}, {"options": FrameOptions(low_pass=0.2)}):
         with pytest.raises(ConfigError, match="a page contains the whole stream"):
-            check_page(**{"frame": None, "frames": None, "sh_degree": None, "low_pass": 0.0, **wish})
+            check_page(**{"frame": None, "frames": None, "options": FrameOptions(), **wish})

@@ -9,13 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from exporters.plain import picture, psnr, some
 from structgstream.errors import ConfigError
 from structgstream.exporters.baked_gaussians import BakedGaussians
 from structgstream.exporters.splat import splat_bytes
 from structgstream.exporters.write import write_gaussians
 from structgstream.geometry import quaternion_matrices
 from structgstream.scene.harmonics import Y0
+from tests.support.plain import picture, psnr, some
 
 
 def read_splat(data: bytes) -> BakedGaussians:

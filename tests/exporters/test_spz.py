@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 import torch
 
-from exporters.plain import RIG, picture, psnr, some
 from structgstream.errors import ConfigError
 from structgstream.exporters.baked_gaussians import BakedGaussians
+from structgstream.exporters.formats import FrameOptions, SpzVersion
 from structgstream.exporters.spz import fractional_bits, spz_bytes
 from structgstream.exporters.write import write_gaussians
+from tests.support.plain import RIG, picture, psnr, some
 
 
 @pytest.fixture
@@ -28,10 +29,12 @@ def read_spz() -> Iterator[Callable[[Path], gsply.GSData]]:
     gsply.use_backend("python")
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2])
-def test_spz_as_gsply_reads_it(degree: int, tmp_path: Path, read_spz: Callable[[Path], gsply.GSData]) -> None:
+@pytest.mark.parametrize(("degree", "version"), [(0, 2), (2, 2), (1, 3), (3, 3), (0, 4), (3, 4)])
+def test_spz_as_gsply_reads_it(
+    degree: int, version: SpzVersion, tmp_path: Path, read_spz: Callable[[Path], gsply.GSData]
+) -> None:
     wanted = some(degree=degree)
-    write_gaussians(tmp_path / "set.spz", wanted, format="spz")
+    write_gaussians(tmp_path / "set.spz", wanted, format="spz", options=FrameOptions(spz_version=version))
     data = read_spz(tmp_path / "set.spz")
     sh = [torch.tensor(np.asarray(data.sh0))[:, None]]
     if degree:
@@ -51,6 +54,8 @@ def test_spz_as_gsply_reads_it(degree: int, tmp_path: Path, read_spz: Callable[[
     torch.testing.assert_close(found.opacities, wanted.opacities, atol=0.501 / 255, rtol=1e-5)
     torch.testing.assert_close(found.sh[:, 0], wanted.sh[:, 0], atol=0.501 / (0.15 * 255), rtol=1e-5)
     torch.testing.assert_close(found.sh[:, 1:].abs(), wanted.sh[:, 1:].abs().clamp(max=1), atol=1.01 / 128, rtol=0)
+    along = (found.quats * wanted.y_up().quats).sum(1).abs()
+    assert along.min() > (0.995 if version == 2 else 0.999995), "versions 3 and 4 have 10 bits a component"
     # The reader leaves the axes as the file has them: a camera that is turned alike sees the same picture, with
     # directions, and so every sign of every coefficient, as they are in the file.
     camera = RIG["cam01"]

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from exporters.plain import some
 from structgstream.errors import StorageError, StreamError
-from structgstream.exporters.formats import FORMATS, Format
-from structgstream.exporters.write import write_gaussians
+from structgstream.exporters.formats import Format
+from structgstream.exporters.write import FORMAT_BYTES, write_gaussians
 from structgstream.similarity import Similarity
+from tests.support.plain import some
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", FORMAT_BYTES)
 def test_a_full_disk_leaves_the_old_file(format: Format, tmp_path: Path) -> None:
     path = tmp_path / f"set.{format}"
     path.write_bytes(b"old")
@@ -28,7 +28,7 @@ def test_a_full_disk_leaves_the_old_file(format: Format, tmp_path: Path) -> None
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", FORMAT_BYTES)
 @pytest.mark.parametrize("scale", [1e-300, 1e300])
 def test_values_that_no_file_can_hold_are_refused(format: Format, scale: float, tmp_path: Path) -> None:
     gaussians = some().in_capture_units(Similarity((0.0, 0.0, 0.0), scale))

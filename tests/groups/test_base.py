@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from clip_groups import made
-from streams import same, small_stream
 from structgstream.codec.reader import open_stream
 from structgstream.errors import ConfigError, StreamError
 from structgstream.groups.base import GroupBase
 from structgstream.groups.join import join_segments
+from tests.support.clip_groups import made
+from tests.support.streams import same, small_stream
 
 
 def test_the_beginning_of_a_longer_stream_is_the_same_base(tmp_path: Path) -> None:

@@ -6,12 +6,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from backends import quickest_backend
-from clip_groups import made
 from structgstream.cameras import CameraRig
 from structgstream.groups.base import GroupBase
 from structgstream.groups.border import draw_border, moving_at_border
 from structgstream.scene.scene import Scene
+from tests.support.backends import quickest_backend
+from tests.support.clip_groups import made
 
 
 def most_seen(scene: Scene, rig: CameraRig) -> int:

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.errors import StreamError
-from structgstream.groups.group_list import groups_path, read_groups, write_groups
+from structgstream.groups.boundaries import groups_path, read_groups, write_groups
+from tests.support.properties import examples
 
 
 @examples(60)

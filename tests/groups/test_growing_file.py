@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from killed import folders_of_the_killed
+from structgstream.atomic_files import partial_path
 from structgstream.errors import StorageError
 from structgstream.groups.growing_file import GrowingFile, name_finished
-from structgstream.whole_files import partial_path
+from tests.support.killed import folders_of_the_killed
 
 
 def test_it_grows_under_another_name_and_goes_on(tmp_path: Path) -> None:

@@ -8,12 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from streams import STEPS, small_scene
 from structgstream.codec.fields.quantization import dequantize, quantize
 from structgstream.groups.seam_blend import FADE_FRAMES, NEIGHBOURS, SeamBlend
 from structgstream.kernels.values import HeadWeights
 from structgstream.scene.scene import Scene
 from structgstream.training.online.patching import IDS_PER_FRAME
+from tests.support.streams import STEPS, small_scene
 
 SIDE = 2 * NEIGHBOURS
 """Anchors of each of two heaps far apart, so that each is a neighbourhood of its own."""

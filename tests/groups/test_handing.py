@@ -5,13 +5,13 @@ from pathlib import Path
 
 import torch
 
-from backends import quickest_backend
-from clip_groups import FRAMES, LENGTH, made
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import open_stream
 from structgstream.groups.blending import Border
 from structgstream.groups.join import join_segments
 from structgstream.scene.scene import Scene
+from tests.support.backends import quickest_backend
+from tests.support.clip_groups import FRAMES, LENGTH, made
 
 
 def scenes_of(path: Path) -> list[Scene]:

@@ -9,20 +9,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backends import quickest_backend
-from clip_groups import CAPTURE, OPTIONS, Made, fit, made, task
-from shared_folder import made_once
 from structgstream.errors import ConfigError, TaskError
 from structgstream.executors.task import PYTHON, Task
 from structgstream.groups import join
 from structgstream.groups.base import GroupBase
 from structgstream.groups.blending import Border
-from structgstream.groups.blending_run import MOST_GROUPS, BlendedRun, main, runs_of
+from structgstream.groups.blending_run import MAX_GROUPS, BlendedRun, main, runs_of
 from structgstream.groups.join import PURPOSE, join_segments
 from structgstream.groups.pictures import open_for
 from structgstream.groups.seam_blend import OWN_FRAMES
 from structgstream.groups.track_pass import track_capture
 from structgstream.owned_folders import own_folder
+from tests.support.backends import quickest_backend
+from tests.support.clip_groups import CAPTURE, OPTIONS, Made, fit, made, task
+from tests.support.shared_folder import made_once
 
 FRAMES = 12
 BORDERS = (2, 2 + OWN_FRAMES)
@@ -98,5 +98,5 @@ def test_runs_have_every_group_but_the_first_once_and_begin_after_long_ones(leng
     assert [number for run in runs for number in run] == [*range(1, len(lengths))]
     assert all(lengths[run.start - 1] >= OWN_FRAMES for run in runs[1:])
     if min(lengths) >= OWN_FRAMES:
-        assert max(map(len, runs), default=0) <= MOST_GROUPS
+        assert max(map(len, runs), default=0) <= MAX_GROUPS
         assert len(runs) >= min(workers, len(lengths) - 1) // 2

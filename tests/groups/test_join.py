@@ -6,8 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from clip_groups import FRAMES, LENGTH, made
-from streams import moved, small_scene, write_stream
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
@@ -16,6 +14,8 @@ from structgstream.groups import join
 from structgstream.groups.join import check_births, join_segments
 from structgstream.owned_folders import MARKER
 from structgstream.training.online.patching import IDS_PER_FRAME
+from tests.support.clip_groups import FRAMES, LENGTH, made
+from tests.support.streams import moved, small_scene, write_stream
 
 
 def test_the_result_is_an_ordinary_stream(tmp_path: Path) -> None:

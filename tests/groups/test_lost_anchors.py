@@ -11,7 +11,7 @@ from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig, SpawnRules
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.views import training_views
-from worlds import moved_since, moving_world
+from tests.support.worlds import moved_since, moving_world
 
 SHIFT = 0.4
 WORLD = moving_world(2, cameras=6, speed=SHIFT, width=96, height=64)
@@ -39,7 +39,7 @@ def recalled(scene: Scene, *, config: LostAnchorConfig = CONFIG) -> tuple[torch.
         views,
         find_active_tiles(split, views, config=motion, backend=BACKEND),
         floor=None,
-        least_pixels=motion.LEAST_PIXELS,
+        min_pixels=motion.MIN_PIXELS,
         births=SpawnRules(picture_width=96),
         config=config,
         backend=BACKEND,
@@ -71,7 +71,7 @@ def test_what_is_where_it_should_be_stays_bit_for_bit() -> None:
 
 def test_what_is_a_little_off_is_left_to_the_iterations() -> None:
     row = seen_alone()
-    wide = replace(CONFIG, least_pixels=1e3)
+    wide = replace(CONFIG, min_pixels=1e3)
     positions, count = recalled(arrived(but=[row]), config=wide)
     assert count == 0
     assert torch.equal(positions, arrived(but=[row]).anchors.positions)

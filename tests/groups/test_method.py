@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 import torch
 
-from rigs import random_scene
 from structgstream.errors import ConfigError, OutOfMemoryError
 from structgstream.groups import method
 from structgstream.groups.first_frame import GroupStartConfig
@@ -20,10 +19,11 @@ from structgstream.groups.method import (
     lowered_budget,
     lowered_start,
 )
-from structgstream.pipeline import Past
-from structgstream.presets import TINY
-from structgstream.struct_gstream import FrameZeroContext
+from structgstream.session.pipeline import Past
+from structgstream.session.presets import TINY
+from structgstream.session.struct_gstream import FrameZeroContext
 from structgstream.training.result import FitResult
+from tests.support.rigs import random_scene
 
 FIRST = 6
 SCENE = random_scene(5, free=2)

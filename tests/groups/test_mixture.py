@@ -6,14 +6,13 @@ from dataclasses import replace
 import pytest
 from torch import Tensor
 
-from backends import quickest_backend
-from clip_groups import made
 from structgstream import cameras
 from structgstream.cameras import CameraRig
 from structgstream.groups.base import GroupBase
-from structgstream.groups.border import draw_border
-from structgstream.groups.mixture import visible_mixtures
+from structgstream.groups.border import draw_border, visible_mixtures
 from structgstream.scene.scene import Scene
+from tests.support.backends import quickest_backend
+from tests.support.clip_groups import made
 
 
 @pytest.fixture(scope="module")

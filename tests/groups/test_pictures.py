@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clip_groups import CAPTURE, made
 from structgstream.errors import CaptureError
 from structgstream.groups.base import GroupBase
 from structgstream.groups.pictures import fingerprint, open_for
+from tests.support.clip_groups import CAPTURE, made
 
 
 def test_it_is_opened_as_the_header_says() -> None:

@@ -11,9 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
-from small_segments import END, FIRST, FROM_FRAME_0, IDENTITY, base, encoded, write
-from streams import small_stream
 from structgstream.codec.container.records import PREFIX, packed
 from structgstream.errors import StreamError
 from structgstream.groups.segment_file import (
@@ -25,6 +22,9 @@ from structgstream.groups.segment_file import (
     inspect_segment,
     open_segment,
 )
+from tests.support.properties import examples
+from tests.support.small_segments import END, FIRST, FROM_FRAME_0, IDENTITY, base, encoded, write
+from tests.support.streams import small_stream
 
 COUNT = END - FIRST
 

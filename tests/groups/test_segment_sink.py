@@ -8,17 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from killed import folders_of_the_killed
-from properties import examples
-from small_segments import END, FIRST, FROM_FRAME_0, IDENTITY, base, encoded, write
-from streams import same
+from structgstream.atomic_files import partial_path
 from structgstream.codec.container import byte_source
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError, StorageError
 from structgstream.groups import segment_sink
 from structgstream.groups.segment_file import inspect_segment, open_segment
 from structgstream.groups.segment_sink import GroupSoFar, SegmentSink, resume_segment
-from structgstream.whole_files import partial_path
+from tests.support.killed import folders_of_the_killed
+from tests.support.properties import examples
+from tests.support.small_segments import END, FIRST, FROM_FRAME_0, IDENTITY, base, encoded, write
+from tests.support.streams import same
 
 COUNT = END - FIRST
 

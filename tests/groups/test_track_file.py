@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from killed import folders_of_the_killed
+from structgstream.atomic_files import partial_path
 from structgstream.errors import StreamError
 from structgstream.groups.track_file import PREFIX, SIGNATURE, TrackHead, TrackStart, TrackWriter, open_track
-from structgstream.whole_files import partial_path
+from tests.support.killed import folders_of_the_killed
 
 HEAD = TrackHead("ab", "cd", 0.01, 500, 4, {"scale": 0.5})
 

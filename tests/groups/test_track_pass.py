@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from clip_groups import FRAMES, LENGTH, OPTIONS, made, track
+from structgstream.atomic_files import partial_path
 from structgstream.errors import ConfigError
 from structgstream.groups.base import GroupBase
-from structgstream.groups.group_list import groups_path
+from structgstream.groups.boundaries import groups_path
 from structgstream.groups.segment_file import open_segment
 from structgstream.groups.segment_sink import GroupSoFar
 from structgstream.groups.track_file import open_track
-from structgstream.whole_files import partial_path
+from tests.support.clip_groups import FRAMES, LENGTH, OPTIONS, made, track
 
 
 def test_a_track_has_a_start_for_each_group() -> None:

@@ -12,13 +12,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from rigs import arc_rig, random_scene
 from structgstream.kernels import cuda, cuda_anchors, cuda_library
 from structgstream.kernels.backend import Backend, cpu_backend, cuda_backend, nonblocking, reference_backend
 from structgstream.kernels.cuda_library import CUDA_PROTOTYPES, KernelLibrary
 from structgstream.kernels.cuda_tiles import PairBudget
 from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import TileSelection, tile_grid
+from tests.support.rigs import arc_rig, random_scene
 
 native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 BUILDERS = [

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from splats import splats_of, viewport_of
 from structgstream.codec.entropy import adaptive, rans
 from structgstream.errors import OutOfMemoryError
 from structgstream.kernels import cpu_anchors, cpu_motion, cpu_raster
 from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import Anchors, Neighbors, ViewFlows
+from tests.support.splats import splats_of, viewport_of
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason="the native library is not built here")
 Z = torch.zeros

@@ -4,9 +4,9 @@
 import numpy as np
 import torch
 
-from rigs import random_scene
 from structgstream.kernels.reference_anchors import activate_anchors
 from structgstream.kernels.values import Anchors
+from tests.support.rigs import random_scene
 
 
 def generated(scene, center, visible):

@@ -6,7 +6,6 @@ import math
 import pytest
 import torch
 
-from published import published_ssim
 from structgstream.kernels.reference_losses import (
     adam_step,
     change_bits,
@@ -17,6 +16,7 @@ from structgstream.kernels.reference_losses import (
     volume,
     window,
 )
+from tests.support.published import published_ssim
 
 
 def pictures() -> tuple[torch.Tensor, torch.Tensor]:

@@ -6,8 +6,8 @@ import math
 import pytest
 import torch
 
-from splats import splats_of, viewport_of
 from structgstream.kernels.reference_raster import blending_weights, rasterize
+from tests.support.splats import splats_of, viewport_of
 
 K = torch.tensor([[50.0, 0, 16.5], [0, 50.0, 12.5], [0, 0, 1]], dtype=torch.float64)
 EYE = torch.eye(4, dtype=torch.float64)

@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from rigs import arc_rig
 from structgstream.kernels import cpu_motion, reference_motion
 from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import SweepView, Swept
+from tests.support.rigs import arc_rig
 
 needs_native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 SWEEPERS = [
@@ -38,7 +38,7 @@ def emerged(planes: int = 65) -> tuple[list[SweepView], torch.Tensor, torch.Tens
 @pytest.mark.parametrize("sweep", SWEEPERS)
 def test_what_emerged_is_found_where_it_is(sweep) -> None:
     scene, pixel, farthest = emerged()
-    found: Swept = sweep(scene, 1, pixel, farthest, planes=65, least_supports=2, most_contradictions=0.34)
+    found: Swept = sweep(scene, 1, pixel, farthest, planes=65, min_supports=2, max_contradictions=0.34)
     center = float(scene[1].viewmat[2, 3])
     # Any depth at which the ray stays within the disc's image in all views is as good; the middle of them is taken.
     assert abs(float(found.depths) - center) < 0.15
@@ -49,7 +49,7 @@ def test_what_emerged_is_found_where_it_is(sweep) -> None:
 def test_one_view_alone_is_contradicted(sweep) -> None:
     scene, pixel, farthest = emerged()
     alone = [v if i == 1 else replace(v, missing=torch.zeros_like(v.missing)) for i, v in enumerate(scene)]
-    found: Swept = sweep(alone, 1, pixel, farthest, planes=65, least_supports=1, most_contradictions=0.34)
+    found: Swept = sweep(alone, 1, pixel, farthest, planes=65, min_supports=1, max_contradictions=0.34)
     assert float(found.depths) == 0.0
     assert torch.isinf(found.costs).all()
 
@@ -59,5 +59,5 @@ def test_what_is_hidden_has_no_vote(sweep) -> None:
     """Behind what is rendered nothing can emerge: with a wall before the disc no point is supported."""
     scene, pixel, _ = emerged()
     walled = [replace(v, depths=torch.full_like(v.depths, 1.5)) for v in scene]
-    found: Swept = sweep(walled, 1, pixel, torch.tensor([6.0]), planes=65, least_supports=2, most_contradictions=0.34)
+    found: Swept = sweep(walled, 1, pixel, torch.tensor([6.0]), planes=65, min_supports=2, max_contradictions=0.34)
     assert float(found.depths) < 1.7  # before the wall, or nowhere

@@ -5,16 +5,15 @@ from dataclasses import replace
 
 import pytest
 
-from rigs import arc_rig
-from structgstream.presets import PAPER_DATA, PRESETS, PaperData, departures
 from structgstream.scene.state import PAPER_DYNAMIC
+from structgstream.session.presets import PAPER_DATA, PRESETS, PaperData, departures
+from tests.support.rigs import arc_rig
 
-PAPERS = ["paper-n3dv", "paper-meetroom", "paper-immersive"]
+PAPER, PAPERS = PRESETS["paper-n3dv"], ["paper-n3dv", "paper-meetroom", "paper-immersive"]
 
 
-@pytest.mark.parametrize("name", PAPERS)
-def test_frame_0(name: str) -> None:
-    initial = PRESETS[name].initial
+def test_frame_0() -> None:
+    initial = PAPER.initial
     assert initial.voxel_size == 0.005
     assert initial.offsets_per_anchor == 5
     assert initial.FEATURE_WIDTH == 32
@@ -23,20 +22,18 @@ def test_frame_0(name: str) -> None:
     assert initial.distance_input
     assert not initial.camera_color
     assert not initial.random_background
-    assert not PRESETS[name].environment.enabled
+    assert not PAPER.environment.enabled
     assert initial.coarse_iterations == initial.medium_iterations == 0
 
 
-@pytest.mark.parametrize("name", PAPERS)
-def test_loss(name: str) -> None:
-    initial, online = PRESETS[name].initial.losses, PRESETS[name].online.losses
+def test_loss() -> None:
+    initial, online = PAPER.initial.losses, PAPER.online.losses
     assert (initial.l1, initial.ssim, initial.volume, initial.offset_distance) == (1.0, 0.2, 0.01, 0.005)
     assert (online.l1, online.ssim, online.volume) == (1.0, 0.2, 0.01)
 
 
-@pytest.mark.parametrize("name", PAPERS)
-def test_online(name: str) -> None:
-    online = PRESETS[name].online
+def test_online() -> None:
+    online = PAPER.online
     assert online.iterations == 100
     assert online.dynamic == PAPER_DYNAMIC
     rates = online.rates
@@ -52,9 +49,8 @@ def test_online(name: str) -> None:
     assert rates.final_share == 1.0
 
 
-@pytest.mark.parametrize("name", PAPERS)
-def test_patching(name: str) -> None:
-    patching = PRESETS[name].online.patching
+def test_patching() -> None:
+    patching = PAPER.online.patching
     assert patching.iteration == 50
     assert patching.grad_threshold == 1e-3
     assert patching.COVARIANCE_FACTOR == 2.0

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.errors import ConfigError
 from structgstream.parallel.cost import (
     Costs,
@@ -18,6 +17,7 @@ from structgstream.parallel.cost import (
     stream_bytes,
     workers_for,
 )
+from tests.support.properties import examples
 
 COSTS = Costs(
     header_seconds=100.0,

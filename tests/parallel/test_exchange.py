@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from stand_ins import job, sha256, workers
 from structgstream.executors.task import Task
 from structgstream.parallel.driver import drive
 from structgstream.parallel.exchange import ObjectStore, SharedFolder
@@ -13,49 +12,48 @@ from structgstream.parallel.object_folder import ObjectFolder
 from structgstream.parallel.parts import Parts
 from tests.support import stand_in
 from tests.support.flaky_store import flaky_store
+from tests.support.stand_ins import job, sha256, workers
 
 
-def plain(folder: Path) -> Path:
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The stream of a run without a store."""
-    with Parts(folder / "plain").held(), workers() as executor:
-        drive(job(folder / "a"), Parts(folder / "plain"), executor)
-    return folder / "a" / "out.sgs"
+    folder = tmp_path_factory.mktemp("plain")
+    with Parts(folder / "plain").locked(), workers() as executor:
+        drive(job(folder), Parts(folder / "plain"), executor)
+    return folder / "out.sgs"
 
 
 def stored(folder: Path, url: str) -> Path:
     """The stream of a run with one."""
     parts = Parts(folder / "parts")
     (folder / "b").mkdir(exist_ok=True)
-    with parts.held(), workers() as executor:
+    with parts.locked(), workers() as executor:
         exchange = ObjectStore(ObjectFolder(url), parts, cut=stand_in.cut)
         drive(job(folder / "b"), parts, executor, exchange=exchange)
     return folder / "b" / "out.sgs"
 
 
-def test_a_run_by_a_store_gives_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "a").mkdir()
+def test_a_run_by_a_store_gives_the_same_bytes(plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STRUCTGSTREAM_SCRATCH", str(tmp_path / "scratch"))
     url = f"file://{tmp_path / 'store'}"
-    first = plain(tmp_path)
-    assert sha256(stored(tmp_path, url)) == sha256(first)
+    assert sha256(stored(tmp_path, url)) == sha256(plain)
     assert (tmp_path / "store" / "segments" / "group-000004-000008.sgs").exists()
     assert not any((tmp_path / "scratch").iterdir())
     # A driver on another machine, with nothing but the store, goes on there.
     (tmp_path / "store" / "segments" / "group-000004-000008.sgs").unlink()
     (tmp_path / "parts").rename(tmp_path / "lost")
-    first.rename(tmp_path / "first")
-    assert sha256(stored(tmp_path, url)) == sha256(tmp_path / "first")
+    assert sha256(stored(tmp_path, url)) == sha256(plain)
 
 
 def test_a_store_that_refuses_every_third_request_costs_only_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("s3fs", reason="s3fs, of the extra cloud, is not installed")
     pytest.importorskip("moto.server", reason="moto, of the extra dev, is not installed")
-    (tmp_path / "a").mkdir()
     monkeypatch.setenv("STRUCTGSTREAM_SCRATCH", str(tmp_path / "scratch"))
     with flaky_store(3) as (url, application):
-        assert sha256(stored(tmp_path, url)) == sha256(plain(tmp_path))
+        assert sha256(stored(tmp_path, url)) == sha256(plain)
         assert application.refused >= 10
 
 

@@ -4,10 +4,10 @@
 import pytest
 import torch
 
-from parity.adam_steps import OPTIONS, steps
 from structgstream.errors import BackendError
 from structgstream.kernels import cpu_losses, reference_losses
 from structgstream.kernels.native import native_reason
+from tests.support.adam_steps import OPTIONS, steps
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 

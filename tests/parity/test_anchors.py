@@ -5,11 +5,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from splats import viewport_of
 from structgstream.errors import BackendError
 from structgstream.kernels import cpu_anchors, reference_anchors
 from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import Anchors, HeadWeights, MLPWeights, StructuredGaussians, TileSelection, tile_grid
+from tests.support.splats import viewport_of
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 

@@ -4,8 +4,8 @@
 import pytest
 import torch
 
-from parity.adam_steps import OPTIONS, steps
 from structgstream.kernels import cuda, reference_losses
+from tests.support.adam_steps import OPTIONS, steps
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.needs_cuda)]
 

@@ -7,10 +7,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from splats import viewport_of
 from structgstream.cameras import Viewport
 from structgstream.kernels import cuda_anchors, reference_anchors, reference_raster
 from structgstream.kernels.values import Anchors, HeadWeights, MLPWeights, StructuredGaussians, TileSelection, tile_grid
+from tests.support.splats import viewport_of
 
 M, K, D, HIDDEN = 60, 5, 12, 16
 WIDTH, HEIGHT = 53, 41

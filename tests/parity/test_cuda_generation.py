@@ -11,11 +11,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from parity.test_cuda_anchors import ATTRIBUTES, HEIGHT, WIDTH, K, M, camera, tensors
 from structgstream.errors import BackendError
 from structgstream.kernels import cuda_anchors, reference_anchors
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.values import Anchors, HeadWeights, MLPWeights, StructuredGaussians, TileSelection, tile_grid
+from tests.parity.test_cuda_anchors import ATTRIBUTES, HEIGHT, WIDTH, K, M, camera, tensors
 
 ONLINE = (0, 1, 2, 4, 9, 10, 11, 12)  # positions, both scales, features and F_c
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.needs_cuda)]

@@ -6,16 +6,16 @@ from dataclasses import replace
 import pytest
 import torch
 
-from backends import quickest_backend
-from pretended_gpu import moved
-from recorders import Repeater
 from structgstream.kernels.backend import cuda_backend
 from structgstream.kernels.cuda_graph import GraphMemory
 from structgstream.scene.state import state_of
 from structgstream.training.online.config import MotionConfig, OnlineConfig, PatchingConfig, SmoothnessConfig
 from structgstream.training.online.fit import fit_next_frame
 from structgstream.training.online.preprocess import preprocess
-from worlds import moving_world
+from tests.support.backends import quickest_backend
+from tests.support.pretended_gpu import moved
+from tests.support.recorders import Repeater
+from tests.support.worlds import moving_world
 
 
 @pytest.mark.needs_cuda

@@ -11,12 +11,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from splats import splats_of, viewport_of
 from structgstream.cameras import Viewport
 from structgstream.kernels import cuda, reference_raster
 from structgstream.kernels.cuda_library import kernel_library
 from structgstream.kernels.cuda_tiles import PairBudget
 from structgstream.kernels.values import TILE_PIXELS, Rasterizer, TileSelection, tile_grid
+from tests.support.splats import splats_of, viewport_of
 
 WIDTH, HEIGHT, NEAR, COUNT = 41, 35, 0.2, 30
 PAIRS = 700

@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from splats import viewport_of
 from structgstream.kernels import cuda, cuda_anchors, reference_anchors
 from structgstream.kernels.cuda_tiles import tile_lists
 from structgstream.kernels.reference_raster import boxes_reaching_tiles
 from structgstream.kernels.values import Anchors, HeadWeights, MLPWeights, TileSelection, tile_grid
+from tests.support.splats import viewport_of
 
 VIEW = viewport_of(torch.eye(4), torch.tensor([[30.0, 0, 20], [0, 30, 20], [0, 0, 1]]), width=40, height=40, near=0.1)
 WAITS = ("_local_scalar_dense", "nonzero", "masked_select", "equal", "is_nonzero", "_unique2", "unique_dim")

@@ -9,7 +9,6 @@ from typing import Any, cast
 import pytest
 import torch
 
-from rigs import random_scene
 from structgstream.errors import OutOfMemoryError
 from structgstream.kernels import cpu_fit
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
@@ -26,7 +25,8 @@ from structgstream.training.online.split import DynamicSplit
 from structgstream.training.parameters import RoundingConfig
 from structgstream.training.result import FitResult, Step, Stopwatch
 from structgstream.training.views import View, blackened, training_views
-from worlds import moving_world
+from tests.support.rigs import random_scene
+from tests.support.worlds import moving_world
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 WORLD = moving_world(2)

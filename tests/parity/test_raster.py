@@ -12,12 +12,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from splats import splats_of, viewport_of
 from structgstream.cameras import Viewport
 from structgstream.kernels import cpu_raster, cuda, reference_raster
 from structgstream.kernels.native import native_reason
 from structgstream.kernels.reference_raster import rasterize as reference
 from structgstream.kernels.values import TileSelection, tile_grid
+from tests.support.splats import splats_of, viewport_of
 
 native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 WIDTH, HEIGHT, NEAR = 75, 53, 0.2  # No multiple of the tile.

@@ -5,11 +5,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from published import published_ssim
 from structgstream.errors import BackendError
 from structgstream.kernels import cpu_losses, reference_losses
 from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import TileSelection, tile_grid
+from tests.support.published import published_ssim
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 

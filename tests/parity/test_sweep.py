@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 import torch
 
-from rigs import arc_rig
 from structgstream.kernels import cpu_motion, cuda, reference_motion
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import SweepView, Swept
+from tests.support.rigs import arc_rig
 
 needs_native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
@@ -46,7 +46,7 @@ def rays(seed: int, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
     return pixels, (1.5 + 3 * torch.rand(150, generator=generator)).to(dtype)
 
 
-RULES = {"planes": 17, "least_supports": 2, "most_contradictions": 0.34}
+RULES = {"planes": 17, "min_supports": 2, "max_contradictions": 0.34}
 
 
 @pytest.fixture(

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from rigs import look_at
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.matching import project
-from structgstream.pose_check.resection import Resection, explained, resected
+from structgstream.pose_check.resection import Resection, explained, resect
 from structgstream.pose_check.tracks import Tracks
+from tests.support.rigs import look_at
 
 NOISE = 0.3  # pixels
 
@@ -49,7 +49,7 @@ def moved(camera: Camera, by: Floats) -> Camera:
 
 
 def of(given: Camera, tracks: Tracks) -> Resection:
-    found = resected(tracks, given, "cam")
+    found = resect(tracks, given, "cam")
     assert found is not None
     return found
 
@@ -62,7 +62,7 @@ def test_a_turn_is_stated(degrees: float, wrong: float) -> None:
     assert found.degrees == pytest.approx(degrees, abs=max(3 * found.degrees_error, 0.02))
     assert found.degrees_error < 0.05
     assert (found.share_of_distance, found.focal_percent) == (0, 0)
-    assert found.told.startswith(f"place it {found.degrees:.2f} degrees")
+    assert found.description.startswith(f"place it {found.degrees:.2f} degrees")
 
 
 def test_a_move_is_stated() -> None:
@@ -70,7 +70,7 @@ def test_a_move_is_stated() -> None:
     assert found.better
     assert found.share_of_distance == pytest.approx(0.02, abs=0.003)
     assert found.degrees == 0
-    assert "of its distance to the scene" in found.told
+    assert "of its distance to the scene" in found.description
 
 
 @pytest.mark.parametrize("factor", [1.02, 0.95])
@@ -82,7 +82,7 @@ def test_a_focal_length_is_stated(factor: float) -> None:
     assert found.better
     assert found.focal_percent == pytest.approx(100 * (1 / factor - 1), abs=0.2)
     assert (found.degrees, found.share_of_distance) == (0, 0)
-    assert ("shorter" if factor > 1 else "longer") in found.told
+    assert ("shorter" if factor > 1 else "longer") in found.description
 
 
 def test_a_good_camera_is_as_given() -> None:
@@ -94,19 +94,19 @@ def test_a_good_camera_is_as_given() -> None:
 @pytest.mark.parametrize(("count", "wrong"), [(120, 0.5), (16, 0.5)])
 def test_wrong_matches_do_not_condemn(count: int, wrong: float) -> None:
     for seed in range(5):
-        found = resected(observed(count, wrong=wrong, seed=seed), true_camera(), "cam")
+        found = resect(observed(count, wrong=wrong, seed=seed), true_camera(), "cam")
         assert found is not None
         assert not found.better
 
 
 def test_what_no_camera_explains_is_not_better() -> None:
-    found = resected(observed(wrong=1.0), true_camera(), "cam")
+    found = resect(observed(wrong=1.0), true_camera(), "cam")
     assert found is None or not (found.better or found.as_given)
 
 
 def test_too_few_points_say_nothing() -> None:
-    assert resected(observed(5), true_camera(), "cam") is None
-    assert resected(observed(), true_camera(), "other") is None
+    assert resect(observed(5), true_camera(), "cam") is None
+    assert resect(observed(), true_camera(), "other") is None
 
 
 def test_points_that_a_camera_explains_are_counted() -> None:

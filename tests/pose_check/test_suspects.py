@@ -6,11 +6,11 @@ from itertools import combinations
 
 import numpy as np
 
-from evidence_made import wide_ring
 from structgstream.data.matching import Pair
 from structgstream.data.pair_matches import PairError
 from structgstream.pose_check.tracks import Tracks
-from structgstream.pose_check.verdicts import Suspects, accused, find_suspects
+from structgstream.pose_check.verdicts import Suspects, find_suspects, track_outlier
+from tests.support.evidence_made import wide_ring
 
 GOOD, WRONG = PairError(0.3, 0.02, 80), PairError(6.0, 0.3, 80)
 
@@ -93,10 +93,10 @@ def tracks_of(residuals: Mapping[str, float], *, points: int = 20) -> Tracks:
 
 def test_points_accuse_the_camera_that_sees_them_elsewhere() -> None:
     clean = Suspects((), (), 0.75, False)
-    assert accused(tracks_of({"a": 0.3, "b": 0.4, "c": 0.3, "d": 5.0}), clean) == "d"
-    assert accused(tracks_of({"a": 0.3, "b": 0.4, "c": 0.3, "d": 0.7}), clean) is None  # hardly worse
-    assert accused(tracks_of({"a": 2.0, "b": 2.0, "c": 2.0, "d": 4.0}), clean) is None  # all are soft
-    assert accused(tracks_of({"a": 0.3, "b": 0.4, "c": 0.3, "d": 5.0}, points=10), clean) is None  # too few
-    assert accused(tracks_of({"a": 0.3, "b": 0.4, "d": 5.0}), clean) is None  # three do not outvote one
+    assert track_outlier(tracks_of({"a": 0.3, "b": 0.4, "c": 0.3, "d": 5.0}), clean) == "d"
+    assert track_outlier(tracks_of({"a": 0.3, "b": 0.4, "c": 0.3, "d": 0.7}), clean) is None  # hardly worse
+    assert track_outlier(tracks_of({"a": 2.0, "b": 2.0, "c": 2.0, "d": 4.0}), clean) is None  # all are soft
+    assert track_outlier(tracks_of({"a": 0.3, "b": 0.4, "c": 0.3, "d": 5.0}, points=10), clean) is None  # too few
+    assert track_outlier(tracks_of({"a": 0.3, "b": 0.4, "d": 5.0}), clean) is None  # three do not outvote one
     known = Suspects(("d",), (), 0.75, False)
-    assert accused(tracks_of({"a": 0.3, "b": 0.4, "c": 0.3, "d": 5.0, "e": 0.2}), known) is None
+    assert track_outlier(tracks_of({"a": 0.3, "b": 0.4, "c": 0.3, "d": 5.0, "e": 0.2}), known) is None

@@ -5,8 +5,8 @@ from collections.abc import Callable
 
 import pytest
 
-from evidence_made import Cameras, evidence_of, scattered, shifted, turned, wide_ring
-from structgstream.pose_check.verdicts import LEAST_MATCHES, Verdict, judge
+from structgstream.pose_check.verdicts import MIN_MATCHES, Verdict, judge
+from tests.support.evidence_made import Cameras, evidence_of, scattered, shifted, turned, wide_ring
 
 RIG = wide_ring(7)
 
@@ -74,4 +74,4 @@ def test_few_matches_accuse_nobody() -> None:
     assert found.suspects.off in ((), ("cam3",))
     if not found.suspects.off:
         assert found.unchecked in ((), ("cam3",))
-    assert 5 * len(RIG) < LEAST_MATCHES
+    assert 5 * len(RIG) < MIN_MATCHES

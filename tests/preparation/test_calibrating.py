@@ -9,27 +9,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from captures import write_video
-from filmed import ring
-from rooms import write_room
+from structgstream.data.calibration import Calibration, PosedCamera
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
-from structgstream.data.posed import Calibration, PosedCamera
 from structgstream.errors import CalibrationError, ConfigError
-from structgstream.preparation.calibrating import (
-    check_complete,
-    check_enough,
-    check_used,
-    chosen_method,
-    from_other_tool,
-    packed,
-    scaled,
-    summary,
-    unpacked,
-)
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
+from structgstream.preparation.camera_steps import check_enough, check_used, chosen_method
 from structgstream.preparation.footage import Footage, find_footage
-from structgstream.preparation.options import Distance, PrepareOptions
+from structgstream.preparation.given_calibration import given_cameras
+from structgstream.preparation.options import PrepareOptions
+from structgstream.preparation.solvers import check_complete, packed, summary, unpacked
 from structgstream.preparation.steps import Stored
+from tests.support.captures import write_video
+from tests.support.filmed import ring
+from tests.support.rooms import write_room
 
 NONE = np.empty(0, np.intp)
 
@@ -110,14 +102,14 @@ def test_the_calibration_of_another_tool_is_for_these_pictures(tmp_path: Path) -
     there = find(tmp_path)
     calibration = chosen_method(there, PrepareOptions(calibration=tmp_path / "calibration"))
     assert isinstance(calibration, Calibration)
-    found = from_other_tool(calibration, there)
+    found = given_cameras(calibration, there)
     assert list(found.cameras) == ["cam00", "cam01", "cam02"]
     for name, filmed in found.cameras.items():
         np.testing.assert_allclose(filmed.camera.viewmat.numpy(), rig[name].viewmat.numpy(), atol=1e-6)
     assert (len(found.points), len(found.observations)) == (0, 0)
     write_video(tmp_path / "cam03.mp4", [np.zeros((120, 160, 3), np.uint8)])
     with pytest.raises(CalibrationError, match="cam03"):
-        from_other_tool(calibration, find(tmp_path))
+        given_cameras(calibration, find(tmp_path))
 
 
 @pytest.mark.parametrize(("by_exif", "reason"), [(True, "turn them without loss"), (None, "export the pictures")])
@@ -135,8 +127,8 @@ def test_a_calibration_of_turned_pictures_is_refused_for_stored_ones(
         Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / f"{camera.name}.jpg", exif=exif)
     calibration = Calibration(tmp_path / "intri.yml", cameras, turned_by_exif=by_exif)
     with pytest.raises(CalibrationError, match=reason):
-        from_other_tool(calibration, find(tmp_path))
-    assert len(from_other_tool(replace(calibration, turned_by_exif=False), find(tmp_path)).cameras) == 3
+        given_cameras(calibration, find(tmp_path))
+    assert len(given_cameras(replace(calibration, turned_by_exif=False), find(tmp_path)).cameras) == 3
 
 
 def find(where: Path) -> Footage:
@@ -167,14 +159,3 @@ def test_a_calibration_in_a_line() -> None:
     rig = ring(3, radius=2.6, arc_degrees=40)
     assert summary(solved(rig)) == "3 cameras, 1 points, median reprojection error 5.00 px"
     assert summary(solved(rig, off=None)) == "3 cameras"
-
-
-def test_a_measured_distance_gives_metres() -> None:
-    found = solved(ring(3, radius=2.6, arc_degrees=40))
-    assert scaled(found, PrepareOptions()) is found
-    metric = scaled(found, PrepareOptions(distance=Distance("cam00", "cam02", 7.0)))
-    centers = [filmed.camera.center for filmed in metric.cameras.values()]
-    assert metric.metres
-    assert float((centers[0] - centers[2]).norm()) == pytest.approx(7.0)
-    with pytest.raises(CalibrationError):
-        scaled(found, PrepareOptions(distance=Distance("cam00", "nobody", 7.0)))

@@ -8,18 +8,17 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from footage_made import still_room
-from rooms import write_room
-from structgstream.data.posed import Calibration
+from structgstream.data.calibration import Calibration
 from structgstream.data.timeline import Clock
 from structgstream.errors import CalibrationError, ConfigError
-from structgstream.preparation.calibrating import chosen_method
 from structgstream.preparation.calibration.solved import SolvedCalibration
-from structgstream.preparation.camera_steps import CameraSteps
-from structgstream.preparation.claiming import SOURCE
+from structgstream.preparation.camera_steps import CameraSteps, chosen_method
+from structgstream.preparation.clocks import TIMESTAMPS, Clocks
 from structgstream.preparation.options import Distance, PrepareOptions
-from structgstream.preparation.solvers import TIMESTAMPS, Clocks
-from structgstream.preparation.steps import FOLDER, Job, Silent, new_job
+from structgstream.preparation.output_folder import SOURCE
+from structgstream.preparation.steps import FOLDER, Job, Silent, Steps
+from tests.support.footage_made import still_room
+from tests.support.rooms import write_room
 
 NONE = PrepareOptions(synchronize="none")
 
@@ -32,7 +31,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def job(room: Path, capture: Path, options: PrepareOptions = NONE) -> Job:
-    return new_job(room, capture, options=options, listener=Silent())
+    return Job(room, capture, options, Steps(capture, Silent()))
 
 
 def run(job: Job) -> tuple[Clocks, SolvedCalibration]:
@@ -50,7 +49,7 @@ def test_what_was_found_is_described_and_claimed(room: Path, tmp_path: Path) -> 
     one = job(room, tmp_path / "out")
     footage = CameraSteps(one).find()
     assert footage.cameras == ("cam00", "cam01", "cam02", "cam03")
-    assert one.told["find"] == "4 videos, 160x120, 2 frames, 30 a second"
+    assert one.steps.summaries["find"] == "4 videos, 160x120, 2 frames, 30 a second"
     assert (tmp_path / "out" / FOLDER / SOURCE).is_file()
     assert CameraSteps(job(room, tmp_path / "o", replace(NONE, without=("cam01",)))).find().cameras == (
         "cam00", "cam02", "cam03",
@@ -97,7 +96,7 @@ def test_a_second_time_everything_is_there(room: Path, tmp_path: Path) -> None:
     assert list(solved.cameras) == list(first[1].cameras)
     for name, filmed in solved.cameras.items():
         assert (filmed.camera.viewmat == first[1].cameras[name].camera.viewmat).all()
-    assert again.told["scale"].startswith("arbitrary units; --distance")
+    assert again.steps.summaries["scale"].startswith("arbitrary units; --distance")
 
 
 @pytest.mark.parametrize(
@@ -129,7 +128,7 @@ def test_a_table_of_times_that_comes_later_is_looked_at(tmp_path: Path) -> None:
 
 
 def test_clocks_come_back_as_they_were(room: Path, tmp_path: Path) -> None:
-    found = Clocks({"a": Clock(0.25, 1.00001), "b": Clock()}, "motion", "told", {"a": 0.001}, {"a": 0.002}, sure=False)
+    found = Clocks({"a": Clock(0.25, 1.00001), "b": Clock()}, "motion", "summary", sure=False)
     assert CameraSteps(job(room, tmp_path))._clocks("clocks", {}, lambda: found) == found
     other = CameraSteps(job(room, tmp_path))._clocks("clocks", {}, lambda: pytest.fail("it is there"))
     assert other == found
@@ -156,11 +155,12 @@ def test_focal_lengths_that_pictures_state_are_told(tmp_path: Path) -> None:
     one = job(tmp_path, tmp_path / "out")
     _, solved = run(one)
     assert list(solved.cameras) == list(rig)
-    assert "began with the focal lengths that the pictures of 4 of 4 cameras state (0.896 of" in one.told["calibrate"]
-    assert "the files of camera 'cam02' say that pictures are to be turned" in one.told["find"]
+    focals = "began with the focal lengths that the pictures of 4 of 4 cameras state (0.896 of"
+    assert focals in one.steps.summaries["calibrate"]
+    assert "the files of camera 'cam02' say that pictures are to be turned" in one.steps.summaries["find"]
     again = job(tmp_path, tmp_path / "out")
     run(again)
-    assert again.told["calibrate"] == one.told["calibrate"]
+    assert again.steps.summaries["calibrate"] == one.steps.summaries["calibrate"]
 
 
 def test_a_calibration_of_two_files_is_read_again_when_the_second_changes(room: Path, tmp_path: Path) -> None:

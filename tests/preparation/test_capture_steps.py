@@ -10,16 +10,17 @@ import cv2
 import numpy as np
 import pytest
 
-from rooms import write_room
 from structgstream.data.prepared import PreparedCapture, prepared_entries, read_prepared
 from structgstream.data.timeline import Clock
 from structgstream.errors import ConfigError, StorageError
-from structgstream.preparation.calibrating import chosen_method, from_other_tool
 from structgstream.preparation.calibration.solved import SolvedCalibration
+from structgstream.preparation.camera_steps import chosen_method
 from structgstream.preparation.capture_steps import POINTS, CaptureSteps, assembled, held_out_of
 from structgstream.preparation.footage import Footage, find_footage
+from structgstream.preparation.given_calibration import given_cameras
 from structgstream.preparation.options import PrepareOptions
-from structgstream.preparation.steps import FOLDER, Job, Silent, new_job
+from structgstream.preparation.steps import FOLDER, Job, Silent, Steps
+from tests.support.rooms import write_room
 
 NONE = PrepareOptions(synchronize="none", near=0.25)
 
@@ -29,13 +30,13 @@ def made(where: Path, options: PrepareOptions = NONE) -> tuple[Footage, SolvedCa
     footage = find_footage(where)
     method = chosen_method(footage, options)
     assert not isinstance(method, str)
-    solved = from_other_tool(method, footage)
+    solved = given_cameras(method, footage)
     clocks = {name: Clock(0.1 * index) for index, name in enumerate(footage.cameras)}
     return footage, solved, assembled(footage, clocks, solved, options)
 
 
 def job(videos: Path, capture: Path, options: PrepareOptions = NONE) -> Job:
-    found = new_job(videos, capture, options=options, listener=Silent())
+    found = Job(videos, capture, options, Steps(capture, Silent()))
     found.steps._keys["synchronize"] = "a key"
     return found
 
@@ -71,12 +72,12 @@ def test_files_are_brought_with_their_masks(tmp_path: Path) -> None:
     (tmp_path / "videos" / "masks" / "cam00" / "0.png").write_bytes(b"mask")
     one = job(tmp_path / "videos", tmp_path / "out")
     (tmp_path / "out").mkdir()
-    CaptureSteps(one).bring(footage, content)
+    CaptureSteps(one).link(footage, content)
     for name in content.cameras:
         assert (tmp_path / "out" / "videos" / f"{name}.mp4").samefile(tmp_path / "videos" / f"{name}.mp4")
     assert (tmp_path / "out" / "masks" / "cam00" / "0.png").read_bytes() == b"mask"
     assert read_prepared(tmp_path / "out").near == 0.25
-    assert one.told["bring"] == "4 cameras by hard link or copy"
+    assert one.steps.summaries["link"] == "4 cameras by hard link or copy"
 
 
 def test_masks_of_cameras_that_are_left_out_stay_behind(tmp_path: Path) -> None:
@@ -87,13 +88,13 @@ def test_masks_of_cameras_that_are_left_out_stay_behind(tmp_path: Path) -> None:
     for name in ("cam00.png", "cam01.png", "cam01/0.png", "cam02.png"):
         (masks / name).write_bytes(name.encode())
     (tmp_path / "out").mkdir()
-    CaptureSteps(job(tmp_path / "videos", tmp_path / "out")).bring(footage, content)
+    CaptureSteps(job(tmp_path / "videos", tmp_path / "out")).link(footage, content)
     assert (brought / "cam01" / "0.png").is_file()
     (brought / "cam02.png").unlink()
     (brought / "cam02.png").write_bytes(b"drawn by hand")
     less = replace(NONE, without=("cam01", "cam02"))
     for _ in range(2):
-        CaptureSteps(job(tmp_path / "videos", tmp_path / "out", less)).bring(footage, content)
+        CaptureSteps(job(tmp_path / "videos", tmp_path / "out", less)).link(footage, content)
         assert sorted(entry.name for entry in brought.iterdir()) == ["cam00.png", "cam02.png"]
     assert sorted(entry.name for entry in masks.iterdir()) == ["cam00.png", "cam01", "cam01.png", "cam02.png"]
 
@@ -117,7 +118,7 @@ def test_a_near_plane_that_is_given_is_not_looked_for(tmp_path: Path) -> None:
     _, _, content = made(tmp_path / "videos")
     one = job(tmp_path / "videos", tmp_path / "out")
     assert CaptureSteps(one).near(content) is content
-    assert "near" not in one.told
+    assert "near" not in one.steps.summaries
 
 
 def brought(tmp_path: Path, options: PrepareOptions = NONE) -> tuple[Job, CaptureSteps, PreparedCapture]:
@@ -126,7 +127,7 @@ def brought(tmp_path: Path, options: PrepareOptions = NONE) -> tuple[Job, Captur
     one = job(tmp_path / "videos", tmp_path / "out", options)
     steps = CaptureSteps(one)
     (tmp_path / "out").mkdir(exist_ok=True)
-    steps.bring(footage, content)
+    steps.link(footage, content)
     return one, steps, content
 
 
@@ -139,7 +140,7 @@ def test_near_plane_and_points_are_kept(tmp_path: Path) -> None:
     points = np.load(tmp_path / "out" / POINTS)
     assert points.shape[1] == 3
     assert np.isfinite(points).all()
-    assert one.told["points"] == f"{len(points):,} points of frame 0"
+    assert one.steps.summaries["points"] == f"{len(points):,} points of frame 0"
     written = read_prepared(tmp_path / "out")
     assert (written.near, written.points) == (near.near, POINTS) == (pointed.near, pointed.points)
     again, steps, content = brought(tmp_path, options)
@@ -172,7 +173,7 @@ def test_the_check_is_done_again_when_its_report_is_gone(tmp_path: Path) -> None
     assert again.steps.skipped == ["points"]
     assert report.is_file()
     count = f"{len(findings)} finding{'s' * (len(findings) != 1)}"
-    assert one.told["check"] == f"{count}; report/index.html"
+    assert one.steps.summaries["check"] == f"{count}; report/index.html"
 
 
 def test_a_size_that_cannot_be(tmp_path: Path) -> None:

@@ -6,9 +6,9 @@ import av
 import numpy as np
 import pytest
 
-from captures import numbers, picture, write_picture, write_video, write_videos
 from structgstream.errors import CaptureError
 from structgstream.preparation.footage import find_footage
+from tests.support.captures import numbers, picture, write_picture, write_video, write_videos
 
 
 def test_videos_in_natural_order(tmp_path: Path) -> None:

@@ -3,11 +3,11 @@ from pathlib import Path
 
 import pytest
 
-from captures import numbers, write_videos
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
 from structgstream.preparation.footage import find_footage
 from structgstream.preparation.instants import shared_seconds, shots_of, spread_moments
+from tests.support.captures import numbers, write_videos
 
 
 def test_pictures_of_one_moment_by_the_clocks(tmp_path: Path) -> None:

@@ -1,25 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calls of the solvers: which clocks, which pictures, and what is said when there are none."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from captures import write_video
 from structgstream.data.timeline import Clock
 from structgstream.errors import CalibrationError, CaptureError
+from structgstream.preparation.clocks import TIMESTAMPS, Clocks, first_clocks, synchronized
 from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.solvers import (
-    TIMESTAMPS,
-    Clocks,
     board_footage,
-    first_clocks,
+    describe_focals,
+    describe_turns,
     matched_pictures,
-    synchronized,
+    stated_focals,
 )
+from tests.support.captures import write_video
 
 NAMES = ("a", "b", "c")
 
@@ -49,7 +51,7 @@ def test_one_signal_starts_all(tmp_path: Path) -> None:
     found = synchronized(filmed(tmp_path), PrepareOptions(synchronize="none"))
     assert (found.method, found.sure) == ("none", True)
     assert dict(found.clocks) == dict.fromkeys(NAMES, Clock())
-    assert found.told.startswith("none: ")
+    assert found.summary.startswith("none: ")
 
 
 def test_a_table_of_times_is_taken_by_itself(tmp_path: Path) -> None:
@@ -60,7 +62,6 @@ def test_a_table_of_times_is_taken_by_itself(tmp_path: Path) -> None:
     starts = {name: clock.offset_seconds for name, clock in found.clocks.items()}
     assert starts["b"] - starts["a"] == pytest.approx(0.1, abs=1e-4)
     assert starts["c"] - starts["a"] == pytest.approx(0.0, abs=1e-4)
-    assert set(found.late_seconds) == set(found.uncertainty_seconds) == set(NAMES)
 
 
 def test_single_pictures_have_no_clocks(tmp_path: Path) -> None:
@@ -83,7 +84,7 @@ def test_before_a_calibration_motion_may_fail_and_nothing_else(tmp_path: Path) -
     for how in ("auto", "motion"):
         found = first_clocks(footage, PrepareOptions(synchronize=how))
         assert (found.method, found.sure, dict(found.clocks)) == ("motion", False, dict.fromkeys(NAMES, Clock()))
-        assert found.told.startswith("motion: not without the calibration. ")
+        assert found.summary.startswith("motion: not without the calibration. ")
     with pytest.raises(CaptureError):
         first_clocks(footage, PrepareOptions(synchronize="audio"))
     (tmp_path / TIMESTAMPS).write_text("a,b\n")
@@ -130,3 +131,45 @@ def test_the_board_is_filmed_by_all_in_the_same_mode(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match="'b' filmed the board with 48x64 pixels .* and the take with 64x48"):
         board_footage(footage, options)
     assert board_footage(footage.only(("a", "c")), replace(options, fps=25)).cameras == ("a", "c")
+
+
+def write(path: Path, film: int | None, *, orientation: int = 1) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    if film is not None:
+        exif.get_ifd(0x8769)[0xA405] = film
+    Image.new("RGB", (400, 300)).save(path, exif=exif)
+
+
+def test_the_first_picture_of_each_camera_counts(tmp_path: Path) -> None:
+    for name, film in {"a": 26, "b": None, "c": 52}.items():
+        write(tmp_path / name / "0.jpg", film)
+        write(tmp_path / name / "1.jpg", 90)
+    footage = find_footage(tmp_path)
+    focals = stated_focals(footage)
+    one = 26 * 500 / math.hypot(36, 24)
+    assert focals == {"a": pytest.approx(one), "c": pytest.approx(2 * one)}
+    assert describe_focals(focals, footage) == (
+        "began with the focal lengths that the pictures of 2 of 3 cameras state (0.751 to 1.502 of the longer side)"
+    )
+    assert "state (0.751 of the longer side)" in describe_focals({"a": one}, footage)
+
+
+def test_videos_state_none(tmp_path: Path) -> None:
+    for name in "ab":
+        write_video(tmp_path / f"{name}.mp4", [np.zeros((48, 64, 3), np.uint8)])
+    footage = find_footage(tmp_path)
+    assert stated_focals(footage) == {}
+    assert describe_focals({}, footage) == ""
+
+
+def test_pictures_that_say_that_they_are_to_be_turned(tmp_path: Path) -> None:
+    for name, orientation in {"a": 1, "b": 6, "c": 8}.items():
+        write(tmp_path / f"{name}.jpg", None, orientation=orientation)
+    footage = find_footage(tmp_path)
+    assert describe_turns(footage).startswith("the files of ")
+    assert "'b'" in describe_turns(footage)
+    assert "'a'" not in describe_turns(footage)
+    assert footage.size("b") == (400, 300), "as stored"
+    assert describe_turns(footage.only(["a"])) == ""

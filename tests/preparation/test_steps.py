@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from killed import folders_of_the_killed
 from structgstream.errors import StorageError
 from structgstream.preparation.steps import FOLDER, Silent, Steps, Stored, fingerprint
+from tests.support.killed import folders_of_the_killed
 
 
 def run(steps: Steps, step: str, value: int, done: list[str], *, after: tuple[str, ...] = ()) -> int:
@@ -116,3 +116,41 @@ def test_a_fingerprint_is_of_content_and_time(tmp_path: Path) -> None:
     before = fingerprint(files)
     (tmp_path / "b" / "d" / "e").write_text("deeper")
     assert fingerprint(files) != before
+
+
+class Heard:
+    """A listener that records all calls."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[object, ...]] = []
+
+    def begin(self, step: str, *, skipped: bool) -> None:
+        self.calls.append(("begin", step, skipped))
+
+    def progress(self, done: int, total: int, what: str) -> None:
+        self.calls.append(("progress", done, total, what))
+
+    def end(self, step: str, summary: str) -> None:
+        self.calls.append(("end", step, summary))
+
+
+def test_steps_are_reported_and_their_summaries_recorded(tmp_path: Path) -> None:
+    heard = Heard()
+    steps = Steps(tmp_path / "capture", heard)
+    steps.begin("scale", skipped=True)
+    steps.progress(1, 3, "cam00")
+    steps.end("scale", "metres")
+    found = steps.run(
+        "count",
+        {},
+        lambda: 4,
+        pack=lambda value: Stored({"value": value}),
+        unpack=lambda stored: stored.values["value"],
+        summary={4: "four"}.__getitem__,
+    )
+    assert found == 4
+    assert heard.calls == [
+        ("begin", "scale", True), ("progress", 1, 3, "cam00"), ("end", "scale", "metres"),
+        ("begin", "count", False), ("end", "count", "four"),
+    ]  # fmt: skip
+    assert steps.summaries == {"scale": "metres", "count": "four"}

@@ -3,10 +3,10 @@ from pathlib import Path
 
 import pytest
 
-from reports import frame_report
 from structgstream.codec.segments.quality_list import QUALITIES, read_list
-from structgstream.qualities.bit_rates import LEAST_PACKETS, BitRates, bits_per_second, expected_bits
+from structgstream.qualities.bit_rates import MIN_PACKETS, BitRates, bits_per_second, expected_bits
 from structgstream.qualities.ladder import Quality
+from tests.support.reports import frame_report
 
 LOW, HIGH = Quality("low", -1.0), Quality("high", 1.0)
 
@@ -36,9 +36,9 @@ def test_measured_rates_replace_the_expected_ones(tmp_path: Path) -> None:
     rates = BitRates(tmp_path, (LOW, HIGH))
     rates.begin(resume=False)
     assert listed(tmp_path) == {"low": expected_bits(LOW), "high": expected_bits(HIGH)}
-    frames(rates, 0, LEAST_PACKETS, low=100, high=1000)
+    frames(rates, 0, MIN_PACKETS, low=100, high=1000)
     assert listed(tmp_path) == {"low": expected_bits(LOW), "high": expected_bits(HIGH)}
-    frames(rates, LEAST_PACKETS, LEAST_PACKETS + 1, low=100, high=1000)
+    frames(rates, MIN_PACKETS, MIN_PACKETS + 1, low=100, high=1000)
     assert listed(tmp_path) == {"low": 8000, "high": 80000}
 
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 import math
 
-from reports import frame_report
 from structgstream.evaluation.run_log import log_entry
-from structgstream.qualities.joint_frame import joint_entry, joint_report
+from structgstream.qualities.recording import joint_entry, joint_report
+from tests.support.reports import frame_report
 
 
 def test_bytes_and_seconds_are_sums() -> None:

@@ -4,8 +4,8 @@ from dataclasses import replace
 import pytest
 
 from structgstream.errors import ConfigError
-from structgstream.presets import PRESETS
 from structgstream.qualities.ladder import Quality, configured, qualities_in
+from structgstream.session.presets import PRESETS
 
 
 def test_the_coarsest_comes_first() -> None:

@@ -3,11 +3,11 @@ from dataclasses import replace
 
 import torch
 
-from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
 from structgstream.kernels.reference_anchors import activate_anchors
 from structgstream.kernels.values import Anchors, TileSelection, tile_grid
 from structgstream.scene.render import draw
+from tests.support.rigs import arc_rig, random_scene
 
 
 def test_culling_never_changes_a_pixel() -> None:

@@ -3,11 +3,11 @@ from dataclasses import replace
 
 import torch
 
-from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import select_backend
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.render import render
 from structgstream.scene.state import state_of
+from tests.support.rigs import arc_rig, random_scene
 
 
 def test_the_scene_looks_as_before_until_appearance_changes() -> None:

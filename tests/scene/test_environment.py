@@ -6,11 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from rigs import arc_rig, random_scene
-from spheres import fibonacci_sphere
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.environment import background, environment, pixel_directions
 from structgstream.scene.render import draw, render
+from tests.support.rigs import arc_rig, random_scene
+from tests.support.spheres import fibonacci_sphere
 
 BACKEND, CAMERA = reference_backend(), arc_rig()["cam01"]
 

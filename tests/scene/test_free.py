@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 import torch
 
-from rigs import random_scene
 from structgstream.scene.free import FreeGaussians
+from tests.support.rigs import random_scene
 
 
 def test_rows_keep_their_identity() -> None:

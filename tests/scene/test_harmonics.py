@@ -5,8 +5,8 @@ import math
 
 import torch
 
-from spheres import fibonacci_sphere
 from structgstream.scene.harmonics import MAX_DEGREE, Y0, sh_basis
+from tests.support.spheres import fibonacci_sphere
 
 
 def test_the_harmonics_are_orthonormal() -> None:

@@ -4,11 +4,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.order import in_morton_order, morton_cells, morton_keys, morton_order
 from structgstream.scene.render import draw
 from structgstream.scene.state import state_of
+from tests.support.rigs import arc_rig, random_scene
 
 
 def test_a_cube_is_walked_through_octant_by_octant() -> None:

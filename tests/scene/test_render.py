@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 import torch
 
-from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.render import draw, render
+from tests.support.rigs import arc_rig, random_scene
 
 
 def test_rendering_has_the_cameras_size_and_no_graph() -> None:

@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from backends import quickest_backend
-from rigs import arc_rig, look_at, random_scene
 from structgstream.cameras import Camera, CameraRig
 from structgstream.scene.render import render
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
+from tests.support.backends import quickest_backend
+from tests.support.rigs import arc_rig, look_at, random_scene
 
 BACKEND = quickest_backend()
 RIG = arc_rig(width=96, height=64)

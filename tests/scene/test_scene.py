@@ -3,8 +3,8 @@ from dataclasses import replace
 
 import torch
 
-from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
+from tests.support.rigs import arc_rig, random_scene
 
 
 def test_ids_name_the_slot_of_each_gaussian() -> None:

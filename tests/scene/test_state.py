@@ -5,7 +5,6 @@ from typing import get_args
 import pytest
 import torch
 
-from rigs import random_scene
 from structgstream.errors import ConfigError
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import (
@@ -21,6 +20,7 @@ from structgstream.scene.state import (
     tensor_of,
     with_dynamic_fields,
 )
+from tests.support.rigs import random_scene
 
 
 def test_state_and_scene_are_inverse() -> None:

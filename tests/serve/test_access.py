@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from starlette.requests import Request
 
-from properties import examples
 from structgstream.serve.access import MAX_PARAMETERS, Authorizer, Query, Refused, parsed_query, query_of
 from structgstream.serve.tokens import EVERY_STREAM, Access, TokenKeys
+from tests.support.properties import examples
 
 KEYS = TokenKeys((b"k" * 32,))
 NOW = 1000.0

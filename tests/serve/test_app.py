@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from segment_folders import GrowingFolder
-from serving import Served, hosted
-from streams import small_stream
 from structgstream.codec.segments.manifest import manifest_from_json
 from structgstream.codec.segments.quality_list import ListedQuality, list_from_json, write_list
 from structgstream.serve.app import ServerSettings
 from structgstream.serve.pages import bundle
+from tests.support.segment_folders import GrowingFolder
+from tests.support.serving import Served, hosted
+from tests.support.streams import small_stream
 
 STREAM = small_stream(7)
 PNG = b"\x89PNG\r\n\x1a\n not a whole picture"

@@ -18,15 +18,15 @@ from pathlib import Path
 import pytest
 import yaml
 
-from segment_folders import GrowingFolder
-from serving import Served, hosted
-from streams import small_stream
 from structgstream.cli.app import TERMINATED
 from structgstream.cli.options import parse_known_options
 from structgstream.cli.reconstruct import Reconstruct
 from structgstream.serve.app import ServerSettings
 from structgstream.serve.listening import LOOPBACK_NAMES
 from structgstream.serve.tokens import TokenKeys
+from tests.support.segment_folders import GrowingFolder
+from tests.support.serving import Served, hosted
+from tests.support.streams import small_stream
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 NAME = "live.example.org"

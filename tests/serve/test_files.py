@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.codec.segments.manifest import history_name, init_name, part_name, segment_name
 from structgstream.serve.files import hash_in_name, is_plain_path, is_stream_name, open_below
+from tests.support.properties import examples
 
 
 def content(folder: Path, *parts: str) -> bytes | None:

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from segment_folders import GrowingFolder
-from streams import small_stream
 from structgstream.serve.files import OpenedFile, open_below
 from structgstream.serve.manifest_watch import BrokenManifest, ManifestWatch, snapshot
+from tests.support.segment_folders import GrowingFolder
+from tests.support.streams import small_stream
 
 STREAM = small_stream(7)
 LONG_SECONDS = 30.0

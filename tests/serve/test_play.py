@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pictures import decoded_picture
-from serving import Served, served
-from streams import small_stream
-from structgstream.data.clip import bundled_clip_path
+from structgstream.data.json_videos import bundled_clip_path
 from structgstream.data.open import open_capture
 from structgstream.serve.pages import bundle
 from structgstream.serve.play import Truth
 from structgstream.serve.stream_file import StreamFile
+from tests.support.pictures import decoded_picture
+from tests.support.serving import Served, served
+from tests.support.streams import small_stream
 
 STREAM = small_stream(6)
 

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from segment_folders import GrowingFolder
-from serving import Served, hosted
-from streams import small_stream
 from structgstream.serve import streams
 from structgstream.serve.app import ServerSettings
+from tests.support.segment_folders import GrowingFolder
+from tests.support.serving import Served, hosted
+from tests.support.streams import small_stream
 
 STREAM = small_stream(7)
 SECRET = b"root:x:0:0 what no client may see"

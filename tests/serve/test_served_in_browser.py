@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chromium import Browser, Tab, opened_browser
-from rigs import random_scene
-from segment_folders import GrowingFolder
-from serving import hosted
-from streams import compact_header, moved, write_stream
 from structgstream.codec.segments.quality_list import ListedQuality, write_list
 from structgstream.codec.sinks import MemorySink
-from structgstream.evaluation.png import png_bytes
+from structgstream.evaluation.pictures import png_bytes
 from structgstream.serve.app import ServerSettings
 from structgstream.serve.tokens import EVERY_STREAM, TokenKeys
+from tests.support.chromium import Browser, Tab, opened_browser
+from tests.support.rigs import random_scene
+from tests.support.segment_folders import GrowingFolder
+from tests.support.serving import hosted
+from tests.support.streams import compact_header, moved, write_stream
 
 KEYS = TokenKeys((b"a secret of thirty-two characters",))
 SHOWN = 'document.querySelector("structgstream-player")?.stats?.settled'

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from streams import small_stream
 from structgstream.codec.container.records import FOOTER, FOOTER_MAGIC
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.errors import StorageError, StreamError
 from structgstream.serve.pages import bundle, single_page
 from structgstream.serve.stream_file import StreamFile, check_has_header, write_page, write_site
+from tests.support.streams import small_stream
 
 STREAM = small_stream()
 HEADER_BYTES = StreamReader(STREAM).header_bytes

@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from segment_folders import GrowingFolder
-from serving import Served, hosted
-from streams import small_stream
 from structgstream.errors import ConfigError
 from structgstream.serve import tokens
 from structgstream.serve.app import ServerSettings
 from structgstream.serve.tokens import EVERY_STREAM, Access, TokenKeys, read_keys
+from tests.support.segment_folders import GrowingFolder
+from tests.support.serving import Served, hosted
+from tests.support.streams import small_stream
 
 STREAM = small_stream(4)
 KEYS = TokenKeys((b"a secret of thirty-two characters",))

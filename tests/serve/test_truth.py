@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from memory_captures import MemoryCapture
-from pictures import decoded_picture
-from structgstream.data.clip import bundled_clip_path
+from structgstream.data.json_videos import bundled_clip_path
 from structgstream.data.open import open_capture
 from structgstream.data.source import FrameSource
 from structgstream.errors import CaptureError
 from structgstream.serve.play import Truth
+from tests.support.memory_captures import MemoryCapture
+from tests.support.pictures import decoded_picture
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,9 @@ from pathlib import Path
 import av
 import pytest
 
-from senders import mpeg_ts, sender, sent_stream
-from structgstream.data.clip import bundled_clip_path
+from structgstream.data.json_videos import bundled_clip_path
 from structgstream.data.live.rig_file import read_rig
+from tests.support.sender_modules import mpeg_ts, sender, sent_stream
 
 WRAP = 2**33
 

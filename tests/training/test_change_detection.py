@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from rigs import arc_rig
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.preprocess import detect_changes
 from structgstream.training.views import View, blackened, training_views
-from tests.varied import varied
+from tests.support.rigs import arc_rig
+from tests.support.varied import varied
 
 RIG = arc_rig(3)
 

@@ -2,13 +2,13 @@
 
 import torch
 
-from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import ParameterName
 from structgstream.training.frame0.densify import Densifier, GrowthConfig
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import ANCHOR_ROWS, Parameters
+from tests.support.rigs import arc_rig, random_scene
 
 CONFIG = GrowthConfig(collect_from=0, start=0, interval=5, eligible_count=0, prune_visits=0)
 

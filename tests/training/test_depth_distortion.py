@@ -4,10 +4,10 @@
 import pytest
 import torch
 
-from rigs import arc_rig
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.frame0.regularizers import DepthDistortionConfig, depth_distortion
+from tests.support.rigs import arc_rig
 
 RIG = arc_rig()
 CAMERA = RIG["cam01"]

@@ -11,7 +11,7 @@ from structgstream.training.frame0.regularizers import (
     RandomNumbers,
     perturbation_at,
 )
-from tests.varied import varied
+from tests.support.varied import varied
 
 COUNT = 20_000
 

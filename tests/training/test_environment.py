@@ -5,19 +5,19 @@ from dataclasses import replace
 
 import torch
 
-from rigs import arc_rig, random_scene
 from structgstream.frames import MultiViewFrame
-from structgstream.kernels.backend import reference_backend
 from structgstream.scene.color import CameraColor
 from structgstream.scene.environment import environment, pixel_directions
 from structgstream.scene.render import render
 from structgstream.training.frame0.fit import InitialConfig, fit_first_frame
 from structgstream.training.frame0.seeding import EnvironmentConfig, fit_environment
 from structgstream.training.views import training_views
-from tests.varied import varied
-from worlds import moving_world
+from tests.support.backends import quickest_backend
+from tests.support.rigs import arc_rig, random_scene
+from tests.support.varied import varied
+from tests.support.worlds import moving_world
 
-BACKEND, RIG = reference_backend(), arc_rig(5)
+BACKEND, RIG = quickest_backend(), arc_rig(5)
 TRUTH = torch.tensor([[0.1, 0.0, -0.2], [0.2, 0.1, 0.0], [0.05, 0.3, 0.2], [-0.1, 0.1, 0.1]])
 
 

@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 
 from structgstream.errors import ConfigError
 from structgstream.kernels.values import HeadWeights
-from structgstream.presets import COMPACT
 from structgstream.scene.scene import Scene
+from structgstream.session.presets import COMPACT
 from structgstream.training.online.config import ExposureConfig, OnlineConfig
 from structgstream.training.online.exposure import exposure_reference, with_exposure_of
 from structgstream.training.views import View, training_views
-from tests.varied import varied
-from worlds import World, moving_world
+from tests.support.varied import varied
+from tests.support.worlds import World, moving_world
 
 CONFIG = varied(ExposureConfig(enabled=True), PICTURE_SCALE=1.0)
 WORLD = moving_world(1, cameras=6)  # Five of them train.
@@ -62,14 +62,14 @@ def test_a_change_of_light_is_found_in_each_channel(change: tuple[float, float, 
 
 def test_the_same_light_keeps_every_bit() -> None:
     assert followed(WORLD.scene, views_of(WORLD, np.zeros(3))) is WORLD.scene
-    faint = varied(CONFIG, LEAST_CHANGE=0.05)
+    faint = varied(CONFIG, MIN_CHANGE=0.05)
     assert followed(WORLD.scene, views_of(WORLD, np.full(3, 0.03)), config=faint) is WORLD.scene
 
 
 def test_light_that_has_changed_is_followed_in_small_steps() -> None:
     """What is too little to begin with is followed afterwards."""
     first = on_grid(WORLD.scene)
-    config = varied(CONFIG, LEAST_CHANGE=0.04, LEAST_FURTHER_CHANGE=0.015)
+    config = varied(CONFIG, MIN_CHANGE=0.04, MIN_FURTHER_CHANGE=0.015)
     reference = exposure_reference(first, views_of(WORLD, np.zeros(3)), config=config)
 
     def light(scene: Scene, change: float, step: float = 1 / 1024) -> Scene:
@@ -84,7 +84,7 @@ def test_light_that_has_changed_is_followed_in_small_steps() -> None:
 
 
 def test_a_change_of_less_than_half_a_step_changes_nothing() -> None:
-    first, config = on_grid(WORLD.scene, step=1 / 16), varied(CONFIG, LEAST_CHANGE=0.005)
+    first, config = on_grid(WORLD.scene, step=1 / 16), varied(CONFIG, MIN_CHANGE=0.005)
     reference = exposure_reference(first, views_of(WORLD, np.zeros(3)), config=config)
     faint = views_of(WORLD, np.full(3, -0.02))
     assert with_exposure_of(first, faint, reference, config=config, step=1 / 1024) is not first

@@ -10,7 +10,7 @@ from structgstream.training.online.config import LiftConfig
 from structgstream.training.online.measure import FlowEvidence
 from structgstream.training.online.scene_flow import lift_flow
 from structgstream.training.views import training_views
-from worlds import World, moving_world
+from tests.support.worlds import World, moving_world
 
 CPU = torch.device("cpu")
 BACKEND = reference_backend()

@@ -45,7 +45,7 @@ def test_small_pictures_are_searched_up_to_their_full_size() -> None:
     config = FlowConfig()
     assert [config.level_of(width) for width in (160, 320, 479, 480, 640, 1920)] == [0, 0, 0, 1, 1, 1]
     assert FlowConfig(finest_level=2).level_of(640) == 1
-    assert FlowConfig(least_width=0).level_of(160) == 1
+    assert FlowConfig(min_width=0).level_of(160) == 1
     with pytest.raises(ConfigError, match="finest level -1"):
         FlowConfig(finest_level=-1)
 

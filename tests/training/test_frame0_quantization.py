@@ -7,7 +7,6 @@ from functools import cache
 import pytest
 import torch
 
-from rigs import arc_rig, random_scene
 from structgstream.cameras import CameraRig
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.appearance import with_appearance
@@ -24,7 +23,8 @@ from structgstream.training.frame0.quantization import (
     regauge,
 )
 from structgstream.training.parameters import RoundingConfig
-from tests.varied import varied
+from tests.support.rigs import arc_rig, random_scene
+from tests.support.varied import varied
 
 BACKEND = reference_backend()
 RIG = arc_rig(7, width=40, height=32)

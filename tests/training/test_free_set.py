@@ -14,7 +14,7 @@ from structgstream.training.online.patching import IDS_PER_FRAME, FreeSet
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import FREE_ROWS, Parameters, parameters_of_fields
 from structgstream.training.views import training_views
-from worlds import moving_world
+from tests.support.worlds import moving_world
 
 CPU = torch.device("cpu")
 BACKEND = reference_backend()

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import torch
 
-from backends import quickest_backend
 from structgstream.groups.first_frame import GroupStartConfig, fit_group_start
 from structgstream.scene.state import state_of
 from structgstream.training.online.config import (
@@ -23,8 +22,9 @@ from structgstream.training.online.preprocess import detect_changes
 from structgstream.training.parameters import RoundingConfig
 from structgstream.training.residuals import residual_floor
 from structgstream.training.views import training_views
-from tests.varied import varied
-from worlds import World, moving_world, psnr, rendered
+from tests.support.backends import quickest_backend
+from tests.support.varied import varied
+from tests.support.worlds import World, moving_world, psnr, rendered
 
 SPEED, FRAME = 0.06, 4
 MOTION = MotionConfig(enabled=True, picture_scale=0.5, residual_threshold=0.05)
@@ -124,7 +124,7 @@ def test_births_of_several_rounds_have_identities_of_their_own() -> None:
     world = moving_world(FRAME + 1, cameras=6, emerges_at=1, movers=0, width=96, height=64)
     none = torch.zeros(len(world.scene.anchors) + len(world.scene.free), 3)
     motion = MotionConfig(enabled=True, picture_scale=1.0)
-    config = replace(CONFIG, motion=motion, spawn=varied(SpawnConfig(enabled=True), RULES=SpawnRules(least_hits=2)))
+    config = replace(CONFIG, motion=motion, spawn=varied(SpawnConfig(enabled=True), RULES=SpawnRules(min_hits=2)))
     found = fit(world, none, start=replace(START, flow_rounds=0), config=config)
     births = found.scene.free.births
     assert len(births) > 0

@@ -3,10 +3,10 @@ from dataclasses import replace
 
 import torch
 
-from rigs import random_scene
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.values import StructuredGaussians
 from structgstream.training.frame0.densify import GrowthConfig, OpacityStatistics, grow, prunable_mask
+from tests.support.rigs import random_scene
 
 VOXEL = 0.01
 
@@ -97,9 +97,9 @@ def test_room_for_anchors_comes_little_by_little() -> None:
     assert [config.room_at(at, 1_000) for at in (50, 100, 200, 500, 900)] == [1_000, 1_000, 2_000, 5_000, 5_000]
     assert config.room_at(200, 9_000) == 5_000  # More seeds than there may be: none is added.
     assert GrowthConfig(max_anchors=5_000).room_at(0, 1_000) == 5_000
-    assert replace(config, least_growth=0.25).room_at(500, 8_000) == 10_000
-    assert replace(config, least_growth=0.25).room_at(300, 8_000) == 9_000
-    assert replace(config, least_growth=0.25).room_at(500, 1_000) == 5_000
+    assert replace(config, min_growth=0.25).room_at(500, 8_000) == 10_000
+    assert replace(config, min_growth=0.25).room_at(300, 8_000) == 9_000
+    assert replace(config, min_growth=0.25).room_at(500, 1_000) == 5_000
 
 
 def test_the_last_interval_is_left_to_what_grew_before_it() -> None:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from rigs import random_scene
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.losses import InitialLossWeights, offset_distance, volume
+from tests.support.rigs import random_scene
 
 
 def test_volume_is_the_product_of_scales() -> None:

@@ -5,9 +5,7 @@ from dataclasses import replace
 
 import torch
 
-from rigs import arc_rig, random_scene
 from structgstream.gaussians import Gaussians, concatenate
-from structgstream.kernels.backend import reference_backend
 from structgstream.training.online.measure import (
     accumulate,
     flow_evidence,
@@ -16,11 +14,13 @@ from structgstream.training.online.measure import (
     slot_count,
     sum_by_primitive,
 )
-from worlds import emerging_ball
+from tests.support.backends import quickest_backend
+from tests.support.rigs import arc_rig, random_scene
+from tests.support.worlds import emerging_ball
 
 RIG = arc_rig(4, width=48, height=32)
 CAMERA = RIG[RIG.training[0]]
-BACKEND = reference_backend()
+BACKEND = quickest_backend()
 
 
 def gaussians_with_ids(ids: list[int]) -> Gaussians:

@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames after the first, in a world whose motion is known."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 import torch
 
-from backends import quickest_backend
-from structgstream.kernels.backend import Backend, reference_backend
+from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, state_of
 from structgstream.training.online.config import (
@@ -22,8 +20,9 @@ from structgstream.training.online.fit import fit_next_frame
 from structgstream.training.online.patching import IDS_PER_FRAME
 from structgstream.training.online.preprocess import preprocess
 from structgstream.training.result import Step
-from tests.varied import varied
-from worlds import moving_world, psnr, rendered
+from tests.support.backends import quickest_backend
+from tests.support.varied import varied
+from tests.support.worlds import moving_world, psnr, rendered
 
 QUICK = OnlineConfig(
     iterations=24,
@@ -49,12 +48,11 @@ def fit(scene, world, index, *, config=QUICK, seed=0, on_step=None, backend: Bac
     )
 
 
-@pytest.mark.parametrize("backend", [quickest_backend, reference_backend])
-def test_anchors_follow_motion(backend: Callable[[], Backend]) -> None:
+def test_anchors_follow_motion() -> None:
     world = moving_world(2)
     truth = world.frames[1].images["cam00"]  # Held out.
     before = psnr(rendered(world.scene, world, "cam00"), truth)
-    result = fit(world.scene, world, 1, config=without_patching(QUICK), backend=backend())
+    result = fit(world.scene, world, 1, config=without_patching(QUICK))
     after = psnr(rendered(result.scene, world, "cam00"), truth)
     assert after > before + 3.0
     moved = (result.scene.anchors.positions - world.scene.anchors.positions).mean(0)

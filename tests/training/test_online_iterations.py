@@ -7,7 +7,6 @@ from typing import Any, cast
 
 import torch
 
-from rigs import random_scene
 from structgstream.kernels.backend import reference_backend
 from structgstream.kernels.values import TileSelection, tile_grid
 from structgstream.scene.active_tiles import ActiveTiles
@@ -21,7 +20,8 @@ from structgstream.training.optim import Adam, LastPass
 from structgstream.training.parameters import Parameters, parameters_of_fields
 from structgstream.training.result import Stopwatch
 from structgstream.training.views import training_views
-from worlds import moving_world
+from tests.support.rigs import random_scene
+from tests.support.worlds import moving_world
 
 CPU = torch.device("cpu")
 BACKEND = reference_backend()

@@ -2,10 +2,10 @@
 import pytest
 import torch
 
-from rigs import random_scene
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.optim import BETAS, EPS, Adam, LearningRate, constant, leaves
 from structgstream.training.parameters import Parameters
+from tests.support.rigs import random_scene
 
 
 def test_rates_are_log_linear() -> None:

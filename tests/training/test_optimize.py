@@ -8,8 +8,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from recorders import Repeater
-from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.state import PAPER_DYNAMIC
 from structgstream.training.losses import Loss, LossWeights, view_loss
@@ -17,6 +15,8 @@ from structgstream.training.optim import Adam, Hooks, Schedule, gradients_of, le
 from structgstream.training.parameters import FREE_ROWS, Parameters, parameters_of_fields
 from structgstream.training.result import Step, Stopwatch
 from structgstream.training.views import View
+from tests.support.recorders import Repeater
+from tests.support.rigs import arc_rig, random_scene
 
 CPU = torch.device("cpu")
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import torch
 
-from structgstream.kernels.backend import reference_backend
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.measure import ViewChange
 from structgstream.training.online.select import inlier_views, is_scene_cut, outlier_candidates, unrecognized_faults
 from structgstream.training.views import training_views
-from tests.varied import varied
-from worlds import moved_since, moving_world
+from tests.support.backends import quickest_backend
+from tests.support.varied import varied
+from tests.support.worlds import moved_since, moving_world
 
 USUAL = ViewChange(changed_share=0.05, wrong_share=0.02, repeated=False)
 WORLD = moving_world(2, speed=0.06, movers=10, cameras=7)
@@ -89,7 +89,7 @@ def test_what_few_views_cannot_show_is_said() -> None:
 
 
 def test_a_black_picture_moves_nothing() -> None:
-    cpu, backend = torch.device("cpu"), reference_backend()
+    cpu, backend = torch.device("cpu"), quickest_backend()
     before, views = (training_views(WORLD.frames[t], WORLD.rig, cpu) for t in (0, 1))
     spoiled = [replace(v, image=torch.zeros_like(v.image)) if n in (1, 3) else v for n, v in enumerate(views)]
     good = [n for n in range(len(views)) if n not in (1, 3)]
@@ -103,7 +103,7 @@ def test_a_black_picture_moves_nothing() -> None:
 
 
 def test_a_light_switched_on_is_a_jump() -> None:
-    cpu, backend = torch.device("cpu"), reference_backend()
+    cpu, backend = torch.device("cpu"), quickest_backend()
     before, views = (training_views(WORLD.frames[t], WORLD.rig, cpu) for t in (0, 1))
     bright = [replace(v, image=(v.image.int() + 60).clamp(max=255).to(torch.uint8)) for v in views]
     found = moved_since(WORLD.scene, bright, before, config=CONFIG, backend=backend, flow_from=range(len(views)))

@@ -3,10 +3,10 @@ from dataclasses import replace
 
 import torch
 
-from rigs import random_scene
 from structgstream.scene.color import CameraColor
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
 from structgstream.training.parameters import FREE_ROWS, Parameters, detached, parameters_of_fields
+from tests.support.rigs import random_scene
 
 
 def test_taking_apart_and_putting_together_changes_no_bit() -> None:

@@ -3,7 +3,6 @@ from dataclasses import replace
 
 import torch
 
-from rigs import arc_rig, random_scene
 from structgstream.gaussians import Gaussians
 from structgstream.geometry import quaternion_matrices
 from structgstream.kernels.backend import reference_backend
@@ -16,6 +15,7 @@ from structgstream.training.online.patching import (
     survivor_mask,
 )
 from structgstream.training.views import View
+from tests.support.rigs import arc_rig, random_scene
 
 
 def generator() -> torch.Generator:

@@ -7,13 +7,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from backends import quickest_backend
-from rigs import random_scene
 from structgstream import cameras
 from structgstream.cameras import Camera, CameraRig, enlargement
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.values import TILE_PIXELS
-from structgstream.training.frame0.densify import MOST_ANCHORS, GrowthConfig
+from structgstream.training.frame0.densify import MAX_ANCHORS, GrowthConfig
 from structgstream.training.online.config import ExposureConfig, MotionConfig, SmoothnessConfig
 from structgstream.training.online.exposure import exposure_reference
 from structgstream.training.online.measure import measure
@@ -25,7 +23,9 @@ from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.parameters import pixel_size
 from structgstream.training.residuals import residual_floor
 from structgstream.training.views import View, training_views
-from worlds import moving_world
+from tests.support.backends import quickest_backend
+from tests.support.rigs import random_scene
+from tests.support.worlds import moving_world
 
 CPU = torch.device("cpu")
 WIDTH, HEIGHT = 96, 64
@@ -136,7 +136,7 @@ def test_larger_pictures_may_have_more_anchors() -> None:
     config = GrowthConfig(max_anchors=50_000)
     assert config.for_pictures(1.0) == config
     assert config.for_pictures(1.5).max_anchors == 75_000
-    assert config.for_pictures(100.0).max_anchors == MOST_ANCHORS
+    assert config.for_pictures(100.0).max_anchors == MAX_ANCHORS
     unbounded = GrowthConfig()
     assert unbounded.for_pictures(6.0) == unbounded
 

@@ -6,7 +6,7 @@ import torch
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.online.config import MotionConfig, SceneFlowConfig
 from structgstream.training.online.preprocess import FramePictures, PictureChange, preprocess
-from worlds import moving_world
+from tests.support.worlds import moving_world
 
 WORLD = moving_world(2, cameras=6, movers=60, speed=0.08, width=128, height=96)
 MOTION = MotionConfig(enabled=True, picture_scale=0.5)

@@ -16,12 +16,13 @@ from structgstream.training.online.spawn import SpawnResult, prune_and_spawn
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.residuals import ResidualFloor, residual_floor
 from structgstream.training.views import training_views
-from tests.varied import varied
-from worlds import emerging_ball, moved_since, moving_world
+from tests.support.backends import quickest_backend
+from tests.support.varied import varied
+from tests.support.worlds import emerging_ball, moved_since, moving_world
 
 CPU = torch.device("cpu")
 WORLD = moving_world(2, cameras=6, emerges_at=1, movers=0, width=96, height=64)
-CONFIG = varied(SpawnConfig(enabled=True), RULES=SpawnRules(least_hits=2))
+CONFIG = varied(SpawnConfig(enabled=True), RULES=SpawnRules(min_hits=2))
 BACKENDS = [
     pytest.param(reference_backend, id="reference"),
     pytest.param(cpu_backend, id="cpu", marks=pytest.mark.skipif(native_reason() is not None, reason="no native")),
@@ -46,7 +47,7 @@ def renewed(
         first_birth=1 << 32,
         floor=residual_floor(WORLD.scene, first, scale=1.0, backend=backend) if floor is None else floor,
         room=room,
-        least_pixels=motion.LEAST_PIXELS,
+        min_pixels=motion.MIN_PIXELS,
         config=config,
         backend=backend,
     )
@@ -66,7 +67,7 @@ def test_an_emerging_ball_is_born_where_it_is(backend) -> None:
 
 
 def test_what_emerges_before_something_that_frame_0_drew_badly_is_born_if_the_floor_is_eased() -> None:
-    scene, backend = WORLD.scene, reference_backend()
+    scene, backend = WORLD.scene, quickest_backend()
     first = training_views(WORLD.frames[0], WORLD.rig, CPU)
     floor = residual_floor(scene, first, scale=1.0, backend=backend)
     bad = replace(floor, maps={i: torch.full_like(of_view, 0.02) for i, of_view in floor.maps.items()})
@@ -88,36 +89,36 @@ def test_where_no_picture_lacks_anything_nothing_is_drawn(monkeypatch: pytest.Mo
         return draw(*arguments, **options)
 
     monkeypatch.setattr("structgstream.training.online.spawn.draw", counting)
-    assert not len(renewed(reference_backend(), config=replace(CONFIG, missing_threshold=10.0)).new_free)
+    assert not len(renewed(quickest_backend(), config=replace(CONFIG, missing_threshold=10.0)).new_free)
     assert not drawn
-    assert len(renewed(reference_backend()).new_free)
+    assert len(renewed(quickest_backend()).new_free)
     assert drawn, "where something is missing it is"
 
 
 def test_births_keep_to_the_room_there_is() -> None:
-    everything = renewed(reference_backend())
-    few = renewed(reference_backend(), config=replace(CONFIG, most=2)).new_free
+    everything = renewed(quickest_backend())
+    few = renewed(quickest_backend(), config=replace(CONFIG, most=2)).new_free
     assert len(few) == 2
     assert float(few.log_scales.min()) > float(everything.new_free.log_scales.max()), "what is missing is born coarser"
-    assert len(renewed(reference_backend(), room=1).new_free) == 1
-    assert len(renewed(reference_backend(), room=0).new_free) == 0
+    assert len(renewed(quickest_backend(), room=1).new_free) == 1
+    assert len(renewed(quickest_backend(), room=0).new_free) == 0
     assert len(everything.new_free) > 2
 
 
 def test_off_nothing_is_born() -> None:
-    found = renewed(reference_backend(), config=replace(CONFIG, enabled=False))
+    found = renewed(quickest_backend(), config=replace(CONFIG, enabled=False))
     assert len(found.new_free) == 0
     assert found.kept.all()
 
 
 def test_when_everything_is_missing_nothing_is_born_and_that_is_told() -> None:
-    found = renewed(reference_backend(), config=varied(CONFIG, RULES=replace(CONFIG.RULES, most_missing_share=1e-4)))
+    found = renewed(quickest_backend(), config=varied(CONFIG, RULES=replace(CONFIG.RULES, max_missing_share=1e-4)))
     assert found.refused
     assert len(found.new_free) == 0
 
 
 def test_births_are_repeated_bit_for_bit() -> None:
-    one, other = (renewed(reference_backend()).new_free for _ in range(2))
+    one, other = (renewed(quickest_backend()).new_free for _ in range(2))
     assert torch.equal(one.means, other.means)
     assert torch.equal(one.colors, other.colors)
 
@@ -134,7 +135,7 @@ def test_a_ghost_dies() -> None:
         colors=ghost.colors,
         births=torch.tensor([3]),
     )
-    backend = reference_backend()
+    backend = quickest_backend()
     scene = replace(WORLD.scene, free=free)
     first, views = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (0, 1))
     motion = MotionConfig(enabled=True, picture_scale=1.0, residual_threshold=0.05)
@@ -149,7 +150,7 @@ def test_a_ghost_dies() -> None:
         first_birth=1 << 32,
         floor=floor,
         room=1000,
-        least_pixels=0.3,
+        min_pixels=0.3,
         config=CONFIG,
         backend=backend,
     )
@@ -164,16 +165,16 @@ THIN = varied(
         ThinSpawnConfig.RULES,
         picture_width=96,
         missing_threshold=0.10 / 9,
-        most_contradictions=0.34,
-        most_cost=0.12,
-        least_hits=2,
+        max_contradictions=0.34,
+        max_cost=0.12,
+        min_hits=2,
     ),
 )
 
 
 def test_what_the_first_sweep_does_not_see_the_second_one_bears() -> None:
-    assert not len(renewed(reference_backend(), config=BLIND).new_free)
-    found = renewed(reference_backend(), config=replace(BLIND, thin=THIN))
+    assert not len(renewed(quickest_backend(), config=BLIND).new_free)
+    found = renewed(quickest_backend(), config=replace(BLIND, thin=THIN))
     assert found.thin_count == len(found.new_free) > 0
     ball = emerging_ball(0.95)
     near = (found.new_free.means - ball.means).norm(dim=1)
@@ -181,29 +182,29 @@ def test_what_the_first_sweep_does_not_see_the_second_one_bears() -> None:
 
 
 def test_the_second_sweep_is_left_out_where_the_first_one_bears() -> None:
-    alone, both = (renewed(reference_backend(), config=config) for config in (CONFIG, replace(CONFIG, thin=THIN)))
+    alone, both = (renewed(quickest_backend(), config=config) for config in (CONFIG, replace(CONFIG, thin=THIN)))
     assert torch.equal(alone.new_free.means, both.new_free.means)
     assert both.thin_count == 0
 
 
 def test_the_second_sweep_bears_nothing_where_it_would_bear_more_than_thin_content() -> None:
     """In a throw everything that lags would be born, and stand where anchors belong."""
-    number = len(renewed(reference_backend(), config=replace(BLIND, thin=THIN)).new_free)
+    number = len(renewed(quickest_backend(), config=replace(BLIND, thin=THIN)).new_free)
     for most, born in ((number, number), (number - 1, 0)):
         found = renewed(
-            reference_backend(), config=replace(BLIND, thin=varied(THIN, RULES=replace(THIN.RULES, most=most)))
+            quickest_backend(), config=replace(BLIND, thin=varied(THIN, RULES=replace(THIN.RULES, most=most)))
         )
         assert len(found.new_free) == found.thin_count == born
         assert found.counts["refused thin"] == number - born, "counted in the log"
 
 
 def test_a_cap_that_makes_births_coarser_is_told_in_the_log() -> None:
-    free = len(renewed(reference_backend(), config=CONFIG).new_free)
-    capped = renewed(reference_backend(), config=replace(CONFIG, most=free - 1))
+    free = len(renewed(quickest_backend(), config=CONFIG).new_free)
+    capped = renewed(quickest_backend(), config=replace(CONFIG, most=free - 1))
     assert 0 < len(capped.new_free) < free
     assert capped.counts["merged"] == free - len(capped.new_free)
 
 
 def test_the_second_sweep_bears_nothing_where_much_is_missing() -> None:
-    few = varied(THIN, RULES=replace(THIN.RULES, most_missing_share=1e-4))
-    assert not len(renewed(reference_backend(), config=replace(BLIND, thin=few)).new_free)
+    few = varied(THIN, RULES=replace(THIN.RULES, max_missing_share=1e-4))
+    assert not len(renewed(quickest_backend(), config=replace(BLIND, thin=few)).new_free)

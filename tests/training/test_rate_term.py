@@ -4,10 +4,10 @@
 import pytest
 import torch
 
-from rigs import random_scene
 from structgstream.codec.fields.quantization import RateTerm
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.parameters import Parameters, parameters_of_fields
+from tests.support.rigs import random_scene
 
 BACKEND = reference_backend()
 

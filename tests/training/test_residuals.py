@@ -7,16 +7,16 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
-from structgstream.kernels.backend import reference_backend
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.residuals import ResidualFloor, apply_camera_color, box_mean, residual, residual_floor
 from structgstream.training.views import blackened, training_views
-from tests.varied import varied
-from worlds import moved_since, moving_world
+from tests.support.backends import quickest_backend
+from tests.support.varied import varied
+from tests.support.worlds import moved_since, moving_world
 
 CPU = torch.device("cpu")
 WORLD = moving_world(3, speed=0.06, movers=20)
-BACKEND = reference_backend()
+BACKEND = quickest_backend()
 
 
 def views(t: int):

@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 import torch
 
-from rigs import arc_rig, random_scene
 from structgstream.cameras import Camera, CameraRig
 from structgstream.codec.fields.packet_fields import CODABLE, dequantize_state, quantize_state
 from structgstream.codec.fields.quantization import LARGEST, round_straight_through
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import FieldName, ParameterName, parameters_of, state_of
 from structgstream.training.parameters import Parameters, RoundingConfig, parameters_of_fields, pixel_size
-from tests.varied import varied
+from tests.support.rigs import arc_rig, random_scene
+from tests.support.varied import varied
 
 
 def test_rounding_is_drawn_and_not_felt() -> None:

@@ -9,7 +9,7 @@ from structgstream.training.online.preprocess import flow_views
 from structgstream.training.online.scene_flow import apply_scene_flow
 from structgstream.training.online.split import DynamicSplit, with_displacements
 from structgstream.training.views import training_views
-from worlds import World, moved_since, moving_world
+from tests.support.worlds import World, moved_since, moving_world
 
 CPU = torch.device("cpu")
 BACKEND = reference_backend()

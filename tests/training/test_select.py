@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from rigs import random_scene
 from structgstream.errors import ConfigError
-from structgstream.kernels.backend import reference_backend
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig
@@ -17,8 +15,10 @@ from structgstream.training.online.select import changed_primitives
 from structgstream.training.online.split import DynamicSplit
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.views import training_views
-from tests.varied import varied
-from worlds import moved_since, moving_world
+from tests.support.backends import quickest_backend
+from tests.support.rigs import random_scene
+from tests.support.varied import varied
+from tests.support.worlds import moved_since, moving_world
 
 CPU = torch.device("cpu")
 CONFIG = varied(MotionConfig(enabled=True, picture_scale=1.0), REACH_PIXELS=1)
@@ -27,7 +27,7 @@ WORLD = moving_world(2, speed=0.06, movers=20)
 
 def moving(before: int = 0, now: int = 1, *, config: MotionConfig = CONFIG):
     views, earlier = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (now, before))
-    return moved_since(WORLD.scene, views, earlier, config=config, backend=reference_backend())
+    return moved_since(WORLD.scene, views, earlier, config=config, backend=quickest_backend())
 
 
 def test_the_anchors_that_moved_are_found_and_few_others() -> None:
@@ -57,13 +57,13 @@ def test_nothing_moves_between_equal_pictures() -> None:
 
 
 def test_one_view_is_not_enough() -> None:
-    config = varied(CONFIG, LEAST_VIEWS=len(WORLD.rig.training) + 1)
+    config = varied(CONFIG, MIN_VIEWS=len(WORLD.rig.training) + 1)
     assert not moving(config=config).anchors.any()
-    assert moving(config=varied(CONFIG, LEAST_VIEWS=1)).anchors.sum() >= moving().anchors.sum()
+    assert moving(config=varied(CONFIG, MIN_VIEWS=1)).anchors.sum() >= moving().anchors.sum()
 
 
 def test_each_view_tells_which_gaussians_it_shows() -> None:
-    backend, found = reference_backend(), moving()
+    backend, found = quickest_backend(), moving()
     views = training_views(WORLD.frames[1], WORLD.rig, CPU)
     assert found.visible.keys() == {view.index for view in views}
     for view in views:
@@ -75,11 +75,11 @@ def test_each_view_tells_which_gaussians_it_shows() -> None:
 
 
 def test_what_moved_before_moves_more_easily() -> None:
-    strict = varied(replace(CONFIG, hysteresis=0.2), LEAST_SHARE=0.9)
+    strict = varied(replace(CONFIG, hysteresis=0.2), MIN_SHARE=0.9)
     views, earlier = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (1, 0))
 
     def found(older: Scene | None) -> torch.Tensor:
-        return moved_since(WORLD.scene, views, earlier, config=strict, backend=reference_backend(), older=older).anchors
+        return moved_since(WORLD.scene, views, earlier, config=strict, backend=quickest_backend(), older=older).anchors
 
     shift = torch.zeros_like(WORLD.scene.anchors.positions)
     shift[:20] = 0.01
@@ -119,7 +119,7 @@ def test_free_gaussians_that_no_view_shows_stay() -> None:
     )
     scene = replace(WORLD.scene, free=free)
     views = training_views(WORLD.frames[0], WORLD.rig, CPU)
-    part = DynamicSplit.of(scene, moved_since(scene, views, views, config=CONFIG, backend=reference_backend()))
+    part = DynamicSplit.of(scene, moved_since(scene, views, views, config=CONFIG, backend=quickest_backend()))
     assert part.merge(part.dynamic).free.births.tolist() == [1, 2]
 
 
@@ -129,7 +129,7 @@ def test_a_camera_that_was_absent_before_does_not_vote_and_is_seen() -> None:
     back, others = views[1], [view for n, view in enumerate(views) if n != 1]
     floor = ResidualFloor(1.0, {view.index: torch.zeros(32, 48) for view in views})
     for given in (None, floor):
-        options = {"config": replace(CONFIG, residual_threshold=0.1), "backend": reference_backend(), "floor": given}
+        options = {"config": replace(CONFIG, residual_threshold=0.1), "backend": quickest_backend(), "floor": given}
         found = moved_since(WORLD.scene, views, [view for view in before if view.index != back.index], **options)
         alone = moved_since(WORLD.scene, others, [view for view in before if view.index != back.index], **options)
         assert torch.equal(found.anchors, alone.anchors)
@@ -145,7 +145,7 @@ def test_a_camera_without_a_floor_votes_by_its_pictures_alone() -> None:
     dark_before = [replace(view, image=view.image // 2) if view.index == 2 else view for view in before]
     known = {view.index: torch.ones(32, 48) for view in views if view.index != 2}
     config = replace(CONFIG, residual_threshold=0.05)
-    floor, backend = ResidualFloor(1.0, known), reference_backend()
+    floor, backend = ResidualFloor(1.0, known), quickest_backend()
     found = moved_since(WORLD.scene, dark, dark_before, config=config, backend=backend, floor=floor)
     plain = moved_since(WORLD.scene, dark, dark_before, config=CONFIG, backend=backend)
     assert torch.equal(found.anchors, plain.anchors)
@@ -161,5 +161,5 @@ def test_what_a_mask_hides_gets_no_vote_from_its_view() -> None:
         views, before = (
             training_views(replace(frame, masks=masks), WORLD.rig, CPU) for frame in (frames[1], frames[0])
         )
-        found = moved_since(WORLD.scene, views, before, config=CONFIG, backend=reference_backend())
+        found = moved_since(WORLD.scene, views, before, config=CONFIG, backend=quickest_backend())
         assert bool(found.anchors[:20].any()) == expected  # two of the four see it, then one

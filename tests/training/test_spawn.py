@@ -19,7 +19,7 @@ from structgstream.training.online.spawn import (
 )
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.views import View, training_views
-from worlds import moving_world
+from tests.support.worlds import moving_world
 
 RULES = SpawnRules()
 WORLD = moving_world(1, width=96, height=64)
@@ -29,10 +29,10 @@ VIEWS = training_views(WORLD.frames[0], WORLD.rig, torch.device("cpu"))
 def test_blame_takes_two_views_and_half_of_those_that_see() -> None:
     coverage = torch.tensor([[10.0, 10, 10, 10], [10, 10, 10, 0.1], [10, 10, 10, 0.1], [10, 0, 10, 0.1]])
     wrong = torch.tensor([[6.0, 6, 6, 6], [6, 0, 6, 0.1], [0, 0, 6, 0.1], [0, 0, 0, 0.1]])
-    found = outlier_mask(coverage, wrong, least_pixels=0.3, rules=RULES)
+    found = outlier_mask(coverage, wrong, min_pixels=0.3, rules=RULES)
     # Two of four; one of three; three of four; one, since the others do not see it.
     assert found.tolist() == [True, False, True, False]
-    assert not outlier_mask(coverage, 0.5 * coverage, least_pixels=0.3, rules=RULES).any(), "half is not more than half"
+    assert not outlier_mask(coverage, 0.5 * coverage, min_pixels=0.3, rules=RULES).any(), "half is not more than half"
 
 
 def spoiled(view: View) -> torch.Tensor:
@@ -82,7 +82,7 @@ def test_a_view_of_which_nothing_counts_neither_supports_nor_contradicts() -> No
     backend, color = reference_backend(), CameraColor.identity(len(views))
     without = {v.index: draw(world.scene.gaussians(v.camera, backend), v.camera, backend).image for v in views}
     depths = {v.index: torch.full((64, 96), torch.inf) for v in views}
-    rules = replace(RULES, residual_threshold=0.05, most_contradictions=0.2, least_hits=1)
+    rules = replace(RULES, residual_threshold=0.05, max_contradictions=0.2, min_hits=1)
     floor = ResidualFloor(1.0, {v.index: torch.zeros(64, 96) for v in views})
 
     def born(last: ViewResidual) -> int:
@@ -120,7 +120,7 @@ def test_where_there_are_too_many_whole_clusters_are_born_or_none(
     overflow: str, most: int, rows: list[int], refused: int
 ) -> None:
     points = lines(4, 8, 3)
-    rules = replace(RULES, overflow=overflow, most=most, least_hits=1)
+    rules = replace(RULES, overflow=overflow, most=most, min_hits=1)
     found = _merge_points(points, torch.rand(15, 3), torch.ones(15), first_birth=7, rules=rules)
     assert found.refused_count == refused
     assert sorted({round(float(y) / 50) for y in found.free.means[:, 1]}) == rows
@@ -129,7 +129,7 @@ def test_where_there_are_too_many_whole_clusters_are_born_or_none(
 
 
 def test_where_there_are_too_many_births_are_coarser() -> None:
-    rules = replace(RULES, overflow="coarser", most=9, least_hits=1)
+    rules = replace(RULES, overflow="coarser", most=9, min_hits=1)
     found = _merge_points(lines(4, 8, 3), torch.rand(15, 3), torch.ones(15), first_birth=0, rules=rules)
     assert (0 < len(found.free) <= 9, found.refused_count) == (True, 0)
     assert found.merged_count == 15 - len(found.free), "a cap that binds is told"

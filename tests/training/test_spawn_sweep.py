@@ -13,11 +13,11 @@ from structgstream.training.online.spawn import Sweep, missing_share
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.residuals import residual_floor
 from structgstream.training.views import training_views
-from worlds import emerging_ball, moved_since, moving_world
+from tests.support.worlds import emerging_ball, moved_since, moving_world
 
 CPU = torch.device("cpu")
 WORLD = moving_world(2, cameras=6, emerges_at=1, movers=0, width=96, height=64)
-RULES = SpawnRules(least_hits=2)
+RULES = SpawnRules(min_hits=2)
 
 
 def sweep(rules: SpawnRules = RULES) -> Sweep:
@@ -80,7 +80,7 @@ def test_without_room_nothing_is_born_and_with_room_as_much_as_there_is() -> Non
     missing = swept.missing()
     assert not len(swept.births(missing, first_birth=0, room=0).free)
     assert len(swept.births(missing, first_birth=0, room=2).free) == 2
-    unsupported = sweep(replace(RULES, least_supports=6)).births(missing, first_birth=0, room=9)
+    unsupported = sweep(replace(RULES, min_supports=6)).births(missing, first_birth=0, room=9)
     assert not len(unsupported.free), "six others of six"
     assert not unsupported.refused_count
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from rigs import random_scene
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
 from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import TileSelection
@@ -23,8 +22,9 @@ from structgstream.training.optim import gradients_of
 from structgstream.training.parameters import Parameters, parameters_of_fields
 from structgstream.training.result import Stopwatch
 from structgstream.training.views import training_views
-from tests.varied import varied
-from worlds import moving_world
+from tests.support.rigs import random_scene
+from tests.support.varied import varied
+from tests.support.worlds import moving_world
 
 CPU = torch.device("cpu")
 WORLD = moving_world(2, width=96, height=64)

@@ -4,8 +4,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from backends import quickest_backend
-from rigs import arc_rig, random_scene
 from structgstream.kernels.backend import reference_backend
 from structgstream.kernels.reference_losses import l1_ssim as reference_l1_ssim
 from structgstream.kernels.values import TileSelection
@@ -16,6 +14,8 @@ from structgstream.training.losses import LossWeights, picture_loss, view_loss, 
 from structgstream.training.parameters import Parameters
 from structgstream.training.result import Stopwatch
 from structgstream.training.views import View, blackened
+from tests.support.backends import quickest_backend
+from tests.support.rigs import arc_rig, random_scene
 
 CPU = torch.device("cpu")
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from backends import quickest_backend
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.groups.tracking import TrackConfig, Tracked, Tracker, _measure_view, track_frame
 from structgstream.training.online.config import LiftConfig, MotionConfig
-from worlds import World, moving_world
+from tests.support.backends import quickest_backend
+from tests.support.worlds import World, moving_world
 
 SPEED, FRAMES = 0.06, 5
 CONFIG = TrackConfig(scale=1.0, cameras=8, picture_scale=0.5)

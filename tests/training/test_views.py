@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from rigs import arc_rig
 from structgstream.frames import MultiViewFrame
 from structgstream.training.views import View, area_mean, coarse_to_fine, reduced, shuffled_views, training_views
+from tests.support.rigs import arc_rig
 
 RIG = arc_rig()
 

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import torch
 
-from rigs import random_scene
-from streams import same
 from structgstream.scene.appearance import with_appearance
 from structgstream.training.frame0.seeding import warm_start
+from tests.support.rigs import random_scene
+from tests.support.streams import same
 
 CELL = 0.1
 

@@ -2,7 +2,7 @@
 """Films the player for the README: the page of a stream, turned from side to side while it plays, as an animated WebP.
 
     structgstream export clip.sgs -o clip.html
-    PYTHONPATH=tests python tools/player/film.py clip.html docs/images/player.webp
+    PYTHONPATH=. python tools/player/film.py clip.html docs/images/player.webp
 
 Each picture is a screenshot of a real browser, taken when the player says that what it shows is settled; so the film's
 pace is not that of the machine that made it.
@@ -15,7 +15,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from chromium import Tab, opened_browser
+from tests.support.chromium import Tab, opened_browser
 
 PLAYER = 'document.querySelector("structgstream-player")'
 

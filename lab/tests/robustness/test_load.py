@@ -12,12 +12,12 @@ from lab.robustness.load import digests, measured, parsed
 from lab.robustness.load_fetch import fetched
 from lab.robustness.load_players import play
 from lab.robustness.load_report import table
-from rigs import random_scene
-from segment_folders import GrowingFolder
-from serving import hosted
-from streams import compact_header, moved, small_stream, write_stream
 from structgstream.codec.sinks import FileSink
 from structgstream.serve.app import ServerSettings
+from tests.support.rigs import random_scene
+from tests.support.segment_folders import GrowingFolder
+from tests.support.serving import hosted
+from tests.support.streams import compact_header, moved, small_stream, write_stream
 
 STREAM = small_stream(7)
 
@@ -32,7 +32,7 @@ def test_the_whole_in_small(tmp_path: Path) -> None:
     assert (alone["players"], together["players"]) == (0, 4)
     assert together["fast"]["exact"] == together["fast"]["players"] == 2
     assert together["slow"]["wrong"] == together["slow"]["broken"] == 0
-    assert result["live"]["server"]["most_bytes"] > 0
+    assert result["live"]["server"]["max_bytes"] > 0
     servers = result["throughput"]["segments"]["servers"]
     assert {"serve", "python -m http.server"} <= servers.keys()
     assert all(one["exact"] for one in servers.values())

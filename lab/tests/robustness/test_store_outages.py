@@ -10,7 +10,7 @@ import pytest
 
 from lab.robustness.store_outages import KINDS, Reader, Row, one_event, services, table
 from repeated_streams import small_sent
-from segment_streams import folder, packets, written
+from tests.support.segment_streams import folder, packets, written
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
 

@@ -4,11 +4,11 @@ from pathlib import Path
 import pytest
 
 from lab.stream_entropy import counted_init, packet_bytes, told
-from streams import compact_header, moved, small_scene, write_stream
 from structgstream.codec.entropy.adaptive import AdaptiveDecoder
 from structgstream.codec.entropy.section_coder import SectionDecoder
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
+from tests.support.streams import compact_header, moved, small_scene, write_stream
 
 
 @pytest.fixture

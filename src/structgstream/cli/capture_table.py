@@ -13,20 +13,29 @@ from structgstream.cli.tables import compact_table, literal_cells, name_value_ta
 
 if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
+    from structgstream.data.video_index import VideoTrack
 
 
 def describe_capture(path: Path) -> dict[str, Any]:
     """The capture at ``path`` as plain values: ``layout``, ``fps``, ``frames``, ``held_out``, ``cameras``, ``remarks``.
 
-    ``remarks`` are the warnings of its reader: what is left out, and why.
+    ``remarks`` are the warnings of its reader: what is left out, and why. A folder without calibration is described as
+    the footage that ``prepare`` would read.
 
     Raises:
         CaptureError: it cannot be opened.
     """
-    from structgstream.data.open import layout_of, open_capture
+    from structgstream.data.open import Uncalibrated, layout_of, open_capture
+    from structgstream.preparation.footage import NoFootage
 
     with _warnings() as remarks:
-        source = open_capture(path)
+        try:
+            source = open_capture(path)
+        except Uncalibrated as error:
+            try:
+                return _describe_footage(path, remarks)
+            except NoFootage:
+                raise error from None
         cameras = {name: _camera(source, name) for name in source.rig}
     return {
         "layout": layout_of(path),
@@ -36,6 +45,34 @@ def describe_capture(path: Path) -> dict[str, Any]:
         "points": None if source.points is None else len(source.points),
         "cameras": cameras,
         "remarks": remarks,
+    }
+
+
+def _describe_footage(path: Path, remarks: list[str]) -> dict[str, Any]:
+    from structgstream.preparation.footage import find_footage
+
+    footage = find_footage(path)
+    cameras: dict[str, Any] = {}
+    for name in footage.cameras:
+        stamps, track = footage.stamps(name), footage.tracks.get(name)
+        colors, turned = ("-", "no") if track is None else (track.colors, _turned(track))
+        cameras[name] = {
+            "size": footage.size(name),
+            "lens": "-",
+            "frames": len(stamps),
+            "colors": colors,
+            "turned": turned,
+        }
+        cameras[name] |= {"first_seconds": float(stamps[0]), "last_seconds": float(stamps[-1])}
+    remark = f"There is no calibration: structgstream prepare {path} -o CAPTURE makes a capture of these files."
+    return {
+        "layout": "videos or pictures without calibration",
+        "fps": footage.fps,
+        "frames": min(camera["frames"] for camera in cameras.values()),
+        "held_out": [],
+        "points": None,
+        "cameras": cameras,
+        "remarks": [*remarks, remark],
     }
 
 
@@ -85,7 +122,7 @@ def _camera(source: "FrameSource", name: str) -> dict[str, Any]:
         track, stamps = stored.tracks[name], [stamp for stamp in stored.stamps[name] if stamp is not None]
         times = [(stamp - track.origin) * track.tick_seconds for stamp in (stamps[0], stamps[-1])]
         found |= {"frames": len(stamps), "first_seconds": times[0], "last_seconds": times[1], "colors": track.colors}
-        found["turned"] = f"{90 * track.quarter_turns} degrees" if track.quarter_turns else "no"
+        found["turned"] = _turned(track)
     elif isinstance(stored, ImageSource):
         places = [place for place, file in enumerate(stored.files[name]) if file is not None]
         found |= {"frames": len(places)}
@@ -94,6 +131,10 @@ def _camera(source: "FrameSource", name: str) -> dict[str, Any]:
         turn = stored.turns.get(name, 1)
         found["turned"] = "no" if turn == 1 else f"EXIF {turn}"
     return found
+
+
+def _turned(track: "VideoTrack") -> str:
+    return f"{90 * track.quarter_turns} degrees" if track.quarter_turns else "no"
 
 
 @contextmanager
@@ -105,7 +146,7 @@ def _warnings() -> Iterator[list[str]]:
         def emit(self, record: logging.LogRecord) -> None:
             found.append(record.getMessage())
 
-    handler, logger = Collector(logging.WARNING), logging.getLogger("structgstream.data")
+    handler, logger = Collector(logging.WARNING), logging.getLogger("structgstream")
     propagates, logger.propagate = logger.propagate, False
     logger.addHandler(handler)
     try:

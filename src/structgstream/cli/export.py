@@ -8,12 +8,12 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
 
 from structgstream.cli.app import usage_errors
-from structgstream.cli.options import Device, StreamFile, check_ending, parse_options
-from structgstream.cli.plain_text import say
-from structgstream.cli.progress import human_bytes
-from structgstream.exporters.formats import FORMATS, Format, PageFormat
+from structgstream.cli.options import EXPORTS, Device, Flag, StreamFile, check_ending, parse_options
+from structgstream.cli.progress import human_bytes, print_lines
+from structgstream.exporters.formats import FORMATS, Format, FrameOptions, PageFormat, SpzVersion
 
 
 @dataclass(frozen=True)
@@ -23,51 +23,80 @@ class Export:
     OUT.html is one page with a player and the whole stream, which opens without a server. --format site gives a folder
     for any web server, from which a viewer fetches only the played packets.
 
-    OUT.ply, OUT.splat or OUT.spz is one frame for other programs, any other name a folder of frame_000000.ply and so
-    on. View-dependent opacity and shape are averaged over the training cameras; colours are spherical harmonics fitted
-    to their views. Units and axes are the capture's own (.spz: y up, z back). Losses: docs/export.md.
+    OUT.ply, .splat, .spz, .sog or .glb is one frame for other programs, OUT.usd or .4dgs has all frames, OUT.zip is a
+    zip and any other name a folder of frame_000000.ply and so on. View-dependent opacity and shape are averaged over
+    the training cameras; colours are spherical harmonics fitted to their views; what that loses is printed. Units are
+    the capture's own, axes too (.spz, .glb, .usd, .4dgs: y up, z back). --list shows what each format is for.
 
     Example: structgstream export ball.sgs -o ball.html
 
     Example: structgstream export ball.sgs --frame 5 -o ball.ply
 
     Example: structgstream export ball.sgs --frames 0 19 --format spz -o ball-spz
+
+    Example: structgstream export ball.sgs -o ball.usd
     """
 
     stream: tyro.conf.Positional[StreamFile]
     """The stream file."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
-    """Output file or folder. Default: a file (with --frame) or a folder beside the stream."""
+    """Output file or folder. Default: a file (with --frame) or a folder next to the stream."""
     format: Annotated[Format | PageFormat | None, tyro.conf.arg(help_behavior_hint="")] = None
     """Format of the files. Default: the suffix of OUT, else ply."""
     frame: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Export only this frame."""
     frames: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="FIRST LAST", help_behavior_hint="")] = None
     """First and last frame to export. Default: all."""
-    sh_degree: Annotated[int | None, tyro.conf.arg(metavar="0..2", help_behavior_hint="")] = None
+    sh_degree: Annotated[int | None, tyro.conf.arg(metavar="0..3", help_behavior_hint="")] = None
     """Degree of the spherical harmonics. Default: 1; .splat has none."""
     low_pass: Annotated[float, tyro.conf.arg(metavar="0..1", help_behavior_hint="")] = 0.0
     """Widen Gaussians by this variance, in squared training pixels, for viewers that show the scene larger than it was
     filmed (0.2) or have no low-pass of their own (0.3). Default: 0, best at the size of the training pictures."""
+    crop: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        tyro.conf.arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint=""),
+    ] = None
+    """Leave out Gaussians outside this box: its lowest and its highest corner, in units of the capture."""
+    min_opacity: Annotated[float, tyro.conf.arg(metavar="0..1", help_behavior_hint="")] = 0.0
+    """Leave out Gaussians below this opacity."""
+    max_splats: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    """Largest number of Gaussians of a frame; the smallest and most transparent are left out."""
+    pad_sh: Flag = False
+    """Write all 45 f_rest properties of a .ply, which some importers need."""
+    spz_version: Annotated[SpzVersion, tyro.conf.arg(help_behavior_hint="")] = 2
+    """Version of .spz: all readers know 2; 3 and 4 have finer rotations, 4 is compressed with zstd."""
+    list: Flag = False
+    """List the formats: what each is for, and what reads it."""
     device: Device = "auto"
     """Back-end that evaluates the MLPs."""
 
 
 def main(arguments: list[str]) -> None:
     """Exports and prints the path of the result."""
+    if "--list" in arguments:
+        _list_formats(Console())
+        return
     options = parse_options(Export, "export", arguments=arguments)
-    check_ending(options.output, *(f".{name}" for name in (*FORMATS, "html")), command="export", folder=True)
-    from structgstream.exporters.request import check_degree, check_low_pass, check_page, choose_frames, destination
+    check_ending(options.output, *EXPORTS, ".zip", ".html", command="export", folder=True)
+    from structgstream.exporters.request import check_page, choose_frames, destination
 
     frame, frames = options.frame, options.frames
+    chosen = FrameOptions(
+        degree=options.sh_degree,
+        low_pass=options.low_pass,
+        box=options.crop,
+        min_opacity=options.min_opacity,
+        max_splats=options.max_splats,
+        pad_sh=options.pad_sh,
+        spz_version=options.spz_version,
+    )
     with usage_errors():
         output, format = destination(options.stream, options.output, format=options.format, frame=frame, frames=frames)
         if format == "html" or format == "site":
-            check_page(frame=frame, frames=frames, sh_degree=options.sh_degree, low_pass=options.low_pass)
+            check_page(frame=frame, frames=frames, options=chosen)
             _export_page(options.stream, output, format)
             return
-        degree = check_degree(options.sh_degree, format)
-        low_pass = check_low_pass(options.low_pass)
+        chosen.check(format)
     from structgstream.codec.reader import open_stream
     from structgstream.exporters.frames import write_frames
     from structgstream.kernels.backend import select_backend
@@ -76,7 +105,7 @@ def main(arguments: list[str]) -> None:
     with usage_errors():
         numbers = choose_frames(reader.runs, output, frame=frame, frames=frames)
     backend = select_backend(options.device)
-    written = gaussians = 0
+    gaussians, files, loss = 0, set[Path](), None
     bar = Progress(
         TextColumn("exporting"),
         BarColumn(bar_width=32),
@@ -87,17 +116,36 @@ def main(arguments: list[str]) -> None:
     )
     with bar:
         task = bar.add_task("frames", total=len(numbers))
-        files = write_frames(reader, numbers, output, format=format, backend=backend, degree=degree, low_pass=low_pass)
-        for file in files:
-            written += file.bytes
-            gaussians += file.gaussians
+        for written in write_frames(reader, numbers, output, format=format, backend=backend, options=chosen):
+            files.add(written.path)
+            gaussians += written.gaussians
+            loss = loss or written.loss
             bar.advance(task)
     what = "1 frame" if len(numbers) == 1 else f"{len(numbers)} frames"
-    text = f"Wrote {output}: {what}, {gaussians:,} Gaussians, {human_bytes(written)}"
+    size_bytes = sum(path.stat().st_size for path in files)
     console = Console()
-    say(console, text)
+    print_lines(console, f"Wrote {output}: {what}, {gaussians:,} Gaussians, {human_bytes(size_bytes)}")
+    if loss is not None:
+        held_out = "" if loss.held_out is None else f", {loss.held_out:.1f} dB at the held-out ones"
+        print_lines(
+            console,
+            f"Plain Gaussians of frame {numbers[0]}, against the stream's own pictures: PSNR {loss.training:.1f} dB at "
+            f"the training cameras{held_out}.",
+        )
     if reader.damage:
-        say(console, f"The stream is damaged: {reader.cut_reason}.")
+        print_lines(console, f"The stream is damaged: {reader.cut_reason}.")
+
+
+def _list_formats(console: Console) -> None:
+    table = Table(box=None, pad_edge=False)
+    for title in ("format", "what for", "read by", "file", "SH degree"):
+        table.add_column(title, overflow="fold")
+    for name, info in FORMATS.items():
+        file = "all frames" if info.all_frames else "one frame"
+        table.add_row(name, info.purpose, info.readers, file, f"0 to {info.max_degree}" if info.max_degree else "0")
+    table.add_row("html", "one page with a player and the whole stream", "browsers", "all frames", "")
+    table.add_row("site", "the same as a folder for a web server", "browsers", "all frames", "")
+    console.print(table)
 
 
 def _export_page(path: Path, output: Path, format: PageFormat) -> None:
@@ -111,4 +159,4 @@ def _export_page(path: Path, output: Path, format: PageFormat) -> None:
         size_bytes = write_site(output, stream)
         then = "put the folder on any web server"
     text = f"Wrote {output}, {human_bytes(size_bytes)}; {then}"
-    say(Console(), text)
+    print_lines(Console(), text)

@@ -10,10 +10,11 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import UsageError, usage_errors
+from structgstream.exporters.formats import SUFFIXES
 
 if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
-    from structgstream.presets import StreamConfig
+    from structgstream.session.presets import StreamConfig
 
 Options = TypeVar("Options")
 Device = Literal["auto", "cpu", "cuda", "reference"]
@@ -48,7 +49,8 @@ class CaptureOptions:
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif")
 VIDEOS = (".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".mpg", ".ts")
-KNOWN_ENDINGS = frozenset({*PICTURES, *VIDEOS, ".html", ".json", ".pdf", ".ply", ".sgs", ".splat", ".spz"})
+EXPORTS = tuple(f".{name}" for name in SUFFIXES)
+KNOWN_ENDINGS = frozenset({*PICTURES, *VIDEOS, *EXPORTS, ".html", ".json", ".pdf", ".sgs", ".zip"})
 """Endings of pictures, videos, exports and streams, of which a command writes some."""
 RENAMED = {"--quiet": "--split-at-low-motion", "--odd": "--allow-unaligned"}
 """Options of before, and what they are called now."""
@@ -153,7 +155,7 @@ def resolve_config(
             a constant now.
     """
     from structgstream.config_fields import constant_at
-    from structgstream.presets import DEFAULT_PRESET, StreamConfig, preset_named, renamed
+    from structgstream.session.presets import DEFAULT_PRESET, StreamConfig, preset_named, renamed
 
     for option in (override.partition("=")[0] for override in overrides if override.startswith("--")):
         path = option.removeprefix("--").replace("-", "_")

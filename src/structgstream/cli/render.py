@@ -12,7 +12,7 @@ from rich.console import Console
 
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import Device, Flag, StreamFile, check_ending, parse_options
-from structgstream.cli.plain_text import say
+from structgstream.cli.progress import print_lines
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from structgstream.kernels.backend import Backend
     from structgstream.scene.scene import Scene
 
-LEAST_PATH_SECONDS = 4.0  # a shorter stream is played slowed, forward and backward, while the camera moves
-MOST_PATH_SECONDS = 3600.0
+MIN_PATH_SECONDS = 4.0  # a shorter stream is played slowed, forward and backward, while the camera moves
+MAX_PATH_SECONDS = 3600.0
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Render:
     scene: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="[FOLDER]", help_behavior_hint="")] = None
     """The capture, for --compare."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
-    """Output file or folder. Default: a video beside the stream, named after the camera or the path."""
+    """Output file or folder. Default: a video next to the stream, named after the camera or the path."""
     camera: Annotated[str | None, tyro.conf.arg(metavar="CAMERA", help_behavior_hint="")] = None
     """A camera of the rig; with --path orbit, the one to circle. Default: the first held-out one."""
     path: Annotated[Literal["orbit", "arc"] | None, tyro.conf.arg(help_behavior_hint="")] = None
@@ -69,8 +69,8 @@ def main(arguments: list[str]) -> None:
         raise UsageError("--compare needs the capture's folder after the stream, and a camera, not a --path.")
     if options.scene is not None and not options.compare:
         raise UsageError("the capture's folder is only used with --compare.")
-    if options.seconds is not None and not (options.path and 0.0 < options.seconds <= MOST_PATH_SECONDS):
-        raise UsageError(f"--seconds is the duration of a --path, above 0 and at most {MOST_PATH_SECONDS:g}.")
+    if options.seconds is not None and not (options.path and 0.0 < options.seconds <= MAX_PATH_SECONDS):
+        raise UsageError(f"--seconds is the duration of a --path, above 0 and at most {MAX_PATH_SECONDS:g}.")
     if options.between is not None and options.path != "arc":
         raise UsageError("--between gives the ends of --path arc.")
     from structgstream.codec.reader import open_stream
@@ -97,7 +97,7 @@ def main(arguments: list[str]) -> None:
         pictures = camera_pictures(reader, backend, camera=choose_camera(reader, options.camera), frame=options.frame)
     single = output.suffix.lower() == ".png"
     write_pictures(output, islice(pictures, 1) if single else pictures, fps=reader.header.fps)
-    say(Console(), f"Wrote {output}")
+    print_lines(Console(), f"Wrote {output}")
 
 
 def write_pictures(output: Path, pictures: "Iterable[NDArray[np.uint8]]", *, fps: float) -> None:
@@ -107,7 +107,7 @@ def write_pictures(output: Path, pictures: "Iterable[NDArray[np.uint8]]", *, fps
         StorageError: something cannot be written.
     """
     from structgstream.data.video_writer import VideoWriter
-    from structgstream.evaluation.png import write_png
+    from structgstream.evaluation.pictures import write_png
 
     with Console(stderr=True).status("rendering") as status:
         if output.suffix.lower() == ".mp4":
@@ -149,7 +149,7 @@ def path_pictures(
     from structgstream.scene.state import on_device
 
     header = reader.header
-    length = max(len(reader.packets) / header.fps, LEAST_PATH_SECONDS) if seconds is None else seconds
+    length = max(len(reader.packets) / header.fps, MIN_PATH_SECONDS) if seconds is None else seconds
     count = max(round(length * header.fps), 1)
     rig = header.rig
     views: list[Camera] = orbit(rig, count, around=camera) if path == "orbit" else arc(rig, count, between=between)
@@ -161,9 +161,9 @@ def compared_pictures(
     reader: "StreamReader", scene: Path, *, backend: "Backend", options: Render
 ) -> "Iterator[NDArray[np.uint8]]":
     """Truth, rendering and difference of a camera, frame by frame."""
-    from structgstream.evaluation.capture import capture_of
     from structgstream.evaluation.evaluate import compared_frames
     from structgstream.evaluation.pictures import side_by_side
+    from structgstream.evaluation.recording import capture_of
 
     camera = choose_camera(reader, options.camera)
     _check_frame(reader, options.frame)

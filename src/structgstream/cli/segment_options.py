@@ -36,12 +36,12 @@ class SegmentOptions:
     """file: OUT is one file. segments: OUT is a folder of immutable files and a manifest, which any web host can serve
     while it grows. Default: segments if OUT is a folder with a manifest.json, else file."""
     window: Annotated[float | None, tyro.conf.arg(metavar="SECONDS", help_behavior_hint="")] = None
-    """Segments only: how far viewers can go back; older segments are removed. Default: everything is kept."""
+    """Segments only: how far viewers can go back; older segments are removed. Default: nothing is removed."""
     keep: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 120.0
     """Segments only: how long a file stays that the manifest no longer names; viewers may be about to fetch it."""
     publish: Annotated[str | None, tyro.conf.arg(metavar="URL", help_behavior_hint="")] = None
     """Segments only: copy OUT to this folder of an object store as it grows, such as s3://bucket/studio. When it cannot
-    be reached, the stream goes on in OUT, and what is missing is copied later. Needs the extra cloud."""
+    be reached, the stream continues in OUT, and is copied later. Needs the extra cloud."""
 
     def chosen(self, output: Path) -> Sink:
         """The sink of ``output``.

@@ -12,7 +12,7 @@ import tyro
 from structgstream.cli.app import UsageError, usage_errors
 from structgstream.cli.options import Flag, parse_options
 
-MOST_HOURS = 24 * 366
+MAX_HOURS = 24 * 366
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class Token:
 def main(arguments: list[str]) -> None:
     """Prints a token."""
     options = parse_options(Token, "token", arguments=arguments)
-    if not (math.isfinite(options.hours) and 0.0 < options.hours <= MOST_HOURS):
-        raise UsageError(f"--hours {options.hours:g} is not above 0 and at most {MOST_HOURS}, a year.")
+    if not (math.isfinite(options.hours) and 0.0 < options.hours <= MAX_HOURS):
+        raise UsageError(f"--hours {options.hours:g} is not above 0 and at most {MAX_HOURS}, a year.")
     if bool(options.stream) == options.every:
         raise UsageError("name one stream, or say --every.")
     from structgstream.serve.tokens import EVERY_STREAM, read_keys

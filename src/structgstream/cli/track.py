@@ -12,9 +12,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from structgstream.cli.app import Interrupted, UsageError
 from structgstream.cli.options import Device, Flag, Folder, StreamFile, check_ending, parse_options
-from structgstream.cli.plain_text import say
-from structgstream.cli.progress import human_bytes
-from structgstream.cli.termination import Terminated, Termination
+from structgstream.cli.progress import human_bytes, print_lines
+from structgstream.cli.signals import Terminated, Termination
 
 if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
@@ -29,7 +28,7 @@ class Track:
     (docs/cluster.md).
 
     TRACK holds where things are when a group begins, TRACK.groups a line a:b for each group. After Ctrl-C or a kill the
-    same command goes on; a finished track is left as it is.
+    same command continues; a finished track is not changed.
 
     Example: structgstream track basketball --init header.sgs -o ball.track --groups 60
 
@@ -66,16 +65,15 @@ def main(arguments: list[str]) -> None:
     """Tracks with a progress bar, and lists the groups."""
     options = parse_options(Track, "track", arguments=arguments)
     check_ending(options.output, command="track")
+    from structgstream.atomic_files import partial_path
     from structgstream.cli.app import usage_errors
     from structgstream.groups.base import GroupBase
-    from structgstream.groups.boundaries import check_length
-    from structgstream.groups.group_list import groups_path
+    from structgstream.groups.boundaries import check_length, groups_path
     from structgstream.groups.pictures import open_for
     from structgstream.groups.segment_file import open_segment
     from structgstream.groups.track_pass import TrackOptions
     from structgstream.groups.tracking import TrackConfig
     from structgstream.kernels.backend import select_backend
-    from structgstream.whole_files import partial_path
 
     base = GroupBase.read(options.init)
     length = base.key_interval if options.groups is None else options.groups
@@ -130,7 +128,7 @@ def _say(path: Path, frames: int, spent: float | None) -> None:
 
     groups = open_track(path).groups or []
     size = human_bytes(path.stat().st_size)
-    say(
+    print_lines(
         Console(),
         f"Wrote {path}: {frames} frames, {size}; {len(groups)} groups in {path}.groups: "
         + " ".join(f"{first}:{end}" for first, end in groups[:8])

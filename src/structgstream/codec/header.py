@@ -78,7 +78,7 @@ def _match(name: FieldName, value: Tensor, sizes: dict[str, int], where: str) ->
 MAX_IMAGE_SIDE = 65_535
 MAX_IMAGE_PIXELS = 2**26
 """8192 x 8192: more than any camera's video, and 0.8 GB as floats, so that a small file cannot fill the memory."""
-_LEAST_STEP = 2.0**-64
+_MIN_STEP = 2.0**-64
 
 
 def pack_header(header: StreamHeader) -> bytes:
@@ -216,7 +216,7 @@ def _header(description: dict[str, Any], static: Mapping[FieldName, Tensor]) -> 
 
 def _step(value: object) -> float:
     # Within these bounds the product of step and bin is neither infinite nor denormal.
-    if not _LEAST_STEP <= (step := _positive(value)) <= 1 / _LEAST_STEP or float(np.float32(step)) != step:
+    if not _MIN_STEP <= (step := _positive(value)) <= 1 / _MIN_STEP or float(np.float32(step)) != step:
         raise ValueError(f"the step {value!r}; it must be a float32 number from 2^-64 to 2^64")
     return step
 

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
+from structgstream.atomic_files import sync_folder
 from structgstream.codec.container.byte_source import ByteSlice, ByteSource, FileBytes, check_room, free_bytes
 from structgstream.codec.container.damage import readable_part
 from structgstream.codec.container.index import INDEX_ENTRY, Period, pack_index, period_at
@@ -25,7 +26,6 @@ from structgstream.codec.segments.stored_bytes import StoredBytes
 from structgstream.errors import StorageError
 from structgstream.file_locks import lock_file
 from structgstream.scene.scene import Scene
-from structgstream.whole_files import sync_folder
 
 
 class _Writer:

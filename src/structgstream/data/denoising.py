@@ -27,7 +27,7 @@ from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MultiViewFrame
 
 SMOOTHING_PIXELS = 3
-MOST_FRAMES = 256  # sums of 8-bit pictures are 16-bit numbers
+MAX_FRAMES = 256  # sums of 8-bit pictures are 16-bit numbers
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class DenoisingConfig:
     size (``cameras.enlargement``)."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.frames <= MOST_FRAMES:
-            raise ConfigError(f"Denoising takes 1 to {MOST_FRAMES} frames; got {self.frames}.")
+        if not 1 <= self.frames <= MAX_FRAMES:
+            raise ConfigError(f"Denoising takes 1 to {MAX_FRAMES} frames; got {self.frames}.")
 
 
 @dataclass(frozen=True)

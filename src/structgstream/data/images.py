@@ -350,6 +350,21 @@ def turned(picture: NDArray[Pixel], orientation: int) -> NDArray[Pixel]:
     return np.ascontiguousarray(picture[:: -1 if down else 1, :: -1 if across else 1])
 
 
+def reduced_picture(picture: NDArray[np.uint8], longest_side: int) -> NDArray[np.uint8]:
+    """A picture ``[H, W]`` or ``[H, W, C]`` averaged over areas so that no side exceeds ``longest_side`` pixels.
+
+    Raises:
+        MissingExtraError: cv2 is not installed.
+    """
+    height, width = picture.shape[:2]
+    factor = longest_side / max(width, height)
+    if factor >= 1:
+        return picture
+    cv2 = opencv()
+    size = (max(round(width * factor), 1), max(round(height * factor), 1))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
 def reduced_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
     """``mask`` ``[H, W]`` at another ``size``, width and height: a pixel counts if all that it is made of counts."""
     if mask.shape[1::-1] == size:

@@ -6,7 +6,7 @@ Neighbours are chosen by the cameras' geometry, and a keypoint is only compared 
 pixel's centre at (0.5, 0.5).
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
-from structgstream.data.images import opencv
+from structgstream.data.images import opencv, reduced_mask, reduced_picture
 
 Pair = tuple[str, str]
 """Names of two cameras."""
@@ -33,10 +33,16 @@ class Features:
 
 
 def sift_features(
-    image: NDArray[np.uint8], *, count: int, contrast: float = 0.01, mask: NDArray[np.bool_] | None = None
+    image: NDArray[np.uint8],
+    *,
+    count: int,
+    contrast: float = 0.01,
+    mask: NDArray[np.bool_] | None = None,
+    longest_side: int | None = None,
 ) -> Features:
     """The strongest ``count`` SIFT keypoints of an RGB picture ``[H, W, 3]``, of its pixels ``mask`` ``[H, W]``.
 
+    Larger pictures are reduced to ``longest_side`` pixels; keypoints are in pixels of ``image`` all the same.
     Descriptors are square-rooted after L1 normalisation, so that their dot product is the Hellinger kernel
     (Arandjelovic and Zisserman, CVPR 2012).
 
@@ -44,6 +50,10 @@ def sift_features(
         MissingExtraError: cv2 is not installed.
     """
     cv2 = opencv()
+    height, width = image.shape[:2]
+    if longest_side is not None:
+        image = reduced_picture(image, longest_side)
+        mask = None if mask is None else reduced_mask(mask, image.shape[1::-1])
     # Without the precise upscale every keypoint would be off by a quarter of a pixel.
     sift = cv2.SIFT.create(
         nfeatures=count,
@@ -58,6 +68,7 @@ def sift_features(
     if descriptors is None or len(keypoints) == 0:
         return Features(np.empty((0, 2)), np.empty((0, 128), np.float32))
     pixels = np.array([keypoint.pt for keypoint in keypoints], np.float64) + 0.5
+    pixels *= width / image.shape[1], height / image.shape[0]
     rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9), dtype=np.float32)
     return Features(pixels, rooted)
 
@@ -152,6 +163,18 @@ def unique_pairs(neighbours: Mapping[str, tuple[str, ...]]) -> list[Pair]:
         for other in others:
             pairs.setdefault(frozenset((name, other)), (name, other))
     return list(pairs.values())
+
+
+def connected_groups(names: Iterable[str], pairs: Iterable[Pair]) -> list[tuple[str, ...]]:
+    """Groups of cameras that pairs connect, the largest first; each in the order of ``names``."""
+    group = {name: index for index, name in enumerate(names)}
+    for one, two in pairs:
+        old, new = max(group[one], group[two]), min(group[one], group[two])
+        group = {name: new if index == old else index for name, index in group.items()}
+    members: dict[int, list[str]] = {}
+    for name, index in group.items():
+        members.setdefault(index, []).append(name)
+    return sorted(map(tuple, members.values()), key=len, reverse=True)
 
 
 def fundamental_matrix(first: Camera, second: Camera) -> Floats:

@@ -12,6 +12,14 @@ from structgstream.cameras import CameraRig
 from structgstream.data.calibration import with_near
 from structgstream.data.camera_files import ROOTS, pictures_in, roots_of, unread_files, videos_in
 from structgstream.data.colmap import find_model
+from structgstream.data.dataset_layouts import (
+    open_immersive,
+    open_n3dv,
+    open_panoptic,
+    recognizes_immersive,
+    recognizes_n3dv,
+    recognizes_panoptic,
+)
 from structgstream.data.found_calibrations import (
     calibration_below,
     has_calibration,
@@ -20,15 +28,12 @@ from structgstream.data.found_calibrations import (
     recognizes_calibrated,
 )
 from structgstream.data.held_out import best_surrounded
-from structgstream.data.immersive import open_immersive, recognizes_immersive
 from structgstream.data.json_videos import open_json_videos, recognizes_json_videos
 from structgstream.data.masks import FOLDER, with_masks
-from structgstream.data.n3dv import open_n3dv, recognizes_n3dv
-from structgstream.data.panoptic import open_panoptic, recognizes_panoptic
 from structgstream.data.posed_capture import NoFrames, open_posed
 from structgstream.data.prepared import open_prepared, recognizes_prepared
 from structgstream.data.source import FrameSource
-from structgstream.data.transforms_capture import open_transforms, recognizes_transforms
+from structgstream.data.transforms import open_transforms, recognizes_transforms
 from structgstream.data.wrappers import WithoutPoints, WithRig, resized, section
 from structgstream.errors import CaptureError, ConfigError, StructGStreamError
 
@@ -151,6 +156,10 @@ def _opener(path: Path) -> Callable[[Path], FrameSource] | None:
     return next((opens for recognises, opens in FORMATS if recognises(path)), None)
 
 
+class Uncalibrated(CaptureError):
+    """A folder without any file that could be a calibration: at best what cameras filmed, for ``prepare``."""
+
+
 def _opened(folder: Path, opens: Callable[[Path], FrameSource]) -> FrameSource:
     try:
         return with_masks(opens(folder), folder / FOLDER)
@@ -197,9 +206,14 @@ def _located(path: Path) -> tuple[Path, Callable[[Path], FrameSource]]:
     if any(Path(name).suffix.lower() in CALIBRATION_SUFFIXES for name in content):
         why = f"no calibration that is known here; it holds {shown}{unread_files(path)}"
     elif any(videos_in(root) or pictures_in(root) for root in roots_of(path)):
-        why = f"no calibration; it holds {shown}. structgstream prepare calibrates videos and pictures"
+        raise Uncalibrated(
+            f"The folder {path} has no calibration; it holds {shown}. structgstream prepare calibrates videos and "
+            f"pictures.\n{LAYOUTS}"
+        )
     else:
-        why = f"no supported layout; it holds {shown}{unread_files(path)}"
+        raise Uncalibrated(
+            f"The folder {path} has no supported layout; it holds {shown}{unread_files(path)}.\n{LAYOUTS}"
+        )
     raise CaptureError(f"The folder {path} has {why}.\n{LAYOUTS}")
 
 

@@ -16,13 +16,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from structgstream.atomic_files import atomic_write
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import calibrated_camera, calibrated_rig
 from structgstream.data.calibration_files.reading import positive, read_array, readable
-from structgstream.data.folder_files import by_stem, files_of
+from structgstream.data.camera_files import by_stem, files_of
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
-from structgstream.data.picture_size import picture_size
+from structgstream.data.picture_headers import picture_size
 from structgstream.data.source import FrameSource
 from structgstream.data.text_files import Unreadable, mapping, number, pixels, read_json
 from structgstream.data.timeline import Clock, common_slots, natural, picture_slots
@@ -30,7 +31,6 @@ from structgstream.data.undistortion import UndistortedSource
 from structgstream.data.video import synchronised
 from structgstream.data.video_index import scan_videos
 from structgstream.errors import CalibrationError, CaptureError
-from structgstream.whole_files import write_whole
 
 FILE = "capture.json"
 FORMAT, VERSION = "structgstream-capture", 1
@@ -91,7 +91,7 @@ def write_prepared(path: Path, capture: PreparedCapture) -> None:
         StorageError: the file cannot be written.
     """
     content = json.dumps(prepared_entries(capture), indent=1) + "\n"
-    write_whole(path / FILE, content.encode())
+    atomic_write(path / FILE, content.encode())
 
 
 def prepared_entries(capture: PreparedCapture) -> dict[str, Any]:

@@ -27,7 +27,7 @@ UNMARKED = {(False, True): "utf-16-le", (True, False): "utf-16-be"}
 """By whether the first and the second byte are zero, which a character of a calibration's beginning is not."""
 
 
-MOST_PIXELS = 65_535  # of a side of a picture
+MAX_PIXELS = 65_535  # of a side of a picture
 
 
 class Unreadable(ValueError):
@@ -44,7 +44,7 @@ BROKEN = (
 def read_text(file: Path) -> str:
     """The text of a file in UTF-8, UTF-16 or UTF-32, with or without a byte order mark; lines end with ``\\n``.
 
-    Letters with marks are composed, as :func:`~structgstream.data.folder_files.name_of` has them.
+    Letters with marks are composed, as :func:`~structgstream.data.camera_files.name_of` has them.
 
     Raises:
         Unreadable: it is in another encoding.
@@ -128,7 +128,7 @@ def pixels(size: Any) -> tuple[int, int]:
     if isinstance(size, str) or not hasattr(size, "__len__") or len(size) != 2:
         raise Unreadable(f"{_shown(size)} in place of width and height")
     width, height = (round(number(side)) for side in size)
-    if not 1 <= min(width, height) <= max(width, height) <= MOST_PIXELS:
+    if not 1 <= min(width, height) <= max(width, height) <= MAX_PIXELS:
         raise Unreadable(f"a picture of {width}x{height} pixels")
     return width, height
 

@@ -122,12 +122,12 @@ class Undistortion:
 
     def _size(self, number: int) -> tuple[int, int]:
         """The size of the lens's picture after so many halvings; at first it is reduced as far as nothing is lost."""
-        factor = (self._least_scale if self._least_scale >= WORTH_REDUCING else 1.0) * 2**number
+        factor = (self._min_scale if self._min_scale >= WORTH_REDUCING else 1.0) * 2**number
         camera = self.filmed.camera
         return max(round(camera.width / factor), 1), max(round(camera.height / factor), 1)
 
     @cached_property
-    def _least_scale(self) -> float:
+    def _min_scale(self) -> float:
         """Least pixels of the lens, along any direction, in a pixel of the pinhole."""
         across = np.linspace(1, self.target.width - 1, SCALE_SAMPLES)
         down = np.linspace(1, self.target.height - 1, SCALE_SAMPLES)

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
-from structgstream.data.instants import Placed, measured_rate, origin_of, place, tell_time_error
-from structgstream.data.timeline import Clock, common_slots
-from structgstream.data.video_index import VideoTrack
+from structgstream.data.timeline import Clock, Placed, common_slots, measured_rate, origin_of, place, tell_time_error
+from structgstream.data.video_index import STREAM_FORMATS, VideoTrack
 from structgstream.data.video_pictures import Mask, Picture, pictures_at
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.frames import MultiViewFrame
@@ -134,6 +133,7 @@ def synchronised(
                 f"camera {name!r} are for {camera.width}x{camera.height}; scale the intrinsics, "
                 "or use the video that was calibrated."
             )
+    times = _common_times(tracks, clocks)
     measured = measured_fps(tracks, clocks)
     if fps is not None and clocks is None and measured is not None and abs(measured / fps - 1) > 0.02:
         raise CaptureError(
@@ -141,7 +141,7 @@ def synchronised(
             "correct the number."
         )
     rate = fps or measured or 30.0  # one frame per camera: any rate is right
-    positions = {name: _seconds(tracks[name], clocks, name) * rate for name in rig}
+    positions = {name: times[name] * rate for name in rig}
     origin = origin_of(list(positions.values()))
     placed = {name: place(own - origin) for name, own in positions.items()}
     common = common_slots(
@@ -168,13 +168,24 @@ def measured_fps(tracks: Mapping[str, VideoTrack], clocks: Mapping[str, Clock] |
                 f"The {len(track.stamps)} frames of the video {track.path} all have the same time stamp, so they "
                 "cannot be matched with other cameras; write it again with the time of each frame."
             )
-    return measured_rate([_seconds(track, clocks, name) for name, track in tracks.items()])
+    return measured_rate([*_common_times(tracks, clocks).values()])
 
 
-def _seconds(track: VideoTrack, clocks: Mapping[str, Clock] | None, name: str) -> NDArray[np.float64]:
-    """The frames' times on the common clock."""
-    clock = Clock() if clocks is None else clocks.get(name, Clock())
-    return clock.common_seconds(track.seconds)
+def _common_times(
+    tracks: Mapping[str, VideoTrack], clocks: Mapping[str, Clock] | None
+) -> dict[str, NDArray[np.float64]]:
+    """The frames' times of each video on the common clock, seconds.
+
+    Without clocks, and where containers differ, videos in containers for transmission begin at 0 as the others do:
+    FFmpeg writes the first picture of an MPEG transport stream at 1.4 s.
+    """
+    if clocks is not None:
+        return {name: clocks.get(name, Clock()).common_seconds(track.seconds) for name, track in tracks.items()}
+    is_mixed = len({track.container for track in tracks.values()}) > 1
+    starts = {
+        name: track.start if is_mixed and track.container in STREAM_FORMATS else 0 for name, track in tracks.items()
+    }
+    return {name: track.seconds - starts[name] * track.tick_seconds for name, track in tracks.items()}
 
 
 def _slots(placed: Placed, *, keep_repeated: bool) -> list[int]:

@@ -32,6 +32,8 @@ VIDEO_SUFFIXES = frozenset({
     ".mp4", ".mov", ".m4v", ".3gp", ".360", ".mkv", ".webm", ".avi", ".ts", ".mts", ".m2ts", ".mpg", ".mpeg", ".mxf",
     ".nut", ".flv", ".asf", ".wmv", ".ogv", ".ogg", ".y4m", ".h264", ".264", ".h265", ".265", ".hevc",
 })  # fmt: skip
+STREAM_FORMATS = frozenset({"mpegts", "mpeg"})
+"""FFmpeg's names of containers for transmission, whose time stamps begin anywhere; files of the others begin at 0."""
 PROGRESSIVE = 1  # the largest AVFieldOrder of pictures that are not fields; 0 is unknown
 # The upper left of a display matrix (ISO/IEC 14496-12) and the quarter turns counterclockwise that it stands for.
 TURNS = {(1, 0, 0, 1): 0, (0, -1, 1, 0): 1, (-1, 0, 0, -1): 2, (0, 1, -1, 0): 3}
@@ -51,6 +53,8 @@ class VideoTrack:
         keyframes: presentation times, ascending, in ticks, of the frames that decode alone.
         colors: what the file states of its colours, in words.
         origin: ticks of time 0. AVI states no presentation times; its first frame is at 0.
+        container: FFmpeg's name of the container.
+        start: presentation time, in ticks, of the first picture, which may be one that does not decode.
     """
 
     path: Path
@@ -62,6 +66,8 @@ class VideoTrack:
     keyframes: tuple[int, ...] = ()
     colors: str = ""
     origin: int = 0
+    container: str = ""
+    start: int = 0
 
     @property
     def seconds(self) -> NDArray[np.float64]:
@@ -178,12 +184,14 @@ def _scan(path: Path) -> VideoTrack:
         seconds = float(stream.time_base)
         if not started:  # Some recorders mark no key frame, or write none.
             first = _first_of(path)
-        origin = stamps[0] - (packets[0].dts or 0) if stamps and container.format.name == "avi" else 0
+        start = stamps[0] if stamps else 0
+        origin = start - (packets[0].dts or 0) if container.format.name == "avi" else 0
         stamps = _decodable(path, stamps, first, seconds)
         turns = _quarter_turns(path, stream, first)
         size = (stream.height, stream.width) if turns % 2 else (stream.width, stream.height)
         colors = stated_colors(path, first)
-        return VideoTrack(path, tuple(stamps), seconds, *size, turns, tuple(sorted(keys)), colors, origin)
+        keyframes, kind = tuple(sorted(keys)), container.format.name
+        return VideoTrack(path, tuple(stamps), seconds, *size, turns, keyframes, colors, origin, kind, start)
 
 
 def _decodable(path: Path, stamps: list[int], first: "VideoFrame | None", seconds: float) -> list[int]:

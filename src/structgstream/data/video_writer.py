@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.atomic_files import give_name, partial_path
 from structgstream.data.video_index import load_av
 from structgstream.errors import StorageError
-from structgstream.whole_files import give_name, partial_path
 
 BT709, LIMITED_RANGE, FULL_RANGE = 1, 1, 2  # values of ISO/IEC 23091-2 and of libavutil
 BICUBIC, ACCURATE_ROUNDING = 0x4, 0x40000

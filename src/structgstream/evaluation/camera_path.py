@@ -13,7 +13,7 @@ from structgstream.errors import ConfigError
 ORBIT_SHARE = 0.5  # of the distance to the nearest cameras; farther out, surfaces were seen from one side only
 NEIGHBOURS = 3
 ARC_HALF_ANGLE = math.radians(50.0)
-LEAST_NEAR_SHARE = 0.01
+MIN_NEAR_SHARE = 0.01
 """A free camera's near plane is at least this share of its nearest camera's, because nearer content is blurred."""
 
 
@@ -105,7 +105,7 @@ def free_near(rig: CameraRig, eye: Tensor) -> float:
     """
     distances = (rig.centers - eye).norm(dim=1)
     near = list(rig.cameras.values())[int(distances.argmin())].near
-    return max(near - float(distances.min()), LEAST_NEAR_SHARE * near)
+    return max(near - float(distances.min()), MIN_NEAR_SHARE * near)
 
 
 def central_camera(rig: CameraRig) -> str:

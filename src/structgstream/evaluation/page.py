@@ -6,9 +6,9 @@ from html import escape
 from pathlib import Path
 from urllib.parse import quote
 
-from structgstream.evaluation.png import write_png
+from structgstream.atomic_files import atomic_write
+from structgstream.evaluation.pictures import write_png
 from structgstream.evaluation.worst import Crop
-from structgstream.whole_files import write_whole
 
 PAGE, FOLDER = "index.html", "worst"
 HEADINGS = {"changed": "Worst on changed pixels", "ghosts": "Most ghosts"}
@@ -57,7 +57,7 @@ def write_page(folder: Path, crops: Sequence[Crop], *, title: str, pictures: Seq
             parts += [f"<h2>{heading}</h2><p>Truth, rendering, difference times four.</p>", *figures]
     parts += [f"<p><img class=wide src='{quote(name)}' alt='{escape(name)}'>" for name in pictures]
     parts.append("<p>Every number: <a href='report.json'>report.json</a></html>\n")
-    write_whole(folder / PAGE, "\n".join(parts).encode(), called="The page", new_folder=True, sync=False)
+    atomic_write(folder / PAGE, "\n".join(parts).encode(), called="The page", new_folder=True, sync=False)
 
 
 def _figure(name: str, crop: Crop) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from structgstream.whole_files import write_whole
+from structgstream.atomic_files import atomic_write
 
 
 @dataclass(frozen=True)
@@ -235,7 +235,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     Raises:
         StorageError: the file cannot be written.
     """
-    write_whole(path, json_text(content).encode(), new_folder=True)
+    atomic_write(path, json_text(content).encode(), new_folder=True)
 
 
 def json_text(content: Mapping[str, Any]) -> str:

@@ -14,11 +14,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from structgstream.atomic_files import atomic_write, side_path
 from structgstream.errors import StorageError
-from structgstream.whole_files import side_path, write_whole
 
 if TYPE_CHECKING:
-    from structgstream.frame_report import FrameReport
+    from structgstream.session.frame_report import FrameReport
 
 
 RENAMED_COUNTS = {
@@ -53,7 +53,7 @@ def begin_log(stream: Path, *, frames: int = 0) -> None:
     """
     check_side_files(stream)
     entries = [entry for index, entry in sorted(read_log(stream).items()) if index < frames]
-    write_whole(log_path(stream), _lines(entries), called="The log")
+    atomic_write(log_path(stream), _lines(entries), called="The log")
 
 
 def check_side_files(stream: Path) -> None:

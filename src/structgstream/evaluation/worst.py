@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.evaluation.masks import changed_pixels
-from structgstream.evaluation.metrics import squared_errors
+from structgstream.evaluation.metrics import changed_pixels, squared_errors
 from structgstream.evaluation.pictures import side_by_side
 from structgstream.evaluation.report import FrameScores, Scores
 
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
 Reason = Literal["changed", "ghosts"]
 REASONS: tuple[Reason, ...] = ("changed", "ghosts")
 MOST = 3
-LEAST_SHARE = 0.001
+MIN_SHARE = 0.001
 """Smallest share of changed pixels over which a PSNR is meaningful."""
 WINDOW_SHARE = 0.25
 """Side of a window, as a share of the picture's longer side."""
@@ -32,7 +31,7 @@ WINDOW_SHARE = 0.25
 def badness(scores: Scores, reason: Reason) -> float | None:
     """Measure of a picture's error, larger is worse; None if it is not bad for this reason."""
     if reason == "changed":
-        few = scores.psnr_changed is None or scores.changed_share < LEAST_SHARE
+        few = scores.psnr_changed is None or scores.changed_share < MIN_SHARE
         return None if few or scores.psnr_changed is None else -scores.psnr_changed
     return (scores.ghost_share or 0.0) * (scores.disoccluded_share or 0.0) or None
 

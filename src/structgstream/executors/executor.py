@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import Protocol
 
 from structgstream.errors import ConfigError
-from structgstream.executors.task import Ending, Task
+from structgstream.executors.task import Task, TaskResult
 
 
 class Executor(Protocol):
@@ -31,7 +31,7 @@ class Executor(Protocol):
         """Marks a task as done that was not submitted, for the tasks that depend on it."""
         ...
 
-    def wait(self, seconds: float) -> Sequence[Ending]:
+    def wait(self, seconds: float) -> Sequence[TaskResult]:
         """Starts tasks that are ready, waits up to ``seconds`` for a task to end, and returns the results."""
         ...
 
@@ -85,7 +85,7 @@ class Engine(Protocol):
         """Starts a task; there must be room for it."""
         ...
 
-    def ended(self, seconds: float) -> list[Ending]:
+    def ended(self, seconds: float) -> list[TaskResult]:
         """Waits up to ``seconds`` for a task to end; returns the results of all that have ended."""
         ...
 
@@ -152,7 +152,7 @@ class TaskQueue:
                 del self._missing[follower]
                 self._ready.append(follower)
 
-    def wait(self, seconds: float) -> Sequence[Ending]:
+    def wait(self, seconds: float) -> Sequence[TaskResult]:
         """See :meth:`Executor.wait`."""
         self._begin()
         if not self._running:

@@ -13,8 +13,8 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import IO
 
-from structgstream.executors.process import CommandProcess, opened_log, tail_of, waited_for
-from structgstream.executors.task import PYTHON, Ending, Task
+from structgstream.executors.local import CommandProcess, opened_log, tail_of, waited_for
+from structgstream.executors.task import PYTHON, Task, TaskResult
 
 WAIT_SECONDS = 3600.0
 INTERRUPTED = 130
@@ -41,7 +41,7 @@ class InlineEngine:
         """See ``Engine.start``; it runs in :meth:`ended`."""
         self._next = task
 
-    def ended(self, seconds: float) -> list[Ending]:
+    def ended(self, seconds: float) -> list[TaskResult]:
         """See ``Engine.ended``; returns when the task has ended, regardless of ``seconds``."""
         task, self._next = self._next, None
         if task is None:
@@ -50,14 +50,14 @@ class InlineEngine:
             return [_in_a_process(task)]
         begun = time.monotonic()
         status, output = _called(task.command[2], list(task.command[3:]), task.environment, log=task.log)
-        return [Ending(task.name, status, time.monotonic() - begun, output=output)]
+        return [TaskResult(task.name, status, time.monotonic() - begun, output=output)]
 
     def stop(self) -> None:
         """See ``Engine.stop``."""
         self._next = None
 
 
-def _in_a_process(task: Task) -> Ending:
+def _in_a_process(task: Task) -> TaskResult:
     process = CommandProcess(task, environment={})
     try:
         while True:

@@ -7,7 +7,7 @@ from typing import Literal
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.inline import InlineEngine
 from structgstream.executors.local import LocalEngine
-from structgstream.executors.places import shared_out
+from structgstream.executors.task import allocate_slots
 
 ExecutorName = Literal["inline", "local", "ray"]
 
@@ -43,12 +43,12 @@ def open_executor(options: ExecutorOptions, *, cores: int, gpus: int = 0) -> Tas
         ConfigError: there is less than one worker or thread, or the cluster cannot be joined.
         MissingExtraError: a package is missing.
     """
-    places = shared_out(workers=options.workers, cores=cores, gpus=gpus, threads=options.threads)
+    slots = allocate_slots(workers=options.workers, cores=cores, gpus=gpus, threads=options.threads)
     if options.name == "inline":
         return TaskQueue(InlineEngine())
     if options.name == "local":
-        return TaskQueue(LocalEngine(places))
+        return TaskQueue(LocalEngine(slots))
     from structgstream.executors.ray_cluster import RayEngine, RayOptions
 
-    threads = options.threads or (1 if options.address else places[0].threads)
-    return TaskQueue(RayEngine(RayOptions(options.address, len(places), threads)))
+    threads = options.threads or (1 if options.address else slots[0].threads)
+    return TaskQueue(RayEngine(RayOptions(options.address, len(slots), threads)))

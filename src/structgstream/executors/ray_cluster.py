@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from structgstream.errors import ConfigError, MissingExtraError
-from structgstream.executors.places import thread_environment
 from structgstream.executors.ray_worker import CommandKilled, run_task
-from structgstream.executors.task import Ending, Task
+from structgstream.executors.task import Task, TaskResult, thread_environment
 
 OLDEST = (2, 52)
 OBJECT_STORE_BYTES = 80 * 2**20
@@ -103,18 +102,18 @@ class RayEngine:
         environment = thread_environment(self._options.cores)
         self._pending[options.remote(sent, environment)] = (task.name, time.monotonic())
 
-    def ended(self, seconds: float) -> list[Ending]:
+    def ended(self, seconds: float) -> list[TaskResult]:
         """See ``Engine.ended``."""
         ready, _ = self._ray.wait(list(self._pending), num_returns=1, timeout=seconds)
         return [self._ending(reference) for reference in ready]
 
-    def _ending(self, reference: Any) -> Ending:
+    def _ending(self, reference: Any) -> TaskResult:
         name, begun = self._pending.pop(reference)
         try:
             return self._ray.get(reference)
         except self._ray.exceptions.RayError as error:
             reason = str(getattr(error, "cause", None) or error)
-            return Ending(name, -1, time.monotonic() - begun, output=reason)
+            return TaskResult(name, -1, time.monotonic() - begun, output=reason)
 
     def stop(self) -> None:
         """See ``Engine.stop``; a cluster that was joined continues without this process."""

@@ -3,8 +3,8 @@
 
 from collections.abc import Mapping
 
-from structgstream.executors.process import CommandProcess, waited_for
-from structgstream.executors.task import Ending, Task
+from structgstream.executors.local import CommandProcess, waited_for
+from structgstream.executors.task import Task, TaskResult
 
 POLL_SECONDS = 1.0
 
@@ -13,7 +13,7 @@ class CommandKilled(Exception):
     """A signal ended a command; Ray restarts the task."""
 
 
-def run_task(task: Task, environment: Mapping[str, str]) -> Ending:
+def run_task(task: Task, environment: Mapping[str, str]) -> TaskResult:
     """Runs the command in a process of this machine, which is killed when this process ends.
 
     Raises:

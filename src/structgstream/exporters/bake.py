@@ -28,7 +28,7 @@ from structgstream.scene.render import draw
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
 
-LEAST_OPACITY = 1.0 / 255.0
+MIN_OPACITY = 1.0 / 255.0
 """Opacity below which a rasteriser does not draw a Gaussian."""
 
 
@@ -156,7 +156,7 @@ class _Sums:
         """The averages and the fit."""
         counted = self.seen if self.baking.opacity == "seen" else self.drawn
         opacities = self.opacity / counted.clamp(min=1.0)
-        rows = torch.nonzero((self.drawn > 0) & (self.weight > 0) & (opacities >= LEAST_OPACITY))[:, 0]
+        rows = torch.nonzero((self.drawn > 0) & (self.weight > 0) & (opacities >= MIN_OPACITY))[:, 0]
         if not len(rows):
             raise StreamError("No training camera sees any Gaussian of the scene, so there is nothing to export.")
         weight = self.weight[rows]

@@ -16,6 +16,9 @@ from structgstream.kernels.backend import Backend
 from structgstream.scene.harmonics import sh_basis
 from structgstream.similarity import Similarity
 
+HALF_TURN_SIGNS = (1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
+"""Signs of the spherical harmonics up to degree 3 under half a turn around x."""
+
 
 @dataclass(frozen=True)
 class BakedGaussians:
@@ -71,3 +74,18 @@ class BakedGaussians:
         """The same Gaussians in the capture's units; axes do not change, because a similarity has no rotation."""
         means = similarity.inverse_points(self.means.cpu().double()).to(self.means)
         return replace(self, means=means, scales=self.scales / similarity.scale)
+
+    def y_up(self) -> "BakedGaussians":
+        """The same Gaussians with y up and z back instead of y down and z forward: half a turn around x."""
+        signs = self.sh.new_tensor(HALF_TURN_SIGNS[: self.sh.shape[1]])
+        return replace(
+            self,
+            means=self.means * self.means.new_tensor((1.0, -1.0, -1.0)),
+            quats=self.quats * self.quats.new_tensor((1.0, 1.0, -1.0, -1.0)),
+            sh=self.sh * signs[:, None],
+        )
+
+    def by_importance(self) -> Tensor:
+        """Indices ``[N]`` by volume times opacity, largest first."""
+        importance = self.scales.log().sum(1) + self.opacities.log()
+        return importance.argsort(descending=True, stable=True)

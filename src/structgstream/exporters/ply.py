@@ -6,12 +6,15 @@ constant colour coefficients ``f_dc``, the others ``f_rest`` (all of red, then g
 opacity, logarithms of the scales, and a quaternion wxyz.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
 from structgstream.exporters.baked_gaussians import BakedGaussians
+from structgstream.exporters.formats import MAX_SH_DEGREE, FrameOptions
 
-LEAST_OPACITY = 1e-6  # A logit of 0 or 1 is not finite.
+MIN_OPACITY = 1e-6  # A logit of 0 or 1 is not finite.
 
 
 def properties(degree: int) -> list[str]:
@@ -22,8 +25,11 @@ def properties(degree: int) -> list[str]:
     return ["x", "y", "z", "nx", "ny", "nz", *colors, "opacity", *shape]
 
 
-def ply_bytes(gaussians: BakedGaussians) -> bytes:
+def ply_bytes(gaussians: BakedGaussians, options: FrameOptions | None = None) -> bytes:
     """A whole ``.ply`` file, in the units and axes of ``gaussians``."""
+    if options is not None and options.pad_sh:
+        missing = (MAX_SH_DEGREE + 1) ** 2 - gaussians.sh.shape[1]
+        gaussians = replace(gaussians, sh=torch.nn.functional.pad(gaussians.sh, (0, 0, 0, missing)))
     names = properties(gaussians.degree)
     lines = ["ply", "format binary_little_endian 1.0", "comment axes: x right, y down, z forward"]
     lines += [f"element vertex {len(gaussians)}", *(f"property float {name}" for name in names), "end_header"]
@@ -32,7 +38,7 @@ def ply_bytes(gaussians: BakedGaussians) -> bytes:
         torch.zeros_like(gaussians.means),
         gaussians.sh[:, 0],
         gaussians.sh[:, 1:].transpose(1, 2).flatten(1),
-        gaussians.opacities.clamp(LEAST_OPACITY, 1.0 - LEAST_OPACITY).logit()[:, None],
+        gaussians.opacities.clamp(MIN_OPACITY, 1.0 - MIN_OPACITY).logit()[:, None],
         gaussians.scales.log(),
         gaussians.quats,
     ]

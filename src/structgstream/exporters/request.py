@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Resolves and checks the options of an export: format, destination and frames."""
+"""Resolves the destination, format and frames of an export."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 from structgstream.errors import ConfigError
-from structgstream.exporters.formats import FORMATS, PAGES, Format, PageFormat
+from structgstream.exporters.formats import FORMATS, PAGES, SUFFIXES, Format, FrameOptions, PageFormat
 
 
 def destination(
@@ -32,8 +32,8 @@ def destination(
         raise ConfigError("--frame names one frame, --frames the first and the last; give one of them.")
     if output is None:
         format = format or "ply"
-        if format == "html":
-            return stream.with_suffix(".html"), format
+        if format == "html" or (format in FORMATS and FORMATS[format].all_frames and frame is None):
+            return stream.with_suffix(f".{format}"), format
         name = f"{stream.stem}-{format}" if frame is None else f"{stream.stem}-{frame}.{format}"
         return stream.with_name(name), format
     ending = output.suffix.lower().lstrip(".")
@@ -41,55 +41,30 @@ def destination(
         raise ConfigError(f"a page is a file whose name ends in .html, unlike {output.name}.")
     if format == "site" or output.is_dir() or not ending:
         return output, format or "ply"
-    for known in (*FORMATS, "html"):
-        if ending == known:
-            if format not in (None, known):
-                raise ConfigError(f"the name {output.name} asks for .{ending}, and --format for {format}.")
-            return output, known
+    if ending == "zip":
+        format = format or "ply"
+        if FORMATS[format].all_frames:
+            raise ConfigError(f"a .{format} file contains all frames; name it {output.stem}.{format}, without a zip.")
+        return output, format
+    known = "html" if ending == "html" else SUFFIXES.get(ending)
+    if known is not None:
+        if format not in (None, known):
+            raise ConfigError(f"the name {output.name} asks for .{ending}, and --format for {format}.")
+        return output, known
     if format is None:
         known = ", ".join((*FORMATS, *PAGES))
         raise ConfigError(f"there is no format .{ending}; there are {known}. For a folder of this name add --format.")
     return output, format
 
 
-def check_page(*, frame: int | None, frames: tuple[int, int] | None, sh_degree: int | None, low_pass: float) -> None:
+def check_page(*, frame: int | None, frames: tuple[int, int] | None, options: FrameOptions) -> None:
     """Check that no options of other formats are given for a page.
 
     Raises:
         ConfigError: one is given.
     """
-    if frame is not None or frames is not None or sh_degree is not None or low_pass:
-        raise ConfigError(
-            "a page contains the whole stream; --frame, --frames, --sh-degree and --low-pass are for other formats."
-        )
-
-
-def check_degree(degree: int | None, format: Format) -> int | None:
-    """The degree to bake, or None for the default.
-
-    Raises:
-        ConfigError: there is no such degree, or the format does not support it.
-    """
-    from structgstream.scene.harmonics import MAX_DEGREE
-
-    if degree is not None and not 0 <= degree <= MAX_DEGREE:
-        raise ConfigError(f"--sh-degree {degree} is not one of 0 to {MAX_DEGREE}.")
-    if format == "splat":
-        if degree:
-            raise ConfigError(f"a .splat file has one colour per Gaussian; --sh-degree {degree} needs ply or spz.")
-        return 0
-    return degree
-
-
-def check_low_pass(variance: float) -> float:
-    """The variance, squared training pixels, by which exported Gaussians are widened.
-
-    Raises:
-        ConfigError: it is below 0, above 1 or not a number.
-    """
-    if not 0.0 <= variance <= 1.0:
-        raise ConfigError(f"--low-pass {variance:g} is no variance in squared training pixels; expected 0 to 1.")
-    return variance
+    if frame is not None or frames is not None or options != FrameOptions():
+        raise ConfigError("a page contains the whole stream; choices of frames and of Gaussians are for other formats.")
 
 
 def choose_frames(
@@ -125,5 +100,6 @@ def choose_frames(
 
 
 def is_one_file(output: Path) -> bool:
-    """Whether ``output`` is a file for one frame, not a folder."""
-    return output.suffix.lower().lstrip(".") in FORMATS and not output.is_dir()
+    """Whether ``output`` is a file for one frame."""
+    format = SUFFIXES.get(output.suffix.lower().lstrip("."))
+    return format is not None and not FORMATS[format].all_frames and not output.is_dir()

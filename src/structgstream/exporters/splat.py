@@ -11,18 +11,13 @@ from torch import Tensor
 
 from structgstream.errors import ConfigError
 from structgstream.exporters.baked_gaussians import BakedGaussians
+from structgstream.exporters.formats import FrameOptions
 from structgstream.scene.harmonics import Y0
 
 ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 
-def by_importance(gaussians: BakedGaussians) -> BakedGaussians:
-    """Sorted by volume times opacity, largest first, so that a partly loaded file shows the largest Gaussians."""
-    importance = gaussians.scales.log().sum(1) + gaussians.opacities.log()
-    return gaussians.select(importance.argsort(descending=True, stable=True))
-
-
-def splat_bytes(gaussians: BakedGaussians) -> bytes:
+def splat_bytes(gaussians: BakedGaussians, options: FrameOptions | None = None) -> bytes:
     """A whole ``.splat`` file, in the units and axes of ``gaussians``.
 
     Raises:
@@ -33,7 +28,7 @@ def splat_bytes(gaussians: BakedGaussians) -> bytes:
             f"A .splat file has one colour per Gaussian, got spherical harmonics of degree {gaussians.degree}; "
             "bake with degree 0."
         )
-    gaussians = by_importance(gaussians)
+    gaussians = gaussians.select(gaussians.by_importance())  # a partly loaded file shows the largest ones
     rows = np.empty(len(gaussians), ROW)
     rows["mean"] = gaussians.means.cpu().numpy()
     rows["scale"] = gaussians.scales.cpu().numpy()

@@ -12,8 +12,8 @@ from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.header import unpack_header
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet
 from structgstream.errors import ConfigError, StreamError
-from structgstream.presets import StreamConfig, from_json
 from structgstream.scene.scene import Scene
+from structgstream.session.presets import StreamConfig, from_json
 
 
 @dataclass(frozen=True)

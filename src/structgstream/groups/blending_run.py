@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import cast
 
+from structgstream.atomic_files import atomic_write
 from structgstream.codec.container.records import PREFIX, read_record
 from structgstream.codec.header import unpack_header
 from structgstream.codec.packets import StreamHeader
@@ -22,9 +23,8 @@ from structgstream.groups.blending import Border, GroupBlender
 from structgstream.groups.seam_blend import OWN_FRAMES
 from structgstream.groups.segment_file import open_segment
 from structgstream.kernels.backend import BackendName, select_backend
-from structgstream.whole_files import write_whole
 
-MOST_GROUPS = 8
+MAX_GROUPS = 8
 """Largest number of groups in a run: a process takes two seconds to start, and reports its result when it ends."""
 
 
@@ -61,7 +61,7 @@ def runs_of(lengths: Sequence[int], *, workers: int) -> list[range]:
         lengths: number of frames of each group, in order.
         workers: number of processes; there are at least as many runs if groups are long enough.
     """
-    size = min(MOST_GROUPS, -(-(len(lengths) - 1) // workers))
+    size = min(MAX_GROUPS, -(-(len(lengths) - 1) // workers))
     runs, begin = [], 1
     for number in range(2, len(lengths)):
         if number - begin >= size and lengths[number - 1] >= OWN_FRAMES:
@@ -98,7 +98,7 @@ def main(arguments: list[str]) -> None:
     blender.follow(before)
     before.close()
     records = b"".join(_records(blender, [Path(path) for path in paths]))
-    write_whole(Path(output), json.dumps([asdict(border) for border in borders]).encode() + b"\n" + records)
+    atomic_write(Path(output), json.dumps([asdict(border) for border in borders]).encode() + b"\n" + records)
 
 
 if __name__ == "__main__":

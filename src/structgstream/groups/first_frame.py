@@ -143,7 +143,7 @@ class _Rounds:
                 first_birth=self._first_birth(current.free),
                 floor=self.floor,
                 room=config.patching.max_free - len(split.static.free),
-                least_pixels=config.motion.LEAST_PIXELS,
+                min_pixels=config.motion.MIN_PIXELS,
                 config=config.spawn,
                 backend=backend,
             )
@@ -185,7 +185,7 @@ class _Rounds:
             views,
             find_active_tiles(split, views, config=config.motion, backend=fit.backend),
             floor=self.floor,
-            least_pixels=config.motion.LEAST_PIXELS,
+            min_pixels=config.motion.MIN_PIXELS,
             births=config.spawn.rules,
             config=self.start.lost_anchors,
             backend=fit.backend,

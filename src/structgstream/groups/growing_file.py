@@ -5,8 +5,8 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
+from structgstream.atomic_files import give_name, open_exclusive, partial_path
 from structgstream.errors import StorageError
-from structgstream.whole_files import give_name, open_alone, partial_path
 
 
 def name_finished(path: Path) -> None:
@@ -35,7 +35,7 @@ class GrowingFile:
     def __init__(self, path: Path, *, keep: int = 0) -> None:
         self.path, self.partial = path, partial_path(path)
         try:
-            self._file = open_alone(self.partial, of=path, buffering=0)
+            self._file = open_exclusive(self.partial, of=path, buffering=0)
             try:
                 self._begin(keep)
             except BaseException:

@@ -8,19 +8,19 @@ from itertools import accumulate
 from pathlib import Path
 from typing import BinaryIO
 
+from structgstream.atomic_files import atomic_file
 from structgstream.codec.container.index import pack_index
 from structgstream.codec.reader import open_stream
 from structgstream.errors import ConfigError, StreamError, TaskError
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.local import LocalEngine
-from structgstream.executors.places import shared_out
+from structgstream.executors.task import allocate_slots
 from structgstream.groups.blending import Border, GroupBlender
 from structgstream.groups.blending_run import BlendedRun, header_of, run_task, runs_of
 from structgstream.groups.segment_file import Segment, open_segment
 from structgstream.kernels.backend import Backend
 from structgstream.owned_folders import own_folder, remove_own
 from structgstream.training.online.patching import IDS_PER_FRAME
-from structgstream.whole_files import whole_file
 
 POLL_SECONDS = 0.2
 PURPOSE = "hand-over of a join"
@@ -64,7 +64,7 @@ def join_segments(
     # A blended stream is checked as a single group.
     ends = accumulate(frames for _, _, frames in segments)
     firsts = [0, *ends][:-1] if backend is None else [0]
-    with whole_file(output, check=(lambda path: check_births(path, firsts)) if check else None) as file:
+    with atomic_file(output, check=(lambda path: check_births(path, firsts)) if check else None) as file:
         written = _Written(file)
         written.add(segments[0][1])
         if backend is not None and workers > 1 and len(runs) > 1:
@@ -98,7 +98,7 @@ def _blended(
     """The result of each of ``runs``, in order, computed by ``workers`` processes."""
     outputs = [folder / f"run-{number}" for number in range(len(runs))]
     done = set[str]()
-    with TaskQueue(LocalEngine(shared_out(workers=workers, cores=workers))) as queue:
+    with TaskQueue(LocalEngine(allocate_slots(workers=workers, cores=workers))) as queue:
         for run, output in zip(runs, outputs):
             queue.submit(run_task(paths[run.start - 1 : run.stop], output, device=backend.name))
         for output in outputs:

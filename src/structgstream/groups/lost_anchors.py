@@ -37,7 +37,7 @@ class LostAnchorConfig:
     feature_bandwidth: float = 0.5
     """A neighbour's weight is a Gaussian of the root mean square difference of features; this is its standard
     deviation, in standard deviations of the features."""
-    least_pixels: float = 3.0
+    min_pixels: float = 3.0
     """Anchors that would move by no more pixels than this are not relocated."""
 
 
@@ -48,7 +48,7 @@ def relocate_lost_anchors(
     active_tiles: Mapping[int, ActiveTiles],
     *,
     floor: ResidualFloor | None,
-    least_pixels: float,
+    min_pixels: float,
     births: SpawnRules,
     config: LostAnchorConfig,
     backend: Backend,
@@ -61,7 +61,7 @@ def relocate_lost_anchors(
         views: views of the frame.
         active_tiles: by view index, with up-to-date renderings; views without an entry are skipped.
         floor: baseline residuals of frame 0; None for none.
-        least_pixels: views in which an anchor covers fewer pixels do not count.
+        min_pixels: views in which an anchor covers fewer pixels do not count.
         births: thresholds of the outlier test.
         config: configuration of the relocation.
         backend: the compute back-end.
@@ -73,14 +73,14 @@ def relocate_lost_anchors(
     if not config.enabled or pixel is None or len(first) < 2:
         return dynamic, 0
     with torch.no_grad():
-        outliers = _outlier_anchors(dynamic, views, active_tiles, floor, least_pixels, births, backend)
+        outliers = _outlier_anchors(dynamic, views, active_tiles, floor, min_pixels, births, backend)
         if not outliers.any() or outliers.all():
             return dynamic, 0
         positions = dynamic.anchors.positions
         displacements = positions - first.positions
         rows = outliers.nonzero()[:, 0]
         expected = _displacements_of_neighbours(first, displacements, rows, ~outliers, config)
-        far = (expected - displacements[rows]).norm(dim=1) > config.least_pixels * pixel
+        far = (expected - displacements[rows]).norm(dim=1) > config.min_pixels * pixel
         rows, expected = rows[far], expected[far]
         positions = positions.index_copy(0, rows, first.positions[rows] + expected)
     return replace(dynamic, anchors=replace(dynamic.anchors, positions=positions)), len(rows)
@@ -91,7 +91,7 @@ def _outlier_anchors(
     views: Sequence[View],
     active_tiles: Mapping[int, ActiveTiles],
     floor: ResidualFloor | None,
-    least_pixels: float,
+    min_pixels: float,
     births: SpawnRules,
     backend: Backend,
 ) -> Tensor:
@@ -113,7 +113,7 @@ def _outlier_anchors(
         wrong.append(sums[: len(dynamic.anchors), 1])
     if not coverage:
         return torch.zeros(len(dynamic.anchors), dtype=torch.bool, device=dynamic.anchors.positions.device)
-    return outlier_mask(torch.stack(coverage), torch.stack(wrong), least_pixels=least_pixels, rules=births)
+    return outlier_mask(torch.stack(coverage), torch.stack(wrong), min_pixels=min_pixels, rules=births)
 
 
 def _displacements_of_neighbours(

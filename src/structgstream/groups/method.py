@@ -10,15 +10,15 @@ from torch import Tensor
 
 from structgstream.cameras import CameraRig
 from structgstream.errors import ConfigError
-from structgstream.frames import LEAST_CAMERAS, MultiViewFrame
+from structgstream.frames import MIN_CAMERAS, MultiViewFrame
 from structgstream.groups.first_frame import GroupStartConfig, fit_group_start
 from structgstream.kernels.backend import Backend
-from structgstream.pipeline import FrameTask, Past
-from structgstream.presets import StreamConfig
-from structgstream.rate_control import with_rate_control
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
-from structgstream.struct_gstream import FrameZeroContext, StructGStream
+from structgstream.session.pipeline import FrameTask, Past
+from structgstream.session.presets import StreamConfig
+from structgstream.session.rate_control import with_rate_control
+from structgstream.session.struct_gstream import FrameZeroContext, StructGStream
 from structgstream.training.online.config import OnlineConfig
 from structgstream.training.online.fit import held
 from structgstream.training.online.preprocess import FramePictures, preprocess
@@ -136,7 +136,7 @@ class GroupMethod:
 
     def _begin(self, entry: GroupEntry, past: Past[Scene, FrameZeroContext], task: FrameTask) -> FitResult[Scene]:
         pictures, device = task.pictures, task.backend.device
-        if len(pictures.views) < LEAST_CAMERAS:
+        if len(pictures.views) < MIN_CAMERAS:
             return held(with_displacements(on_device(past.state, device), entry.displacements.to(device)))
         return fit_group_start(
             on_device(past.state, device),

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from structgstream.atomic_files import partial_path
 from structgstream.codec.container.byte_source import check_room, free_bytes
 from structgstream.codec.container.index import INDEX_ENTRY, Period, pack_index
 from structgstream.codec.container.records import PREFIX, RecordType, packed, read_record
@@ -16,7 +17,6 @@ from structgstream.groups.base import GroupBase
 from structgstream.groups.growing_file import GrowingFile, name_finished
 from structgstream.groups.segment_file import Segment, SegmentIdentity, open_segment
 from structgstream.scene.scene import Scene
-from structgstream.whole_files import partial_path
 
 _TYPES = {PacketKind.KEY: RecordType.KEY, PacketKind.DELTA: RecordType.DELTA}
 _KINDS = {record: kind for kind, record in _TYPES.items()}

@@ -39,7 +39,7 @@ from structgstream.training.residuals import apply_camera_color
 from structgstream.training.result import Stopwatch
 from structgstream.training.views import View, area_mean, as_picture, blackened, training_views
 
-FEWEST_HALVED, MOST_CAMERAS = 6, 14
+FEWEST_HALVED, MAX_CAMERAS = 6, 14
 """A frame uses half of a rig's cameras if that number is within these bounds."""
 
 
@@ -51,7 +51,7 @@ class TrackConfig:
     """Size of the pictures relative to those of the stream."""
     cameras: int | None = None
     """Approximate upper bound of the cameras used in a frame. Of a larger rig every second or third camera is used, in
-    turn. None: half of the cameras (:data:`FEWEST_HALVED`, :data:`MOST_CAMERAS`)."""
+    turn. None: half of the cameras (:data:`FEWEST_HALVED`, :data:`MAX_CAMERAS`)."""
     picture_scale: float = 0.25
     """Scale at which coverage is computed, relative to these pictures."""
     flow: FlowConfig = FlowConfig(apart=True, far=True)
@@ -104,7 +104,7 @@ class Tracker:
     def stride(self, cameras: int) -> int:
         """Distance between used cameras in a rig of ``cameras`` cameras: 1 uses all of them."""
         half = -(-cameras // 2)
-        usual = min(half if half >= FEWEST_HALVED else cameras, MOST_CAMERAS)
+        usual = min(half if half >= FEWEST_HALVED else cameras, MAX_CAMERAS)
         most = usual if self.config.cameras is None else self.config.cameras
         return -(-cameras // max(most, 2))
 
@@ -171,7 +171,7 @@ def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tra
             votes = torch.stack([entry.votes for entry in seen]).sum(0)
             # A moving primitive stays dynamic with a single vote, because not all cameras are used in each frame.
             continued = (past.velocities != 0).any(1) & (votes > 0)
-            moving = (votes >= tracker.motion.LEAST_VIEWS) | continued
+            moving = (votes >= tracker.motion.MIN_VIEWS) | continued
             moving[: len(scene.anchors)] |= _occluded(tracker.motion, scene, seen, moving[: len(scene.anchors)])
             primitives = moving.nonzero()[:, 0]
         with watch.stage("flow between pictures"):
@@ -230,7 +230,7 @@ def _measure_view(tracker: Tracker, scene: Scene, view: View, change: PictureCha
     sums *= _pixel_area(tracker, view, size)
     moved = sum_by_primitive(sums, primitives, scene)
     total, changed = moved[:, 3], moved[:, 7]
-    votes = (changed > motion.LEAST_PIXELS) & (changed > motion.LEAST_SHARE * total)
+    votes = (changed > motion.MIN_PIXELS) & (changed > motion.MIN_SHARE * total)
     of_view = ViewChange(float(change.changed.float().mean()), 0.0, repeated=change.repeated)
     return _ViewEvidence(view, tiles, gaussians, primitives, votes, sums[:, 3], moved[:, :7], of_view)
 
@@ -252,10 +252,10 @@ def _occluded(motion: MotionConfig, scene: Scene, seen: Sequence[_ViewEvidence],
         of_view = torch.zeros(len(entry.votes), dtype=torch.bool, device=moving.device)
         of_view[entry.primitives] = True
         drawn += of_view[:anchors]
-        shown += entry.flows[:anchors, 3] > motion.LEAST_PIXELS
-    among = ((drawn >= motion.LEAST_VIEWS) | (shown >= motion.LEAST_VIEWS)).nonzero()[:, 0]
+        shown += entry.flows[:anchors, 3] > motion.MIN_PIXELS
+    among = ((drawn >= motion.MIN_VIEWS) | (shown >= motion.MIN_VIEWS)).nonzero()[:, 0]
     occluded[among] = occluded_dynamic(
-        scene.anchors.positions[among], moving[among], shown[among] >= motion.LEAST_VIEWS, share=motion.occluded_share
+        scene.anchors.positions[among], moving[among], shown[among] >= motion.MIN_VIEWS, share=motion.occluded_share
     )
     return occluded
 

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
+from structgstream.atomic_files import partial_path
 from structgstream.data.denoising import denoised
 from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError, StorageError
@@ -19,14 +20,13 @@ from structgstream.groups.segment_sink import GroupSoFar, SegmentSink, resume_se
 from structgstream.groups.track_file import TrackStart, open_track
 from structgstream.groups.track_pass import dense
 from structgstream.kernels.backend import Backend
-from structgstream.pipeline import Pipeline
 from structgstream.recorder import LogExtras, Run, record
 from structgstream.scene.scene import Scene
-from structgstream.struct_gstream import FrameZeroContext, stream_pipeline
+from structgstream.session.pipeline import Pipeline
+from structgstream.session.struct_gstream import FrameZeroContext, stream_pipeline
 from structgstream.training.result import StepListener
-from structgstream.whole_files import partial_path
 
-LEAST_PIXELS = 0.5
+MIN_PIXELS = 0.5
 """A primitive whose tracked displacement is at most this, in pixels of a median camera, counts as not displaced."""
 
 
@@ -148,7 +148,7 @@ def _run(
 def _entry(start: TrackStart, base: GroupBase, source: FrameSource) -> GroupEntry:
     displacements, velocities = dense(base.scene(), start, step=base.position_step)
     # Smaller displacements are within the tracking error; these primitives retain frame 0's exact values.
-    least = LEAST_PIXELS / base.config.online.rounding.at_quality("position_pixels") * base.position_step
+    least = MIN_PIXELS / base.config.online.rounding.at_quality("position_pixels") * base.position_step
     displacements[(displacements.abs() <= least).all(1)] = 0.0
 
     @cache

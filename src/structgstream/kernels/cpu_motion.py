@@ -125,8 +125,8 @@ def sweep(
     farthest: Tensor,
     *,
     planes: int,
-    least_supports: int,
-    most_contradictions: float,
+    min_supports: int,
+    max_contradictions: float,
 ) -> Swept:
     """See ``reference_motion.sweep``."""
     assert len(pixels) == len(farthest), (pixels.shape, farthest.shape)
@@ -141,7 +141,7 @@ def sweep(
         slot.K[:] = view.K.reshape(-1).tolist()
         slot.near_plane = view.near
     rays = pixels.to(torch.int64).contiguous(), farthest.float().contiguous(), len(pixels)
-    rules = planes, least_supports, most_contradictions
+    rules = planes, min_supports, max_contradictions
     found = torch.empty(len(pixels)), torch.empty(len(pixels))
     native_library().sgs_sweep(given, len(views), view_index, *rays, *rules, *found, torch.get_num_threads())
     return Swept(*found)

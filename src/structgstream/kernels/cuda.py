@@ -266,8 +266,8 @@ def sweep(
     farthest: Tensor,
     *,
     planes: int,
-    least_supports: int,
-    most_contradictions: float,
+    min_supports: int,
+    max_contradictions: float,
 ) -> Swept:
     """See ``reference_motion.sweep``; float32. Results repeat bit for bit."""
     assert len(pixels) == len(farthest), (pixels.shape, farthest.shape)
@@ -287,7 +287,7 @@ def sweep(
     library.call(
         "sgs_cuda_sweep",
         *(ctypes.addressof(given), len(views), view_index, pixels, farthest, len(pixels)),
-        *(planes, least_supports, most_contradictions, votes, found.depths, found.costs),
+        *(planes, min_supports, max_contradictions, votes, found.depths, found.costs),
         device=farthest.device,
     )
     return found

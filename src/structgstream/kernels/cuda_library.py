@@ -19,9 +19,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from structgstream.atomic_files import give_name
 from structgstream.errors import BackendError
 from structgstream.kernels.native import declare
-from structgstream.whole_files import give_name
 
 CUDA_PROTOTYPES: Mapping[str, tuple[str, str]] = {
     "sgs_cuda_l1_ssim": ("i", "pppiippppppp"),

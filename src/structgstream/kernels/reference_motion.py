@@ -185,8 +185,8 @@ def sweep(
     farthest: Tensor,
     *,
     planes: int,
-    least_supports: int,
-    most_contradictions: float,
+    min_supports: int,
+    max_contradictions: float,
 ) -> Swept:
     """For each ray the depth of least cost among ``planes`` candidates, evenly spaced in inverse depth.
 
@@ -201,8 +201,8 @@ def sweep(
         pixels: ``[P, 2]`` int64, column and row.
         farthest: ``[P]`` depth at which each ray ends; it starts at the view's near plane.
         planes: candidate depths per ray.
-        least_supports: number of supports that a valid point needs.
-        most_contradictions: largest share of contradictions among supports and contradictions of a valid point.
+        min_supports: number of supports that a valid point needs.
+        max_contradictions: largest share of contradictions among supports and contradictions of a valid point.
     """
     own = views[view_index]
     x, y = pixels.unbind(1)
@@ -236,7 +236,7 @@ def sweep(
     share = contradictions / (supports + contradictions).clamp(min=1.0)
     some = supports.clamp(min=1.0)
     costs = difference / some + MISS_COST * share + LONELY_COST / some
-    costs = torch.where((supports >= least_supports) & (share <= most_contradictions), costs, torch.inf)
+    costs = torch.where((supports >= min_supports) & (share <= max_contradictions), costs, torch.inf)
     least, plane = _middle_of_cheapest(costs)
     return Swept(torch.where(least.isfinite(), z.gather(1, plane)[:, 0], 0.0), least)
 

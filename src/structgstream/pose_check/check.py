@@ -9,8 +9,8 @@ Note [Wrong matches]
 ~~~~~~~~~~~~~~~~~~~~
 Of repeated texture, or between cameras far apart, wrong matches fit an epipolar geometry of their own, and a pair of
 right poses is contradicted by up to two thirds of its matches (`examples/throw`, cameras 29 degrees apart). So a pair
-only accuses: points that the other cameras agree on decide (`verdicts.judge`). Pairs of neighbours, which seldom match
-wrongly, are looked at first, and no others where all of them agree.
+only raises a suspicion: points that the other cameras agree on decide (`verdicts.judge`). Pairs of neighbours, which
+seldom match wrongly, are looked at first, and no others where all of them agree.
 """
 
 import logging
@@ -22,9 +22,8 @@ from structgstream.data.calibration import listed
 from structgstream.data.pair_matches import PAIR_SHARE, PairError, PairMatcher, neighbor_errors
 from structgstream.errors import CalibrationError
 from structgstream.frames import MultiViewFrame
-from structgstream.pose_check.evidence import ALL_PAIRS, Evidence, gather, pair_errors
-from structgstream.pose_check.explanations import explain, readings_of
-from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.findings import Finding, explain, readings_of
+from structgstream.pose_check.tracks import ALL_PAIRS, Evidence, gather, pair_errors
 from structgstream.pose_check.verdicts import Verdict, find_suspects, judge
 
 MIN_MATCHES = 100  # of a rig, for a verdict
@@ -60,7 +59,7 @@ class PoseCheck:
 def examine_poses(
     frame: MultiViewFrame, cameras: Mapping[str, Camera], *, matcher: PairMatcher | None = None
 ) -> tuple[Evidence, Verdict]:
-    """Matches of one instant's pictures, and which cameras they say are off.
+    """Matches of one instant's pictures, and which cameras are off by them.
 
     Raises:
         MissingExtraError: cv2 or scipy is not installed.
@@ -88,7 +87,7 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig) -> PoseCheck:
     matcher = PairMatcher(frame.images, masks=frame.masks)
     near = neighbor_errors(cameras, matcher)
     check = _summed({pair: error for pair, error in near.items() if error is not None}, cameras)
-    if check.conclusive and not check.unmatched and not _accused(near, cameras):
+    if check.conclusive and not check.unmatched and not _contradicted(near, cameras):
         return check
     evidence, verdict = examine_poses(frame, cameras, matcher=matcher)
     check = _summed(pair_errors(evidence, cameras), cameras)
@@ -104,13 +103,13 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig) -> PoseCheck:
         _log.warning(
             "The pictures of %s of %d match those of no other camera, so their poses and names are not confirmed; look "
             "at structgstream prepare --check.",
-            listed(check.unmatched, most=12), len(cameras),
+            listed(check.unmatched, limit=12), len(cameras),
         )  # fmt: skip
     off = tuple(cameras) if verdict.suspects.everything else verdict.suspects.off
     return PoseCheck(check.matches, check.share_violating, off, check.unmatched, tuple(findings))
 
 
-def _accused(errors: Mapping[tuple[str, str], PairError | None], cameras: Mapping[str, Camera]) -> bool:
+def _contradicted(errors: Mapping[tuple[str, str], PairError | None], cameras: Mapping[str, Camera]) -> bool:
     """Whether a pair of neighbours contradicts the poses."""
     found = {pair: error for pair, error in errors.items() if error is not None}
     return bool(find_suspects(found, cameras).bad) or any(error.share > PAIR_SHARE for error in found.values())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the pictures of one camera say of its pose and focal length, given points that the other cameras agree on.
+"""Resection of one camera: the pose and focal length that fit points that the other cameras agree on.
 
 Matches that contradict a pose may be wrong matches: of a court or a facade they even fit some epipolar geometry. A
 camera that is off has another pose, or another focal length, which explains what the given one does not; wrong matches
@@ -15,13 +15,13 @@ from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv
 from structgstream.data.matching import project
-from structgstream.pose_check.tracks import AGREE_PIXELS, Tracks
+from structgstream.pose_check.tracks import AGREE_PIXELS, Tracks, pixel_scale
 
-LEAST_SEEN = 8
-LEAST_POINTS = 12
-LEAST_SHARE = 0.4  # of a camera's points that a corrected camera must explain
-LEAST_GAIN = 0.5  # largest share of the error that a correction leaves, if the camera is to be off
-SIMPLE_ENOUGH = 1.1  # of the least error, up to which the correction with fewer causes is taken
+MIN_SEEN = 8
+MIN_POINTS = 12
+MIN_SHARE = 0.4  # of a camera's points that a corrected camera must explain
+MIN_GAIN = 0.5  # largest share of the error that a correction leaves, if the camera is to be off
+SIMPLE_ENOUGH = 1.1  # of the smallest error, up to which the correction with fewer causes is taken
 SIGMAS = 3.0
 TURN, MOVE, FOCAL = slice(0, 3), slice(3, 6), slice(6, 7)
 BY_CHANCE = 3  # points that a pose may explain beyond those that another one does, as it has six degrees of freedom
@@ -34,7 +34,7 @@ class Resection:
 
     Args:
         points: number of points that it explains.
-        kept: number of points that the given camera explains.
+        given_points: number of points that the given camera explains.
         seen: number of points that have a keypoint in its picture.
         given_pixels: median distance of the keypoints of ``points`` to where the given camera sees these.
         corrected_pixels: the same of the corrected one.
@@ -47,7 +47,7 @@ class Resection:
     """
 
     points: int
-    kept: int
+    given_points: int
     seen: int
     given_pixels: float
     corrected_pixels: float
@@ -61,16 +61,18 @@ class Resection:
     @property
     def better(self) -> bool:
         """Whether the corrected camera explains most points, and these much better than the given one."""
-        enough = self.points >= max(LEAST_POINTS, LEAST_SHARE * self.seen)
-        return enough and self.corrected_pixels < LEAST_GAIN * self.given_pixels
+        enough = self.points >= max(MIN_POINTS, MIN_SHARE * self.seen)
+        return enough and self.corrected_pixels < MIN_GAIN * self.given_pixels
 
     @property
     def as_given(self) -> bool:
         """Whether no other camera explains more than the given one, so that what contradicts it are wrong matches."""
-        return not self.better and self.kept >= max(LEAST_SEEN // 2, LEAST_SHARE * self.seen, self.points - BY_CHANCE)
+        return not self.better and self.given_points >= max(
+            MIN_SEEN // 2, MIN_SHARE * self.seen, self.points - BY_CHANCE
+        )
 
     @property
-    def told(self) -> str:
+    def description(self) -> str:
         """By how much the camera is off, as far as that is beyond chance; empty if nothing is."""
         away = []
         if self.degrees > SIGMAS * self.degrees_error:
@@ -106,7 +108,7 @@ class _View:
         return flat * self.focal * np.exp(change[FOCAL]) + self.principal
 
 
-def resected(tracks: Tracks, camera: Camera, name: str) -> Resection | None:
+def resect(tracks: Tracks, camera: Camera, name: str) -> Resection | None:
     """What corrects a camera to the points that others agree on; None if too few of them are in its picture.
 
     Args:
@@ -118,18 +120,18 @@ def resected(tracks: Tracks, camera: Camera, name: str) -> Resection | None:
         MissingExtraError: cv2 or scipy is not installed.
     """
     own = tracks.of(name) if name in tracks.names else np.zeros(len(tracks.point), bool)
-    if own.sum() < LEAST_SEEN:
+    if own.sum() < MIN_SEEN:
         return None
     points, pixels = tracks.points[tracks.point[own]], tracks.pixels[own]
-    limit = AGREE_PIXELS * max(camera.width / 1000, 1)
+    limit = AGREE_PIXELS * pixel_scale(camera.width)
     view = _view(camera)
     starts = [start for start in (np.zeros(7), _by_points(camera, points, pixels, limit)) if start is not None]
     best = max((_adjusted(view, start, points, pixels, limit) for start in starts), key=lambda found: found[1].sum())
     change, fits = best
-    kept = np.linalg.norm(project(camera, points)[0] - pixels, axis=1) < limit
-    if fits.sum() < max(LEAST_SEEN, kept.sum()):  # nothing explains more than the given camera
-        change, fits = np.zeros(7), kept
-    if fits.sum() < LEAST_SEEN // 2:
+    given_points = np.linalg.norm(project(camera, points)[0] - pixels, axis=1) < limit
+    if fits.sum() < max(MIN_SEEN, given_points.sum()):  # nothing explains more than the given camera
+        change, fits = np.zeros(7), given_points
+    if fits.sum() < MIN_SEEN // 2:
         return None
     change, errors = _simplest(view, change, points[fits], pixels[fits], limit)
     distance = float(np.median(np.linalg.norm(points[fits] - view.center - change[MOVE], axis=1)))
@@ -138,7 +140,7 @@ def resected(tracks: Tracks, camera: Camera, name: str) -> Resection | None:
     turned, moved = float(np.linalg.norm(change[TURN])), float(np.linalg.norm(change[MOVE]))
     return Resection(
         points=int(fits.sum()),
-        kept=int(kept.sum()),
+        given_points=int(given_points.sum()),
         seen=int(own.sum()),
         given_pixels=float(np.median(given)),
         corrected_pixels=float(np.median(corrected)),
@@ -155,8 +157,8 @@ def explained(tracks: Tracks, camera: Camera, name: str) -> int:
     """Number of points that lie near their keypoints in a camera's picture if that is ``camera``."""
     own = tracks.of(name)
     seen, depths = project(camera, tracks.points[tracks.point[own]])
-    apart = np.linalg.norm(seen - tracks.pixels[own], axis=1)
-    return int(((depths > 0) & (apart < 2 * AGREE_PIXELS * max(camera.width / 1000, 1))).sum())
+    distances = np.linalg.norm(seen - tracks.pixels[own], axis=1)
+    return int(((depths > 0) & (distances < 2 * AGREE_PIXELS * pixel_scale(camera.width))).sum())
 
 
 def _view(camera: Camera) -> _View:
@@ -185,7 +187,7 @@ def _adjusted(view: _View, start: Floats, points: Floats, pixels: Floats, limit:
     change = start
     for _ in range(2):
         near = np.linalg.norm(view.pixels(change, points) - pixels, axis=1) < 4 * limit
-        if near.sum() < LEAST_SEEN // 2:
+        if near.sum() < MIN_SEEN // 2:
             return change, near & False
         change = _solved(view, change, points[near], pixels[near], CAUSES[-1], limit)[0]
     return change, np.linalg.norm(view.pixels(change, points) - pixels, axis=1) < limit
@@ -201,8 +203,8 @@ def _simplest(
         for cause in causes:
             start[cause] = change[cause]
         solved.append(_solved(view, start, points, pixels, causes, limit))
-    least = solved[-1][1]
-    found, _, covariance = next(one for one in solved if one[1] <= SIMPLE_ENOUGH * least)
+    min_error = solved[-1][1]
+    found, _, covariance = next(one for one in solved if one[1] <= SIMPLE_ENOUGH * min_error)
     return found, tuple(_error(found[cause], covariance[cause, cause]) for cause in (TURN, MOVE, FOCAL))  # pyright: ignore[reportReturnType]
 
 

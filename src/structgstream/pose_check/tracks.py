@@ -1,21 +1,93 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points that several cameras agree on, and how far each camera's keypoints lie from them."""
+"""Matches of one instant's pictures, found without the poses, and the points that several cameras agree on."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
-from structgstream.data.matching import epipolar_errors, fundamental_matrix, project, rays
-from structgstream.pose_check.evidence import Evidence
+from structgstream.data.matching import Pair, epipolar_errors, fundamental_matrix, project, rays
+from structgstream.data.pair_matches import PairError, PairMatcher, neighbor_pairs, pair_error
+from structgstream.frames import MultiViewFrame
 
-AGREE_PIXELS = 3.0  # of pictures up to 1000 pixels wide, in proportion above
-LEAST_VIEWS = 3
-MOST_PAIRS = 45  # of a point's observations, from which it is looked for: all pairs of ten
+ALL_PAIRS = 32  # cameras; with more, only neighbours by the given poses are matched
+NEIGHBOURS = 8
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Keypoints and matches of one instant.
+
+    Args:
+        images: name of a camera to its picture ``[H, W, 3]``.
+        keypoints: name of a camera to pixels ``[S, 2]``.
+        matches: pair of cameras to numbers of keypoints ``[M, 2]``; empty where they see too little in common.
+    """
+
+    images: Mapping[str, NDArray[np.uint8]]
+    keypoints: Mapping[str, Floats]
+    matches: Mapping[Pair, NDArray[np.intp]]
+
+    def pixels(self, pair: Pair) -> tuple[Floats, Floats]:
+        """Matched pixels ``[M, 2]`` in both pictures."""
+        rows = self.matches[pair]
+        return self.keypoints[pair[0]][rows[:, 0]], self.keypoints[pair[1]][rows[:, 1]]
+
+    def overlapping(self) -> list[Pair]:
+        """Pairs with matches."""
+        return [pair for pair, rows in self.matches.items() if len(rows)]
+
+
+def gather(
+    frame: MultiViewFrame,
+    cameras: Mapping[str, Camera],
+    *,
+    matcher: PairMatcher | None = None,
+    readings: Collection[Mapping[str, Camera]] = (),
+) -> Evidence:
+    """Matches of all pairs of a frame's pictures; of large rigs those of neighbours, by the cameras and by ``readings``
+    of their poses.
+
+    Args:
+        frame: the pictures.
+        cameras: as given.
+        matcher: of the same pictures, where some pairs were matched before.
+        readings: other poses of the same cameras.
+
+    Raises:
+        MissingExtraError: cv2 is not installed.
+    """
+    names = [name for name in cameras if name in frame.images]
+    if len(names) <= ALL_PAIRS:
+        pairs = list(combinations(names, 2))
+    else:
+        rigs = [{name: rig[name] for name in names} for rig in (cameras, *readings)]
+        pairs = list(dict.fromkeys(pair for rig in rigs for pair in neighbor_pairs(rig, count=NEIGHBOURS)))
+    matcher = matcher or PairMatcher(frame.images, masks=frame.masks)
+    matches = matcher.indices(pairs)
+    return Evidence(frame.images, {name: matcher.keypoints(name) for name in names if pairs}, matches)
+
+
+def pair_errors(evidence: Evidence, cameras: Mapping[str, Camera]) -> dict[Pair, PairError]:
+    """The error of every pair with matches."""
+    return {
+        pair: pair_error(cameras[pair[0]], cameras[pair[1]], *evidence.pixels(pair)) for pair in evidence.overlapping()
+    }
+
+
+AGREE_PIXELS = 3.0  # times pixel_scale
+MIN_VIEWS = 3
+MAX_PAIRS = 45  # of a point's observations, from which it is looked for: all pairs of ten
 ROUNDS = 2
+
+
+def pixel_scale(width: float) -> float:
+    """The factor of thresholds in pixels for pictures of this width: 1 up to 1000 pixels, in proportion above."""
+    return max(width / 1000, 1)
 
 
 @dataclass(frozen=True)
@@ -62,20 +134,20 @@ class _Table:
         if not len(self.point):
             return self
         views = np.bincount(self.point[self.used], minlength=int(self.point.max()) + 1)
-        kept = views[self.point] >= 2
-        _, numbered = np.unique(self.point[kept], return_inverse=True)
-        return _Table(numbered.astype(np.intp), self.camera[kept], self.pixels[kept], self.used[kept])
+        rows = views[self.point] >= 2
+        _, numbered = np.unique(self.point[rows], return_inverse=True)
+        return _Table(numbered.astype(np.intp), self.camera[rows], self.pixels[rows], self.used[rows])
 
 
 def build_tracks(evidence: Evidence, cameras: Mapping[str, Camera], *, off: Collection[str] = ()) -> Tracks:
-    """Points from the matches of cameras that are not ``off``; observations of those that are are kept, too.
+    """Points from the matches of cameras that are not ``off``; those of ``off`` cameras are included.
 
     Keypoints that matches connect are one point; a point with two keypoints in one picture is left out. Points lie
     where the rays of their keypoints pass closest, in the sense of least squares; of a point whose keypoints disagree
     those count on which most of them agree.
     """
     names = tuple(name for name in cameras if name in evidence.keypoints)
-    limit = AGREE_PIXELS * max(max((cameras[name].width for name in names), default=0) / 1000, 1)
+    limit = AGREE_PIXELS * pixel_scale(max((cameras[name].width for name in names), default=0))
     nodes, edges = _edges(evidence, cameras, names, off=off, limit=limit)
     point, camera, keypoint = _components(nodes, edges, names, evidence)
     pixels = np.empty((len(point), 2))
@@ -137,8 +209,8 @@ def _components(
     _, position, count = np.unique(once, return_inverse=True, return_counts=True)
     twice = np.zeros(label.max() + 1, bool)
     twice[label[count[position] > 1]] = True
-    kept = ~twice[label]
-    return label[kept], camera[kept], node[kept] - first[camera[kept]]
+    unique = ~twice[label]
+    return label[unique], camera[unique], node[unique] - first[camera[unique]]
 
 
 def _agreeing(table: _Table, cameras: list[Camera], limit: float) -> _Table:
@@ -153,21 +225,21 @@ def _agreeing(table: _Table, cameras: list[Camera], limit: float) -> _Table:
     used = table.used.copy()
     rows = np.flatnonzero(table.used & np.isin(table.point, doubted))
     for own in np.split(rows[order := np.argsort(table.point[rows], kind="stable")], _starts(table.point[rows][order])):
-        if len(own) <= LEAST_VIEWS:  # two of three always agree
+        if len(own) <= MIN_VIEWS:  # two of three always agree
             continue
         pairs = np.stack(np.triu_indices(len(own), 1), axis=1)
-        pairs = pairs[np.unique(np.linspace(0, len(pairs) - 1, MOST_PAIRS).round().astype(int))]
+        pairs = pairs[np.unique(np.linspace(0, len(pairs) - 1, MAX_PAIRS).round().astype(int))]
         each = _Table(
             np.repeat(np.arange(len(pairs)), len(own)),
             np.tile(table.camera[own], len(pairs)),
             np.tile(table.pixels[own], (len(pairs), 1)),
             (np.arange(len(own)) == pairs[:, :1]).ravel() | (np.arange(len(own)) == pairs[:, 1:]).ravel(),
         )
-        apart = _residuals(_closest(each, cameras), each, cameras).reshape(len(pairs), len(own))
-        within = apart < limit
-        best = np.lexsort((np.where(within, apart, limit).sum(1), -within.sum(1)))[0]
+        errors = _residuals(_closest(each, cameras), each, cameras).reshape(len(pairs), len(own))
+        within = errors < limit
+        best = np.lexsort((np.where(within, errors, limit).sum(1), -within.sum(1)))[0]
         rivals = within[(within & ~within[best]).any(1)].sum(1).max(initial=0)
-        if within[best].sum() > max(rivals, LEAST_VIEWS - 1, len(own) / 2):
+        if within[best].sum() > max(rivals, MIN_VIEWS - 1, len(own) / 2):
             used[own] = within[best]
     return replace(table, used=used)
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which cameras are off, and by how much.
 
-Those that disagree with others which agree with each other, held against points of several cameras.
+Those that disagree with others which agree with each other, compared with points of several cameras.
 """
 
 from collections.abc import Collection, Mapping
@@ -12,17 +12,16 @@ import numpy as np
 from structgstream.cameras import Camera
 from structgstream.data.matching import Pair
 from structgstream.data.pair_matches import PairError
-from structgstream.pose_check.evidence import Evidence, pair_errors
-from structgstream.pose_check.resection import Resection, resected
-from structgstream.pose_check.tracks import LEAST_VIEWS, Tracks, build_tracks
+from structgstream.pose_check.resection import Resection, resect
+from structgstream.pose_check.tracks import MIN_VIEWS, Evidence, Tracks, build_tracks, pair_errors, pixel_scale
 
 TIMES_TYPICAL = 4.0
-FLOOR_PIXELS = 0.75  # of pictures up to 1000 pixels wide, in proportion above
-MOST_WEIGHT = 100  # matches above which a pair is not trusted more
+FLOOR_PIXELS = 0.75  # times pixel_scale
+MAX_WEIGHT = 100  # matches above which a pair is not trusted more
 OFF_SHARE = 0.5
 VIOLATING_SHARE = 0.5
-LEAST_ACCUSING, LEAST_CAMERAS, ACCUSING_TIMES = 15, 4, 2.5
-LEAST_MATCHES = 60  # of a camera's pairs, from which on they tell something without points; chance makes 20 to 25
+MIN_OUTLIER_POINTS, MIN_CAMERAS, OUTLIER_RATIO = 15, 4, 2.5
+MIN_MATCHES = 60  # of a camera's pairs, from which on they count without points; chance makes 20 to 25
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ def find_suspects(errors: Mapping[Pair, PairError], cameras: Mapping[str, Camera
     """
     limit = _limit(errors, cameras)
     bad = {pair for pair, error in errors.items() if error.pixels > limit or error.share > VIOLATING_SHARE}
-    weights = {pair: min(error.matches, MOST_WEIGHT) for pair, error in errors.items()}
+    weights = {pair: min(error.matches, MAX_WEIGHT) for pair, error in errors.items()}
     off: list[str] = []
     remaining = [name for name in cameras if any(name in pair for pair in errors)]
     while remaining:
@@ -73,9 +72,9 @@ def find_suspects(errors: Mapping[Pair, PairError], cameras: Mapping[str, Camera
     return Suspects(tuple(off), tuple(pair for pair in errors if pair in bad), limit, everything)
 
 
-def accused(tracks: Tracks, suspects: Suspects, *, cleared: Collection[str] = ()) -> str | None:
-    """The camera, if any, that sees points farther from where the others say than these do, although its pairs look
-    well.
+def track_outlier(tracks: Tracks, suspects: Suspects, *, cleared: Collection[str] = ()) -> str | None:
+    """The camera, if any, whose observations lie farther from the points of the others than theirs, although its pairs
+    look well.
 
     Along an epipolar line a match may lie anywhere: in a row of cameras, no pair reveals one that was turned along it.
     Points of several cameras do.
@@ -87,24 +86,24 @@ def accused(tracks: Tracks, suspects: Suspects, *, cleared: Collection[str] = ()
     """
     medians = {}
     for name in tracks.names:
-        seen = tracks.residuals[tracks.of(name) & (tracks.views[tracks.point] >= LEAST_VIEWS)]
-        if name not in suspects.off and len(seen) >= LEAST_ACCUSING:
+        seen = tracks.residuals[tracks.of(name) & (tracks.views[tracks.point] >= MIN_VIEWS)]
+        if name not in suspects.off and len(seen) >= MIN_OUTLIER_POINTS:
             medians[name] = float(np.median(seen))
-    if len(medians) < LEAST_CAMERAS:
+    if len(medians) < MIN_CAMERAS:
         return None
     named = [name for name in medians if name not in cleared]
     if not named:
         return None
     worst = max(named, key=lambda name: medians[name])
     others = float(np.median([median for name, median in medians.items() if name != worst]))
-    return worst if medians[worst] > ACCUSING_TIMES * others else None
+    return worst if medians[worst] > OUTLIER_RATIO * others else None
 
 
 def _limit(errors: Mapping[Pair, PairError], cameras: Mapping[str, Camera]) -> float:
     """Pixels; relative to the better pairs, because soft pictures have large errors in any calibration."""
     width = max((camera.width for camera in cameras.values()), default=0)
     typical = float(np.percentile([error.pixels for error in errors.values()], 25)) if errors else 0.0
-    floor = FLOOR_PIXELS * max(width / 1000, 1)
+    floor = FLOOR_PIXELS * pixel_scale(width)
     return max(floor, min(TIMES_TYPICAL * typical, 4 * floor))
 
 
@@ -116,7 +115,7 @@ def _share(name: str, bad: Collection[Pair], weights: Mapping[Pair, int], off: C
 
 
 def _amount(name: str, errors: Mapping[Pair, PairError], off: Collection[str]) -> float:
-    """Median error of a camera's pairs, to tell the culprit among cameras of equal shares."""
+    """Median error of a camera's pairs, to choose among cameras of equal shares."""
     own = [error.pixels for pair, error in errors.items() if name in pair and not set(pair) & set(off)]
     return float(np.median(own)) if own else 0.0
 
@@ -143,8 +142,8 @@ class Verdict:
 def judge(evidence: Evidence, cameras: Mapping[str, Camera]) -> Verdict:
     """Names the cameras that are off.
 
-    Pairs accuse; then points of the other cameras decide. A camera is off when another pose or focal length explains
-    these points much better than the given one, and it is not when none explains more of them.
+    Pairs raise a suspicion; then points of the other cameras decide. A camera is off when another pose or focal length
+    explains these points much better than the given one, and it is not when none explains more of them.
 
     Raises:
         MissingExtraError: cv2 or scipy is not installed.
@@ -154,21 +153,21 @@ def judge(evidence: Evidence, cameras: Mapping[str, Camera]) -> Verdict:
     if suspects.everything:
         return Verdict(suspects, build_tracks(evidence, cameras))
     tracks = build_tracks(evidence, cameras, off=suspects.off)
-    resections = {name: resected(tracks, cameras[name], name) for name in suspects.off}
+    resections = {name: resect(tracks, cameras[name], name) for name in suspects.off}
     off, doubtful, unchecked = [], [], []
     for name, found in resections.items():
         if found is not None and found.as_given:
             continue
         against, favouring = _matches(name, errors, suspects)
-        if _is_off(found, suspects) or (against >= LEAST_MATCHES and not favouring):
+        if _is_off(found, suspects) or (against >= MIN_MATCHES and not favouring):
             off.append(name)
-        elif against >= LEAST_MATCHES:
+        elif against >= MIN_MATCHES:
             doubtful.append(name)
         elif against:
             unchecked.append(name)
     suspects = replace(suspects, off=tuple(off))
     found = {name: one for name in off if (one := resections[name]) is not None and one.better}
-    return _with_accused(evidence, cameras, Verdict(suspects, tracks, found, tuple(doubtful), tuple(unchecked)))
+    return _with_track_outliers(evidence, cameras, Verdict(suspects, tracks, found, tuple(doubtful), tuple(unchecked)))
 
 
 def _is_off(found: Resection | None, suspects: Suspects) -> bool:
@@ -183,13 +182,13 @@ def _matches(name: str, errors: Mapping[Pair, PairError], suspects: Suspects) ->
     return against, sum(own.values()) - against
 
 
-def _with_accused(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Verdict) -> Verdict:
+def _with_track_outliers(evidence: Evidence, cameras: Mapping[str, Camera], verdict: Verdict) -> Verdict:
     """The verdict with cameras whose pairs look well, but which see points elsewhere than the others do."""
     suspects, resections, cleared = verdict.suspects, dict(verdict.resections), {*verdict.doubtful, *verdict.unchecked}
     tracks = build_tracks(evidence, cameras, off=suspects.off)
-    while (name := accused(tracks, suspects, cleared=cleared)) is not None:
+    while (name := track_outlier(tracks, suspects, cleared=cleared)) is not None:
         without = build_tracks(evidence, cameras, off=(*suspects.off, name))
-        found = resected(without, cameras[name], name)
+        found = resect(without, cameras[name], name)
         if found is None or not _is_off(found, suspects):
             cleared.add(name)
             continue

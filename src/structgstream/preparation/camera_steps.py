@@ -3,38 +3,43 @@
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict
+from pathlib import Path
 
-from structgstream.data.calibration import listed
-from structgstream.data.posed import Calibration
-from structgstream.data.timeline import Clock
-from structgstream.errors import ConfigError
-from structgstream.frames import LEAST_CAMERAS
-from structgstream.preparation.calibrating import (
-    check_complete,
-    check_enough,
-    described,
-    focals_told,
-    from_other_tool,
-    packed,
-    scaled,
-    stated_focals,
-    summary,
-    turns_told,
-    unpacked,
-)
-from structgstream.preparation.calibration.solved import SolvedCalibration
-from structgstream.preparation.claiming import claim
-from structgstream.preparation.footage import Footage, find_footage
-from structgstream.preparation.options import PrepareOptions
-from structgstream.preparation.solvers import (
+from structgstream.data.calibration import Calibration, listed
+from structgstream.errors import CalibrationError, ConfigError
+from structgstream.frames import MIN_CAMERAS
+from structgstream.preparation.calibration.solved import SolvedCalibration, with_distance
+from structgstream.preparation.clocks import (
     TIMESTAMPS,
     Clocks,
     first_clocks,
-    refined,
-    solved_by,
+    packed_clocks,
     synchronized,
+    unpacked_clocks,
+)
+from structgstream.preparation.footage import Footage, find_footage
+from structgstream.preparation.given_calibration import (
+    calibration_key,
+    find_calibration,
+    given_cameras,
+    require_calibration,
+)
+from structgstream.preparation.options import METHODS, PrepareOptions
+from structgstream.preparation.output_folder import mark_output
+from structgstream.preparation.solvers import (
+    check_complete,
+    describe_focals,
+    describe_turns,
+    packed,
+    refined,
+    solve_cameras,
+    stated_focals,
+    summary,
+    unpacked,
 )
 from structgstream.preparation.steps import Job, Stored, fingerprint
+
+MIN_SOLVED = 3  # cameras, for poses that can be checked
 
 
 class CameraSteps:
@@ -46,10 +51,10 @@ class CameraSteps:
 
     def __init__(self, job: Job) -> None:
         self.videos, self.capture, self.options = job.videos, job.capture, job.options
-        self.steps, self.listener = job.steps, job.listener
+        self.steps = job.steps
 
     def find(self) -> Footage:
-        self.listener.begin("find", skipped=False)
+        self.steps.begin("find")
         footage = find_footage(self.videos, picture_fps=self.options.fps)
         self._check_names(self.options.without, footage, purpose="leave out")
         footage = footage.only([name for name in footage.cameras if name not in self.options.without])
@@ -60,9 +65,9 @@ class CameraSteps:
         )
         check_enough(footage)
         self._check_trained(footage)
-        claim(self.capture, self.videos)
-        turns = turns_told(footage)
-        self.listener.end("find", _described(footage) + (f"; {turns}" if turns else ""))
+        mark_output(self.capture, self.videos)
+        turns = describe_turns(footage)
+        self.steps.end("find", _described(footage) + (f"; {turns}" if turns else ""))
         return footage
 
     def _check_names(self, names: Collection[str], footage: Footage, *, purpose: str) -> None:
@@ -75,10 +80,10 @@ class CameraSteps:
     def _check_trained(self, footage: Footage) -> None:
         """Refuses to hold out more cameras than can be spared, before anything takes time."""
         held_out = set(self.options.held_out) - {"auto"}
-        if len(footage.cameras) - len(held_out) < LEAST_CAMERAS:
+        if len(footage.cameras) - len(held_out) < MIN_CAMERAS:
             raise ConfigError(
                 f"{self.videos} has {len(footage.cameras)} cameras, {len(held_out)} of them held out; a reconstruction "
-                f"needs {LEAST_CAMERAS} or more to train on: hold out fewer."
+                f"needs {MIN_CAMERAS} or more to train on: hold out fewer."
             )
 
     def synchronize(self, footage: Footage, method: str | Calibration) -> Clocks:
@@ -86,7 +91,7 @@ class CameraSteps:
 
         def find() -> Clocks:
             if not isinstance(method, str):
-                return synchronized(footage, self.options, cameras=from_other_tool(method, footage).cameras)
+                return synchronized(footage, self.options, cameras=given_cameras(method, footage).cameras)
             # Pictures of a board are matched by their time, so there clocks must be known first.
             by_itself = method == "sfm" or self.options.board_videos is not None
             return (first_clocks if by_itself else synchronized)(footage, self.options)
@@ -96,7 +101,7 @@ class CameraSteps:
             "table": fingerprint({"table": table}) if (table := footage.where / TIMESTAMPS).is_file() else None,
             "fps": footage.fps,
             "how": self.options.synchronize,
-            "calibration": method if isinstance(method, str) else described(method),
+            "calibration": method if isinstance(method, str) else calibration_key(method),
             "board": self.options.board_videos is not None,
         }
         return self._clocks("synchronize", inputs, find)
@@ -122,7 +127,7 @@ class CameraSteps:
         self, step: str, inputs: Mapping[str, object], find: Callable[[], Clocks], after: tuple[str, ...] = ()
     ) -> Clocks:
         return self.steps.run(
-            step, inputs, find, pack=_packed_clocks, unpack=_unpacked_clocks, summary=lambda found: found.told,
+            step, inputs, find, pack=packed_clocks, unpack=unpacked_clocks, summary=lambda found: found.summary,
             after=after,
         )  # fmt: skip
 
@@ -130,7 +135,7 @@ class CameraSteps:
         options = self.options
         name = method if isinstance(method, str) else method.where.name
         inputs = {
-            "method": method if isinstance(method, str) else described(method),
+            "method": method if isinstance(method, str) else calibration_key(method),
             "board": asdict(options.board),
             "lens": options.lens,
             "intrinsics": options.intrinsics,
@@ -143,8 +148,8 @@ class CameraSteps:
         solved = self._solved(
             "calibrate",
             inputs,
-            lambda: (_first(method, footage, clocks, options, focals), focals_told(focals, footage)),
-            said=lambda found, told: f"{name}: {summary(found)}" + (f"; {told}" if told else ""),
+            lambda: (_first(method, footage, clocks, options, focals), describe_focals(focals, footage)),
+            describe=lambda found, detail: f"{name}: {summary(found)}" + (f"; {detail}" if detail else ""),
             after="synchronize",
         )
         last = "calibrate"
@@ -153,14 +158,21 @@ class CameraSteps:
                 last := "refine",
                 {},
                 lambda: refined(solved, footage, clocks, options),
-                said=lambda found, told: told,
+                describe=lambda found, detail: detail,
                 after="calibrate",
             )
+        distance = options.distance
+
+        def scale() -> tuple[SolvedCalibration, str]:
+            if distance is None:
+                return solved, ""
+            return with_distance(solved, distance.first, distance.second, metres=distance.metres), ""
+
         return self._solved(
             "scale",
-            {"distance": None if options.distance is None else asdict(options.distance)},
-            lambda: (scaled(solved, options), ""),
-            said=lambda found, told: "metres" if found.metres else "arbitrary units; --distance A B 3.2m gives metres",
+            {"distance": None if distance is None else asdict(distance)},
+            scale,
+            describe=lambda found, _: "metres" if found.metres else "arbitrary units; --distance A B 3.2m gives metres",
             after=last,
         )
 
@@ -170,23 +182,76 @@ class CameraSteps:
         inputs: Mapping[str, object],
         solve: Callable[[], tuple[SolvedCalibration, str]],
         *,
-        said: Callable[[SolvedCalibration, str], str],
+        describe: Callable[[SolvedCalibration, str], str],
         after: str,
     ) -> SolvedCalibration:
         def pack(found: tuple[SolvedCalibration, str]) -> Stored:
             stored = packed(found[0])
-            return Stored({**stored.values, "told": found[1]}, stored.arrays)
+            return Stored({**stored.values, "detail": found[1]}, stored.arrays)
 
         found = self.steps.run(
             step,
             inputs,
             solve,
             pack=pack,
-            unpack=lambda stored: (unpacked(stored), str(stored.values["told"])),
-            summary=lambda found: said(*found),
+            unpack=lambda stored: (unpacked(stored), str(stored.values.get("detail", stored.values.get("told", "")))),
+            summary=lambda found: describe(*found),
             after=(after,),
         )
         return found[0]
+
+
+def chosen_method(footage: Footage, options: PrepareOptions) -> str | Calibration:
+    """``sfm``, ``board``, or the calibration to use.
+
+    Raises:
+        CalibrationError: the requested calibration is missing or broken.
+    """
+    if str(options.calibration) not in METHODS:
+        return require_calibration(Path(options.calibration))
+    if options.calibration != "auto":
+        return str(options.calibration)
+    if options.board_videos is not None:
+        return "board"
+    return find_calibration(footage.where) or "sfm"
+
+
+def check_used(method: str | Calibration, footage: Footage, options: PrepareOptions) -> None:
+    """
+    Raises:
+        ConfigError: an option has no effect, so that its user expects another capture.
+    """
+    if options.fps is not None and footage.tracks:
+        raise ConfigError(
+            f"The videos of {footage.where} state the time of each frame, and --fps is the rate of folders of "
+            "pictures; leave out --fps."
+        )
+    if options.board_videos is not None and method != "board":
+        raise ConfigError(
+            "Videos of a board (--board-videos) calibrate by --calibration board alone; choose that, or leave them out."
+        )
+    if options.intrinsics != "own" and method != "sfm":
+        raise ConfigError(
+            "Shared intrinsics (--intrinsics) are estimated by structure from motion alone; choose --calibration sfm, "
+            "or leave them out."
+        )
+    if options.lens is not None and isinstance(method, Calibration) and not options.refine:
+        raise ConfigError(
+            f"{method.where} states the lenses, so --lens {options.lens} has no effect; add --refine to adjust them to "
+            "the pictures, choose --calibration sfm, or leave out --lens."
+        )
+
+
+def check_enough(footage: Footage) -> None:
+    """
+    Raises:
+        CalibrationError: too few cameras for poses that can be checked.
+    """
+    if len(footage.cameras) < MIN_SOLVED:
+        raise CalibrationError(
+            f"{footage.where} has {listed(footage.cameras)} alone; a capture needs {MIN_SOLVED} or more, as two "
+            "cameras cannot confirm each other's calibration: film with more."
+        )
 
 
 def _first(
@@ -197,34 +262,8 @@ def _first(
     focals: Mapping[str, float],
 ) -> SolvedCalibration:
     if isinstance(method, str):
-        return check_complete(solved_by(method, footage, clocks, options, focals=focals), footage)
-    return from_other_tool(method, footage)
-
-
-def _packed_clocks(found: Clocks) -> Stored:
-    return Stored(
-        {
-            "clocks": {name: asdict(clock) for name, clock in found.clocks.items()},
-            "method": found.method,
-            "told": found.told,
-            "late_seconds": dict(found.late_seconds),
-            "uncertainty_seconds": dict(found.uncertainty_seconds),
-            "sure": found.sure,
-        }
-    )
-
-
-def _unpacked_clocks(stored: Stored) -> Clocks:
-    values = stored.values
-    clocks = {name: Clock(**clock) for name, clock in values["clocks"].items()}
-    return Clocks(
-        clocks,
-        values["method"],
-        values["told"],
-        values["late_seconds"],
-        values["uncertainty_seconds"],
-        values["sure"],
-    )
+        return check_complete(solve_cameras(method, footage, clocks, options, focals=focals), footage)
+    return given_cameras(method, footage)
 
 
 def _described(footage: Footage) -> str:

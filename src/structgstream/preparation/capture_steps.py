@@ -8,9 +8,10 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.atomic_files import atomic_file
 from structgstream.cameras import CameraRig
 from structgstream.data.calibration import NEAR_IN_RIG_RADII
-from structgstream.data.folder_files import REPORT
+from structgstream.data.camera_files import REPORT
 from structgstream.data.held_out import best_surrounded
 from structgstream.data.masks import FOLDER as MASKS
 from structgstream.data.open import open_capture
@@ -32,11 +33,10 @@ from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.checking.check import Examination, check_capture, examine_capture
 from structgstream.preparation.checking.scales import nearest_depth, observed_depths
 from structgstream.preparation.footage import Footage
-from structgstream.preparation.linking import bring, drop_others, unbring
 from structgstream.preparation.options import PrepareOptions
+from structgstream.preparation.output_folder import link, remove_others, unlink
 from structgstream.preparation.steps import FOLDER, Job, Stored, fingerprint
 from structgstream.similarity import rig_radius
-from structgstream.whole_files import whole_file
 
 POINTS = "points.npy"
 NEAR_SHARE = 0.5  # of the depth of the nearest points: what comes closer later is still drawn
@@ -51,34 +51,35 @@ class CaptureSteps:
 
     def __init__(self, job: Job) -> None:
         self.videos, self.capture, self.options = job.videos, job.capture, job.options
-        self.steps, self.listener, self.told = job.steps, job.listener, job.told
+        self.steps = job.steps
         self.examination: Examination | None = None  # which two steps look at
         self._opened: FrameSource | None = None
 
-    def bring(self, footage: Footage, content: PreparedCapture) -> None:
-        self.listener.begin("bring", skipped=False)
+    def link(self, footage: Footage, content: PreparedCapture) -> None:
+        self.steps.begin("link")
         for number, (name, camera) in enumerate(content.cameras.items()):
-            self.listener.progress(number, len(content.cameras), name)
+            self.steps.progress(number, len(content.cameras), name)
             target = self.capture / camera.files
             source = footage.path(name)
-            bring(source, target / source.name if not footage.tracks and source.is_file() else target,
-                  link=self.options.link)  # fmt: skip
+            if not footage.tracks and source.is_file():
+                target = target / source.name
+            link(source, target, how=self.options.link)
             if not footage.tracks:
-                drop_others(target, [file.name for file in footage.stills[name]])
-        self._bring_masks()
+                remove_others(self.capture / camera.files, [file.name for file in footage.stills[name]])
+        self._link_masks()
         write_prepared(self.capture, content)
         how = {"hard": "hard link or copy", "symlink": "symlink", "copy": "copy"}[self.options.link]
-        self.listener.end("bring", f"{len(content.cameras)} cameras by {how}")
+        self.steps.end("link", f"{len(content.cameras)} cameras by {how}")
 
-    def _bring_masks(self) -> None:
-        """All but those of cameras that are left out, which go where an earlier run has brought them."""
+    def _link_masks(self) -> None:
+        """All masks but those of cameras that are left out; these are removed where an earlier run linked them."""
         folder = self.videos / MASKS
         for entry in sorted(folder.iterdir()) if folder.is_dir() else ():
             target = self.capture / MASKS / entry.name
             if (entry.name if entry.is_dir() else entry.stem) in self.options.without:
-                unbring(entry, target)
+                unlink(entry, target)
             else:
-                bring(entry, target, link=self.options.link)
+                link(entry, target, how=self.options.link)
 
     def near(self, content: PreparedCapture) -> PreparedCapture:
         """With the near plane from the points that pictures confirm."""
@@ -117,20 +118,20 @@ class CaptureSteps:
             summary=lambda points: f"{len(points):,} points of frame 0",
             after=("synchronize",),
         )  # fmt: skip
-        with whole_file(self.capture / POINTS) as file:
+        with atomic_file(self.capture / POINTS) as file:
             np.save(file, found)
         content = replace(content, points=POINTS)
         write_prepared(self.capture, content)
         return content
 
     def check(self, content: PreparedCapture) -> tuple[Finding, ...]:
-        from structgstream.preparation.report.write import write_report
+        from structgstream.preparation.report.page import write_report
 
         def look() -> tuple[Finding, ...]:
             source = self._source(content)
-            checked = check_capture(source, unit=content.unit, listener=self.listener, examination=self.examination)
-            checked = replace(checked, report=replace(checked.report, steps=dict(self.told)))
-            write_report(self.capture / REPORT, checked, listener=self.listener)
+            checked = check_capture(source, unit=content.unit, listener=self.steps, examination=self.examination)
+            checked = replace(checked, report=replace(checked.report, steps=dict(self.steps.summaries)))
+            write_report(self.capture / REPORT, checked, listener=self.steps)
             return checked.report.findings
 
         if not (self.capture / REPORT / "index.html").is_file():
@@ -156,7 +157,7 @@ class CaptureSteps:
         return inputs
 
     def _source(self, content: PreparedCapture) -> FrameSource:
-        """The capture, opened once: indexing videos takes time, and what is to be said of them is said once."""
+        """The capture, opened once: indexing videos takes time, and its warnings should come once."""
         if self._opened is None:
             self._opened = open_capture(self.capture)
         points = None

@@ -21,10 +21,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.audio import read_audio
-from structgstream.data.camera_files import NO_CAMERAS, UNREAD, filmed_folder, other_roots
-from structgstream.data.folder_files import check_link, files_of, is_hidden, name_of
+from structgstream.data.camera_files import (
+    NO_CAMERAS,
+    UNREAD,
+    check_link,
+    files_of,
+    filmed_folder,
+    is_hidden,
+    name_of,
+    other_roots,
+)
 from structgstream.data.images import PICTURE_SUFFIXES, read_picture, significant_bits
-from structgstream.data.picture_size import check_one_series, picture_size
+from structgstream.data.picture_headers import check_one_series, picture_size
 from structgstream.data.posed_capture import filmed_roots
 from structgstream.data.prepared import pictures_of
 from structgstream.data.timeline import natural, picture_slots
@@ -41,6 +49,10 @@ FILMED = VIDEO_SUFFIXES | PICTURE_SUFFIXES | UNREAD
 """What a camera may have written, also in ways that are not read here."""
 CHAPTER = re.compile(r"(G[HLPSX]\d\d|GOPR)", re.IGNORECASE)  # of a GoPro, GX010001 and GX020001
 LAYOUTS = "CAMERA.mp4, CAMERA/anything.mp4, CAMERA/FRAME.jpg or CAMERA.jpg"
+
+
+class NoFootage(CaptureError):
+    """A folder without a video or a picture."""
 
 
 @dataclass(frozen=True)
@@ -117,16 +129,16 @@ class Footage:
                 )
 
     def _decoded(self, name: str, track: VideoTrack, indices: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
-        def tell(lost: int, following: int | None, reason: str) -> None:
+        def refuse(lost: int, following: int | None, reason: str) -> None:
             raise CaptureError(
                 f"The video {track.path} of camera {name!r} cannot be decoded at {lost * track.tick_seconds:.3f} s "
                 f"({reason}): truncated or damaged; copy or record it again, or leave it out with --without {name}."
             )
 
         stamps = [track.stamps[index] for index in indices]
-        with closing(pictures_at(track, stamps, size=(track.width, track.height), on_damage=tell)) as pictures:
+        with closing(pictures_at(track, stamps, size=(track.width, track.height), on_damage=refuse)) as pictures:
             for shown in pictures:
-                assert shown is not None, "what is lost was told"
+                assert shown is not None, "a lost picture raises"
                 yield shown[0]
 
     def audio(self, name: str) -> tuple[NDArray[np.float32], float] | None:
@@ -178,8 +190,8 @@ def find_footage(where: Path, *, picture_fps: float | None = None) -> Footage:
         kind = "a file" if where.exists() else "missing"
         raise CaptureError(f"{where} is {kind}; give the folder that holds the cameras' videos ({LAYOUTS}).")
     found = {root: _found(root) for root in dict.fromkeys(filmed_roots(where)) if root.is_dir()}
-    # A stray picture or preview beside the folder of the videos is no take: two cameras come before one.
-    root = next((root for least in (2, 1) for root, files in found.items() if len(files) >= least), None)
+    # A stray picture or preview next to the folder of the videos is no take: two cameras come before one.
+    root = next((root for count in (2, 1) for root, files in found.items() if len(files) >= count), None)
     if root is None or len(found[root]) < 2:
         root = next(other_roots(where), None) or next(other_roots(where, pictures=True), root)
     if root is not None:
@@ -191,9 +203,9 @@ def find_footage(where: Path, *, picture_fps: float | None = None) -> Footage:
         _check_left(root, files)
         ordered = {name: files[name] for name in sorted(files, key=natural)}
         return _footage(where, ordered, picture_fps or PICTURE_FPS)
-    held = ", ".join(sorted(entry.name for entry in where.iterdir())[:6])
-    found = f"holds no videos and no pictures, but {held}" if held else "is empty"
-    raise CaptureError(f"{where} {found}; expected {LAYOUTS}.")
+    contents = ", ".join(sorted(entry.name for entry in where.iterdir())[:6])
+    found = f"holds no videos and no pictures, but {contents}" if contents else "is empty"
+    raise NoFootage(f"{where} {found}; expected {LAYOUTS}.")
 
 
 def _of_size(picture: NDArray[np.uint8], size: tuple[int, int], name: str, file: Path) -> NDArray[np.uint8]:
@@ -281,10 +293,10 @@ def _found(root: Path) -> dict[str, Path]:
 
 
 def _check_left(root: Path, found: Mapping[str, Path]) -> None:
-    """What is no camera, told, so that none is lost unnoticed.
+    """Warns of files and folders that are no camera, so that none is lost unnoticed.
 
     Raises:
-        CaptureError: an empty folder beside those of cameras.
+        CaptureError: an empty folder among those of cameras.
     """
     taken = next(iter(found.values()))
     for entry in sorted(entry for entry in root.iterdir() if not is_hidden(entry)):

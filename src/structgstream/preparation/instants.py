@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures of the same instants, by the clocks of the cameras."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import overload
 
@@ -18,7 +18,7 @@ STILL_PICTURES = 9
 
 @dataclass(frozen=True)
 class Shots(Sequence[Picture]):
-    """Pictures of one camera, decoded when they are asked for, so that a long take does not fill the memory."""
+    """Pictures of one camera, decoded on access, so that a long take does not fill the memory."""
 
     footage: Footage
     camera: str
@@ -26,14 +26,6 @@ class Shots(Sequence[Picture]):
 
     def __len__(self) -> int:
         return len(self.indices)
-
-    def __iter__(self) -> Iterator[Picture]:
-        """In order, in one pass through the file."""
-        order = sorted(set(self.indices))
-        if list(self.indices) == order:
-            yield from self.footage.pictures(self.camera, order)
-        else:
-            yield from (self[number] for number in range(len(self)))
 
     @overload
     def __getitem__(self, number: int) -> Picture: ...
@@ -96,9 +88,7 @@ def still_pictures(footage: Footage) -> dict[str, list[Picture]]:
 
 def spread_moments(first: float, last: float, count: int) -> list[float]:
     """Moments from the first to the last, both included; fewer when the take has no length."""
-    if last <= first:
-        return [first]
-    return np.linspace(first, last, max(count, 1)).tolist() if count > 1 else [first]
+    return np.linspace(first, last, count).tolist() if last > first and count > 1 else [first]
 
 
 def _length(spans: Mapping[str, tuple[float, float]], name: str) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a user may ask of a preparation."""
+"""The options of a preparation, and how they are written on the command line."""
 
 import math
 import re
@@ -11,9 +11,9 @@ from structgstream.data.rectilinear import check_field_of_view
 from structgstream.errors import ConfigError
 from structgstream.preparation.calibration.board import Board
 from structgstream.preparation.calibration.colmap import LensModel
-from structgstream.preparation.linking import Link
 from structgstream.preparation.synchronization import Method
 
+Link = Literal["hard", "symlink", "copy"]
 METHODS = ("auto", "sfm", "board")
 UNITS_IN_METRES = {"": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "in": 0.0254, "ft": 0.3048}
 
@@ -32,7 +32,7 @@ class PrepareOptions:
     """How a capture is made.
 
     Args:
-        calibration: ``sfm``, ``board``, ``auto`` (a file of another tool beside the videos, else ``sfm``), or a
+        calibration: ``sfm``, ``board``, ``auto`` (a file of another tool next to the videos, else ``sfm``), or a
             calibration file or the folder that holds one.
         lens: distortion that is estimated: ``pinhole``, ``radial``, ``opencv``, ``brown`` or ``fisheye``; None for
             ``radial`` by structure from motion and ``opencv`` by a board.
@@ -48,7 +48,7 @@ class PrepareOptions:
         near: near plane in the capture's units; None to take it from the points.
         fps: frames a second of pictures; None for 30.
         without: names of cameras to leave out.
-        link: how files are brought into the capture.
+        link: how files get into the capture.
         instants: most instants that structure from motion looks at; it looks at three where these have texture enough.
     """
 

@@ -8,20 +8,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from structgstream.data.folder_files import REPORT
+from structgstream.data.calibration import Calibration
+from structgstream.data.camera_files import REPORT
 from structgstream.data.open import open_capture
-from structgstream.data.posed import Calibration
 from structgstream.data.prepared import read_prepared, recognizes_prepared
 from structgstream.pose_check.findings import Finding
-from structgstream.preparation.calibrating import check_board, check_used, chosen_method
-from structgstream.preparation.camera_steps import CameraSteps
+from structgstream.preparation.camera_steps import CameraSteps, check_used, chosen_method
 from structgstream.preparation.capture_steps import CaptureSteps, assembled
 from structgstream.preparation.checking.check import Checked, check_capture
-from structgstream.preparation.claiming import alone
 from structgstream.preparation.footage import Footage
 from structgstream.preparation.options import PrepareOptions
-from structgstream.preparation.report.write import write_report
-from structgstream.preparation.steps import Job, Listener, Silent, new_job
+from structgstream.preparation.output_folder import lock_output
+from structgstream.preparation.report.page import write_report
+from structgstream.preparation.steps import Job, Listener, Silent, Steps
 
 
 @dataclass(frozen=True)
@@ -30,8 +29,8 @@ class Preparation:
 
     Args:
         path: its folder, for ``open_capture`` and ``reconstruct``.
-        findings: what the check says, errors first.
-        steps: what each step found, in words.
+        findings: of the check, errors first.
+        steps: summaries of the steps.
         skipped: steps whose results were there already.
         report: the page of the report.
     """
@@ -51,7 +50,7 @@ def prepare_capture(
     Args:
         videos: the folder of the cameras' videos or pictures, see ``preparation.footage``.
         capture: the folder to make; the same call again does only what has changed.
-        options: what is asked for.
+        options: of the preparation.
         listener: receives steps and progress.
 
     Raises:
@@ -61,13 +60,14 @@ def prepare_capture(
         MissingExtraError: a package is missing that a step needs.
     """
     options = options or PrepareOptions()
-    job = new_job(videos, capture, options=options, listener=listener or Silent())
+    job = Job(videos, capture, options, Steps(capture, listener or Silent()))
     find = CameraSteps(job)
     footage = find.find()
     method = chosen_method(footage, options)
     check_used(method, footage, options)
-    check_board(method, options)
-    with alone(capture):
+    if method == "board":
+        options.board.opencv_board()  # raises, before anything takes time, for markers that OpenCV does not have
+    with lock_output(capture):
         return _made(job, find, footage, method)
 
 
@@ -79,10 +79,12 @@ def _made(job: Job, find: CameraSteps, footage: Footage, method: str | Calibrati
     clocks = find.synchronize_again(footage, first, method, solved)
     content = assembled(footage, clocks.clocks, solved, options)
     make = CaptureSteps(job)
-    make.bring(footage, content)
+    make.link(footage, content)
     content = make.points(make.near(content))
     findings = make.check(content)
-    return Preparation(job.capture, findings, job.told, tuple(job.steps.skipped), job.capture / REPORT / "index.html")
+    return Preparation(
+        job.capture, findings, job.steps.summaries, tuple(job.steps.skipped), job.capture / REPORT / "index.html"
+    )
 
 
 def check_folder(path: Path, *, report: Path | None, listener: Listener | None = None) -> Checked:

@@ -1,17 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calls synchronisation and calibration with the pictures of the footage that they need."""
+"""Solves for the cameras with the pictures that each method needs, and packs the result for the cache of steps."""
 
+import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
 
 from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera
-from structgstream.data.timeline import Clock
+from structgstream.data.picture_headers import read_exif
+from structgstream.data.prepared import LENSES, camera_of, lens_model
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.calibration.board_solving import solve_board
 from structgstream.preparation.calibration.refinement import refine
-from structgstream.preparation.calibration.solved import SolvedCalibration
+from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
 from structgstream.preparation.calibration.structure import solve_structure
+from structgstream.preparation.clocks import Clocks, synchronized
 from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.instants import (
     Picture,
@@ -22,102 +28,14 @@ from structgstream.preparation.instants import (
     still_pictures,
 )
 from structgstream.preparation.options import PrepareOptions
-from structgstream.preparation.synchronization import Method, synchronize
+from structgstream.preparation.steps import Stored
 
-TIMESTAMPS = "timestamps.csv"
 BOARD_SECONDS = 0.4
-"""Between pictures of the board: it moves slowly, and neighbouring pictures say the same."""
+"""Between pictures of the board: it moves slowly, and neighbouring pictures show the same."""
 BOARD_MOMENTS = 60
-SURE_PERIODS = 0.5
-"""Standard error of a clock, in frame periods, up to which pictures of one moment can be chosen by it."""
 
 
-@dataclass(frozen=True)
-class Clocks:
-    """The clocks of all cameras.
-
-    Args:
-        clocks: by camera.
-        method: how they were found, see ``preparation.synchronization``.
-        told: that, and what else is to be known, in words.
-        late_seconds: by camera, how much later than the common instants its frames are.
-        uncertainty_seconds: by camera, standard error of its time.
-        sure: whether pictures of one moment can be chosen by them.
-    """
-
-    clocks: Mapping[str, Clock]
-    method: str
-    told: str
-    late_seconds: Mapping[str, float] = field(default_factory=dict)
-    uncertainty_seconds: Mapping[str, float] = field(default_factory=dict)
-    sure: bool = True
-
-
-def synchronized(
-    footage: Footage,
-    options: PrepareOptions,
-    *,
-    cameras: Mapping[str, LensCamera] | None = None,
-) -> Clocks:
-    """The clocks of the cameras.
-
-    Args:
-        footage: what they filmed.
-        options: ``synchronize`` says how.
-        cameras: their calibration, where it is known.
-
-    Raises:
-        CaptureError: they cannot be synchronised so, or have no moment in common.
-        ConfigError: an unknown method.
-    """
-    single = all(len(footage.stamps(name)) == 1 for name in footage.cameras)
-    chosen: Method = "none" if single else options.synchronize
-    table = footage.where / TIMESTAMPS
-    try:
-        found = synchronize(
-            footage,
-            method=chosen,
-            timestamps=table if table.is_file() else None,
-            cameras=cameras,
-        )
-    except CaptureError as error:
-        if chosen != "auto":
-            raise
-        raise CaptureError(f"{error} Cameras that one signal starts need none of this: --synchronize none.") from None
-    clocks = {name: estimate.clock for name, estimate in found.clocks.items()}
-    shared_seconds(footage, clocks)
-    told = " ".join([f"{found.method}: {found.reason}" + ("." if found.warnings else ""), *found.warnings])
-    errors = {name: estimate.uncertainty_seconds for name, estimate in found.clocks.items()}
-    return Clocks(
-        clocks,
-        found.method,
-        told,
-        {name: estimate.residual_seconds for name, estimate in found.clocks.items()},
-        errors,
-        found.method != "motion" or max(errors.values()) <= SURE_PERIODS / footage.fps,
-    )
-
-
-def first_clocks(footage: Footage, options: PrepareOptions) -> Clocks:
-    """The clocks of cameras whose calibration is to be found without them: by motion they may be unsure, or unknown.
-
-    Motion tells little without a calibration, and poses come from what stands still. So a failure is none here: with
-    the calibration motion is looked at again.
-
-    Raises:
-        CaptureError: by another method they cannot be synchronised.
-        ConfigError: an unknown method.
-    """
-    try:
-        return synchronized(footage, options)
-    except CaptureError as error:
-        if options.synchronize not in ("auto", "motion") or (footage.where / TIMESTAMPS).is_file():
-            raise
-        told = f"motion: not without the calibration. {error}"
-        return Clocks({name: Clock() for name in footage.cameras}, "motion", told, sure=False)
-
-
-def solved_by(
+def solve_cameras(
     method: str,
     footage: Footage,
     clocks: Clocks,
@@ -131,7 +49,7 @@ def solved_by(
         method: either.
         footage: what the cameras filmed.
         clocks: of the cameras.
-        options: what is asked for.
+        options: of the preparation.
         focals: focal lengths in pixels that cameras state, with which structure from motion begins.
 
     Raises:
@@ -154,7 +72,7 @@ def solved_by(
 def refined(
     solved: SolvedCalibration, footage: Footage, clocks: Clocks, options: PrepareOptions
 ) -> tuple[SolvedCalibration, str]:
-    """The calibration adjusted to the pictures, and in words what that changed.
+    """The calibration adjusted to the pictures, and a sentence on what that changed.
 
     Raises:
         CalibrationError: too few matches agree with the calibration.
@@ -163,15 +81,14 @@ def refined(
     found = refine(
         matched_pictures(footage, clocks, options),
         solved.cameras,
-        free="lens" if options.lens else "focal",
         lens=options.lens,
         metres=solved.metres,
     )
-    told = (
-        f"{found.held_back} matches that were kept out lie {found.before_pixels:.2f} px from their epipolar lines "
-        f"before, {found.after_pixels:.2f} after"
+    summary = (
+        f"{found.held_out} held-out matches lie {found.before_pixels:.2f} px from their epipolar lines before, "
+        f"{found.after_pixels:.2f} after"
     )
-    return found.solved, told if found.changed else f"{told}: the given calibration stays"
+    return found.solved, summary if found.changed else f"{summary}: the given calibration stays"
 
 
 def matched_pictures(
@@ -196,7 +113,7 @@ def board_footage(footage: Footage, options: PrepareOptions) -> Footage:
         CaptureError: a camera has none.
         CalibrationError: they have another size.
     """
-    assert options.board_videos is not None, "asked before"
+    assert options.board_videos is not None, "checked before"
     found = find_footage(options.board_videos, picture_fps=options.fps)
     if missing := [name for name in footage.cameras if name not in found.cameras]:
         raise CaptureError(
@@ -212,3 +129,102 @@ def board_footage(footage: Footage, options: PrepareOptions) -> Footage:
                 f"with {other[0]}x{other[1]}; film both in one mode."
             )
     return found
+
+
+def check_complete(solved: SolvedCalibration, footage: Footage) -> SolvedCalibration:
+    """The calibration itself.
+
+    Raises:
+        CalibrationError: cameras could not be placed.
+    """
+    missing = [name for name in footage.cameras if name not in solved.cameras]
+    if missing:
+        raise CalibrationError(
+            f"{listed(missing)} of {footage.where} could not be placed among the other {len(solved.cameras)}: their "
+            "pictures have too little in common; move them closer to the others or show a board to all (structgstream "
+            f"board), or go on without: --without {shlex.join(missing)}."
+        )
+    return solved
+
+
+def stated_focals(footage: Footage) -> dict[str, float]:
+    """Focal lengths in pixels of those cameras whose first picture states one (Exif); videos do not.
+
+    Raises:
+        CaptureError: a picture cannot be read.
+        MissingExtraError: Pillow is not installed.
+    """
+    stated = {name: read_exif(files[0]).focal_pixels for name, files in footage.stills.items()}
+    return {name: focal for name, focal in stated.items() if focal is not None}
+
+
+def describe_focals(focals: Mapping[str, float], footage: Footage) -> str:
+    """Which focal lengths calibration begins with, for users; empty for none."""
+    if not focals:
+        return ""
+    shares = sorted(focal / max(footage.size(name)) for name, focal in focals.items())
+    span = f"{shares[0]:.3f}" + (f" to {shares[-1]:.3f}" if shares[-1] - shares[0] > 5e-4 else "")
+    return (
+        f"began with the focal lengths that the pictures of {len(focals)} of {len(footage.cameras)} cameras state "
+        f"({span} of the longer side)"
+    )
+
+
+def describe_turns(footage: Footage) -> str:
+    """Which cameras' pictures are to be turned to be seen upright (Exif), for users; empty for none.
+
+    A prepared capture has pixels as they are stored, so pictures are never turned, only reported.
+
+    Raises:
+        CaptureError: a picture cannot be read.
+        MissingExtraError: Pillow is not installed.
+    """
+    turned = [name for name, files in footage.stills.items() if read_exif(files[0]).orientation != 1]
+    if not turned:
+        return ""
+    return (
+        f"the files of {listed(turned)} say that pictures are to be turned (Exif orientation), and they are taken as "
+        "they are stored: turn them without loss (exiftran -a, jpegtran) to have them upright"
+    )
+
+
+def summary(solved: SolvedCalibration) -> str:
+    """A calibration in one line."""
+    text = f"{len(solved.cameras)} cameras"
+    if len(solved.observations):
+        errors = solved.errors()
+        errors = errors[np.isfinite(errors)]
+        text += f", {len(solved.points)} points, median reprojection error {np.median(errors):.2f} px"
+    return text
+
+
+def packed(solved: SolvedCalibration) -> Stored:
+    """The calibration as plain values."""
+    cameras: dict[str, Any] = {}
+    for name, filmed in solved.cameras.items():
+        camera = filmed.camera
+        cameras[name] = {
+            "size": [camera.width, camera.height],
+            "K": camera.K.tolist(),
+            "viewmat": camera.viewmat.tolist(),
+            "lens": {"model": lens_model(filmed.lens), **asdict(filmed.lens)},
+        }
+    seen = solved.observations
+    arrays = {
+        "points": solved.points, "point": seen.point, "camera": seen.camera, "pixels": seen.pixels,
+        "instant": seen.instant,
+    }  # fmt: skip
+    return Stored({"cameras": cameras, "missing": list(solved.missing), "metres": solved.metres}, arrays)
+
+
+def unpacked(stored: Stored) -> SolvedCalibration:
+    """The reverse of :func:`packed`."""
+    cameras = {}
+    for name, entry in stored.values["cameras"].items():
+        lens = dict(entry["lens"])
+        kind = LENSES[lens.pop("model")]
+        cameras[name] = LensCamera(camera_of(entry["viewmat"], entry["K"], entry["size"]), kind(**lens))
+    arrays = stored.arrays
+    seen = Observations(arrays["point"], arrays["camera"], arrays["pixels"], arrays["instant"])
+    missing = tuple(stored.values["missing"])
+    return SolvedCalibration(cameras, arrays["points"], seen, missing, bool(stored.values["metres"]))

@@ -17,9 +17,9 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.atomic_files import replacing
 from structgstream.errors import StorageError
 from structgstream.preparation.options import PrepareOptions
-from structgstream.whole_files import replacing
 
 FOLDER = "work"
 VERSION = 4  # of the steps' results; a new one does all steps again
@@ -35,7 +35,7 @@ class Stored:
 
 
 class Listener(Protocol):
-    """Is told of steps as they go."""
+    """Receives steps as they run."""
 
     def begin(self, step: str, *, skipped: bool) -> None:
         """A step begins; ``skipped`` when its result is there already."""
@@ -46,29 +46,33 @@ class Listener(Protocol):
         ...
 
     def end(self, step: str, summary: str) -> None:
-        """A step is done; ``summary`` says what came of it."""
+        """A step is done; ``summary`` describes its result."""
         ...
 
 
 class Silent:
-    """A listener that says nothing."""
+    """A listener that does nothing."""
 
     def begin(self, step: str, *, skipped: bool) -> None:
-        """Says nothing."""
+        """Does nothing."""
 
     def progress(self, done: int, total: int, what: str) -> None:
-        """Says nothing."""
+        """Does nothing."""
 
     def end(self, step: str, summary: str) -> None:
-        """Says nothing."""
+        """Does nothing."""
 
 
 class Steps:
-    """Runs the steps of one capture.
+    """Runs the steps of one capture, reports them, and records their summaries.
 
     Args:
         capture: the capture's folder; results go to ``work`` in it.
-        listener: is told of them.
+        listener: receives them.
+
+    Attributes:
+        skipped: steps whose results were there already.
+        summaries: of each step, for users.
     """
 
     def __init__(self, capture: Path, listener: Listener) -> None:
@@ -76,10 +80,20 @@ class Steps:
         self._listener = listener
         self._keys: dict[str, str] = {}
         self.skipped: list[str] = []
+        self.summaries: dict[str, str] = {}
 
-    def key(self, step: str) -> str:
-        """The key of a step that was run."""
-        return self._keys[step]
+    def begin(self, step: str, *, skipped: bool = False) -> None:
+        """Reports that a step begins."""
+        self._listener.begin(step, skipped=skipped)
+
+    def progress(self, done: int, total: int, what: str) -> None:
+        """Reports that a part of the running step is done."""
+        self._listener.progress(done, total, what)
+
+    def end(self, step: str, summary: str) -> None:
+        """Records and reports the summary of a step."""
+        self.summaries[step] = summary
+        self._listener.end(step, summary)
 
     def run(
         self,
@@ -96,7 +110,7 @@ class Steps:
 
         Args:
             step: its name.
-            inputs: what it depends on beside other steps, as JSON can hold it.
+            inputs: what it depends on apart from other steps, as JSON can hold it.
             compute: makes the result.
             pack: the result as numbers and arrays.
             unpack: the reverse.
@@ -110,14 +124,14 @@ class Steps:
         key = hashlib.sha256(json.dumps(described, sort_keys=True, default=str).encode()).hexdigest()
         self._keys[step] = key
         stored = self._read(step, key)
-        self._listener.begin(step, skipped=stored is not None)
+        self.begin(step, skipped=stored is not None)
         if stored is not None:
             self.skipped.append(step)
             value = unpack(stored)
         else:
             value = compute()
             self._write(step, key, pack(value))
-        self._listener.end(step, summary(value))
+        self.end(step, summary(value))
         return value
 
     def _read(self, step: str, key: str) -> Stored | None:
@@ -148,8 +162,8 @@ class Steps:
 
 
 def fingerprint(files: Mapping[str, Path]) -> list[tuple[str, str, int, int]]:
-    """What tells that files, and those of folders, are the same without reading them: name, file, size and time of
-    change of each."""
+    """Identifies the contents of files and folders without reading them: name, file, size and modification time of
+    each."""
     found = []
     for name, path in files.items():
         inside = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
@@ -167,39 +181,11 @@ class Job:
     Args:
         videos: the folder of what was filmed.
         capture: the folder to make.
-        options: what is asked for.
-        listener: receives the steps.
-        steps: runs them, or takes their results from the disk.
-        told: what each step found, in words.
+        options: of the preparation.
+        steps: runs them, or takes their results from the disk, and reports them.
     """
 
     videos: Path
     capture: Path
     options: PrepareOptions
-    listener: Listener
     steps: Steps
-    told: dict[str, str] = field(default_factory=dict)
-
-
-def new_job(videos: Path, capture: Path, *, options: PrepareOptions, listener: Listener) -> Job:
-    """A preparation that has not begun."""
-    told: dict[str, str] = {}
-    noting = _Noting(listener, told)
-    return Job(videos, capture, options, noting, Steps(capture, noting), told)
-
-
-class _Noting:
-    """Passes everything on, and notes what steps found."""
-
-    def __init__(self, listener: Listener, told: dict[str, str]) -> None:
-        self._listener, self._told = listener, told
-
-    def begin(self, step: str, *, skipped: bool) -> None:
-        self._listener.begin(step, skipped=skipped)
-
-    def progress(self, done: int, total: int, what: str) -> None:
-        self._listener.progress(done, total, what)
-
-    def end(self, step: str, summary: str) -> None:
-        self._told[step] = summary
-        self._listener.end(step, summary)

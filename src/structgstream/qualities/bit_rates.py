@@ -8,14 +8,14 @@ from pathlib import Path
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.quality_list import ListedQuality, read_list, write_list
 from structgstream.errors import StreamError
-from structgstream.frame_report import FrameReport
 from structgstream.qualities.ladder import Quality
+from structgstream.session.frame_report import FrameReport
 
 EXPECTED_BITS = 2e6
 """Estimated bits per second of quality 0, from 1.9 and 2.9 Mbit/s in lab/notes/compact-measured.md. Each further unit
 of quality doubles it."""
-LEAST_PACKETS = 5
-MOST_PACKETS = 60
+MIN_PACKETS = 5
+MAX_PACKETS = 60
 """Number of packets over which a rate is measured: two groups of one second, or more if frames are skipped."""
 CHANGE = 0.1
 """The list is rewritten when a rate differs from the listed one by this share."""
@@ -32,7 +32,7 @@ class BitRates:
     def __init__(self, folder: Path, qualities: Sequence[Quality]) -> None:
         self._folder = folder
         self._listed = {quality.name: expected_bits(quality) for quality in qualities}
-        self._packets = {quality.name: deque[tuple[float, int]](maxlen=MOST_PACKETS + 1) for quality in qualities}
+        self._packets = {quality.name: deque[tuple[float, int]](maxlen=MAX_PACKETS + 1) for quality in qualities}
 
     def begin(self, *, resume: bool) -> None:
         """Writes the list, with the rates of the earlier run if it is resumed.
@@ -60,7 +60,7 @@ class BitRates:
         known = {
             name: bits
             for name, packets in self._packets.items()
-            if len(packets) > (1 if last else LEAST_PACKETS) and (bits := bits_per_second(packets)) is not None
+            if len(packets) > (1 if last else MIN_PACKETS) and (bits := bits_per_second(packets)) is not None
         }
         share = 0.0 if last else CHANGE
         if any(abs(bits - self._listed[name]) > share * self._listed[name] for name, bits in known.items()):

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from structgstream.codec.segments.quality_list import MOST_QUALITIES, is_quality_name
+from structgstream.codec.segments.quality_list import MAX_QUALITIES, is_quality_name
 from structgstream.errors import ConfigError
-from structgstream.presets import MOST_QUALITY, StreamConfig, with_budget
+from structgstream.session.presets import MAX_QUALITY, StreamConfig, with_budget
 
 _GIVEN = re.compile(r"([^=]*)=([^=]*)")
 
@@ -33,9 +33,9 @@ def qualities_in(given: Sequence[str]) -> tuple[Quality, ...]:
         ConfigError: a text is malformed, two qualities have the same name or fineness, or their number is out of range.
     """
     qualities = sorted(map(_parsed, given), key=lambda quality: quality.fineness)
-    if not 2 <= len(qualities) <= MOST_QUALITIES:
+    if not 2 <= len(qualities) <= MAX_QUALITIES:
         raise ConfigError(
-            f"--qualities takes 2 to {MOST_QUALITIES} qualities, which is what players choose from, got "
+            f"--qualities takes 2 to {MAX_QUALITIES} qualities, which is what players choose from, got "
             f"{len(qualities)}; for a single one give --quality."
         )
     # Some file systems do not distinguish upper and lower case.
@@ -66,9 +66,9 @@ def _parsed(text: str) -> Quality:
         name, fineness = ("", float("nan")) if match is None else (match[1], float(match[2]))
     except ValueError:
         name, fineness = "", float("nan")
-    if not is_quality_name(name) or not abs(fineness) <= MOST_QUALITY:
+    if not is_quality_name(name) or not abs(fineness) <= MAX_QUALITY:
         raise ConfigError(
             f"--qualities {text} is no quality; expected NAME=Q, a name of letters, digits, '-' and '_' and a Q from "
-            f"{-MOST_QUALITY:g} to {MOST_QUALITY:g}, such as low=-1 or high=1."
+            f"{-MAX_QUALITY:g} to {MAX_QUALITY:g}, such as low=-1 or high=1."
         )
     return Quality(name, fineness)

@@ -19,10 +19,10 @@ from typing import Any, Generic, TypeVar
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
-from structgstream.pipeline import FrameTask, Past, Pipeline
-from structgstream.presets import StreamConfig
 from structgstream.scene.scene import Scene
-from structgstream.struct_gstream import FrameZeroContext, StructGStream, stream_pipeline
+from structgstream.session.pipeline import FrameTask, Past, Pipeline
+from structgstream.session.presets import StreamConfig
+from structgstream.session.struct_gstream import FrameZeroContext, StructGStream, stream_pipeline
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.result import FitResult
 

@@ -43,7 +43,7 @@ from starlette.routing import Route
 
 from structgstream.codec.container.records import footer_offset
 from structgstream.codec.segments.manifest import MANIFEST
-from structgstream.codec.segments.quality_list import MOST_LIST_BYTES, QUALITIES
+from structgstream.codec.segments.quality_list import MAX_LIST_BYTES, QUALITIES
 from structgstream.serve.access import Authorizer, Refused, query_of, refusal
 from structgstream.serve.files import OpenedFile, hash_in_name, is_plain_path, is_stream_name
 from structgstream.serve.listening import LOOPBACK_NAMES
@@ -267,7 +267,7 @@ class _Routes:
 
     async def _renditions(self, stream: ServedStream, request: Request) -> Response:
         request.scope["counted_as"] = (stream.name, "qualities")
-        content = await _content(await to_thread.run_sync(stream.open, QUALITIES), MOST_LIST_BYTES)
+        content = await _content(await to_thread.run_sync(stream.open, QUALITIES), MAX_LIST_BYTES)
         if content is None:
             raise Refused(404, f"{stream.name} has no such file.")
         headers = {**self._headers, "Cache-Control": self._revalidated}

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from structgstream.atomic_files import atomic_write
 from structgstream.codec.container.byte_source import ByteSource, FileBytes
 from structgstream.codec.container.records import (
     PREFIX,
@@ -18,7 +19,6 @@ from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.stored_bytes import StoredBytes, is_segments, open_segments
 from structgstream.errors import StorageError, StreamError
 from structgstream.serve.pages import bundle, linked_page, single_page
-from structgstream.whole_files import write_whole
 
 PIECE_BYTES = 2**20
 
@@ -103,7 +103,7 @@ def write_page(path: Path, stream: StreamFile) -> int:
     with stream.opened() as data:
         check_has_header(data, str(stream.path))
         page = single_page(stream.path.stem, module=bundle(), stream=data)
-    write_whole(path, page, new_folder=True)
+    atomic_write(path, page, new_folder=True)
     return len(page)
 
 
@@ -127,9 +127,9 @@ def write_site(folder: Path, stream: StreamFile) -> int:
         "player.js": bundle().encode(),
     }
     for name, content in small.items():
-        write_whole(folder / name, content, new_folder=True)
+        atomic_write(folder / name, content, new_folder=True)
     with stream.opened() as data:
-        write_whole(copy, _pieces(data), new_folder=True)
+        atomic_write(copy, _pieces(data), new_folder=True)
         return sum(map(len, small.values())) + len(data)
 
 

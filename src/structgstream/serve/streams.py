@@ -12,11 +12,11 @@ from itertools import islice
 from pathlib import Path
 from typing import Final
 
+from structgstream.atomic_files import side_path
 from structgstream.codec.segments.manifest import MANIFEST
-from structgstream.codec.segments.quality_list import MOST_LIST_BYTES, QUALITIES, list_from_json
+from structgstream.codec.segments.quality_list import MAX_LIST_BYTES, QUALITIES, list_from_json
 from structgstream.errors import PlayerError, StreamError
 from structgstream.serve.files import STREAM_SUFFIX, OpenedFile, is_stream_name, open_below
-from structgstream.whole_files import side_path
 
 REFRESH_SECONDS: Final = 1.0
 MAX_ENTRIES: Final = 10_000
@@ -161,7 +161,7 @@ def _renditions(root: Path, name: str) -> list[str | None]:
     if opened is None:
         return []
     with opened:
-        listed = list_from_json(opened.read(0, min(len(opened), MOST_LIST_BYTES + 1)), name=name)
+        listed = list_from_json(opened.read(0, min(len(opened), MAX_LIST_BYTES + 1)), name=name)
     return [one.folder for one in sorted(listed, key=lambda one: one.bits_per_second)]
 
 

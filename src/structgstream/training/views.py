@@ -22,7 +22,7 @@ from torch import Tensor
 from structgstream.cameras import Camera, CameraRig, enlargement
 from structgstream.frames import MultiViewFrame
 
-MOST_PHASES = 8
+MAX_PHASES = 8
 """Ratios of sizes whose pattern repeats after more pixels than this are left to torch."""
 
 
@@ -116,7 +116,7 @@ def _reduced_picture(picture: Tensor, size: tuple[int, int]) -> Tensor:
     """The bytes ``[H, W, 3]`` averaged down to ``size``, h and w."""
     height, width = picture.shape[:2]
     factor = height // size[0]
-    if factor > MOST_PHASES or (size[0] * factor, size[1] * factor) != (height, width):
+    if factor > MAX_PHASES or (size[0] * factor, size[1] * factor) != (height, width):
         small = area_mean(picture.permute(2, 0, 1)[None].float(), size)
         return small[0].permute(1, 2, 0).round().to(torch.uint8).contiguous()
     # Whole blocks of pixels: sums of integers, in an eighth of the time.
@@ -141,7 +141,7 @@ def _mean_along(planes: Tensor, dim: int, size: int) -> Tensor:
     pixels, outputs = planes.shape[dim] // period, size // period  # The pattern repeats after as many.
     if pixels == outputs:
         return planes
-    if outputs > MOST_PHASES:
+    if outputs > MAX_PHASES:
         shape = (size, planes.shape[3]) if dim == 2 else (planes.shape[2], size)
         return torch.nn.functional.interpolate(planes, size=shape, mode="area")
     every = tuple(slice(None) for _ in range(dim))

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
-from streams import small_stream
 from structgstream.codec.container.damage import readable_part
 from structgstream.codec.container.records import PREFIX, RECORD, prefix, read_record
 from structgstream.codec.reader import StreamReader
 from structgstream.errors import StreamError
+from tests.support.properties import examples
+from tests.support.streams import small_stream
 
 WHOLE = small_stream()
 with StreamReader(WHOLE) as _reader:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from streams import same, small_stream
 from structgstream.codec.container.index import FOOTER, FOOTER_MAGIC, INDEX_ENTRY, pack_index, read_index
 from structgstream.codec.container.records import Record, RecordType, packed, scan_records
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.errors import StreamError
+from tests.support.streams import same, small_stream
 
 STREAM = small_stream()
 RECORDS = list(scan_records(STREAM))

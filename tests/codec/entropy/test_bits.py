@@ -24,7 +24,7 @@ WHERE = "It"
 def test_golomb_codes_come_back(pieces: list[tuple[int, int]]) -> None:
     data = pack_bits(signed_golomb(value, order=order) for value, order in pieces)
     reader = BitReader(data, where=WHERE)
-    assert [reader.signed_golomb(order=order, most_zeros=14) for _, order in pieces] == [value for value, _ in pieces]
+    assert [reader.signed_golomb(order=order, max_zeros=14) for _, order in pieces] == [value for value, _ in pieces]
     reader.end()
 
 
@@ -40,11 +40,11 @@ def test_the_codes_of_the_document() -> None:
 
 def test_more_zeros_than_allowed_and_a_cut() -> None:
     data = pack_bits([golomb(12, order=0)])  # 0001101
-    assert BitReader(data, where=WHERE).golomb(order=0, most_zeros=3) == 12
+    assert BitReader(data, where=WHERE).golomb(order=0, max_zeros=3) == 12
     with pytest.raises(StreamError, match="It holds a number that is cut or out of bounds"):
-        BitReader(data, where=WHERE).golomb(order=0, most_zeros=2)
+        BitReader(data, where=WHERE).golomb(order=0, max_zeros=2)
     with pytest.raises(StreamError, match="It ends within a number"):
-        BitReader(b"\x01", where=WHERE).golomb(order=0, most_zeros=7)
+        BitReader(b"\x01", where=WHERE).golomb(order=0, max_zeros=7)
     with pytest.raises(StreamError, match="It ends within a number"):
         BitReader(b"\x01", where=WHERE).fixed(9)
 

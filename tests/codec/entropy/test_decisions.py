@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.codec.entropy import reference_decisions as reference
 from structgstream.codec.entropy.adaptive import code_activity, code_numbers, code_residuals
 from structgstream.codec.entropy.models import (
@@ -20,6 +19,7 @@ from structgstream.codec.entropy.models import (
 )
 from structgstream.codec.entropy.rans import has_native
 from structgstream.errors import StreamError
+from tests.support.properties import examples
 
 NATIVE = [False, *([True] if has_native() else [])]
 both = pytest.mark.parametrize("native", NATIVE)

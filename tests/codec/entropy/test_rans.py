@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.codec.entropy import rans
 from structgstream.codec.entropy.rans import LANES, decode, encode, has_native, lanes_for, section_bytes
 from structgstream.codec.entropy.tables import FrequencyTables, normalize_counts
 from structgstream.errors import StreamError
+from tests.support.properties import examples
 
 NATIVE = [False, *([True] if has_native() else [])]
 both = pytest.mark.parametrize("native", NATIVE, ids=lambda native: "C++" if native else "NumPy")

@@ -91,5 +91,5 @@ def test_every_damaged_byte_is_refused_or_gives_as_many() -> None:
 def test_bits_come_back(values: list[tuple[int, int]]) -> None:
     data = pack_bits(signed_golomb(value, order=order) for value, order in values)
     reader = BitReader(data, where="It")
-    assert [reader.signed_golomb(order=order, most_zeros=22) for _, order in values] == [value for value, _ in values]
+    assert [reader.signed_golomb(order=order, max_zeros=22) for _, order in values] == [value for value, _ in values]
     reader.end()

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.codec.entropy.bits import fixed, pack_bits, unpack_numbers, varint
 from structgstream.codec.entropy.section_coder import SectionDecoder, SectionEncoder, Tables
 from structgstream.errors import StreamError
+from tests.support.properties import examples
 
 NATURAL = st.one_of(st.integers(0, 20), st.integers(0, 2**31 - 1), st.sampled_from([2**30 - 1, 2**30, 2**31 - 1]))
 RESIDUAL = st.one_of(st.integers(-9, 9), st.integers(-(2**31), 2**31 - 1))

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.codec.entropy.bits import fixed, pack_bits, signed_golomb
 from structgstream.codec.entropy.rans import encode
 from structgstream.codec.entropy.table_choice import choose_tables
@@ -24,6 +23,7 @@ from structgstream.codec.entropy.tables import (
     weights_of,
 )
 from structgstream.errors import StreamError
+from tests.support.properties import examples
 
 COUNTS = st.lists(st.one_of(st.integers(0, 3), st.integers(0, 2**31)), min_size=1, max_size=32)
 

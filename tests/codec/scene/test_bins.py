@@ -7,14 +7,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
-from rigs import random_scene
-from streams import STEPS
 from structgstream.codec.fields.packet_fields import CODABLE, dequantize_state, quantize_state, quantized_fields
 from structgstream.codec.fields.quantization import LARGEST
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, state_of
+from tests.support.properties import examples
+from tests.support.rigs import random_scene
+from tests.support.streams import STEPS
 
 AWKWARD = {name: float(np.float32(0.013 * (i + 1))) for i, name in enumerate(STEPS)}
 

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.codec.entropy.adaptive import AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.entropy.models import Models
 from structgstream.codec.fields import free_rows
-from structgstream.codec.fields.free_rows import MOST_FREE, FreeBins, code_free
+from structgstream.codec.fields.free_rows import MAX_FREE, FreeBins, code_free
 from structgstream.codec.fields.rows import Change
 from structgstream.errors import StreamError
+from tests.support.properties import examples
 
 
 def free(births: list[int], *, seed: int = 0, scale: float = 20.0) -> FreeBins:
@@ -114,7 +114,7 @@ def hostile(count: int, frames: list[int], numbers: list[int]) -> FreeBins:
 @pytest.mark.parametrize(
     ("count", "frames", "numbers", "message"),
     [
-        (MOST_FREE + 1, [], [], "adds 262145 free Gaussians, which makes more than 262144"),
+        (MAX_FREE + 1, [], [], "adds 262145 free Gaussians, which makes more than 262144"),
         (2**31 - 1, [], [], "makes more than 262144"),
         (-1, [], [], "or fewer than none"),
         (2, [2**31 - 1, 2**31 - 1], [1, 1], "births beyond 63 bits"),
@@ -147,7 +147,7 @@ def test_a_count_is_refused_before_anything_is_made_of_it() -> None:
 
 def test_the_most_that_few_bytes_can_make(monkeypatch: pytest.MonkeyPatch) -> None:
     """Births that differ by nothing take no bits: only the limit bounds them, also over several packets."""
-    monkeypatch.setattr(free_rows, "MOST_FREE", 2**12)
+    monkeypatch.setattr(free_rows, "MAX_FREE", 2**12)
     many = FreeBins(np.arange(1, 2**12 + 1), np.zeros((2**12, 14), np.int32), Change.none(2**12, 14))
     writer = new_encoder()
     code_free(writer, many, FreeBins.none(), where="")

@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import documented
-from properties import examples
 from structgstream.codec.entropy.adaptive import AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.entropy.models import Models
 from structgstream.codec.fields.rows import Change, code_change
 from structgstream.errors import StreamError
+from tests.support import documented
+from tests.support.properties import examples
 
 GROUPS = (("anchor_positions", 0, 2), ("offset_scales", 2, 3))
 NOTHING = {"anchor_positions": b"", "offset_scales": b""}

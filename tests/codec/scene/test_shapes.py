@@ -4,11 +4,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from streams import small_scene
 from structgstream.codec.header import check_shapes
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import STATE_TABLE, FieldName, state_of
+from tests.support.streams import small_scene
 
 
 def check(fields: dict[FieldName, torch.Tensor], *, cameras: int = 2) -> None:

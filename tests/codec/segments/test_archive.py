@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from segment_folders import GrowingFolder
-from segment_streams import as_file, folder, packets, written
-from streams import small_stream
 from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest, write_archive
 from structgstream.errors import StorageError, StreamError
+from tests.support.segment_folders import GrowingFolder
+from tests.support.segment_streams import as_file, folder, packets, written
+from tests.support.streams import small_stream
 
 SENT = packets(7)
 

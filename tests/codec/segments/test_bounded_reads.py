@@ -36,14 +36,14 @@ def test_what_never_ends_is_refused_before_it_is_read(tmp_path: Path, kind: str)
     with pytest.raises(StreamError, match=expected):
         read_list(tmp_path)
     with pytest.raises(StreamError, match=expected):
-        store.get("segment-0000-0123456789abcdef.sgs", most_bytes=1000)
+        store.get("segment-0000-0123456789abcdef.sgs", max_bytes=1000)
 
 
 def test_a_file_of_the_stated_size_is_read(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"abc")
-    assert FolderStore(tmp_path).get("a", most_bytes=3) == FolderStore(tmp_path).get("a") == b"abc"
+    assert FolderStore(tmp_path).get("a", max_bytes=3) == FolderStore(tmp_path).get("a") == b"abc"
     with pytest.raises(StreamError, match="a has 3 bytes; expected at most 2"):
-        FolderStore(tmp_path).get("a", most_bytes=2)
+        FolderStore(tmp_path).get("a", max_bytes=2)
 
 
 @pytest.mark.parametrize("content", [b'{"name": "my web application", "icons": []}', b"not JSON"])

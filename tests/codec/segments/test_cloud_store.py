@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from s3_emulator import BUCKET, Emulator, emulator
-from segment_streams import as_file, folder, packets, written
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.mirror import MirroredStore, MirrorOptions
 from structgstream.codec.segments.recovery import stale_files
 from structgstream.codec.segments.store import CloudStore
 from structgstream.codec.segments.stored_bytes import read_manifest, write_archive
 from structgstream.errors import MissingExtraError, StorageError, StreamError
+from tests.support.s3_emulator import BUCKET, Emulator, emulator
+from tests.support.segment_streams import as_file, folder, packets, written
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
 

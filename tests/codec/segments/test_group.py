@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.codec.container.records import FRAME, PacketKind, RecordType, packed
 from structgstream.codec.segments.next_manifest import part_of, records_of, segment_of
 from structgstream.errors import StreamError
+from tests.support.properties import examples
 
 
 def record(frame: int, *, key: bool, content: bytes = b"", period: int = 0) -> bytes:

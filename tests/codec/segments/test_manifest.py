@@ -7,9 +7,6 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
-from segment_folders import GrowingFolder
-from streams import small_stream
 from structgstream.codec.segments.manifest import (
     MANIFEST,
     history_name,
@@ -19,6 +16,9 @@ from structgstream.codec.segments.manifest import (
     sha256_of,
 )
 from structgstream.codec.segments.store import is_ours
+from tests.support.properties import examples
+from tests.support.segment_folders import GrowingFolder
+from tests.support.streams import small_stream
 
 
 def test_the_documented_names() -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.segments.manifest import (
-    MOST_MANIFEST_BYTES,
+    MAX_MANIFEST_BYTES,
     Edge,
     HistoryEntry,
     Manifest,
@@ -176,7 +176,7 @@ def test_a_manifest_that_has_ended_has_no_parts_and_what_is_missing_is_named() -
 
 @pytest.mark.parametrize(
     "data",
-    [b"", b"[]", b"null", b"{", b"\xff\xfe", b'{"fps": NaN}', b"[" * 100_000, b" " * (MOST_MANIFEST_BYTES + 1)],
+    [b"", b"[]", b"null", b"{", b"\xff\xfe", b'{"fps": NaN}', b"[" * 100_000, b" " * (MAX_MANIFEST_BYTES + 1)],
     ids=["empty", "list", "null", "cut", "no UTF-8", "NaN", "deep", "long"],
 )
 def test_what_is_no_manifest_is_refused(data: bytes) -> None:
@@ -212,9 +212,9 @@ def test_a_byte_order_mark_and_what_is_too_long_are_refused() -> None:
     read(GOLDEN)
     with pytest.raises(StreamError, match="is not JSON"):
         read(b"\xef\xbb\xbf" + GOLDEN)
-    read(GOLDEN + b" " * (MOST_MANIFEST_BYTES - len(GOLDEN)))
+    read(GOLDEN + b" " * (MAX_MANIFEST_BYTES - len(GOLDEN)))
     with pytest.raises(StreamError, match="expected at most 4194304"):
-        read(GOLDEN + b" " * (MOST_MANIFEST_BYTES + 1 - len(GOLDEN)))
+        read(GOLDEN + b" " * (MAX_MANIFEST_BYTES + 1 - len(GOLDEN)))
 
 
 @given(st.data())

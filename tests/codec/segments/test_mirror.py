@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from segment_streams import Hands, as_file, folder, header, packets, written
 from structgstream.codec.segments.manifest import MANIFEST, manifest_from_json
 from structgstream.codec.segments.mirror import AnotherStreamError, MirroredStore, MirrorOptions
 from structgstream.codec.segments.recovery import stale_files
@@ -18,6 +17,7 @@ from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest
 from structgstream.errors import StorageError
 from structgstream.owned_folders import MARKER
+from tests.support.segment_streams import Hands, as_file, folder, header, packets, written
 
 SENT = packets(9)
 

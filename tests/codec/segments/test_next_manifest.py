@@ -8,8 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
-from segment_streams import folder, header
 from structgstream.codec.container.records import FRAME, RecordType, packed
 from structgstream.codec.segments.manifest import Edge, PeriodEntry, Window, manifest_from_json, manifest_to_json
 from structgstream.codec.segments.next_manifest import (
@@ -23,6 +21,8 @@ from structgstream.codec.segments.next_manifest import (
     with_segment,
 )
 from structgstream.errors import StreamError
+from tests.support.properties import examples
+from tests.support.segment_streams import folder, header
 
 PERIOD = PeriodEntry(0, "init-0000-0123456789abcdef.sgs", 10, "0" * 64, 0, 0)
 

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from period_streams import FIRSTS, FRAMES, period_of, period_packets, period_stream
-from segment_streams import Hands, Killed, KilledStore, folder
-from streams import same
 from structgstream.codec.container.records import MINOR_WITH_PERIODS, PREFIX
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest, write_archive
 from structgstream.codec.sinks import resume_segments
+from tests.support.period_streams import FIRSTS, FRAMES, period_of, period_packets, period_stream
+from tests.support.segment_streams import Hands, Killed, KilledStore, folder
+from tests.support.streams import same
 
 
 def write(

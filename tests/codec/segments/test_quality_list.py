@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from killed import folders_of_the_killed
 from structgstream.codec.segments.quality_list import (
     QUALITIES,
     ListedQuality,
@@ -16,6 +15,7 @@ from structgstream.codec.segments.quality_list import (
     write_list,
 )
 from structgstream.errors import StorageError, StreamError
+from tests.support.killed import folders_of_the_killed
 
 LOW, HIGH = ListedQuality("low", "low/manifest.json", 1.5e6), ListedQuality("high", "high/manifest.json", 6e6)
 

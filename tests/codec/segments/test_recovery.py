@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from segment_folders import GrowingFolder
-from streams import small_stream
 from structgstream.codec.segments.manifest import MANIFEST, Manifest, Window, manifest_to_json
 from structgstream.codec.segments.recovery import find, stale_files
 from structgstream.codec.segments.store import FolderStore
 from structgstream.errors import StreamError
+from tests.support.segment_folders import GrowingFolder
+from tests.support.streams import small_stream
 
 STREAM = small_stream(8)
 

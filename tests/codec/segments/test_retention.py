@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from segment_streams import folder, header
 from structgstream.codec.segments.manifest import Manifest, PeriodEntry, SegmentEntry, segment_name
 from structgstream.codec.segments.next_manifest import empty_manifest
 from structgstream.codec.segments.retention import Retention, SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
+from tests.support.segment_streams import folder, header
 
 SHA = "0" * 64
 FIRST = PeriodEntry(0, "init-0000-0123456789abcdef.sgs", 10, SHA, 0, 0)

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from killed import folders_of_the_killed
 from structgstream.codec.segments.store import FolderStore, is_ours
 from structgstream.errors import StorageError, StreamError
+from tests.support.killed import folders_of_the_killed
 
 
 def test_files_are_written_replaced_listed_and_removed(tmp_path: Path) -> None:

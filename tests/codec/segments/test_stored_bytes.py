@@ -8,16 +8,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from properties import examples
-from segment_folders import GrowingFolder
-from segment_streams import folder, packets, written
-from streams import small_stream
 from structgstream.codec.container.records import PacketKind
 from structgstream.codec.segments.manifest import MANIFEST, manifest_to_json
 from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import StoredBytes, is_segments, open_segments, read_manifest
 from structgstream.errors import StreamError
+from tests.support.properties import examples
+from tests.support.segment_folders import GrowingFolder
+from tests.support.segment_streams import folder, packets, written
+from tests.support.streams import small_stream
 
 STREAM = small_stream(7)
 
@@ -102,9 +102,9 @@ def test_few_files_are_kept_in_memory_and_none_after_closing(whole: Path, monkey
     read: list[str] = []
     get = FolderStore.get
 
-    def counted(self: FolderStore, name: str, *, most_bytes: int | None = None) -> bytes:
+    def counted(self: FolderStore, name: str, *, max_bytes: int | None = None) -> bytes:
         read.append(name)
-        return get(self, name, most_bytes=most_bytes)
+        return get(self, name, max_bytes=max_bytes)
 
     stored = open_segments(whole)
     monkeypatch.setattr(FolderStore, "get", counted)

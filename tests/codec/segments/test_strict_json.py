@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.codec.segments.strict_json import MOST, Fields, parse_object
 from structgstream.errors import StreamError
+from tests.support.properties import examples
 
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
@@ -77,7 +77,7 @@ def test_what_is_missing_is_named(kind: str) -> None:
 
 @pytest.mark.parametrize("text", ["-1" + "0" * 400, "1" + "0" * 400, "-1e400", "1e400", "true", '"1"', "null", "[1]"])
 def test_numbers_of_any_length_are_refused_in_words(text: str) -> None:
-    one = parse_object(f'{{"x": {text}}}'.encode(), "it", most_bytes=1000)
+    one = parse_object(f'{{"x": {text}}}'.encode(), "it", max_bytes=1000)
     for read in (lambda: one.number("x"), lambda: one.whole("x"), lambda: one.number("x", least=0.0)):
         with pytest.raises(StreamError, match=r"^it has 'x' .*; expected a (whole )?number from .* to "):
             read()
@@ -106,7 +106,7 @@ def test_pairs_do_not_fall() -> None:
 @pytest.mark.parametrize("text", ["\ud800", "a\udfffb"])
 def test_halves_of_characters_are_no_text(text: str) -> None:
     """Nobody could print them; JSON writes them as an escape."""
-    one = parse_object(json.dumps({"x": text}).encode(), "it", most_bytes=100)
+    one = parse_object(json.dumps({"x": text}).encode(), "it", max_bytes=100)
     with pytest.raises(StreamError, match="expected a text") as found:
         one.text("x")
     str(found.value).encode()
@@ -163,20 +163,20 @@ def test_null_is_there_and_nothing_is_not() -> None:
 )
 def test_what_is_no_object(data: bytes) -> None:
     with pytest.raises(StreamError, match="^it is "):
-        parse_object(data, "it", most_bytes=10**6)
+        parse_object(data, "it", max_bytes=10**6)
 
 
 def test_the_length_is_looked_at_first() -> None:
-    assert parse_object(b'{"x":1}', "it", most_bytes=7).whole("x") == 1
+    assert parse_object(b'{"x":1}', "it", max_bytes=7).whole("x") == 1
     with pytest.raises(StreamError, match="it has 8 bytes; expected at most 7"):
-        parse_object(b'{"x":1} ', "it", most_bytes=7)
+        parse_object(b'{"x":1} ', "it", max_bytes=7)
 
 
 @given(st.binary(max_size=40))
 @examples(300)
 def test_nothing_but_an_object_or_a_sentence_comes_out(data: bytes) -> None:
     try:
-        parse_object(data, "it", most_bytes=30)
+        parse_object(data, "it", max_bytes=30)
     except StreamError:
         return
 

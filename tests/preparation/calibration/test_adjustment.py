@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from structgstream.cameras import Camera
+from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import LensCamera, RadialTangential
-from structgstream.data.posed import rotation_matrix
 from structgstream.preparation.calibration.adjustment import Limits, adjust_together, cleaned
-from structgstream.preparation.calibration.comparison import calibration_errors
 from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
+from tests.support.calibration_errors import calibration_errors
 
 CAMERAS, POINTS = 9, 300
 FREE = (FOCAL, ASPECT, ACROSS, DOWN, *DISTORTION["brown"])
@@ -56,7 +56,7 @@ def test_lenses_of_phones_are_told_from_focal_lengths(caplog: pytest.LogCaptureF
     truth, wrong = rig()
     with caplog.at_level(logging.INFO):
         found = adjust_together(
-            guessed(truth), lens=range(CAMERAS), free=FREE, held=np.zeros(CAMERAS, bool), limits=LIMITS
+            guessed(truth), lens=range(CAMERAS), free=FREE, fixed=np.zeros(CAMERAS, bool), limits=LIMITS
         )  # fmt: skip
     errors = calibration_errors(found.cameras, truth.cameras).values()
     assert np.median([abs(error.focal_percent) for error in errors]) < 0.4
@@ -72,7 +72,7 @@ def test_a_known_lens_and_shared_ones_stay_so() -> None:
     cameras = dict(start.cameras) | {"cam0": truth.cameras["cam0"]}
     lens = [0, *[1] * (CAMERAS - 1)]
     found = adjust_together(
-        replace(start, cameras=cameras), lens=lens, free=FREE, held=np.array([True, False]), limits=Limits(20.0, 1.5)
+        replace(start, cameras=cameras), lens=lens, free=FREE, fixed=np.array([True, False]), limits=Limits(20.0, 1.5)
     )
     np.testing.assert_allclose(found.cameras["cam0"].camera.K, truth.cameras["cam0"].camera.K)
     assert found.cameras["cam0"].lens == truth.cameras["cam0"].lens

@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Boards as values: sizes, corners, dictionaries."""
 
+from dataclasses import replace
+from functools import cache
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from structgstream.errors import ConfigError
-from structgstream.preparation.calibration.board import Board, dictionaries
+from structgstream.data.lenses import LensCamera
+from structgstream.errors import CalibrationError, ConfigError
+from structgstream.preparation.calibration.board import Board, board_sightings, dictionaries
+from tests.support.filmed import Film, board_plane, ring, turned
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(7, 5), (5, 7), (3, 4), (12, 9)])
@@ -51,3 +57,65 @@ def test_every_dictionary_that_is_listed_makes_a_board() -> None:
     for name in dictionaries():
         if "ARUCO_ORIGINAL" not in name:
             assert Board(3, 4, 0.05, dictionary=name).opencv_board() is not None
+
+
+BOARD = Board(9, 5, 0.09)
+RIG = ring(2, radius=1.1, arc_degrees=30, focal=300, size=(360, 270))
+Pictures = dict[str, list[NDArray[np.uint8]]]
+
+
+def pose_of(instant: int) -> NDArray[np.float64]:
+    pose = np.eye(4)
+    pose[:3, :3] = turned(14.0 * instant - 28, axis=1) @ turned(8.0 * instant - 16, axis=0)
+    pose[:3, 3] = pose[:3, :3] @ (-0.4, -0.22, 0.0) + (0.03 * instant, 0.0, 0.03 * instant - 0.35)
+    return pose
+
+
+@cache
+def filmed() -> Pictures:
+    films = {name: Film(camera) for name, camera in RIG.items()}
+    return {
+        name: [film.picture([board_plane(BOARD, pose_of(instant))], noise=1, seed=instant) for instant in range(5)]
+        for name, film in films.items()
+    }
+
+
+def expected(camera: LensCamera, instant: int) -> NDArray[np.float64]:
+    pose = pose_of(instant)
+    return camera.pixels(BOARD.corners @ pose[:3, :3].T + pose[:3, 3])
+
+
+def test_corners_are_seen_where_they_are() -> None:
+    """In pixels whose first one has its centre at (0.5, 0.5): half a pixel off would be noticed."""
+    found = board_sightings(filmed(), BOARD)
+    assert {name: [sight.instant for sight in sights] for name, sights in found.items()} == {
+        name: list(range(5)) for name in RIG
+    }
+    for name, sights in found.items():
+        apart = np.concatenate([sight.pixels - expected(RIG[name], sight.instant)[sight.corners] for sight in sights])
+        assert len(apart) > 0.8 * 5 * len(BOARD.corners)
+        assert np.abs(np.median(apart, axis=0)).max() < 0.05
+        assert np.median(np.linalg.norm(apart, axis=1)) < 0.15
+
+
+def test_a_row_of_corners_is_no_sighting() -> None:
+    """Corners on a line say nothing of the board's tilt: of one picture only the two upper rows of squares are left."""
+    whole = board_plane(BOARD, pose_of(2), pixels_a_square=40)
+    height = 100  # half a square of margin and two squares
+    share = height / len(whole.texture)
+    upper = replace(whole, texture=whole.texture[:height], size=(whole.size[0], share * whole.size[1]))
+    pictures = {name: [*shots] for name, shots in filmed().items()}
+    pictures["cam00"][2] = Film(RIG["cam00"]).picture([upper], noise=1)
+    found = board_sightings(pictures, BOARD)
+    assert [sight.instant for sight in found["cam00"]] == [0, 1, 3, 4]
+
+
+def test_too_few_sightings_are_told_with_their_number() -> None:
+    pictures = {**filmed(), "cam01": [*filmed()["cam01"][:3], *[np.full((270, 360, 3), 127, np.uint8)] * 2]}
+    with pytest.raises(CalibrationError, match=r"'cam01' in 3 of 5 pictures, where 4 with 6 corners each are needed"):
+        board_sightings(pictures, BOARD)
+
+
+def test_more_markers_than_the_board_has_are_told() -> None:
+    with pytest.raises(CalibrationError, match=r"markers up to number 21, a board of 9 x 4 squares has 18"):
+        board_sightings(filmed(), Board(9, 4, 0.09))

@@ -8,13 +8,11 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from filmed import ring, turned
 from structgstream.data.lenses import LensCamera, RadialTangential
-from structgstream.preparation.calibration.board import Board
-from structgstream.preparation.calibration.board_model import Sightings
-from structgstream.preparation.calibration.board_sightings import Sighting
-from structgstream.preparation.calibration.board_solving import adjust_board
-from structgstream.preparation.calibration.comparison import calibration_errors
+from structgstream.preparation.calibration.board import Board, Sighting
+from structgstream.preparation.calibration.board_solving import Sightings, adjust_board
+from tests.support.calibration_errors import calibration_errors
+from tests.support.filmed import ring, turned
 
 BOARD = Board(7, 5, 0.12)
 RIG = ring(3, radius=1.4, arc_degrees=50, lens=RadialTangential(k1=-0.12, k2=0.02))

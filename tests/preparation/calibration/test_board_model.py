@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from filmed import ring, turned
 from structgstream.data.lenses import LensCamera
-from structgstream.preparation.calibration.board import Board
-from structgstream.preparation.calibration.board_model import Sightings, board_model, rig_poses, sensor_poses
-from structgstream.preparation.calibration.board_sightings import Sighting
+from structgstream.preparation.calibration.board import Board, Sighting
+from structgstream.preparation.calibration.board_solving import Sightings, board_model, rig_poses, sensor_poses
 from structgstream.preparation.calibration.colmap import colmap_camera
 from structgstream.preparation.calibration.mapping import Freedom, adjust
+from tests.support.filmed import ring, turned
 
 BOARD = Board(7, 5, 0.1)
 RIG = ring(3, radius=1.4, arc_degrees=50)

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from filmed import ring
 from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential
 from structgstream.errors import MissingExtraError
 from structgstream.preparation.calibration.colmap import colmap_camera, colmap_pose, filmed_camera, pycolmap_module
+from tests.support.filmed import ring
 
 FILMED = ring(2, radius=2.0, arc_degrees=40)["cam01"]
 LENSES = [

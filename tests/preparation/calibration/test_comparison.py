@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 
-from filmed import ring
 from structgstream.data.alignment import Alignment
+from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import Fisheye, LensCamera, RadialTangential
-from structgstream.data.posed import rotation_matrix
 from structgstream.errors import CalibrationError
-from structgstream.preparation.calibration.comparison import calibration_errors, lens_difference
+from tests.support.calibration_errors import calibration_errors, lens_difference
+from tests.support.filmed import ring
 
 RIG = ring(6, radius=2.0, arc_degrees=120)
 MOVED = Alignment(3.0, rotation_matrix(np.array([0.1, 2.0, -0.3])), np.array([1.0, 2.0, 3.0]))

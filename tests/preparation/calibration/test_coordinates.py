@@ -2,9 +2,8 @@
 import numpy as np
 import pytest
 
-from filmed import ring
 from structgstream.data.alignment import Alignment
-from structgstream.data.posed import rotation_matrix
+from structgstream.data.calibration import rotation_matrix
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.solved import (
     Observations,
@@ -13,6 +12,7 @@ from structgstream.preparation.calibration.solved import (
     upright,
     with_distance,
 )
+from tests.support.filmed import ring
 
 POINTS = np.random.default_rng(0).uniform(-0.4, 0.4, (12, 3))
 TURN = Alignment(0.7, rotation_matrix(np.array([0.5, 1.0, -2.0])), np.array([4.0, 5.0, 6.0]))

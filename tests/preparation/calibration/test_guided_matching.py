@@ -2,9 +2,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
-from repetitive import POINTS, keypoints_of, ring
-from structgstream.preparation.calibration.matching import GuidedMatchConfig, all_matches, guided_matches
+from structgstream.preparation.calibration import matching
+from structgstream.preparation.calibration.matching import all_matches, guided_matches
+from tests.support.repetitive import POINTS, keypoints_of, ring
 
 
 def test_what_looks_alike_is_told_apart_by_epipolar_lines() -> None:
@@ -31,10 +33,10 @@ def test_matches_share_an_instant() -> None:
     assert not (found[:, 0] == found[:, 1]).any()
 
 
-def test_cameras_that_look_apart_are_not_matched() -> None:
+def test_cameras_that_look_apart_are_not_matched(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(matching, "FACING_DEGREES", 20.0)
     cameras = ring()
-    config = GuidedMatchConfig(degrees=20.0)
-    found = guided_matches(keypoints_of(cameras), cameras, pixels=2.0, workers=1, config=config)
+    found = guided_matches(keypoints_of(cameras), cameras, pixels=2.0, workers=1)
     assert ("cam0", "cam1") in found
     assert ("cam0", "cam5") not in found
 

@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 from concurrent.futures import CancelledError
-from dataclasses import replace
 from threading import Event
 
 import numpy as np
 import pytest
 
-from filmed import noise_texture
+from structgstream.preparation.calibration import keypoints
 from structgstream.preparation.calibration.keypoints import (
-    KeypointConfig,
     all_keypoints,
     camera_keypoints,
     spread_order,
 )
+from tests.support.filmed import noise_texture
 
 pytestmark = pytest.mark.finds_keypoints
 
@@ -39,17 +38,10 @@ def test_what_stands_still_is_kept_once_and_what_moves_adds() -> None:
     assert moved.seen[on_patch, 0].mean() < 0.2  # what hardly changes in so small a patch
 
 
-def test_a_masked_part_gives_none() -> None:
-    mask = np.ones((200, 200), bool)
-    mask[:, :100] = False
-    found = camera_keypoints([scene(0)], [mask])
-    assert len(found) > 20
-    assert (found.pixels[:, 0] >= 100).all()
-
-
-def test_reduced_pictures_give_pixels_of_the_whole_one() -> None:
+def test_reduced_pictures_give_pixels_of_the_whole_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(keypoints, "LONGEST_SIDE", 200)
     large = np.repeat(np.repeat(scene(0), 4, 0), 4, 1)
-    found = camera_keypoints([large], config=KeypointConfig(longest_side=200)).pixels
+    found = camera_keypoints([large]).pixels
     small = camera_keypoints([scene(0)]).pixels
     assert len(found) == len(small)
     np.testing.assert_allclose(found, 4 * small, atol=0.1)
@@ -59,12 +51,14 @@ def test_bare_pictures_give_none() -> None:
     assert len(camera_keypoints([np.full((60, 80, 3), 90, np.uint8)] * 2)) == 0
 
 
-def test_further_instants_are_looked_at_where_the_first_give_little() -> None:
+def test_further_instants_are_looked_at_where_the_first_give_little(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(keypoints, "INSTANTS", 2)
+    monkeypatch.setattr(keypoints, "ENOUGH", 1)
     pictures = {"one": [scene(0), scene(20), scene(40), scene(60), scene(80)]}
-    config = KeypointConfig(instants=2, enough=1)
-    few = all_keypoints(pictures, None, workers=1, config=config)["one"]
+    few = all_keypoints(pictures, workers=1)["one"]
     assert few.seen.any(0).tolist() == [True, False, False, False, True]
-    every = all_keypoints(pictures, None, workers=1, config=replace(config, enough=10**6))["one"]
+    monkeypatch.setattr(keypoints, "ENOUGH", 10**6)
+    every = all_keypoints(pictures, workers=1)["one"]
     assert every.seen.any(0).all()
     assert len(every) > len(few)
 
@@ -98,6 +92,6 @@ def test_an_interruption_is_heard_between_two_pictures() -> None:
 
     pictures = {"one": Interrupting([scene(0)] * 3), "two": Slow([scene(0)] * 3)}
     with pytest.raises(KeyboardInterrupt):
-        all_keypoints(pictures, None, workers=2)
+        all_keypoints(pictures, workers=2)
     assert looked.count("one") == 1
     assert looked.count("two") < 3

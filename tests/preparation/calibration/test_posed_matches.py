@@ -3,7 +3,6 @@ import numpy as np
 import pytest
 import torch
 
-from filmed import ring
 from structgstream.data.lenses import Fisheye, LensCamera, RadialTangential
 from structgstream.preparation.calibration.matching import (
     agreeing_matches,
@@ -11,7 +10,8 @@ from structgstream.preparation.calibration.matching import (
     epipolar_angles,
     epipolar_pixels,
 )
-from views_made import cloud, keypoints_of, matches_of
+from tests.support.filmed import ring
+from tests.support.views_made import cloud, keypoints_of, matches_of
 
 LENS = RadialTangential(k1=-0.12, k2=0.02, p1=0.001)
 RIG = ring(3, radius=2.6, arc_degrees=40, lens=LENS)

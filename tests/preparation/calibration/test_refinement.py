@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 
-from filmed import filmed_room
+from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import LensCamera, RadialTangential
-from structgstream.data.posed import rotation_matrix
 from structgstream.errors import CalibrationError, ConfigError
-from structgstream.preparation.calibration.comparison import calibration_errors
 from structgstream.preparation.calibration.refinement import refine
+from tests.support.calibration_errors import calibration_errors
+from tests.support.filmed import filmed_room
 
 
 def perturbed(rig: dict[str, LensCamera], *, degrees: float, percent: float) -> dict[str, LensCamera]:
@@ -35,7 +35,7 @@ def test_perturbed_poses_come_back_where_they_were() -> None:
     assert found.changed
     assert found.before_pixels > 0.8
     assert found.after_pixels < 0.3
-    assert found.held_back > 100
+    assert found.held_out > 100
     errors = {
         key: calibration_errors(cameras, rig) for key, cameras in (("given", given), ("ours", found.solved.cameras))
     }
@@ -61,26 +61,18 @@ def test_tracks_that_judged_are_adjusted_to_as_well(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(refinement, "_completed", lambda graph, refined, terms, **options: refined)
     judged = refine(pictures, given)
     assert found.changed
-    assert (found.after_pixels, found.held_back) == (judged.after_pixels, judged.held_back)
+    assert (found.after_pixels, found.held_out) == (judged.after_pixels, judged.held_out)
     assert len(found.solved.observations) > 1.15 * len(judged.solved.observations)
 
 
 def test_a_lens_that_was_not_known_is_found() -> None:
     rig, pictures = filmed_room()
     given = {name: replace(one, lens=RadialTangential(k1=-0.06)) for name, one in rig.items()}
-    found = refine(pictures, given, free="lens", lens="radial")
+    found = refine(pictures, given, lens="radial")
     assert found.changed
     before, after = calibration_errors(given, rig), calibration_errors(found.solved.cameras, rig)
     for name in rig:
         assert after[name].lens_pixels < 0.5 * before[name].lens_pixels
-
-
-def test_intrinsics_that_are_not_free_stay() -> None:
-    rig, pictures = filmed_room()
-    found = refine(pictures, perturbed(rig, degrees=0.2, percent=0.0), free="poses")
-    for name, one in found.solved.cameras.items():
-        np.testing.assert_allclose(one.camera.K, rig[name].camera.K)
-        assert one.lens == rig[name].lens
 
 
 def test_what_refining_makes_worse_is_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,4 +101,4 @@ def test_a_camera_that_is_far_off_is_named() -> None:
 def test_a_lens_that_cannot_be_refined_is_refused() -> None:
     rig, pictures = filmed_room()
     with pytest.raises(ConfigError, match="model brown cannot be refined; take opencv"):
-        refine(pictures, rig, free="lens", lens="brown")
+        refine(pictures, rig, lens="brown")

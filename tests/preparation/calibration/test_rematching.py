@@ -3,13 +3,15 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+import pytest
 
-from repetitive import keypoints_of, points, ring
+from structgstream.preparation.calibration import triangulation
 from structgstream.preparation.calibration.adjustment import Limits, adjust_together
-from structgstream.preparation.calibration.comparison import calibration_errors
 from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DOWN, FOCAL
-from structgstream.preparation.calibration.rematching import RematchConfig, rematched
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
+from structgstream.preparation.calibration.triangulation import rematched
+from tests.support.calibration_errors import calibration_errors
+from tests.support.repetitive import keypoints_of, points, ring
 
 LIMITS = Limits(2.0, 1.5)
 FEW = 40
@@ -18,7 +20,7 @@ ADJUST = partial(
     adjust_together,
     lens=range(COUNT),
     free=(FOCAL, ASPECT, ACROSS, DOWN),
-    held=np.zeros(COUNT, bool),
+    fixed=np.zeros(COUNT, bool),
     limits=LIMITS,
 )
 
@@ -48,16 +50,17 @@ def test_more_points_than_stood_out_at_first_make_cameras_more_exact() -> None:
     assert len(np.unique(rows, axis=0)) == len(rows)  # nothing is counted twice
 
 
-def test_a_solution_with_enough_stays() -> None:
+def test_a_solution_with_enough_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(triangulation, "ENOUGH", FEW // 2)
     first = first_solution()
-    config = RematchConfig(enough=FEW // 2)
-    assert rematched(first, {}, limits=LIMITS, adjust=ADJUST, workers=1, config=config) is first
+    assert rematched(first, {}, limits=LIMITS, adjust=ADJUST, workers=1) is first
 
 
-def test_a_solution_stays_if_little_is_gained_or_a_camera_loses() -> None:
+def test_a_solution_stays_if_little_is_gained_or_a_camera_loses(monkeypatch: pytest.MonkeyPatch) -> None:
     first, keypoints = first_solution(), keypoints_of(ring(COUNT))
-    config = RematchConfig(gain=100.0)
-    assert rematched(first, keypoints, limits=LIMITS, adjust=ADJUST, workers=1, config=config) is first
+    with monkeypatch.context() as patched:
+        patched.setattr(triangulation, "MIN_GAIN", 100.0)
+        assert rematched(first, keypoints, limits=LIMITS, adjust=ADJUST, workers=1) is first
 
     def losing(found: SolvedCalibration) -> SolvedCalibration:
         seen = found.observations

@@ -3,10 +3,10 @@
 
 import numpy as np
 
-from filmed import ring
 from structgstream.data.lenses import LensCamera, RadialTangential
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
-from views_made import cloud
+from tests.support.filmed import ring
+from tests.support.views_made import cloud
 
 
 def solved(rig: dict[str, LensCamera], points: np.ndarray, seen: list[tuple[int, int, tuple[float, float]]]):

@@ -7,11 +7,12 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from filmed import ring
-from properties import examples
+from structgstream.data.matching import connected_groups
 from structgstream.preparation.calibration.colmap import colmap_camera, pycolmap_module
-from structgstream.preparation.calibration.view_graph import connected, verified_pairs, write_database
-from views_made import cloud, keypoints_of, matches_of
+from structgstream.preparation.calibration.view_graph import verified_pairs, write_database
+from tests.support.filmed import ring
+from tests.support.properties import examples
+from tests.support.views_made import cloud, keypoints_of, matches_of
 
 RIG = ring(3, radius=2.6, arc_degrees=40)
 CAMERAS = {name: colmap_camera(filmed, number) for number, (name, filmed) in enumerate(RIG.items(), 1)}
@@ -28,7 +29,6 @@ def test_true_matches_are_kept_and_wrong_ones_go() -> None:
         keypoints_of(RIG, points, noise=0.2),
         {("cam00", "cam01"): matches["cam00", "cam01"]},
         CAMERAS,
-        seed=0,
         workers=1,
     ).values()
     inliers = {tuple(row) for row in geometry.inlier_matches.tolist()}
@@ -52,7 +52,6 @@ def test_pairs_that_agree_by_chance_or_in_a_few_points_do_not_pass() -> None:
             ("cam01", "cam02"): matches["cam01", "cam02"][:20],
         },
         CAMERAS,
-        seed=0,
         workers=1,
     )
     assert set(found) == {("cam01", "cam02")}
@@ -68,7 +67,7 @@ def test_the_database_holds_what_was_written(tmp_path: Path) -> None:
         matches[pair][:, 1] = np.argsort(order)[matches[pair][:, 1]]
     numbers = dict(zip(RIG, (1, 1, 2), strict=True))
     cameras = {name: colmap_camera(filmed, numbers[name]) for name, filmed in RIG.items()}
-    geometries = verified_pairs(keypoints, matches, cameras, seed=0, workers=1)
+    geometries = verified_pairs(keypoints, matches, cameras, workers=1)
     ids = write_database(tmp_path / "database.db", keypoints, cameras, geometries)
     assert sorted(ids) == sorted(RIG)
     with pycolmap_module().Database.open(tmp_path / "database.db") as database:
@@ -88,7 +87,7 @@ def test_the_database_holds_what_was_written(tmp_path: Path) -> None:
 @given(st.sets(st.sampled_from(list(combinations(NAMES, 2)))))
 def test_groups_are_what_pairs_connect(pairs: set[tuple[str, str]]) -> None:
     """A pair lies in one group, no smaller groups would do, and the largest comes first."""
-    groups = connected(dict.fromkeys(NAMES), dict.fromkeys(sorted(pairs)))
+    groups = connected_groups(NAMES, sorted(pairs))
     assert sorted(name for group in groups for name in group) == NAMES
     assert [len(group) for group in groups] == sorted(map(len, groups), reverse=True)
     assert all(list(group) == sorted(group) for group in groups)

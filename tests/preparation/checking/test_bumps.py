@@ -6,12 +6,12 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from filmed import Film, Plane, noise_texture, ring, room, turned
 from structgstream.cameras import Camera
 from structgstream.frames import MultiViewFrame
-from structgstream.pose_check.evidence import gather
 from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.tracks import gather
 from structgstream.preparation.checking.bumps import bump_findings, picture_movement
+from tests.support.filmed import Film, Plane, noise_texture, ring, room, turned
 
 Pictures = dict[str, NDArray[np.uint8]]
 

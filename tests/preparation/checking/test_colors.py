@@ -6,7 +6,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from structgstream.pose_check.evidence import Evidence
+from structgstream.pose_check.tracks import Evidence
 from structgstream.preparation.checking.colors import Color, color_findings, compare_colors
 
 SIDE, ACROSS = 9, 12

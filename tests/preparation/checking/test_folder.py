@@ -5,25 +5,25 @@ from pathlib import Path
 
 import pytest
 
-from rooms import write_room
 from structgstream.errors import CaptureError
 from structgstream.preparation.prepare import check_folder
+from tests.support.rooms import write_room
 
 
 class Noted:
     """Notes the steps."""
 
     def __init__(self) -> None:
-        self.told: list[str] = []
+        self.calls: list[str] = []
 
     def begin(self, step: str, *, skipped: bool) -> None:
-        self.told.append(f"begin {step} {skipped}")
+        self.calls.append(f"begin {step} {skipped}")
 
     def progress(self, done: int, total: int, what: str) -> None:
-        self.told.append("progress")
+        self.calls.append("progress")
 
     def end(self, step: str, summary: str) -> None:
-        self.told.append(f"end {step}: {summary}")
+        self.calls.append(f"end {step}: {summary}")
 
 
 def test_a_folder_of_any_layout_is_checked_and_reported(tmp_path: Path) -> None:
@@ -31,8 +31,8 @@ def test_a_folder_of_any_layout_is_checked_and_reported(tmp_path: Path) -> None:
     noted = Noted()
     checked = check_folder(tmp_path / "room", report=tmp_path / "report", listener=noted)
     assert (tmp_path / "report" / "index.html").is_file()
-    assert noted.told[0] == "begin check False"
-    assert noted.told[-1] == f"end check: {len(checked.report.findings)} findings"
+    assert noted.calls[0] == "begin check False"
+    assert noted.calls[-1] == f"end check: {len(checked.report.findings)} findings"
     before = sorted(tmp_path.rglob("*"))
     again = check_folder(tmp_path / "room", report=None)
     assert again.report.findings == checked.report.findings

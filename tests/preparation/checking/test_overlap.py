@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from evidence_made import wide_ring
-from properties import examples
 from structgstream.preparation.checking.overlap import cameras_per_point, coverage, overlap_findings, overlaps
+from tests.support.evidence_made import wide_ring
+from tests.support.properties import examples
 
 NAMES = [f"cam{number}" for number in range(7)]
 EVERY = list(combinations(NAMES, 2))

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from captures import picture, small_rig, write_video
 from structgstream.data.timeline import Clock
 from structgstream.data.video import synchronised
 from structgstream.data.video_index import scan_videos
@@ -18,6 +17,7 @@ from structgstream.preparation.checking.presence import (
     stated_presence,
     whole_frame,
 )
+from tests.support.captures import picture, small_rig, write_video
 
 
 def test_what_files_state_without_decoding(tmp_path: Path) -> None:

@@ -3,8 +3,8 @@ import cv2
 import numpy as np
 import pytest
 
-from filmed import noise_texture
 from structgstream.preparation.checking.bumps import picture_movement
+from tests.support.filmed import noise_texture
 
 SCENE = noise_texture(4, size=320)
 SIZE = 240

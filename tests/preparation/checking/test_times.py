@@ -3,25 +3,20 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from memory_captures import MemoryCapture
-from planes import room_frame, room_rig
-from structgstream.preparation.checking.times import LEAST_FRAMES, measure_times, time_findings
-from structgstream.preparation.synchronization import SynchronizationCheck
-from takes import MadeSource, ring
+from structgstream.cameras import CameraRig
+from structgstream.data.json_videos import bundled_clip
+from structgstream.preparation.checking.times import SynchronizationCheck, check_synchronization, time_findings
+from tests.support.takes import MadeSource, ring
 
 PERIOD = 1 / 30
+RIG = CameraRig(ring(4))
 
 
 def measured(*, off: tuple[str, ...] = (), sigma: float = 1e-4, **late: float) -> SynchronizationCheck:
     return SynchronizationCheck(late, dict.fromkeys(late, sigma), off, (), PERIOD)
-
-
-def test_a_capture_too_short_to_tell() -> None:
-    rig = room_rig(3)
-    assert measure_times(MemoryCapture(rig, [room_frame(rig)] * (LEAST_FRAMES - 1))) is None
-    assert time_findings(None) == []
 
 
 @pytest.mark.parametrize(
@@ -54,20 +49,12 @@ def test_a_little_is_told_of_those_that_are_off_alone() -> None:
 def test_what_cannot_be_told_is_a_note() -> None:
     unknown = SynchronizationCheck({}, {}, (), ("a", "b"), PERIOD)
     (finding,) = time_findings(unknown)
-    assert (finding.severity, finding.sentence) == ("note", unknown.message)
+    assert finding.severity == "note"
 
 
-def test_balls_that_fly_tell_which_camera_is_late() -> None:
-    cameras = ring(4)
-    source = MadeSource(_rig(cameras), {"cam2": 2 * PERIOD})
-    findings = time_findings(measure_times(source))
+def test_a_camera_that_is_late_is_an_error() -> None:
+    findings = time_findings(check_synchronization(MadeSource(RIG, {"cam2": 2 * PERIOD})))
     assert [(finding.severity, finding.cameras) for finding in findings] == [("error", ("cam2",))]
-
-
-def _rig(cameras):
-    from structgstream.cameras import CameraRig
-
-    return CameraRig(cameras)
 
 
 def test_what_may_be_less_than_half_a_frame_is_no_error() -> None:
@@ -85,3 +72,52 @@ def test_pictures_between_those_of_the_others_are_one_warning() -> None:
     assert "those of 'c' 17.4 ms (0.52 frames) too late: less than a frame" in finding.sentence
     unknown = replace(SynchronizationCheck({}, {}, (), ("a", "b"), PERIOD), apart_seconds={"a": 0.0, "b": 0.01})
     assert [finding.severity for finding in time_findings(unknown)] == ["warning", "note"]
+
+
+def test_a_synchronous_capture() -> None:
+    check = check_synchronization(MadeSource(RIG, {}))
+    assert check.conclusive
+    assert not check.off
+    assert not check.undecided
+    assert max(abs(late) for late in check.late_seconds.values()) < 0.15 / 30
+    assert time_findings(check) == []
+
+
+@pytest.mark.parametrize("frames", [1.0, -2.0, 0.5])
+def test_the_camera_that_is_off_is_named(frames: float) -> None:
+    check = check_synchronization(MadeSource(RIG, {"cam2": frames / 30}))
+    assert check.off == ("cam2",)
+    assert check.late_seconds["cam2"] == pytest.approx(frames / 30, abs=0.2 / 30)
+    assert abs(check.late_seconds["cam2"] - frames / 30) < 3 * check.uncertainty_seconds["cam2"]
+
+
+def test_without_motion_it_cannot_be_told() -> None:
+    check = check_synchronization(MadeSource(RIG, {}, still=True))
+    assert not check.conclusive
+    assert check.undecided == tuple(RIG)
+    assert "cannot be told" in time_findings(check)[0].sentence
+
+
+def test_the_bundled_clip_is_synchronous() -> None:
+    check = check_synchronization(bundled_clip())
+    assert check.conclusive
+    assert not check.off
+
+
+def test_what_time_stamps_say_is_not_late() -> None:
+    """Half a frame that is known is no error of the clock; nor is it gone."""
+    stated = dict.fromkeys(RIG, np.zeros(40)) | {"cam2": np.full(40, 0.5 / 30)}
+    check = check_synchronization(MadeSource(RIG, {"cam2": 0.5 / 30}, apart_seconds=stated))
+    assert not check.off
+    assert abs(check.late_seconds["cam2"]) < 0.15 / 30
+    assert check.late_against_others["cam2"] == pytest.approx(0.5 / 30, abs=0.2 / 30)
+    assert check.between == {"cam2": pytest.approx(0.5 / 30)}
+    (finding,) = time_findings(check)
+    assert "the pictures of 'cam2' lie between those of the others" in finding.sentence
+
+
+def test_time_stamps_that_are_wrong() -> None:
+    stated = dict.fromkeys(RIG, np.zeros(40)) | {"cam2": np.full(40, 0.4 / 30)}
+    check = check_synchronization(MadeSource(RIG, {"cam2": 1.4 / 30}, apart_seconds=stated))
+    assert check.off == ("cam2",)
+    assert check.late_seconds["cam2"] == pytest.approx(1 / 30, abs=0.2 / 30)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
-from planes import room_frame, room_rig
 from structgstream.figure import COLORS
 from structgstream.preparation.checking.check import Examination, examine
 from structgstream.preparation.checking.findings import CameraCheck, CheckReport, Coverage, PairCheck
-from structgstream.preparation.report import charts
+from structgstream.preparation.report import pictures as charts
+from tests.support.planes import room_frame, room_rig
 
 
 @pytest.fixture

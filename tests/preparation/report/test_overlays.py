@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evidence_made import turned
-from memory_captures import MemoryCapture
-from planes import HEIGHT, WIDTH, room_frame, room_rig
-from structgstream.pose_check.evidence import pair_errors
+from structgstream.pose_check.tracks import pair_errors
 from structgstream.preparation.checking.check import Checked, check_capture, examine
-from structgstream.preparation.report import overlays
+from structgstream.preparation.report import pictures as overlays
+from tests.support.evidence_made import turned
+from tests.support.memory_captures import MemoryCapture
+from tests.support.planes import HEIGHT, WIDTH, room_frame, room_rig
 
 OFF = "cam03"
 
@@ -44,7 +44,7 @@ def test_pairs_are_the_worst_of_who_is_off_then_the_worst_and_the_surest(checked
     examined = checked.examination
     errors = pair_errors(examined.evidence, examined.cameras)
     pairs = overlays.chosen_pairs(examined)
-    assert len(set(pairs)) == len(pairs) == overlays.MOST_PAIRS
+    assert len(set(pairs)) == len(pairs) == overlays.MAX_PAIRS
     assert pairs[0] == max((pair for pair in errors if OFF in pair), key=lambda pair: errors[pair].pixels)
     assert max(errors, key=lambda pair: errors[pair].pixels) in pairs[:2]
     assert max(errors, key=lambda pair: errors[pair].matches) in pairs

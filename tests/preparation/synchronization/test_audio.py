@@ -7,17 +7,15 @@ import pytest
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.audio import (
-    SPEED_OF_SOUND,
     PairLag,
     Sound,
     audio_lags,
     connected_by,
-    distances_from,
     solve_by_audio,
     sound_of,
 )
 from structgstream.preparation.synchronization.solving import Solution
-from takes import heard, lenses, ring
+from tests.support.takes import heard
 
 CLOCKS = {"a": Clock(0.0), "b": Clock(1.2345), "c": Clock(0.6)}
 
@@ -54,25 +52,6 @@ def test_drift_of_a_long_take() -> None:
     solution = solved(clocks, seconds=60.0, snr_db=15.0, rates=(16000,))
     assert solution.rates["b"] - 1 == pytest.approx(40e-6, abs=4e-6)
     assert solution.offsets["b"] == pytest.approx(0.7, abs=3e-4)
-
-
-def test_known_distances_are_taken_out() -> None:
-    distances = {"a": 1.0, "b": 4.0, "c": 2.0}
-    delays = {name: metres / SPEED_OF_SOUND for name, metres in distances.items()}
-    recorded = heard(CLOCKS, delays=delays, snr_db=20.0)
-    sounds = {name: sound_of(name, sound) for name, sound in recorded.items()}
-    takes = dict.fromkeys(CLOCKS, (0.0, 8.0))
-    biased, right = (
-        solve_by_audio(takes, audio_lags(sounds), drift=False, distances=known) for known in (None, distances)
-    )
-    assert right.offsets["b"] == pytest.approx(1.2345, abs=1e-4)
-    assert biased.offsets["b"] == pytest.approx(1.2345 - 3 / SPEED_OF_SOUND, abs=1e-4)
-
-
-def test_distances_are_those_of_the_lenses() -> None:
-    distances = distances_from(np.array([0.0, -0.4, 0.0]), lenses(ring(3)))
-    assert distances["cam0"] == pytest.approx(3.0)
-    assert distances["cam1"] == pytest.approx(np.hypot(3.0, 0.5))
 
 
 def test_different_sounds_have_no_ties() -> None:

@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.preparation.synchronization.correlation import (
     Signal,
     best_lag,
@@ -14,6 +13,7 @@ from structgstream.preparation.synchronization.correlation import (
     lag_changes,
     resampled,
 )
+from tests.support.properties import examples
 
 
 def smooth(times: np.ndarray, channels: int, seed: int = 0) -> np.ndarray:
@@ -50,7 +50,7 @@ def test_a_constant_has_no_lag() -> None:
 
 
 def test_an_overlap_that_is_too_short_has_no_lag() -> None:
-    assert best_lag(signal(0, 5), signal(0, 60), least_overlap=8) is None
+    assert best_lag(signal(0, 5), signal(0, 60), min_overlap=8) is None
 
 
 def test_irregular_stamps_are_resampled() -> None:

@@ -10,16 +10,15 @@ import pytest
 
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
-from structgstream.preparation.synchronization.changes import Changes, picture_changes
 from structgstream.preparation.synchronization.correlation import Signal
-from structgstream.preparation.synchronization.epipolar import CalibratedGeometry
 from structgstream.preparation.synchronization.motion import (
     PairSignals,
     agreeing_cameras,
     pair_signals,
     solve_by_motion,
 )
-from takes import MadeStreams, lenses, ring
+from structgstream.preparation.synchronization.motion_signals import CalibratedGeometry, Changes, picture_changes
+from tests.support.takes import MadeStreams, lenses, ring
 
 VIEWS = ring(4)
 OFFSETS = {"cam0": 0.0, "cam1": 0.35, "cam2": -0.2333, "cam3": 0.5167}

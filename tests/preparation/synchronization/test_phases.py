@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.preparation.synchronization.phases import (
     GRID_HERTZ,
     OTHER_SECONDS,
@@ -16,6 +15,7 @@ from structgstream.preparation.synchronization.phases import (
     ambiguity_seconds,
     phase_window,
 )
+from tests.support.properties import examples
 
 RATE, LONG = 48_000, 6.0
 REACH = round(REACH_SECONDS * GRID_HERTZ)

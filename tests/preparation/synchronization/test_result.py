@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from properties import examples
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.result import Synchronization, frame_residuals, synchronization
+from tests.support.properties import examples
 
 STAMPS = np.arange(120) / 30
 

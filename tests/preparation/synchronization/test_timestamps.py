@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from structgstream.errors import CaptureError
-from structgstream.preparation.synchronization.timestamps import read_timestamps
+from structgstream.preparation.synchronization.stated_clocks import read_timestamps
 
 STAMPS = {"left": np.arange(90) / 30, "right": np.arange(150) / 50}
 
@@ -32,7 +32,7 @@ def test_all_rows_give_offset_rate_and_spread(tmp_path: Path) -> None:
     clocks = read_timestamps(table(tmp_path, "\n".join(rows)), STAMPS)
     assert clocks["left"].clock.rate == pytest.approx(1.001, abs=1e-4)
     assert clocks["left"].clock.offset_seconds == pytest.approx(100, abs=1e-3)
-    assert clocks["left"].spread_seconds == pytest.approx(1e-4, rel=0.5)
+    assert clocks["left"].sigma_seconds == pytest.approx(1e-4, rel=0.5)
     assert clocks["right"].clock.rate == 1
 
 

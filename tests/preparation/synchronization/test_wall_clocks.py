@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from structgstream.errors import CaptureError
-from structgstream.preparation.synchronization.wall_clocks import creation_seconds, timecode, wall_clocks
+from structgstream.preparation.synchronization.stated_clocks import creation_seconds, timecode, wall_clocks
 
 STAMPS = {"a": np.arange(90) / 25, "b": np.arange(90) / 25}
 DROPPED = np.arange(90) * 1001 / 30000

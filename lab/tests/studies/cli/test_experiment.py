@@ -10,15 +10,12 @@ import cv2
 import pytest
 from rich.console import Console
 
-from backends import QUICKEST
-from quick_streams import CLIP, error_of
-from small_presets import few_points
 from structgstream.cli import main
 from structgstream.cli.options import CaptureOptions, resolve_config
-from structgstream.data.clip import bundled_clip
+from structgstream.data.json_videos import bundled_clip
 from structgstream.data.wrappers import WithRig
 from structgstream.kernels.backend import select_backend
-from structgstream.presets import PRESETS, StreamConfig
+from structgstream.session.presets import PRESETS, StreamConfig
 from structgstream_studies.cli.experiment import Display, ExperimentOptions, capture_part, print_sheet
 from structgstream_studies.experiments.captures import CapturePart
 from structgstream_studies.experiments.results import read_results
@@ -27,6 +24,9 @@ from structgstream_studies.experiments.studies import ablation_runs, with_depend
 from structgstream_studies.experiments.sweep import Outcome, Progress
 from structgstream_studies.experiments.tasks import VariantRun
 from structgstream_studies.experiments.worker import Task
+from tests.support.backends import QUICKEST
+from tests.support.quick_streams import CLIP, error_of
+from tests.support.small_presets import few_points
 
 ROOT = Path(__file__).parents[4]
 SMALL = ["--frames", "2", "--scale", "0.25", "--seeds", "0", "--device", QUICKEST, "--jobs", "2"]

@@ -3,10 +3,10 @@
 
 from dataclasses import replace
 
-from small_presets import FEW_POINTS, TINY_RIG
-from structgstream.data.clip import bundled_clip_path
-from structgstream.presets import COMPACT, StreamConfig
+from structgstream.data.json_videos import bundled_clip_path
+from structgstream.session.presets import COMPACT, StreamConfig
 from structgstream_studies.experiments.captures import CapturePart
+from tests.support.small_presets import FEW_POINTS, TINY_RIG
 
 CLIP = CapturePart(bundled_clip_path(), scale=0.25, frames=3)
 

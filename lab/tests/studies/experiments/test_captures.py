@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rigs import arc_rig
 from structgstream.cameras import CameraRig
-from structgstream.data.clip import bundled_clip_path
+from structgstream.data.json_videos import bundled_clip_path
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MultiViewFrame
 from structgstream_studies.experiments.captures import CapturePart, capture_facts, fingerprint
+from tests.support.rigs import arc_rig
 
 CLIP = CapturePart(bundled_clip_path(), scale=0.25, frames=4)
 

@@ -7,7 +7,7 @@ import pytest
 
 from outcomes import outcome, outcomes
 from structgstream.errors import ConfigError
-from structgstream.presets import COMPACT, PRESETS, RIG, to_json
+from structgstream.session.presets import COMPACT, PRESETS, RIG, to_json
 from structgstream_studies.experiments.effects import (
     BETTER_FIRST,
     CARRIED_SHARE,

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drawn import coloured, pixels_of
 from outcomes import outcome
 from structgstream.figure import COLORS
 from structgstream_studies.experiments.figures import most_varied_crop, write_comparison, write_curves, write_details
 from structgstream_studies.experiments.results import Result
+from tests.support.drawn import coloured, pixels_of
 
 
 def runs(*, e_warp: bool = False) -> list[Result]:

@@ -4,11 +4,11 @@
 import pytest
 
 from outcomes import outcome, outcomes
-from rigs import arc_rig
 from structgstream.errors import ConfigError
 from structgstream_studies.experiments.documents import refresh_text
 from structgstream_studies.experiments.folds import even_cameras, folds_sheet
 from structgstream_studies.experiments.variants import FULL
+from tests.support.rigs import arc_rig
 
 SECOND = {"held_out": ["c", "d"], "scored": ["c", "d"]}
 

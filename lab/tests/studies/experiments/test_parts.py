@@ -7,7 +7,7 @@ import pytest
 
 from outcomes import outcome
 from structgstream.errors import ConfigError
-from structgstream.presets import COMPACT, PRESETS, to_json
+from structgstream.session.presets import COMPACT, PRESETS, to_json
 from structgstream_studies.experiments.effects import WHOLE, effects_sheet
 from structgstream_studies.experiments.parts import NONE, PARTS, parts
 from structgstream_studies.experiments.studies import effect_titles, part_titles, rows_of, variant_titles

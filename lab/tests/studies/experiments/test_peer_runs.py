@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from backends import quickest_backend
 from small_runs import CLIP as LARGER
 from structgstream.errors import ConfigError
 from structgstream.evaluation.run_log import log_path, read_log
@@ -23,6 +22,7 @@ from structgstream_studies.experiments.studies import (
 from structgstream_studies.peers import methods
 from structgstream_studies.peers.methods import METHODS, TINY_METHODS, AnyMethod, open_peer
 from structgstream_studies.peers.threedgs import ThreeDGS
+from tests.support.backends import quickest_backend
 
 BACKEND = quickest_backend()
 CLIP = replace(LARGER, scale=0.125)

@@ -5,7 +5,7 @@ import pytest
 
 from outcomes import outcome
 from structgstream.errors import ConfigError
-from structgstream.presets import COMPACT, RIG, to_json
+from structgstream.session.presets import COMPACT, RIG, to_json
 from structgstream_studies.experiments.rate_distortion import (
     QUALITIES,
     bd_sheet,

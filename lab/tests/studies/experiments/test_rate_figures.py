@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from drawn import coloured, pixels_of
 from outcomes import outcome
 from structgstream.figure import COLORS, INK
 from structgstream_studies.experiments.rate_figures import write_rates
 from structgstream_studies.experiments.results import Result
+from tests.support.drawn import coloured, pixels_of
 
 
 def curve() -> list[Result]:

@@ -4,9 +4,9 @@
 import pytest
 
 from outcomes import outcome, outcomes
-from small_presets import TINY_RIG
-from structgstream.presets import PAPER, RIG, StreamConfig, to_json
+from structgstream.session.presets import PAPER, RIG, StreamConfig, to_json
 from structgstream_studies.experiments.readings import BASE, READINGS, readings_sheet
+from tests.support.small_presets import TINY_RIG
 
 
 @pytest.mark.parametrize("config", [PAPER, RIG, TINY_RIG], ids=["paper", "rig", "tiny"])

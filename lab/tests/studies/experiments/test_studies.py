@@ -10,7 +10,7 @@ from outcomes import outcome
 from small_runs import CLIP, compact, quick
 from structgstream.errors import ConfigError
 from structgstream.kernels.backend import select_backend
-from structgstream.presets import PRESETS
+from structgstream.session.presets import PRESETS
 from structgstream_studies.experiments.readings import READINGS
 from structgstream_studies.experiments.results import write_result
 from structgstream_studies.experiments.studies import (

@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 import torch
 
-from backends import quickest_backend
 from small_runs import CLIP, compact, quick
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
@@ -21,12 +20,13 @@ from structgstream.evaluation.run_log import log_path, read_log
 from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import state_of
-from structgstream.session import Session
-from structgstream.struct_gstream import stream_pipeline
+from structgstream.session.loop import Session
+from structgstream.session.struct_gstream import stream_pipeline
 from structgstream_studies.errors import ExperimentError
 from structgstream_studies.experiments.results import Result, read_result
 from structgstream_studies.experiments.tasks import FirstFrameRun, VariantRun
 from structgstream_studies.experiments.variants import variants
+from tests.support.backends import quickest_backend
 
 
 @dataclass(frozen=True)
@@ -250,7 +250,7 @@ def test_a_first_frame_that_is_there_is_not_fitted_again(runs: Runs, monkeypatch
     def never(*_: Any, **__: Any) -> None:
         raise AssertionError("fitted again")
 
-    monkeypatch.setattr("structgstream.struct_gstream.fit_first_frame", never)
+    monkeypatch.setattr("structgstream.session.struct_gstream.fit_first_frame", never)
     before = runs.first.stream.stat().st_mtime_ns
     runs.first.run(runs.backend)
     assert runs.first.stream.stat().st_mtime_ns == before
@@ -262,7 +262,9 @@ def test_scoring_alone_is_done_again_when_only_the_result_is_missing(
     shutil.copytree(runs.folder / "streams", tmp_path / "streams")
     run = replace(runs.full, folder=tmp_path)
     before = run.stream.stat().st_mtime_ns
-    monkeypatch.setattr("structgstream.struct_gstream.fit_next_frame", lambda *_, **__: pytest.fail("fitted again"))
+    monkeypatch.setattr(
+        "structgstream.session.struct_gstream.fit_next_frame", lambda *_, **__: pytest.fail("fitted again")
+    )
     run.run(runs.backend)
     assert run.done()
     assert run.stream.stat().st_mtime_ns == before

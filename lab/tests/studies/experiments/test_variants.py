@@ -3,7 +3,7 @@
 
 import pytest
 
-from structgstream.presets import MOTION, PAPER, RIG, StreamConfig, to_json
+from structgstream.session.presets import MOTION, PAPER, RIG, StreamConfig, to_json
 from structgstream_studies.experiments.variants import FULL, TABLES, variants
 
 

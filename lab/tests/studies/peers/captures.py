@@ -4,10 +4,10 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-from memory_captures import MemoryCapture
 from structgstream.training.result import FitResult
 from structgstream_studies.peers.methods import AnyMethod
-from worlds import moving_world
+from tests.support.memory_captures import MemoryCapture
+from tests.support.worlds import moving_world
 
 
 def moving_capture(frames: int = 3, *, speed: float = 0.03) -> MemoryCapture:

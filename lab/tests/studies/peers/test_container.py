@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rigs import arc_rig
 from structgstream.codec.container.records import scan_records
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.errors import StorageError, StreamError
@@ -23,6 +22,7 @@ from structgstream_studies.peers.container import (
     unpacked_arrays,
 )
 from structgstream_studies.peers.method import Arrays
+from tests.support.rigs import arc_rig
 
 HEADER = StreamHeader(
     rig=arc_rig(3),

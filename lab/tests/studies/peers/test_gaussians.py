@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import torch
 
-from backends import quickest_backend
 from peers.captures import moving_capture
 from structgstream.scene.render import render
 from structgstream.training.result import Step
@@ -17,6 +16,7 @@ from structgstream_studies.peers.methods import TINY_METHODS
 from structgstream_studies.peers.plain import Y0, PlainGaussians
 from structgstream_studies.peers.threedgstream import apply_transformation, box_of, in_box
 from structgstream_studies.peers.warm_up import WarmUpConfig, identity_loss, warm_up
+from tests.support.backends import quickest_backend
 
 BACKEND = quickest_backend()
 CAPTURE = moving_capture(1)

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 import torch
 
-from backends import quickest_backend
-from memory_captures import MemoryCapture
 from peers.captures import Watched, moving_capture
 from structgstream.codec.container.records import scan_records
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError, StreamError
 from structgstream.recorder import record
 from structgstream.scene.render import render
-from structgstream.session import FrameReport
+from structgstream.session.loop import FrameReport
 from structgstream_studies.peers.codec import peer_pipeline
 from structgstream_studies.peers.methods import METHODS, TINY_METHODS, AnyMethod, open_peer
 from structgstream_studies.peers.threedgstream import ThreeDGStream, ThreeDGStreamConfig
+from tests.support.backends import quickest_backend
+from tests.support.memory_captures import MemoryCapture
 
 BACKEND = quickest_backend()
 NAMES = list(TINY_METHODS)

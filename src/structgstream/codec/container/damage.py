@@ -25,7 +25,7 @@ from structgstream.codec.container.records import (
 )
 from structgstream.errors import StreamError
 
-LEAST_PACKET_BYTES = RECORD.size + FRAME.size + CHECKSUM.size
+MIN_PACKET_BYTES = RECORD.size + FRAME.size + CHECKSUM.size
 _ZSTD = bytes.fromhex("28b52ffd")  # which an init record's description begins with
 _CHUNK_BYTES = 2**20
 _WORK = 4
@@ -62,7 +62,7 @@ class Standing:
 
     def last_frame_at(self, offset: int) -> int:
         """The last frame that a packet at ``offset`` may be: frames before it take bytes, too."""
-        return self.frames + (offset - self.offset) // LEAST_PACKET_BYTES
+        return self.frames + (offset - self.offset) // MIN_PACKET_BYTES
 
 
 class PacketSearch:

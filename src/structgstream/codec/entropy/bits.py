@@ -107,25 +107,25 @@ class BitReader:
         self._position = end
         return value
 
-    def golomb(self, *, order: int, most_zeros: int) -> int:
-        """An Exp-Golomb code with at most ``most_zeros`` leading zeros.
+    def golomb(self, *, order: int, max_zeros: int) -> int:
+        """An Exp-Golomb code with at most ``max_zeros`` leading zeros.
 
         Raises:
             StreamError: it has more, or is truncated.
         """
-        first = self._text.find("1", self._position, self._position + most_zeros + 1)
+        first = self._text.find("1", self._position, self._position + max_zeros + 1)
         if first < 0:
             raise StreamError(f"{self._where} holds a number that is cut or out of bounds; it is damaged.")
         zeros, self._position = first - self._position, first
         return self.fixed(zeros + order + 1) - (1 << order)
 
-    def signed_golomb(self, *, order: int, most_zeros: int) -> int:
+    def signed_golomb(self, *, order: int, max_zeros: int) -> int:
         """A signed Exp-Golomb code, see :func:`signed_golomb`.
 
         Raises:
             StreamError: as :meth:`golomb`.
         """
-        return unzigzag(self.golomb(order=order, most_zeros=most_zeros))
+        return unzigzag(self.golomb(order=order, max_zeros=max_zeros))
 
     def end(self) -> None:
         """Checks that only zero padding of the last byte is left.
@@ -142,7 +142,7 @@ ALPHABET = 16
 LARGEST_SYMBOL = 7
 ESCAPE = 15
 _ORDER = 2
-_MOST_ZEROS = 28
+_MAX_ZEROS = 28
 
 
 def residuals_to_symbols(residuals: NDArray[np.integer]) -> tuple[NDArray[np.uint8], bytes]:
@@ -181,7 +181,7 @@ def symbols_to_residuals(
         raise StreamError(f"{where} has {len(escapes)} bytes for {len(places)} values; it is damaged.")
     reader = BitReader(escapes, where=where)
     for place in places:
-        magnitude = reader.golomb(order=_ORDER, most_zeros=_MOST_ZEROS) + LARGEST_SYMBOL + 1
+        magnitude = reader.golomb(order=_ORDER, max_zeros=_MAX_ZEROS) + LARGEST_SYMBOL + 1
         negative = reader.fixed(1)
         if magnitude > 2**31 - 1 + negative:
             raise StreamError(f"{where} holds a value beyond 32 bits; it is damaged.")

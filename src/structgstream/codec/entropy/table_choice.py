@@ -7,6 +7,7 @@ Costs are integers in units of 2^-16 bit, so the choice is the same on every mac
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,39 +34,51 @@ _PER_LN2 = 94548  # 2^16 / ln 2
 _EXPLICIT_BITS = 2 + 1 + PRECISION_BITS + 1 + 1
 
 
-@dataclass(frozen=True)
-class _Explicit:
-    """Explicitly coded rows of one kind for all contexts.
+class _Form(NamedTuple):
+    """How a row is coded explicitly, in the order in which equally cheap ones are preferred.
 
     Args:
-        rows: ``[C, A]`` frequencies.
-        cost: ``[C]`` of row and symbols, 2^-16 bit.
-        levels, references, present: ``[C, A]``.
-        number: ``[C]`` geometric row that is the reference, or None for the previous row.
-        bitmap: whether presence is coded as one flag per symbol.
+        geometric: whether levels are relative to the geometric row, not to the previous one.
+        precision, order: of levels and of their codes.
+        bitmap: whether presence is coded as one flag per symbol, not as a number of symbols.
     """
 
-    rows: NDArray[np.int64]
-    cost: NDArray[np.int64]
-    levels: NDArray[np.int64]
-    references: NDArray[np.int64]
-    present: NDArray[np.bool_]
-    number: NDArray[np.int64] | None
+    geometric: bool
     precision: int
     order: int
     bitmap: bool
 
-    def bits(self, context: int | np.integer) -> str:
-        """The row of one context as bits."""
-        present = np.flatnonzero(self.present[context])
-        text = "110" if self.number is None else "111" + fixed(int(self.number[context]), NUMBER_BITS)
-        text += fixed(self.precision, PRECISION_BITS) + fixed(self.order, 1) + fixed(self.bitmap, 1)
-        if self.bitmap:
-            text += "".join(fixed(bool(there), 1) for there in self.present[context])
-        else:
-            text += fixed(len(present) - 1, COUNT_BITS)
-        steps = (self.levels - self.references)[context, present].tolist() if len(present) > 1 else []
-        return text + "".join(signed_golomb(step, order=self.order) for step in steps)
+
+_FORMS = [_Form(*form) for form in product((False, True), range(1 << PRECISION_BITS), (0, 1), (False, True))]
+
+
+@dataclass(frozen=True)
+class _Explicit:
+    """Explicitly coded rows of one precision; axes are flags of presence, order, reference, context and symbol.
+
+    Args:
+        rows: ``[2, 2, 2, C, A]`` frequencies.
+        cost: ``[2, 2, 2, C]`` of row and symbols, 2^-16 bit.
+        steps: ``[2, 2, C, A]``, levels relative to those of the reference.
+        present: ``[2, C, A]``.
+    """
+
+    rows: NDArray[np.int64]
+    cost: NDArray[np.int64]
+    steps: NDArray[np.int64]
+    present: NDArray[np.bool_]
+
+    def bits(self, form: _Form, context: int, number: int) -> str:
+        """The row of one context as bits; ``number`` of its geometric row."""
+        flags = self.present[int(form.bitmap), context]
+        present = np.flatnonzero(flags)
+        text = "111" + fixed(number, NUMBER_BITS) if form.geometric else "110"
+        text += fixed(form.precision, PRECISION_BITS) + fixed(form.order, 1) + fixed(form.bitmap, 1)
+        text += (
+            "".join(fixed(bool(there), 1) for there in flags) if form.bitmap else fixed(len(present) - 1, COUNT_BITS)
+        )
+        steps = self.steps[form.order, int(form.geometric), context, present].tolist() if len(present) > 1 else []
+        return text + "".join(signed_golomb(step, order=form.order) for step in steps)
 
 
 def choose_tables(counts: NDArray[np.integer], previous: FrequencyTables) -> tuple[FrequencyTables, bytes]:
@@ -95,53 +108,55 @@ def choose_tables(counts: NDArray[np.integer], previous: FrequencyTables) -> tup
         _EXPLICIT_BITS + COUNT_BITS << COST_BITS
     )
     tried = np.flatnonzero(least < cost)
-    for geometric_reference, precision, order in product((False, True), range(1 << PRECISION_BITS), (0, 1)):
-        references = family[number[tried]] if geometric_reference else kept[tried]
-        its_number = number[tried] if geometric_reference else None
-        for entry in _explicit(counts[tried], references, its_number, precision, order):
-            for place in np.flatnonzero(entry.cost < cost[tried]):
-                context = tried[place]
-                rows[context], cost[context], pieces[context] = entry.rows[place], entry.cost[place], entry.bits(place)
+    if len(tried):
+        references = np.stack([kept[tried], family[number[tried]]])
+        found = [_explicit(counts[tried], references, precision) for precision in range(1 << PRECISION_BITS)]
+        costs = np.stack([found[form.precision].cost[_place(form)] for form in _FORMS])
+        for place, best in enumerate(costs.argmin(0).tolist()):
+            context, form = tried[place], _FORMS[best]
+            if costs[best, place] < cost[context]:
+                rows[context] = found[form.precision].rows[*_place(form), place]
+                pieces[context] = found[form.precision].bits(form, place, int(number[context]))
     changes = any(piece != "0" for piece in pieces)
     return FrequencyTables(rows.astype(np.uint16)), pack_bits(pieces) if changes else b""
 
 
-def _explicit(
-    counts: NDArray[np.int64],
-    reference_rows: NDArray[np.int64],
-    number: NDArray[np.int64] | None,
-    precision: int,
-    order: int,
-) -> list[_Explicit]:
-    """Explicit rows with both codings of presence: as a number of symbols, and as a flag per symbol.
+def _place(form: _Form) -> tuple[int, int, int]:
+    return int(form.bitmap), form.order, int(form.geometric)
+
+
+def _explicit(counts: NDArray[np.int64], reference_rows: NDArray[np.int64], precision: int) -> _Explicit:
+    """Explicit rows of one precision in every form.
 
     With a fixed scale of the weights (the reference's), the best level of each symbol is independent of the others: it
     balances ``count log2(weight)``, the share that the weight takes from all others, and the bits of the level.
+
+    Args:
+        counts: ``[C, A]``.
+        reference_rows: ``[2, C, A]``, the previous rows and the geometric ones.
+        precision: of levels.
     """
-    references = levels_of(reference_rows, precision=precision)
-    every = np.arange(1, top_level(precision) + 1)
-    weights = weights_of(every, precision=precision)
-    steps = _step_bits(precision, order)
-    total = counts.sum(1)[:, None, None]
-    cost = (total * weights * _PER_LN2 >> 12 + precision) - counts[..., None] * logs()[weights >> precision]
-    levels = 1 + (cost + (steps[references - 1] << COST_BITS)).argmin(2)
-    bits = steps[references - 1, levels - 1]
-    occurs = counts > 0
     alphabet = counts.shape[1]
+    references = levels_of(reference_rows, precision=precision)
+    every = weights_of(np.arange(1, top_level(precision) + 1), precision=precision)
+    shares = counts.sum(1)[:, None, None] * every * _PER_LN2 >> 12 + precision
+    level_costs = shares - counts[..., None] * logs()[every >> precision]
+    step_bits = np.stack([_step_bits(precision, order) for order in (0, 1)])[:, references - 1]
+    levels = 1 + (level_costs + (step_bits << COST_BITS)).argmin(-1)
+    bits = np.take_along_axis(step_bits, levels[..., None] - 1, -1)[..., 0]
+    occurs = counts > 0
     last = alphabet - 1 - occurs[:, ::-1].argmax(1)
-    found = []
-    for bitmap in (False, True):
-        present = occurs if bitmap else np.arange(alphabet) <= last[:, None]
-        rows = weighed(np.where(present, weights_of(levels, precision=precision), 0))
-        size = _EXPLICIT_BITS + (alphabet if bitmap else COUNT_BITS) + (0 if number is None else NUMBER_BITS)
-        size = size + np.where(present.sum(1) > 1, (bits * present).sum(1), 0)
-        whole = _data_cost(counts, rows) + (size << COST_BITS)
-        found.append(_Explicit(rows, whole, levels, references, present, number, precision, order, bitmap))
-    return found
+    present = np.stack([np.arange(alphabet) <= last[:, None], occurs])
+    shown = present[:, None, None]
+    rows = weighed(np.where(shown, weights_of(levels, precision=precision), 0))
+    of_presence, of_reference = np.array([COUNT_BITS, alphabet]), np.array([0, NUMBER_BITS])
+    heads = _EXPLICIT_BITS + of_presence[:, None, None, None] + of_reference[:, None]
+    size = heads + np.where(shown.sum(-1) > 1, (bits * shown).sum(-1), 0)
+    return _Explicit(rows, _data_cost(counts, rows) + (size << COST_BITS), levels - references, present)
 
 
 def _data_cost(counts: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    return (counts * code_costs()[rows]).sum(1)
+    return (counts * code_costs()[rows]).sum(-1)
 
 
 @cache

@@ -183,8 +183,8 @@ def code_costs() -> NDArray[np.int64]:
 NUMBER_BITS = 8
 PRECISION_BITS = 2
 COUNT_BITS = 5
-MOST_ZEROS = 8
-_MOST_ROW_BYTES = 72  # 14 bits, 32 presence flags, and 32 levels of at most 17 bits
+MAX_ZEROS = 8
+_MAX_ROW_BYTES = 72  # 14 bits, 32 presence flags, and 32 levels of at most 17 bits
 
 
 def levels_of(frequencies: NDArray[np.integer], *, precision: int) -> NDArray[np.int64]:
@@ -214,7 +214,7 @@ def decode_tables(
     Raises:
         StreamError: the set is damaged.
     """
-    if len(data) > _MOST_ROW_BYTES * previous.contexts:
+    if len(data) > _MAX_ROW_BYTES * previous.contexts:
         raise StreamError(f"{where} has {len(data)} bytes for {previous.contexts} contexts; it is damaged.")
     if not len(data):
         return previous  # empty data: all rows stay
@@ -245,7 +245,7 @@ def _explicit_row(reader: BitReader, reference: NDArray[np.uint16], *, where: st
     levels = np.zeros(alphabet, np.int64)
     levels[present] = levels_of(reference[present], precision=precision)
     for symbol in present if len(present) > 1 else ():
-        levels[symbol] += reader.signed_golomb(order=order, most_zeros=MOST_ZEROS)
+        levels[symbol] += reader.signed_golomb(order=order, max_zeros=MAX_ZEROS)
         if not 1 <= levels[symbol] <= top_level(precision):
             raise StreamError(f"{where} holds a frequency out of bounds; it is damaged.")
     return weighed(weights_of(levels, precision=precision))

@@ -19,7 +19,7 @@ from structgstream.scene.state import FIELDS, FREE_COLUMNS
 FREE_PARAMETERS = FIELDS["free"].parameters
 _ENDS = tuple(accumulate(parameter.columns for parameter in FREE_PARAMETERS))
 GROUPS = tuple((p.path, end - p.columns, end) for p, end in zip(FREE_PARAMETERS, _ENDS, strict=True))
-MOST_FREE = 2**18
+MAX_FREE = 2**18
 """Largest number of free Gaussians of a scene: symbols can cost less than a bit, so bytes do not bound it."""
 _MEANS = range(6, 11)  # columns predicted from the mean: quaternions and opacities
 _LED = (12, 13)  # columns predicted from the change in the column before: green and blue
@@ -108,10 +108,8 @@ def _code_births(coder: AdaptiveCoder, new: FreeBins | None, alive: Bins, *, whe
     """Codes the births, given the bins of the survivors."""
     given = None if new is None else np.array([len(new.births)])
     count = int(coder.numbers("free_births.count", given, [np.zeros(1, np.int32)], counts=[1])[0])
-    if not 0 <= count <= MOST_FREE - len(alive):
-        raise StreamError(
-            f"{where} adds {count} free Gaussians, which makes more than {MOST_FREE}, or fewer than none."
-        )
+    if not 0 <= count <= MAX_FREE - len(alive):
+        raise StreamError(f"{where} adds {count} free Gaussians, which makes more than {MAX_FREE}, or fewer than none.")
     if not count:
         return FreeBins.none()
     nothing = np.zeros(count, np.int32)

@@ -23,12 +23,12 @@ from structgstream.errors import StreamError
 from structgstream.scene.order import CELL_BITS, morton_cells, morton_keys
 from structgstream.scene.state import FIELDS, STATE_TABLE, FieldName, InitCoding
 
-MOST_ANCHORS = 2**22
-MOST_WEIGHTS = 2**20
+MAX_ANCHORS = 2**22
+MAX_WEIGHTS = 2**20
 FREE_NUMBERS, NUMBERS_A_BYTE = 2**20, 64
 """Limits memory: all coded fields together may have 2^20 numbers plus 64 per byte. A symbol can cost nearly no bits, so
 a few bytes could decode to gigabytes. Trained scenes have 5 to 9 numbers per byte."""
-_MOST_GAUSSIANS, _MOST_OTHERS = 64, 256
+_MAX_GAUSSIANS, _MAX_OTHERS = 64, 256
 """Largest K, and largest value of every other letter of a shape."""
 UNCODED_FIELDS: frozenset[FieldName] = frozenset(row.name for row in STATE_TABLE if row.init_coding == "uncoded")
 """Fields that the init record stores raw with either codec."""
@@ -50,7 +50,7 @@ class _Budget:
             raise StreamError(f"{_WHERE} has more than {NUMBERS_A_BYTE} numbers per byte; it is damaged.")
 
 
-def _most_numbers(coded: Iterable[bytes | memoryview]) -> int:
+def _max_numbers(coded: Iterable[bytes | memoryview]) -> int:
     return FREE_NUMBERS + NUMBERS_A_BYTE * sum(map(len, coded))
 
 
@@ -76,7 +76,7 @@ def encode_fields(fields: Mapping[FieldName, Tensor], steps: Mapping[FieldName, 
     encoder = SectionEncoder(Tables())
     numbers = sum(found.size for found in bins.values())
     _code_fields(encoder, bins, bins.keys(), _Budget(numbers))
-    if numbers > (most := _most_numbers(encoder.fields.values())):
+    if numbers > (most := _max_numbers(encoder.fields.values())):
         raise StreamError(
             f"The header has {numbers} numbers, more than the {most} that its bytes allow; take smaller steps."
         )
@@ -97,7 +97,7 @@ def decode_fields(
     if missing := [name for name in names if name not in steps]:
         raise StreamError(f"The header states no step for {', '.join(missing)} in the init record.")
     decoder = SectionDecoder(Tables(), coded, where=_WHERE)
-    bins = _code_fields(decoder, None, coded.keys(), _Budget(_most_numbers(coded.values())))
+    bins = _code_fields(decoder, None, coded.keys(), _Budget(_max_numbers(coded.values())))
     decoder.end()
     return {name: dequantize(found, steps[name]) for name, found in bins.items()}
 
@@ -110,10 +110,10 @@ def _of_coding(coding: InitCoding, names: Set[FieldName]) -> list[FieldName]:
     return [row.name for row in STATE_TABLE if row.init_coding == coding and row.name in names]
 
 
-def most_columns(name: FieldName) -> int:
+def max_columns(name: FieldName) -> int:
     """Largest number of columns of a field that is coded as rows."""
-    most = {"K": _MOST_GAUSSIANS}
-    sizes = (size if isinstance(size, int) else most.get(size, _MOST_OTHERS) for size in FIELDS[name].shape[1:])
+    most = {"K": _MAX_GAUSSIANS}
+    sizes = (size if isinstance(size, int) else most.get(size, _MAX_OTHERS) for size in FIELDS[name].shape[1:])
     return math.prod(sizes)
 
 
@@ -163,7 +163,7 @@ def _code_positions(coder: SectionCoder, bins: Bins | None, budget: _Budget) -> 
     Rows need not be in Z-order; if they are not, signs are coded too.
     """
     given = None if bins is None else len(bins)
-    count = _bounded(coder.number("anchor_positions.rows", given), MOST_ANCHORS, "anchors")
+    count = _bounded(coder.number("anchor_positions.rows", given), MAX_ANCHORS, "anchors")
     budget.take(3 * count)
     if not count:
         return np.zeros((0, 3), np.int32)
@@ -208,7 +208,7 @@ def _code_rows(
 ) -> tuple[Bins, NDArray[np.int32]]:
     """Codes rows ``[n, C]``, column by column, and their shifts, in the context of another field's shifts ``like``."""
     given = None if bins is None else bins.shape[1]
-    columns = _bounded(coder.number(f"{name}.columns", given), most_columns(name), f"columns of {name}")
+    columns = _bounded(coder.number(f"{name}.columns", given), max_columns(name), f"columns of {name}")
     budget.take(columns * len(like))
     shifts = None if bins is None else _common_shifts(bins, like)
     shifts = coder.residuals(f"{name}.shift", shifts, like.astype(np.uint16), count=SHIFTS)
@@ -252,7 +252,7 @@ def _common_shifts(bins: Bins, like: NDArray[np.int32]) -> NDArray[np.int32]:
 def _code_numbers(coder: SectionCoder, name: FieldName, bins: Bins | None, budget: _Budget) -> Bins:
     """Codes numbers ``[n]`` of any size."""
     count = _bounded(
-        coder.number(f"{name}.count", None if bins is None else len(bins)), MOST_WEIGHTS, f"numbers of {name}"
+        coder.number(f"{name}.count", None if bins is None else len(bins)), MAX_WEIGHTS, f"numbers of {name}"
     )
     budget.take(count)
     values = None if bins is None else zigzag(bins.astype(np.int64))

@@ -211,12 +211,12 @@ def history_name(first_segment: int, sha256: str) -> str:
     return f"history-{first_segment:08d}-{sha256[:16]}.json"
 
 
-MOST_MANIFEST_BYTES = 4 * 2**20
-MOST_PAGE_BYTES = 4 * 2**20
-MOST_ENTRIES = 4096
-MOST_GROUP_FRAMES = 65_536
-MOST_SEGMENT_BYTES = 2**40
-MOST_LEVEL = 8
+MAX_MANIFEST_BYTES = 4 * 2**20
+MAX_PAGE_BYTES = 4 * 2**20
+MAX_ENTRIES = 4096
+MAX_GROUP_FRAMES = 65_536
+MAX_SEGMENT_BYTES = 2**40
+MAX_LEVEL = 8
 MIN_FPS = 1e-9
 
 
@@ -232,7 +232,7 @@ def manifest_from_json(data: bytes, *, name: str) -> Manifest:
     Raises:
         StreamError: it is no manifest, of a newer version, or contradicts itself or the format's bounds.
     """
-    top = parse_object(data, name, most_bytes=MOST_MANIFEST_BYTES)
+    top = parse_object(data, name, max_bytes=MAX_MANIFEST_BYTES)
     if (found := top.text("format")) != FORMAT:
         raise StreamError(f"{name} is no manifest of segments: its format is {found!r}; expected {FORMAT!r}.")
     if (version := top.whole("version")) != VERSION:
@@ -252,10 +252,10 @@ def manifest_from_json(data: bytes, *, name: str) -> Manifest:
             published_unix_seconds=edge.number("published_unix_seconds"),
         ),
         window=Window(window.whole("first_frame"), window.whole("first_segment"), _optional(window, "seconds")),
-        periods=tuple(_period(entry) for entry in top.items("periods", most=MOST_ENTRIES)),
-        history=tuple(_page(entry) for entry in top.items("history", most=MOST_ENTRIES)),
-        segments=tuple(_segment(entry) for entry in top.items("segments", most=MOST_ENTRIES)),
-        parts=tuple(_part(entry) for entry in top.items("parts", most=MOST_GROUP_FRAMES)),
+        periods=tuple(_period(entry) for entry in top.items("periods", most=MAX_ENTRIES)),
+        history=tuple(_page(entry) for entry in top.items("history", most=MAX_ENTRIES)),
+        segments=tuple(_segment(entry) for entry in top.items("segments", most=MAX_ENTRIES)),
+        parts=tuple(_part(entry) for entry in top.items("parts", most=MAX_GROUP_FRAMES)),
     )
     _check(manifest, name)
     return manifest
@@ -273,18 +273,18 @@ def page_from_json(data: bytes, entry: HistoryEntry) -> tuple[SegmentEntry, ...]
     Raises:
         StreamError: it is no page, or not what ``entry`` announces.
     """
-    top = parse_object(data, entry.file, most_bytes=MOST_PAGE_BYTES)
+    top = parse_object(data, entry.file, max_bytes=MAX_PAGE_BYTES)
     if top.text("format") != FORMAT or top.whole("version") != VERSION:
         top.refuse(f"is no history page of {FORMAT} {VERSION}")
     if entry.level:
-        pages = tuple(_page(one) for one in top.items("history", most=MOST_ENTRIES))
+        pages = tuple(_page(one) for one in top.items("history", most=MAX_ENTRIES))
         if any(page.level != entry.level - 1 for page in pages):
             top.refuse(f"lists pages of other levels than {entry.level - 1}")
         _check_run(pages, entry.first_segment, entry.first_frame, entry.file)
         counts = sum(page.segments for page in pages), sum(page.frames for page in pages)
         found: tuple[SegmentEntry, ...] | tuple[HistoryEntry, ...] = pages
     else:
-        segments = tuple(_segment(one) for one in top.items("segments", most=MOST_ENTRIES))
+        segments = tuple(_segment(one) for one in top.items("segments", most=MAX_ENTRIES))
         _check_run(segments, entry.first_segment, entry.first_frame, entry.file)
         counts, found = (len(segments), sum(one.frames for one in segments)), segments
     if counts != (entry.segments, entry.frames):
@@ -304,7 +304,7 @@ def _period(fields: Fields) -> PeriodEntry:
     return PeriodEntry(
         period=fields.whole("period"),
         file=fields.file(),
-        bytes=fields.whole("bytes", least=1, most=MOST_SEGMENT_BYTES),
+        bytes=fields.whole("bytes", least=1, most=MAX_SEGMENT_BYTES),
         sha256=fields.sha256(),
         first_frame=fields.whole("first_frame"),
         first_segment=fields.whole("first_segment"),
@@ -314,19 +314,19 @@ def _period(fields: Fields) -> PeriodEntry:
 def _page(fields: Fields) -> HistoryEntry:
     return HistoryEntry(
         file=fields.file(),
-        level=fields.whole("level", most=MOST_LEVEL),
+        level=fields.whole("level", most=MAX_LEVEL),
         first_segment=fields.whole("first_segment"),
         segments=fields.whole("segments", least=1),
         first_frame=fields.whole("first_frame"),
         frames=fields.whole("frames", least=1),
         pts_seconds=fields.pair("pts_seconds"),
-        bytes=fields.whole("bytes", least=1, most=MOST_PAGE_BYTES),
+        bytes=fields.whole("bytes", least=1, most=MAX_PAGE_BYTES),
         sha256=fields.sha256(),
     )
 
 
 def _segment(fields: Fields) -> SegmentEntry:
-    frames = fields.whole("frames", least=1, most=MOST_GROUP_FRAMES)
+    frames = fields.whole("frames", least=1, most=MAX_GROUP_FRAMES)
     entry = SegmentEntry(
         segment=fields.whole("segment"),
         file=fields.file(),
@@ -334,7 +334,7 @@ def _segment(fields: Fields) -> SegmentEntry:
         first_frame=fields.whole("first_frame"),
         frames=frames,
         pts_seconds=fields.pair("pts_seconds"),
-        bytes=fields.whole("bytes", least=1, most=MOST_SEGMENT_BYTES),
+        bytes=fields.whole("bytes", least=1, most=MAX_SEGMENT_BYTES),
         key_bytes=fields.whole("key_bytes", least=1, most=2**33),
         frame_bytes=fields.wholes("frame_bytes", count=frames, least=1, most=2**33),
         sha256=fields.sha256(),

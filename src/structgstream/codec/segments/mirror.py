@@ -102,9 +102,9 @@ class MirroredStore:
             self._started()
             self._changed.notify_all()
 
-    def get(self, name: str, *, most_bytes: int | None = None) -> bytes:
+    def get(self, name: str, *, max_bytes: int | None = None) -> bytes:
         """From the folder."""
-        return self._folder.get(name, most_bytes=most_bytes)
+        return self._folder.get(name, max_bytes=max_bytes)
 
     def delete(self, name: str) -> None:
         """Remove from the folder, when it is not being copied; the copy goes later; a manifest's stays."""
@@ -294,6 +294,6 @@ class MirroredStore:
 def _owner(store: Store) -> Owner | None:
     """As the marker of a store has it; None if there is none."""
     try:
-        return parse_owner(store.get(MARKER, most_bytes=4096))
+        return parse_owner(store.get(MARKER, max_bytes=4096))
     except StreamError:
         return None

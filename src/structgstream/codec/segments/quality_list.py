@@ -7,18 +7,18 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from structgstream.atomic_files import atomic_write
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.store import read_bounded
 from structgstream.codec.segments.strict_json import Fields, parse_object
 from structgstream.errors import StreamError
-from structgstream.whole_files import write_whole
 
 QUALITIES = "qualities.json"
 """The name of the list."""
 FORMAT = "structgstream-qualities"
 VERSION = 1
-MOST_QUALITIES = 8
-MOST_LIST_BYTES = 64 * 1024
+MAX_QUALITIES = 8
+MAX_LIST_BYTES = 64 * 1024
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}", re.ASCII)
 _PATH = re.compile(r"([A-Za-z0-9_-][A-Za-z0-9._-]{0,127}/){0,4}[A-Za-z0-9_-][A-Za-z0-9._-]{0,127}", re.ASCII)
@@ -62,12 +62,12 @@ def list_from_json(data: bytes, *, name: str) -> tuple[ListedQuality, ...]:
     Raises:
         StreamError: it is no list of qualities, of a newer version, or leaves the bounds of players.
     """
-    top = parse_object(data, name, most_bytes=MOST_LIST_BYTES)
+    top = parse_object(data, name, max_bytes=MAX_LIST_BYTES)
     if (found := top.text("format")) != FORMAT:
         raise StreamError(f"{name} is no list of qualities: its format is {found!r}; expected {FORMAT!r}.")
     if (version := top.whole("version")) != VERSION:
         raise StreamError(f"{name} has version {version}; this program reads {VERSION}. Install a newer structgstream.")
-    qualities = tuple(_quality(entry) for entry in top.items("qualities", most=MOST_QUALITIES))
+    qualities = tuple(_quality(entry) for entry in top.items("qualities", most=MAX_QUALITIES))
     if not qualities:
         raise StreamError(f"{name} lists no quality.")
     return qualities
@@ -82,7 +82,7 @@ def read_list(folder: Path) -> tuple[ListedQuality, ...] | None:
     path = folder / QUALITIES
     if not path.exists():
         return None
-    data = read_bounded(path, most_bytes=MOST_LIST_BYTES)
+    data = read_bounded(path, max_bytes=MAX_LIST_BYTES)
     return list_from_json(data, name=str(path))
 
 
@@ -92,7 +92,7 @@ def write_list(folder: Path, qualities: Sequence[ListedQuality]) -> None:
     Raises:
         StorageError: it cannot be written; what was there before stays.
     """
-    write_whole(folder / QUALITIES, list_to_json(qualities), called="The list of qualities")
+    atomic_write(folder / QUALITIES, list_to_json(qualities), called="The list of qualities")
 
 
 def _quality(entry: Fields) -> ListedQuality:

@@ -13,7 +13,7 @@ from structgstream.codec.header import unpack_header
 from structgstream.codec.segments.history import verified
 from structgstream.codec.segments.manifest import (
     MANIFEST,
-    MOST_MANIFEST_BYTES,
+    MAX_MANIFEST_BYTES,
     Edge,
     Manifest,
     PartEntry,
@@ -83,7 +83,7 @@ def stale_files(manifest: Manifest, there: frozenset[str]) -> frozenset[str]:
 
 def _named(store: Store, there: frozenset[str]) -> Draft | None:
     """What the manifest names; a damaged last part is as one that was never written."""
-    data = store.get(MANIFEST, most_bytes=MOST_MANIFEST_BYTES)
+    data = store.get(MANIFEST, max_bytes=MAX_MANIFEST_BYTES)
     manifest = manifest_from_json(data, name=f"{MANIFEST} in {store.name}")
     segments = [entry for entry in manifest.segments if entry.segment >= manifest.window.first_segment]
     for entry in (*manifest.periods, *manifest.history, *segments):

@@ -19,7 +19,7 @@ from structgstream.codec.container.records import RECORD_TYPES, packed
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.segments.manifest import (
     MANIFEST,
-    MOST_MANIFEST_BYTES,
+    MAX_MANIFEST_BYTES,
     Edge,
     Manifest,
     Window,
@@ -192,7 +192,7 @@ class SegmentsSink:
         sequence = 0
         if MANIFEST in there:
             with suppress(StreamError):  # It is being replaced, whatever it says.
-                data = self._store.get(MANIFEST, most_bytes=MOST_MANIFEST_BYTES)
+                data = self._store.get(MANIFEST, max_bytes=MAX_MANIFEST_BYTES)
                 sequence = manifest_from_json(data, name=MANIFEST).sequence
         for name in sorted(there, key=lambda name: (name != MANIFEST, not name.startswith("init-"), name)):
             self._store.delete(name)

@@ -10,14 +10,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
+from structgstream.atomic_files import replacing
 from structgstream.codec.container.byte_source import free_bytes
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.errors import StorageError, StreamError
 from structgstream.file_locks import lock_file, open_lockable
 from structgstream.remote_folders import open_url, reason_of, shown_address
-from structgstream.whole_files import replacing
 
-MOST_FILE_BYTES = 2**32
+MAX_FILE_BYTES = 2**32
 """Of a file whose size no manifest states."""
 _TEMPORARY = ".new-"
 _LOCK = ".writer"
@@ -29,7 +29,7 @@ def is_ours(name: str) -> bool:
     return _OURS.fullmatch(name) is not None
 
 
-def read_bounded(path: Path, *, most_bytes: int) -> bytes:
+def read_bounded(path: Path, *, max_bytes: int) -> bytes:
     """The bytes of a regular file; pipes, devices and files that are too large are refused before they are read.
 
     Raises:
@@ -40,11 +40,11 @@ def read_bounded(path: Path, *, most_bytes: int) -> bytes:
             status = os.fstat(file.fileno())
             if not stat.S_ISREG(status.st_mode):
                 raise StreamError(f"{path} is not a regular file; expected one that a run has written.")
-            data = file.read(most_bytes + 1) if status.st_size <= most_bytes else None
+            data = file.read(max_bytes + 1) if status.st_size <= max_bytes else None
     except OSError as error:
         raise StreamError(f"Cannot read {path} ({error.strerror}).") from error
-    if data is None or len(data) > most_bytes:
-        raise StreamError(f"{path} has {status.st_size} bytes; expected at most {most_bytes}.")
+    if data is None or len(data) > max_bytes:
+        raise StreamError(f"{path} has {status.st_size} bytes; expected at most {max_bytes}.")
     return data
 
 
@@ -64,11 +64,11 @@ class Store(Protocol):
         """
         ...
 
-    def get(self, name: str, *, most_bytes: int | None = None) -> bytes:
+    def get(self, name: str, *, max_bytes: int | None = None) -> bytes:
         """The bytes of a file.
 
         Raises:
-            StreamError: there is none, or it cannot be read, or has more bytes than ``most_bytes``.
+            StreamError: there is none, or it cannot be read, or has more bytes than ``max_bytes``.
         """
         ...
 
@@ -154,9 +154,9 @@ class FolderStore:
                 f"Cannot write {len(data)} bytes to {self.folder / name} ({error.strerror or error})."
             ) from error
 
-    def get(self, name: str, *, most_bytes: int | None = None) -> bytes:
+    def get(self, name: str, *, max_bytes: int | None = None) -> bytes:
         """See :meth:`Store.get`."""
-        return read_bounded(self.folder / name, most_bytes=MOST_FILE_BYTES if most_bytes is None else most_bytes)
+        return read_bounded(self.folder / name, max_bytes=MAX_FILE_BYTES if max_bytes is None else max_bytes)
 
     def delete(self, name: str) -> None:
         """See :meth:`Store.delete`."""
@@ -220,15 +220,15 @@ class CloudStore:
                 self._files.pipe_file(temporary, data)
                 self._files.mv(temporary, path)
 
-    def get(self, name: str, *, most_bytes: int | None = None) -> bytes:
+    def get(self, name: str, *, max_bytes: int | None = None) -> bytes:
         """See ``Store.get``."""
-        end = None if most_bytes is None else most_bytes + 1
+        end = None if max_bytes is None else max_bytes + 1
         try:
             data = self._files.cat_file(f"{self._root}/{name}", end=end)
         except Exception as error:
             raise StreamError(f"Cannot read {name} in {self.name} ({reason_of(error, self._url)}).") from error
-        if most_bytes is not None and len(data) > most_bytes:
-            raise StreamError(f"{name} in {self.name} has more than the expected {most_bytes} bytes.")
+        if max_bytes is not None and len(data) > max_bytes:
+            raise StreamError(f"{name} in {self.name} has more than the expected {max_bytes} bytes.")
         return data
 
     def delete(self, name: str) -> None:

@@ -7,12 +7,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from structgstream.atomic_files import atomic_write
 from structgstream.codec.container.index import Period, pack_index
 from structgstream.codec.container.records import PREFIX, PacketKind, RecordType
 from structgstream.codec.segments.history import segments_from, verified
 from structgstream.codec.segments.manifest import (
     MANIFEST,
-    MOST_MANIFEST_BYTES,
+    MAX_MANIFEST_BYTES,
     Manifest,
     PartEntry,
     SegmentEntry,
@@ -21,7 +22,6 @@ from structgstream.codec.segments.manifest import (
 )
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.errors import StreamError
-from structgstream.whole_files import write_whole
 
 _KEPT_FILES = 2
 
@@ -179,7 +179,7 @@ class StoredBytes:
     def _read(self, entry: StoredFile) -> bytes:
         if self._check:
             return verified(self._store, entry)
-        data = self._store.get(entry.file, most_bytes=entry.bytes)
+        data = self._store.get(entry.file, max_bytes=entry.bytes)
         if len(data) != entry.bytes:
             raise StreamError(
                 f"{entry.file} in {self._store.name} has {len(data)} bytes; the manifest states {entry.bytes}."
@@ -215,7 +215,7 @@ def read_manifest(store: Store) -> Manifest:
     """
     if MANIFEST not in store.names():
         raise StreamError(f"{store.name} has no {MANIFEST}; expected a folder written with --sink segments.")
-    return manifest_from_json(store.get(MANIFEST, most_bytes=MOST_MANIFEST_BYTES), name=f"{MANIFEST} in {store.name}")
+    return manifest_from_json(store.get(MANIFEST, max_bytes=MAX_MANIFEST_BYTES), name=f"{MANIFEST} in {store.name}")
 
 
 def write_archive(store: Store, path: Path) -> int:
@@ -235,5 +235,5 @@ def write_archive(store: Store, path: Path) -> int:
             f"{store.name} is not whole: frames {gone} have left its window (--window). A stream file has no gaps; "
             "reconstruct without a window to archive a whole stream."
         )
-    write_whole(path, stored.files())
+    atomic_write(path, stored.files())
     return len(stored.sizes)

@@ -124,14 +124,14 @@ class Fields:
         raise StreamError(f"{self._where} has {name!r} {_shown(value)}; expected {expected}.")
 
 
-def parse_object(data: bytes, where: str, *, most_bytes: int) -> Fields:
+def parse_object(data: bytes, where: str, *, max_bytes: int) -> Fields:
     """The JSON object in ``data``.
 
     Raises:
-        StreamError: it is longer than ``most_bytes``, or not a JSON object.
+        StreamError: it is longer than ``max_bytes``, or not a JSON object.
     """
-    if len(data) > most_bytes:
-        raise StreamError(f"{where} has {len(data)} bytes; expected at most {most_bytes}.")
+    if len(data) > max_bytes:
+        raise StreamError(f"{where} has {len(data)} bytes; expected at most {max_bytes}.")
     try:
         value = json.loads(data.decode(), parse_int=_number, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:

@@ -16,7 +16,7 @@ import numpy as np
 from structgstream.data.text_files import Unreadable, mapping, number, read_json, read_text, whole
 from structgstream.errors import MissingExtraError
 
-MOST_ENTRIES = 1_000_000  # of a matrix
+MAX_ENTRIES = 1_000_000  # of a matrix
 PLAIN_JSON = re.compile(r'"(camera_?matrix|K|mtx|intrinsics?)"', re.IGNORECASE)
 """What a program that writes OpenCV's matrices as lists calls the first of them."""
 
@@ -105,7 +105,7 @@ def _matrix(found: Mapping[str, Any]) -> np.ndarray:
     rows, columns = whole(found["rows"]), whole(found["cols"])
     data = [found["data"]] if isinstance(found["data"], str) else found["data"]
     values = [number(entry) for entry in data if entry != ""]
-    if not 0 <= rows * columns <= MOST_ENTRIES or min(rows, columns) < 0:
+    if not 0 <= rows * columns <= MAX_ENTRIES or min(rows, columns) < 0:
         raise Unreadable(f"a matrix of {rows}x{columns}")
     if rows * columns == 0:
         return np.empty((rows, columns))

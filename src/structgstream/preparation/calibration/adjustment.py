@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
 from structgstream.data.lenses import Fisheye, LensCamera
-from structgstream.preparation.calibration.bundle import Bundle, Scene, Sights, linearized, solved
+from structgstream.preparation.calibration.bundle import BodyObservations, Bundle, Parameters, linearized, solved
 from structgstream.preparation.calibration.lens_prior import usual_prior
 from structgstream.preparation.calibration.lens_terms import row_of, with_row
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
@@ -18,6 +18,7 @@ from structgstream.preparation.calibration.solved import Observations, SolvedCal
 _log = logging.getLogger(__name__)
 
 
+MAX_PIXELS = 3.0
 ROUNDS, STEPS, SAME = 8, 2, 0.05
 NORMAL_MEDIAN = 1.1774  # of the length of a pair of standard normal numbers
 
@@ -28,11 +29,16 @@ class Limits:
 
     Args:
         pixels: largest reprojection error.
-        degrees: least angle between the rays of a point.
+        degrees: smallest angle between the rays of a point.
     """
 
     pixels: float
-    degrees: float
+    degrees: float = 1.5
+
+    @classmethod
+    def for_pictures(cls, longest_side: int) -> "Limits":
+        """Three pixels of pictures of 1000 pixels on the longer side, in proportion, and never under one."""
+        return cls(max(1.0, MAX_PIXELS * longest_side / 1000))
 
 
 def adjust_together(
@@ -40,7 +46,7 @@ def adjust_together(
     *,
     lens: Sequence[int],
     free: Sequence[int],
-    held: NDArray[np.bool_],
+    fixed: NDArray[np.bool_],
     limits: Limits,
 ) -> SolvedCalibration:
     """``found`` with poses, points and the free terms of its lenses adjusted, without the observations that are off.
@@ -48,16 +54,16 @@ def adjust_together(
     Args:
         lens: number of the lens of each camera; cameras with shared intrinsics have one.
         free: the terms of ``lens_terms.py`` that are estimated.
-        held: by lens, whether it stays.
+        fixed: by lens, whether it stays.
     """
-    bundle, scene = _problem(found, np.asarray(lens, np.intp), tuple(free), held)
-    bundle, scene = estimated(bundle, scene)
-    adjusted = _result(found, bundle, scene)
-    kept = cleaned(adjusted, limits)
-    _tell(adjusted, kept, bundle)
-    again, scene = _problem(kept, bundle.lens, bundle.free, held)
+    bundle, parameters = _problem(found, np.asarray(lens, np.intp), tuple(free), fixed)
+    bundle, parameters = estimated(bundle, parameters)
+    adjusted = _result(found, bundle, parameters)
+    inliers = cleaned(adjusted, limits)
+    _log_adjustment(adjusted, inliers, bundle)
+    again, parameters = _problem(inliers, bundle.lens, bundle.free, fixed)
     again = replace(again, prior=bundle.prior, noise=bundle.noise)
-    return cleaned(_result(kept, again, solved(again, scene)), limits)
+    return cleaned(_result(inliers, again, solved(again, parameters)), limits)
 
 
 def cleaned(found: SolvedCalibration, limits: Limits) -> SolvedCalibration:
@@ -72,81 +78,85 @@ def cleaned(found: SolvedCalibration, limits: Limits) -> SolvedCalibration:
 def chosen(found: SolvedCalibration, good: NDArray[np.bool_]) -> SolvedCalibration:
     """With some of its observations ``[M]`` alone; points without any are left out."""
     seen = found.observations
-    kept, point = np.unique(seen.point[good], return_inverse=True)
+    inliers, point = np.unique(seen.point[good], return_inverse=True)
     observations = Observations(point.astype(np.intp), seen.camera[good], seen.pixels[good], seen.instant[good])
-    return replace(found, points=found.points[kept], observations=observations)
+    return replace(found, points=found.points[inliers], observations=observations)
 
 
 def _problem(
-    found: SolvedCalibration, lens: NDArray[np.intp], free: tuple[int, ...], held: NDArray[np.bool_]
-) -> tuple[Bundle, Scene]:
+    found: SolvedCalibration, lens: NDArray[np.intp], free: tuple[int, ...], fixed: NDArray[np.bool_]
+) -> tuple[Bundle, Parameters]:
     cameras, seen = list(found.cameras.values()), found.observations
-    sights = Sights(seen.camera, seen.point, np.zeros((len(seen), 3)), seen.pixels)
-    turns = np.broadcast_to(np.eye(3), (len(found.points), 3, 3))
-    return posed_problem(cameras, sights, (turns, found.points), lens=lens, free=free, held=held, turning=False)
+    observations = BodyObservations(seen.camera, seen.point, np.zeros((len(seen), 3)), seen.pixels)
+    rotations = np.broadcast_to(np.eye(3), (len(found.points), 3, 3))
+    return posed_problem(
+        cameras, observations, (rotations, found.points), lens=lens, free=free, fixed=fixed, rotating=False
+    )
 
 
 def posed_problem(
     cameras: Sequence[LensCamera],
-    sights: Sights,
+    observations: BodyObservations,
     bodies: tuple[Floats, Floats],
     *,
     lens: NDArray[np.intp],
     free: tuple[int, ...],
-    held: NDArray[np.bool_],
-    turning: bool,
-) -> tuple[Bundle, Scene]:
+    fixed: NDArray[np.bool_],
+    rotating: bool,
+) -> tuple[Bundle, Parameters]:
     """The problem of cameras that see bodies, with the usual prior of their lenses.
 
     Args:
-        bodies: rotations ``[B, 3, 3]`` and places ``[B, 3]``.
+        bodies: rotations ``[B, 3, 3]`` and positions ``[B, 3]``.
     """
-    first = [int(np.flatnonzero(lens == number)[0]) for number in range(len(held))]
+    first = [int(np.flatnonzero(lens == number)[0]) for number in range(len(fixed))]
     rows = np.stack([row_of(cameras[index]) for index in first])
     sizes = np.array([[filmed.camera.width, filmed.camera.height] for filmed in cameras], np.float64)
     fisheye = np.array([isinstance(filmed.lens, Fisheye) for filmed in cameras])
-    alike = np.full(len(held), -1, np.intp)
-    _, groups = np.unique(sizes[first][~held], axis=0, return_inverse=True)
-    alike[~held] = groups.ravel()
-    prior = usual_prior(alike, free, fisheye=bool(fisheye[first][~held].any()))
+    alike = np.full(len(fixed), -1, np.intp)
+    _, groups = np.unique(sizes[first][~fixed], axis=0, return_inverse=True)
+    alike[~fixed] = groups.ravel()
+    prior = usual_prior(alike, free, fisheye=bool(fisheye[first][~fixed].any()))
     views = np.stack([filmed.camera.viewmat.numpy() for filmed in cameras])
-    bundle = Bundle(sights, lens, sizes, fisheye, free, held, turning, prior)
-    return bundle, Scene(views[:, :3, :3], views[:, :3, 3], rows, *bodies)
+    bundle = Bundle(observations, lens, sizes, fisheye, free, fixed, rotating, prior)
+    return bundle, Parameters(views[:, :3, :3], views[:, :3, 3], rows, *bodies)
 
 
-def estimated(bundle: Bundle, scene: Scene) -> tuple[Bundle, Scene]:
+def estimated(bundle: Bundle, parameters: Parameters) -> tuple[Bundle, Parameters]:
     """Adjusted, with the noise and the differences of lenses that fit best."""
     poses = bundle.columns[0]
-    bundle = _with_noise(bundle, scene)
+    bundle = _with_noise(bundle, parameters)
     for _ in range(ROUNDS if bundle.free else 1):
-        scene = solved(bundle, scene, most=STEPS)
-        covariance = linearized(bundle, scene).covariance()
-        prior = bundle.prior.updated(scene.rows, covariance, start=poses, free=bundle.free)
+        parameters = solved(bundle, parameters, max_steps=STEPS)
+        covariance = linearized(bundle, parameters).covariance()
+        prior = bundle.prior.updated(parameters.rows, covariance, start=poses, free=bundle.free)
         change = np.abs(prior.differences / bundle.prior.differences - 1).max(initial=0.0)
-        bundle = _with_noise(replace(bundle, prior=prior), scene)
+        bundle = _with_noise(replace(bundle, prior=prior), parameters)
         if change < SAME:
             break
-    return bundle, solved(bundle, scene)
+    return bundle, solved(bundle, parameters)
 
 
-def _with_noise(bundle: Bundle, scene: Scene) -> Bundle:
-    misses = np.linalg.norm(bundle.misses(scene), axis=1)
+def _with_noise(bundle: Bundle, parameters: Parameters) -> Bundle:
+    residuals = np.linalg.norm(bundle.residuals(parameters), axis=1)
     poses, lenses, size = bundle.columns
-    left = max(0.1, 1 - (poses + lenses + size * len(scene.places)) / (2 * len(misses)))
-    return replace(bundle, noise=max(float(np.median(misses)) / NORMAL_MEDIAN / np.sqrt(left), 1e-3))
+    left = max(0.1, 1 - (poses + lenses + size * len(parameters.body_positions)) / (2 * len(residuals)))
+    return replace(bundle, noise=max(float(np.median(residuals)) / NORMAL_MEDIAN / np.sqrt(left), 1e-3))
 
 
-def _result(found: SolvedCalibration, bundle: Bundle, scene: Scene) -> SolvedCalibration:
-    return replace(found, cameras=cameras_in(scene, found.cameras, bundle.lens), points=scene.places)
+def _result(found: SolvedCalibration, bundle: Bundle, parameters: Parameters) -> SolvedCalibration:
+    return replace(found, cameras=cameras_in(parameters, found.cameras, bundle.lens), points=parameters.body_positions)
 
 
-def cameras_in(scene: Scene, cameras: Mapping[str, LensCamera], lens: NDArray[np.intp]) -> dict[str, LensCamera]:
-    """``cameras`` with the poses and lenses of a scene."""
+def cameras_in(
+    parameters: Parameters, cameras: Mapping[str, LensCamera], lens: NDArray[np.intp]
+) -> dict[str, LensCamera]:
+    """``cameras`` with the poses and lenses of the parameters."""
     adjusted = {}
     for index, (name, filmed) in enumerate(cameras.items()):
         viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = scene.rotations[index], scene.translations[index]
-        adjusted[name] = with_row(filmed, scene.rows[lens[index]], viewmat)
+        viewmat[:3, :3], viewmat[:3, 3] = parameters.rotations[index], parameters.translations[index]
+        adjusted[name] = with_row(filmed, parameters.rows[lens[index]], viewmat)
     return adjusted
 
 
@@ -159,15 +169,15 @@ def _angles(found: SolvedCalibration, good: NDArray[np.bool_]) -> Floats:
     order = np.argsort(seen.point[good], kind="stable")
     rays, points = rays[order], seen.point[good][order]
     widest = np.zeros(len(found.points))
-    for apart in range(1, int(np.bincount(points).max(initial=0))):
-        same = points[apart:] == points[:-apart]
-        sine = np.linalg.norm(np.cross(rays[apart:], rays[:-apart]), axis=1)
-        angle = np.arctan2(sine, (rays[apart:] * rays[:-apart]).sum(1))
-        np.maximum.at(widest, points[apart:][same], angle[same])
+    for step in range(1, int(np.bincount(points).max(initial=0))):
+        same = points[step:] == points[:-step]
+        sine = np.linalg.norm(np.cross(rays[step:], rays[:-step]), axis=1)
+        angle = np.arctan2(sine, (rays[step:] * rays[:-step]).sum(1))
+        np.maximum.at(widest, points[step:][same], angle[same])
     return widest
 
 
-def _tell(before: SolvedCalibration, after: SolvedCalibration, bundle: Bundle) -> None:
+def _log_adjustment(before: SolvedCalibration, after: SolvedCalibration, bundle: Bundle) -> None:
     counts = [np.bincount(own.observations.camera, minlength=len(own.cameras)) for own in (before, after)]
     lost = {name: int(count) for name, count in zip(before.cameras, counts[0] - counts[1], strict=True) if count}
     _log.info(

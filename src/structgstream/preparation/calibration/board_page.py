@@ -9,10 +9,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from structgstream.atomic_files import atomic_write
 from structgstream.data.images import opencv
 from structgstream.errors import ConfigError, MissingExtraError
 from structgstream.preparation.calibration.board import Board
-from structgstream.whole_files import write_whole
 
 Paper = Literal["A4", "A3", "A2", "A1", "A0", "letter", "tabloid"]
 
@@ -66,7 +66,7 @@ def write_board_pdf(path: Path, board: Board, paper: Paper = "A4") -> None:
     )
     content = BytesIO()
     canvas.print_pdf(content, metadata={"CreationDate": None, "Title": f"ChArUco board, {board.text}"})
-    write_whole(path, content.getvalue(), called="The board", new_folder=True)
+    atomic_write(path, content.getvalue(), called="The board", new_folder=True)
 
 
 def board_page(board: Board, paper: Paper) -> tuple[float, float]:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bundle adjustment of cameras that are alike, which COLMAP's has no terms for.
 
-What is adjusted beside cameras are bodies: points, or poses of a board whose corners are known. They are eliminated
+Apart from cameras, bodies are adjusted: points, or poses of a board whose corners are known. They are eliminated
 from the normal equations (Brown, 1958; Triggs et al., Bundle adjustment: a modern synthesis, 2000), which are solved by
 Levenberg's and Marquardt's method with Huber's loss. Terms of intrinsics may have a prior that cameras share
 (``lens_prior.py``).
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
-from structgstream.data.posed import rotation_matrix
+from structgstream.data.calibration import rotation_matrix
 from structgstream.preparation.calibration.lens_prior import LensPrior
 from structgstream.preparation.calibration.lens_terms import derivatives, projected
 
@@ -22,44 +22,44 @@ Indices = NDArray[np.intp]
 
 HUBER = 1.345  # standard deviations of the noise: 95 % as exact as least squares if there are no outliers
 RIDGE = 1e-10  # of the diagonal: the equations do not fix where the world's axes are
-MOST_STEPS = 50
+MAX_STEPS = 50
 SMALL = 1e-6
 
 
 @dataclass(frozen=True)
-class Sights:
+class BodyObservations:
     """What was observed.
 
     Args:
         camera: ``[M]``.
         body: ``[M]``.
-        place: ``[M, 3]``, where on the body; zeros for points.
+        offset: ``[M, 3]``, from the body's origin in its axes; zeros for points.
         pixels: ``[M, 2]``.
     """
 
     camera: Indices
     body: Indices
-    place: Floats
+    offset: Floats
     pixels: Floats
 
 
 @dataclass(frozen=True)
-class Scene:
-    """Everything that is adjusted.
+class Parameters:
+    """Everything that is adjusted: poses and lenses of cameras, poses of bodies.
 
     Args:
         rotations: ``[C, 3, 3]``, world to camera.
         translations: ``[C, 3]``.
         rows: ``[L, TERMS]`` of the lenses.
-        turns: ``[B, 3, 3]`` of the bodies, body to world; identities for points.
-        places: ``[B, 3]`` of the bodies.
+        body_rotations: ``[B, 3, 3]`` of the bodies, body to world; identities for points.
+        body_positions: ``[B, 3]`` of the bodies.
     """
 
     rotations: Floats
     translations: Floats
     rows: Floats
-    turns: Floats
-    places: Floats
+    body_rotations: Floats
+    body_positions: Floats
 
 
 @dataclass(frozen=True)
@@ -67,71 +67,74 @@ class Bundle:
     """A problem of bundle adjustment.
 
     Args:
-        sights: what was observed.
+        observations: of the bodies.
         lens: ``[C]``, which row of lenses a camera has.
         sizes: ``[C, 2]``, width and height of the pictures.
         fisheye: ``[C]``, whether a camera's terms are a fisheye's.
         free: the terms of the rows that are estimated.
-        held: ``[L]``, lenses that stay.
-        turning: whether bodies have rotations.
+        fixed: ``[L]``, lenses that stay.
+        rotating: whether bodies have rotations.
         prior: of the terms.
         noise: standard deviation of the pixels.
     """
 
-    sights: Sights
+    observations: BodyObservations
     lens: Indices
     sizes: Floats
     fisheye: NDArray[np.bool_]
     free: tuple[int, ...]
-    held: NDArray[np.bool_]
-    turning: bool
+    fixed: NDArray[np.bool_]
+    rotating: bool
     prior: LensPrior
     noise: float = 0.5
 
     @property
     def columns(self) -> tuple[int, int, int]:
         """Number of parameters of poses, of lenses, and of a body."""
-        return 6 * len(self.lens), len(self.held) * len(self.free), 6 if self.turning else 3
+        return 6 * len(self.lens), len(self.fixed) * len(self.free), 6 if self.rotating else 3
 
-    def misses(self, scene: Scene) -> Floats:
+    def residuals(self, parameters: Parameters) -> Floats:
         """Projected minus observed ``[M, 2]``, pixels; infinite behind a camera."""
-        own, local = self.sights.camera, self._local(scene)
+        own, local = self.observations.camera, self._local(parameters)
         ahead = local[:, 2] > 0
         safe = np.where(ahead[:, None], local, [0.0, 0.0, 1.0])
-        found = projected(safe, scene.rows[self.lens[own]], self.sizes[own], self.fisheye[own])
-        return np.where(ahead[:, None], found - self.sights.pixels, np.inf)
+        found = projected(safe, parameters.rows[self.lens[own]], self.sizes[own], self.fisheye[own])
+        return np.where(ahead[:, None], found - self.observations.pixels, np.inf)
 
-    def cost(self, scene: Scene) -> float:
+    def cost(self, parameters: Parameters) -> float:
         """Huber's loss of the misses, and what the prior adds."""
-        off = np.linalg.norm(self.misses(scene), axis=1) / self.noise
+        off = np.linalg.norm(self.residuals(parameters), axis=1) / self.noise
         if not np.isfinite(off).all():
             return float("inf")
         loss = np.where(off <= HUBER, off**2 / 2, HUBER * off - HUBER**2 / 2)
-        return float(loss.sum()) + self.prior.cost(scene.rows)
+        return float(loss.sum()) + self.prior.cost(parameters.rows)
 
-    def _local(self, scene: Scene) -> Floats:
-        seen = self.sights
-        world = np.einsum("mab,mb->ma", scene.turns[seen.body], seen.place) + scene.places[seen.body]
-        return np.einsum("mab,mb->ma", scene.rotations[seen.camera], world) + scene.translations[seen.camera]
+    def _local(self, parameters: Parameters) -> Floats:
+        seen = self.observations
+        world = (
+            np.einsum("mab,mb->ma", parameters.body_rotations[seen.body], seen.offset)
+            + parameters.body_positions[seen.body]
+        )
+        return np.einsum("mab,mb->ma", parameters.rotations[seen.camera], world) + parameters.translations[seen.camera]
 
 
-def solved(bundle: Bundle, scene: Scene, *, most: int = MOST_STEPS) -> Scene:
-    """The scene of least cost near ``scene``, or after ``most`` steps."""
-    damping, cost = 1e-4, bundle.cost(scene)
-    for _ in range(most):
-        system = linearized(bundle, scene)
+def solved(bundle: Bundle, parameters: Parameters, *, max_steps: int = MAX_STEPS) -> Parameters:
+    """The parameters of least cost near ``parameters``, or after ``max_steps`` steps."""
+    damping, cost = 1e-4, bundle.cost(parameters)
+    for _ in range(max_steps):
+        system = linearized(bundle, parameters)
         for _ in range(10):
-            tried = system.stepped(bundle, scene, damping)
+            tried = system.stepped(bundle, parameters, damping)
             new = bundle.cost(tried)
             if new <= cost:
                 break
             damping *= 10
         else:
-            return scene
-        gained, scene, cost, damping = cost - new, tried, new, max(damping / 10, 1e-9)
+            return parameters
+        gained, parameters, cost, damping = cost - new, tried, new, max(damping / 10, 1e-9)
         if gained < SMALL * cost:
             break
-    return scene
+    return parameters
 
 
 @dataclass(frozen=True)
@@ -149,20 +152,21 @@ class System:
         from scipy.sparse import bsr_array
 
         diagonal = np.einsum("bii->bi", self.V)
-        inverse: Floats = np.asarray(np.linalg.inv(self.V + _diagonals(damping * diagonal + 1e-12)), np.float64)
-        count, size = len(inverse), inverse.shape[1]
+        count, size = diagonal.shape
+        damped = self.V + (damping * diagonal + 1e-12)[:, :, None] * np.eye(size)
+        inverse: Floats = np.asarray(np.linalg.inv(damped), np.float64)
         blocks = bsr_array((inverse, np.arange(count), np.arange(count + 1)), shape=(count * size, count * size))
         weighed = self.W @ blocks.tocsr()
         own = np.diag(self.A)
         left = self.A + np.diag((damping + RIDGE) * own) - (weighed @ self.W.T).toarray()
         return left, self.gradient - weighed @ self.body_gradient.ravel(), inverse
 
-    def stepped(self, bundle: Bundle, scene: Scene, damping: float) -> Scene:
-        """The scene after one damped step."""
+    def stepped(self, bundle: Bundle, parameters: Parameters, damping: float) -> Parameters:
+        """The parameters after one damped step."""
         left, right, inverse = self.reduced(damping)
         step: Floats = np.asarray(-np.linalg.solve(left, right), np.float64)
         rest = self.body_gradient + (self.W.T @ step).reshape(self.body_gradient.shape)
-        return _moved(bundle, scene, step, -np.einsum("bij,bj->bi", inverse, rest))
+        return _moved(bundle, parameters, step, -np.einsum("bij,bj->bi", inverse, rest))
 
     def covariance(self) -> Floats:
         """Of poses and lenses, in that order."""
@@ -171,46 +175,46 @@ class System:
         return np.linalg.inv(left / np.outer(scale, scale)) / np.outer(scale, scale)
 
 
-def linearized(bundle: Bundle, scene: Scene) -> System:
-    """The normal equations at ``scene``."""
+def linearized(bundle: Bundle, parameters: Parameters) -> System:
+    """The normal equations at ``parameters``."""
     poses, lenses, size = bundle.columns
-    by_camera, by_body, columns = _derivatives(bundle, scene)
-    misses = bundle.misses(scene)
-    off = np.linalg.norm(misses, axis=1) / bundle.noise
+    by_camera, by_body, columns = _derivatives(bundle, parameters)
+    residuals = bundle.residuals(parameters)
+    off = np.linalg.norm(residuals, axis=1) / bundle.noise
     weight = np.where(off <= HUBER, 1.0, HUBER / np.maximum(off, HUBER)) / bundle.noise**2
     total = poses + lenses
     A, gradient = np.zeros((total, total)), np.zeros(total)
     for camera in range(len(bundle.lens)):
-        own = np.flatnonzero(bundle.sights.camera == camera)
+        own = np.flatnonzero(bundle.observations.camera == camera)
         if len(own):
             J, w = by_camera[own], weight[own]
             where = columns[own[0]]
             A[np.ix_(where, where)] += np.einsum("m,mai,maj->ij", w, J, J, optimize=True)
-            gradient[where] += np.einsum("m,mai,ma->i", w, J, misses[own])
-    bundle.prior.add(A, gradient, scene.rows, start=poses, free=bundle.free)
-    stuck = np.diag(A) == 0  # what is held, or seen by nobody
+            gradient[where] += np.einsum("m,mai,ma->i", w, J, residuals[own])
+    bundle.prior.add(A, gradient, parameters.rows, start=poses, free=bundle.free)
+    stuck = np.diag(A) == 0  # what is fixed, or observed by no camera
     A[stuck, stuck] = 1.0
-    count = len(scene.places)
+    count = len(parameters.body_positions)
     V, body_gradient = np.zeros((count, size, size)), np.zeros((count, size))
-    np.add.at(V, bundle.sights.body, np.einsum("m,mai,maj->mij", weight, by_body, by_body))
-    np.add.at(body_gradient, bundle.sights.body, np.einsum("m,mai,ma->mi", weight, by_body, misses))
+    np.add.at(V, bundle.observations.body, np.einsum("m,mai,maj->mij", weight, by_body, by_body))
+    np.add.at(body_gradient, bundle.observations.body, np.einsum("m,mai,ma->mi", weight, by_body, residuals))
     return System(
         A, V, _crossed(bundle, weight, by_camera, by_body, columns, (total, count * size)), gradient, body_gradient
     )
 
 
-def _derivatives(bundle: Bundle, scene: Scene) -> tuple[Floats, Floats, Indices]:
+def _derivatives(bundle: Bundle, parameters: Parameters) -> tuple[Floats, Floats, Indices]:
     """Of the misses by their camera's parameters ``[M, 2, 6 + F]`` and by their body's, and the former's unknowns."""
-    seen, (poses, _, _) = bundle.sights, bundle.columns
+    seen, (poses, _, _) = bundle.observations, bundle.columns
     own, lens = seen.camera, bundle.lens[seen.camera]
-    on_body = np.einsum("mab,mb->ma", scene.turns[seen.body], seen.place)
-    turned = np.einsum("mab,mb->ma", scene.rotations[own], on_body + scene.places[seen.body])
-    local = turned + scene.translations[own]
-    by_point, by_row = derivatives(local, scene.rows[lens], bundle.sizes[own], bundle.fisheye[own], bundle.free)
-    by_row[bundle.held[lens]] = 0.0
+    on_body = np.einsum("mab,mb->ma", parameters.body_rotations[seen.body], seen.offset)
+    turned = np.einsum("mab,mb->ma", parameters.rotations[own], on_body + parameters.body_positions[seen.body])
+    local = turned + parameters.translations[own]
+    by_point, by_row = derivatives(local, parameters.rows[lens], bundle.sizes[own], bundle.fisheye[own], bundle.free)
+    by_row[bundle.fixed[lens]] = 0.0
     by_camera = np.concatenate([by_point @ _crosses(-turned), by_point, by_row], 2)
-    by_world = by_point @ scene.rotations[own]
-    by_body = np.concatenate([by_world @ _crosses(-on_body), by_world], 2) if bundle.turning else by_world
+    by_world = by_point @ parameters.rotations[own]
+    by_body = np.concatenate([by_world @ _crosses(-on_body), by_world], 2) if bundle.rotating else by_world
     free = len(bundle.free)
     columns = np.concatenate([6 * own[:, None] + np.arange(6), poses + free * lens[:, None] + np.arange(free)], 1)
     return by_camera, by_body, columns
@@ -224,25 +228,25 @@ def _crossed(
     size = bundle.columns[2]
     blocks = np.einsum("m,mai,maj->mij", weight, by_camera, by_body)
     rows = np.broadcast_to(columns[:, :, None], blocks.shape)
-    bodies = size * bundle.sights.body[:, None, None] + np.arange(size)
+    bodies = size * bundle.observations.body[:, None, None] + np.arange(size)
     return csr_array((blocks.ravel(), (rows.ravel(), np.broadcast_to(bodies, blocks.shape).ravel())), shape=shape)
 
 
-def _moved(bundle: Bundle, scene: Scene, step: Floats, body_step: Floats) -> Scene:
+def _moved(bundle: Bundle, parameters: Parameters, step: Floats, body_step: Floats) -> Parameters:
     poses, lenses, _ = bundle.columns
     by_pose = step[:poses].reshape(-1, 6)
-    rows = scene.rows.copy()
+    rows = parameters.rows.copy()
     rows[:, bundle.free] += step[poses : poses + lenses].reshape(len(rows), -1)
-    turns = scene.turns
-    if bundle.turning:
-        turns = np.stack([rotation_matrix(w) for w in body_step[:, :3]]) @ turns
+    body_rotations = parameters.body_rotations
+    if bundle.rotating:
+        body_rotations = np.stack([rotation_matrix(w) for w in body_step[:, :3]]) @ body_rotations
     return replace(
-        scene,
-        rotations=np.stack([rotation_matrix(w) for w in by_pose[:, :3]]) @ scene.rotations,
-        translations=scene.translations + by_pose[:, 3:],
+        parameters,
+        rotations=np.stack([rotation_matrix(w) for w in by_pose[:, :3]]) @ parameters.rotations,
+        translations=parameters.translations + by_pose[:, 3:],
         rows=rows,
-        turns=turns,
-        places=scene.places + body_step[:, -3:],
+        body_rotations=body_rotations,
+        body_positions=parameters.body_positions + body_step[:, -3:],
     )
 
 
@@ -251,7 +255,3 @@ def _crosses(vectors: Floats) -> Floats:
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3)
-
-
-def _diagonals(values: Floats) -> Floats:
-    return values[:, :, None] * np.eye(values.shape[1])

@@ -29,11 +29,11 @@ MODELS: dict[LensModel, str] = {
     "brown": "OPENCV",  # none of COLMAP's ends at k3, which is added after its models (bundle.py)
     "fisheye": "OPENCV_FISHEYE",
 }
-QUIET = 3  # COLMAP tells every step and every start that leads nowhere; what comes of it is told by who asked
+QUIET = 3  # COLMAP logs every step and every failed start; results are reported by the callers
 
 
 def pycolmap_module() -> ModuleType:
-    """The module ``pycolmap``, from the extra ``sfm``, told to be quiet."""
+    """The module ``pycolmap``, from the extra ``sfm``, with its log level lowered."""
     try:
         import pycolmap
     except ImportError:

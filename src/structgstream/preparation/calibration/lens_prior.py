@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is known of lenses before any picture is looked at: those of one make are alike.
 
-Note [Alike lenses]: cameras around a scene hardly tell a principal point from a rotation, nor k1 from a focal length.
-Left free, such terms wander off; held at zero, they are wrong, since the principal points of one make of camera lie off
-the centre by the same few pixels. So a term of the lenses of one group (pictures of one size) is normal about a mean
-that the group shares, and that is itself estimated. How far lenses differ is estimated, too, by expectation
-maximisation (Dempster et al., 1977): where the pictures tell lenses apart they stay apart, and where the pictures say
-little they are pooled.
+Note [Alike lenses]: cameras around a scene hardly distinguish a principal point from a rotation, nor k1 from a focal
+length. Left free, such terms wander off; held at zero, they are wrong, since the principal points of one make of camera
+lie off the centre by the same few pixels. So a term of the lenses of one group (pictures of one size) is normal about a
+mean that the group shares, and that is itself estimated. How far lenses differ is estimated, too, by expectation
+maximisation (Dempster et al., 1977): where the pictures distinguish lenses they differ, and where they do not they are
+pooled.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,8 +39,8 @@ USUAL_FISHEYE: Mapping[int, tuple[float, float]] = {
     6: (0.1, 0.005),
     7: (0.1, 0.005),
 }
-WORTH = 2.0  # lenses that the usual differences count as, beside those of the rig
-LEAST = 0.01  # of the usual differences
+WORTH = 2.0  # lenses that the usual differences count as, in addition to those of the rig
+MIN_DIFFERENCE = 0.01  # of the usual differences
 
 
 @dataclass(frozen=True)
@@ -91,15 +91,15 @@ class LensPrior:
             where = start + lenses * len(free) + free.index(term)
             pull = self._pull(group, column)
             own = covariance[np.ix_(where, where)]
-            apart = np.eye(len(lenses)) - pull
-            spread = np.einsum("ij,jk,ik->i", apart, own, apart)
+            centering = np.eye(len(lenses)) - pull
+            spread = np.einsum("ij,jk,ik->i", centering, own, centering)
             unsure = self.differences[group, column] ** 2 * pull  # of the mean, were the lenses known
-            squared = (apart @ rows[lenses, term]) ** 2 + np.maximum(spread, 0) + unsure
+            squared = (centering @ rows[lenses, term]) ** 2 + np.maximum(spread, 0) + unsure
             usual = self.usual[column]
             found = (WORTH * usual**2 + squared.sum()) / (WORTH + len(lenses))
-            differences[group, column] = max(np.sqrt(found), LEAST * usual)
+            differences[group, column] = max(np.sqrt(found), MIN_DIFFERENCE * usual)
             mean = (pull * rows[lenses, term].sum()) ** 2 + pull**2 * max(own.sum(), 0.0) + unsure
-            means[group, column] = max(np.sqrt(mean), LEAST * usual)
+            means[group, column] = max(np.sqrt(mean), MIN_DIFFERENCE * usual)
         return replace(self, means=means, differences=differences)
 
     def _pull(self, group: int, column: int) -> float:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A model from a view graph: incremental mapping, global mapping and bundle adjustment by COLMAP."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +24,7 @@ class Freedom:
 
     Args:
         focal: focal lengths.
-        center: principal points, in :func:`adjust` only and held near the pictures' centres (Note [Principal points]).
+        center: principal points, in :func:`adjust` only, and kept near the pictures' centres (Note [Principal points]).
         lens: distortion.
     """
 
@@ -38,16 +38,16 @@ class Freedom:
         return self.focal or self.center or self.lens
 
 
-def mapped(database: Path, *, mapper: Mapper, freedom: Freedom, fixed: frozenset[int], seed: int) -> Any | None:
+def mapped(database: Path, *, mapper: Mapper, freedom: Freedom, fixed: frozenset[int]) -> Any | None:
     """The model of the most images that a mapper finds, None without one; one thread, so it is repeatable."""
     pycolmap = pycolmap_module()
     folder = database.parent / mapper
     folder.mkdir()
-    pycolmap.set_random_seed(seed)
+    pycolmap.set_random_seed(0)
     if mapper == "incremental":
-        found = pycolmap.incremental_mapping(database, folder, folder, _incremental_options(freedom, fixed, seed))
+        found = pycolmap.incremental_mapping(database, folder, folder, _incremental_options(freedom, fixed))
     else:
-        found = pycolmap.global_mapping(database, folder, folder, _global_options(freedom, seed))
+        found = pycolmap.global_mapping(database, folder, folder, _global_options(freedom))
     return max(found.values(), key=size_of, default=None)
 
 
@@ -56,9 +56,9 @@ def size_of(model: Any) -> tuple[int, int]:
     return model.num_reg_images(), model.compute_num_observations()
 
 
-def _incremental_options(freedom: Freedom, fixed: frozenset[int], seed: int) -> Any:
+def _incremental_options(freedom: Freedom, fixed: frozenset[int]) -> Any:
     options = pycolmap_module().IncrementalPipelineOptions()
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = 0
     options.num_threads = options.mapper.num_threads = 1
     options.extract_colors = False
     options.min_model_size = 2
@@ -73,9 +73,9 @@ def _incremental_options(freedom: Freedom, fixed: frozenset[int], seed: int) -> 
     return options
 
 
-def _global_options(freedom: Freedom, seed: int) -> Any:
+def _global_options(freedom: Freedom) -> Any:
     options = pycolmap_module().GlobalPipelineOptions()
-    options.random_seed = options.mapper.random_seed = seed
+    options.random_seed = options.mapper.random_seed = 0
     options.num_threads = options.mapper.num_threads = 1
     options.mapper.global_positioning.use_gpu = False
     options.mapper.bundle_adjustment.ceres.use_gpu = False
@@ -89,14 +89,12 @@ def adjust(
     *,
     freedom: Freedom,
     fixed: frozenset[int] = frozenset(),
-    poses: bool = True,
     constant_points: bool = False,
 ) -> None:
     """Bundle adjustment of ``model`` in place, with Huber's loss.
 
     Args:
         fixed: ids of cameras whose intrinsics stay.
-        poses: whether poses move; if not, points alone do.
         constant_points: whether points stay.
     """
     pycolmap = pycolmap_module()
@@ -108,12 +106,12 @@ def adjust(
     if constant_points:
         for point in model.point3D_ids():
             config.add_constant_point(point)
-    elif poses:
+    else:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length, options.refine_principal_point = freedom.focal, freedom.center
     options.refine_extra_params = freedom.lens
-    options.refine_rig_from_world = options.refine_sensor_from_rig = poses
+    options.refine_rig_from_world = options.refine_sensor_from_rig = True
     options.min_track_length = 0
     options.ceres.use_gpu = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.HUBER
@@ -129,10 +127,10 @@ def adjust(
 def _held_centers(model: Any, config: Any, *, hold: bool) -> Iterator[None]:
     """Holds the principal points of a model near the centres of their pictures while it is adjusted.
 
-    Note [Principal points]: cameras that surround a scene hardly tell a principal point from a rotation, so freed ones
-    wander off, and focal lengths with them. A point on the optical axis is seen in the principal point whatever focal
-    length and lens are. So each camera gets another picture, of a fixed pose, in which such a point is seen in the
-    picture's centre: one observation more, which hundreds of others overrule where they know better.
+    Note [Principal points]: cameras that surround a scene hardly distinguish a principal point from a rotation, so
+    freed ones wander off, and focal lengths with them. A point on the optical axis is seen in the principal point
+    whatever focal length and lens are. So each camera gets another picture, of a fixed pose, in which such a point is
+    seen in the picture's centre: one observation more, which hundreds of others overrule where they know better.
     """
     free = sorted(set(model.cameras) - set(config.constant_cam_intrinsics))
     if not hold or not free:
@@ -166,7 +164,7 @@ def _held_centers(model: Any, config: Any, *, hold: bool) -> Iterator[None]:
 
 
 def filtered(model: Any, *, pixels: float, degrees: float) -> int:
-    """Removes observations with a larger reprojection error and points with a smaller angle; says how many."""
+    """Removes observations with a larger reprojection error and points with a smaller angle; returns how many."""
     pycolmap = pycolmap_module()
     return pycolmap.ObservationManager(model).filter_all_points3D(pixels, degrees)
 
@@ -177,17 +175,16 @@ def cameras_of(model: Any) -> dict[str, LensCamera]:
     return {image.name: filmed_camera(image.camera, image.cam_from_world()) for image in images}
 
 
-def observed(
-    model: Any, keypoints: Mapping[str, Keypoints], order: Mapping[str, int]
-) -> tuple[np.ndarray, Observations]:
-    """The points ``[P, 3]`` of a model and where they were seen; cameras are numbered by ``order``."""
+def observed(model: Any, keypoints: Mapping[str, Keypoints], names: Iterable[str]) -> tuple[np.ndarray, Observations]:
+    """The points ``[P, 3]`` of a model and where they were seen; cameras are numbered in the order of ``names``."""
+    order = {name: index for index, name in enumerate(names)}
     numbers = sorted(model.point3D_ids())
     points = np.array([model.point3D(number).xyz for number in numbers]).reshape(-1, 3)
     rows: list[tuple[int, int, int]] = []
-    names = {number: model.image(number).name for number in model.reg_image_ids()}
+    images = {number: model.image(number).name for number in model.reg_image_ids()}
     for index, number in enumerate(numbers):
         for element in model.point3D(number).track.elements:
-            rows.append((index, order[names[element.image_id]], element.point2D_idx))
+            rows.append((index, order[images[element.image_id]], element.point2D_idx))
     table = np.array(rows, np.intp).reshape(-1, 3)
     pixels, instants = np.empty((len(table), 2)), np.empty(len(table), np.intp)
     for name, index in order.items():

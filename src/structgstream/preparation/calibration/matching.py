@@ -7,53 +7,40 @@ little texture gets several times the matches once poses are known roughly.
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
-from structgstream.data.descriptor_matches import mutual_matches
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Features, Pair, mutually_best
+from structgstream.data.pair_matches import mutual_matches
 from structgstream.preparation.calibration.keypoints import Keypoints
 
 Indices = NDArray[np.intp]
-LEAST_SINE = 0.02  # rays along the baseline belong to every epipolar plane
+MIN_SINE = 0.02  # rays along the baseline belong to every epipolar plane
 
 
-@dataclass(frozen=True)
-class KeypointMatchConfig:
-    """How keypoints of two cameras are matched.
-
-    Args:
-        ratio: largest ratio of the best to the second-best descriptor distance.
-        distance: largest descriptor distance of a match; unit descriptors are at most sqrt(2) apart.
-    """
-
-    ratio: float = 0.85
-    distance: float = 0.8
+RATIO = 0.85  # largest ratio of the best to the second-best descriptor distance
+GUIDED_RATIO = 0.8  # the same of the best in an epipolar plane to its rivals
+MAX_DISTANCE = 0.8  # of the descriptors of a match; unit descriptors are at most sqrt(2) apart
+DISTINCT_PIXELS = 4.0  # keypoints that lie closer than this to the best one are no rivals of it
+FACING_DEGREES = 70.0  # largest angle between the optical axes of two cameras that are matched
 
 
-def keypoint_matches(
-    first: Keypoints, second: Keypoints, *, config: KeypointMatchConfig = KeypointMatchConfig()
-) -> NDArray[np.uint32]:
+def keypoint_matches(first: Keypoints, second: Keypoints) -> NDArray[np.uint32]:
     """Mutually best matches ``[S, 2]``, indices into the two lists, of keypoints that share an instant."""
     seen = None if first.seen.shape[1] == 1 else (first.seen, second.seen)
-    found = mutual_matches(
-        first.descriptors, second.descriptors, ratio=config.ratio, distance=config.distance, seen=seen
-    )
+    found = mutual_matches(first.descriptors, second.descriptors, ratio=RATIO, distance=MAX_DISTANCE, seen=seen)
     return found.astype(np.uint32)
 
 
-def all_matches(
-    keypoints: Mapping[str, Keypoints], *, workers: int, config: KeypointMatchConfig = KeypointMatchConfig()
-) -> dict[Pair, NDArray[np.uint32]]:
+def all_matches(keypoints: Mapping[str, Keypoints], *, workers: int) -> dict[Pair, NDArray[np.uint32]]:
     """:func:`keypoint_matches` of every pair of cameras."""
     pairs = list(combinations(keypoints, 2))
     with ThreadPoolExecutor(workers) as pool:
-        found = pool.map(lambda pair: keypoint_matches(keypoints[pair[0]], keypoints[pair[1]], config=config), pairs)
+        found = pool.map(lambda pair: keypoint_matches(keypoints[pair[0]], keypoints[pair[1]]), pairs)
         return dict(zip(pairs, found, strict=True))
 
 
@@ -90,12 +77,8 @@ def agreeing_matches(
     degrees: float,
 ) -> dict[Pair, NDArray[np.uint32]]:
     """The matches whose rays pass within ``degrees`` of their epipolar plane."""
-    rays = {name: camera_rays(cameras[name], keypoints[name].pixels) for name in cameras}
-    found = {}
-    for (one, two), pairs in matches.items():
-        angles = epipolar_angles((cameras[one], cameras[two]), (rays[one][pairs[:, 0]], rays[two][pairs[:, 1]]))
-        found[one, two] = pairs[angles < np.radians(degrees)]
-    return found
+    found = _plane_angles(keypoints, matches, cameras)
+    return {pair: matches[pair][angles < np.radians(degrees)] for pair, angles in found.items()}
 
 
 def epipolar_pixels(
@@ -104,31 +87,22 @@ def epipolar_pixels(
     cameras: Mapping[str, LensCamera],
 ) -> dict[Pair, Floats]:
     """Distance of each match to its epipolar plane, in pixels of the longer of the two focal lengths."""
+    focal = {name: float(filmed.camera.K[0, 0]) for name, filmed in cameras.items()}
+    found = _plane_angles(keypoints, matches, cameras)
+    return {(one, two): max(focal[one], focal[two]) * angles for (one, two), angles in found.items()}
+
+
+def _plane_angles(
+    keypoints: Mapping[str, Keypoints],
+    matches: Mapping[Pair, NDArray[np.uint32]],
+    cameras: Mapping[str, LensCamera],
+) -> dict[Pair, Floats]:
+    """:func:`epipolar_angles` ``[S]`` of the matches of each pair."""
     rays = {name: camera_rays(cameras[name], keypoints[name].pixels) for name in cameras}
-    found = {}
-    for (one, two), pairs in matches.items():
-        focal = max(float(cameras[name].camera.K[0, 0]) for name in (one, two))
-        found[one, two] = focal * epipolar_angles(
-            (cameras[one], cameras[two]), (rays[one][pairs[:, 0]], rays[two][pairs[:, 1]])
-        )
-    return found
-
-
-@dataclass(frozen=True)
-class GuidedMatchConfig:
-    """How keypoints of cameras with rough poses are matched.
-
-    Args:
-        ratio: largest ratio of the best descriptor distance in an epipolar plane to that of a rival.
-        distance: largest descriptor distance; unit descriptors are at most sqrt(2) apart.
-        distinct_pixels: keypoints that lie closer than this to the best one are no rivals of it.
-        degrees: largest angle between the optical axes of two cameras that are matched.
-    """
-
-    ratio: float = 0.8
-    distance: float = 0.8
-    distinct_pixels: float = 4.0
-    degrees: float = 70.0
+    return {
+        (one, two): epipolar_angles((cameras[one], cameras[two]), (rays[one][rows[:, 0]], rays[two][rows[:, 1]]))
+        for (one, two), rows in matches.items()
+    }
 
 
 def guided_matches(
@@ -137,7 +111,6 @@ def guided_matches(
     *,
     pixels: float,
     workers: int,
-    config: GuidedMatchConfig = GuidedMatchConfig(),
 ) -> dict[Pair, NDArray[np.uint32]]:
     """Matches of cameras that look the same way: each other's best ones among those near one epipolar plane.
 
@@ -146,7 +119,6 @@ def guided_matches(
         cameras: with their rough poses.
         pixels: how far from the plane a keypoint may lie.
         workers: threads.
-        config: what counts as alike.
 
     Returns:
         ``[S, 2]`` by pair of cameras: indices of the keypoints of the first and of the second.
@@ -156,17 +128,17 @@ def guided_matches(
     def one(pair: Pair) -> NDArray[np.uint32]:
         first, second = pair
         row, column = _near_planes((cameras[first], cameras[second]), (rays[first], rays[second]), pixels=pixels)
-        return _best((keypoints[first], keypoints[second]), row, column, config=config)
+        return _best((keypoints[first], keypoints[second]), row, column)
 
-    pairs = _facing(cameras, degrees=config.degrees)
+    pairs = _facing(cameras)
     with ThreadPoolExecutor(workers) as pool:
         return dict(zip(pairs, pool.map(one, pairs), strict=True))
 
 
-def _facing(cameras: Mapping[str, LensCamera], *, degrees: float) -> Sequence[Pair]:
+def _facing(cameras: Mapping[str, LensCamera]) -> Sequence[Pair]:
     names = list(cameras)
     axes = np.stack([cameras[name].camera.viewmat[2, :3].numpy() for name in names])
-    near = axes @ axes.T > np.cos(np.radians(degrees))
+    near = axes @ axes.T > np.cos(np.radians(FACING_DEGREES))
     return [(names[one], names[two]) for one, two in zip(*np.nonzero(np.triu(near, 1)), strict=True)]
 
 
@@ -187,7 +159,7 @@ def _near_planes(
     across /= np.linalg.norm(across)
     turns = [np.arctan2(ray @ np.cross(base, across), ray @ across) for ray in rays]
     sines = [np.linalg.norm(np.cross(base, ray), axis=1) for ray in rays]
-    usable = [np.flatnonzero(np.isfinite(turn) & (sine > LEAST_SINE)) for turn, sine in zip(turns, sines, strict=True)]
+    usable = [np.flatnonzero(np.isfinite(turn) & (sine > MIN_SINE)) for turn, sine in zip(turns, sines, strict=True)]
     if not len(usable[0]) or not len(usable[1]):
         return none, none
     slack = pixels / max(float(filmed.camera.K[0, 0]) for filmed in cameras)
@@ -205,9 +177,7 @@ def _near_planes(
     return row[near], column[near]
 
 
-def _best(
-    keypoints: tuple[Keypoints, Keypoints], row: Indices, column: Indices, *, config: GuidedMatchConfig
-) -> NDArray[np.uint32]:
+def _best(keypoints: tuple[Keypoints, Keypoints], row: Indices, column: Indices) -> NDArray[np.uint32]:
     """The mutually best ones of the candidates that share an instant."""
     first, second = keypoints
     together = (first.seen[row] & second.seen[column]).any(1)
@@ -217,8 +187,8 @@ def _best(
         Features(second.pixels, second.descriptors),
         row,
         column,
-        ratio=config.ratio,
-        distinct_pixels=config.distinct_pixels,
-        distance=config.distance,
+        ratio=GUIDED_RATIO,
+        distinct_pixels=DISTINCT_PIXELS,
+        distance=MAX_DISTANCE,
     )
     return found.astype(np.uint32)

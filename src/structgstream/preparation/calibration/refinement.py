@@ -3,52 +3,34 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.lenses import LensCamera
-from structgstream.data.matching import Pair
+from structgstream.data.matching import Pair, connected_groups
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.adjustment import Limits, adjust_together
 from structgstream.preparation.calibration.colmap import MODELS, LensModel, holding
-from structgstream.preparation.calibration.comparison import rig_alignment
-from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL
+from structgstream.preparation.calibration.lens_terms import ASPECT, DISTORTION, FOCAL
 from structgstream.preparation.calibration.mapping import Freedom, adjust, cameras_of, filtered, observed
 from structgstream.preparation.calibration.matching import epipolar_pixels
-from structgstream.preparation.calibration.solved import SolvedCalibration, normalized
+from structgstream.preparation.calibration.solved import SolvedCalibration, normalized, rig_alignment
 from structgstream.preparation.calibration.triangulation import (
     PosedGraph,
-    TriangulationConfig,
     posed_graph,
     posed_model,
+    triangulated,
     without,
 )
-from structgstream.preparation.calibration.view_graph import connected
 
 _log = logging.getLogger(__name__)
 
-Free = Literal["poses", "focal", "lens", "all"]
-"""What moves beside poses: nothing; focal lengths; these and distortion; these and principal points."""
-
-HELD_BACK = 5  # one in five tracks judges and is not adjusted
-ROUNDS = (1.0, 0.4, 0.2)
-LEAST_HELD_BACK = 30
-
-
-@dataclass(frozen=True)
-class RefinementConfig:
-    """Configuration of the refinement.
-
-    Args:
-        slack_degrees: how far matches may be from the epipolar planes of the given poses, so how wrong these may be.
-        points: how matches and points are made.
-    """
-
-    slack_degrees: float = 1.5
-    points: TriangulationConfig = field(default_factory=TriangulationConfig)
+SLACK_DEGREES = 1.5  # of matches to the epipolar planes of the given poses, so how wrong these may be
+ROUNDS = (1.0, 0.4, 0.2)  # shares of the slack
+HELD_OUT_TRACKS = 5  # one in five tracks judges and is not adjusted
+MIN_HELD_OUT = 30
 
 
 @dataclass(frozen=True)
@@ -57,16 +39,16 @@ class Refinement:
 
     Args:
         solved: refined cameras, in the coordinates of the given ones; these themselves if refining did not help.
-        before_pixels: median distance of matches that were held back to the epipolar lines of the given cameras.
+        before_pixels: median distance of matches that were held out to the epipolar lines of the given cameras.
         after_pixels: the same of the refined cameras, before they are adjusted to these matches, too.
-        held_back: number of these matches.
+        held_out: number of these matches.
         changed: whether ``solved`` has refined cameras.
     """
 
     solved: SolvedCalibration
     before_pixels: float
     after_pixels: float
-    held_back: int
+    held_out: int
     changed: bool
 
 
@@ -74,22 +56,18 @@ def refine(
     pictures: Mapping[str, Sequence[NDArray[np.uint8]]],
     cameras: Mapping[str, LensCamera],
     *,
-    free: Free = "focal",
     lens: LensModel | None = None,
-    masks: Mapping[str, Sequence[NDArray[np.bool_]]] | None = None,
     metres: bool = False,
-    seed: int = 0,
-    config: RefinementConfig = RefinementConfig(),
 ) -> Refinement:
     """Adjust ``cameras`` to pictures of the same instants.
 
-    One track in five is held back. Only if the refined cameras fit these better than the given ones do, they are
+    One track in five is held out. Only if the refined cameras fit these better than the given ones do, they are
     returned, after a last adjustment to all tracks (adjustment.py); they are moved, turned and scaled to lie as close
     to the given ones as they can.
 
     Args:
-        free: what moves beside poses.
-        lens: the model of the refined lenses; by default the given one's.
+        lens: the model of lenses whose distortion is estimated, too; by default the given distortion stays, and only
+            poses and focal lengths move.
         metres: whether the given cameras are in metres.
 
     Raises:
@@ -101,91 +79,61 @@ def refine(
         raise ConfigError(
             "Lenses of the model brown cannot be refined; take opencv, or leave the lens out to keep the given model."
         )
-    graph = posed_graph(pictures, cameras, masks=masks, seed=seed, config=_widened(config))
+    graph = posed_graph(pictures, cameras, slack_degrees=SLACK_DEGREES)
     _check_connected(cameras, graph)
-    judging = _held_back(graph)
+    judging = _held_out(graph)
     learning = without(graph, judging)
     judges = {pair: graph.matches[pair][judging[pair]] for pair in graph.matches}
-    refined, solved = dict(cameras), None
+    refined = dict(cameras)
     models = {name: MODELS[lens] if lens else holding(filmed.lens) for name, filmed in cameras.items()}
-    freedom = Freedom(focal=free != "poses", lens=free in ("lens", "all"), center=free == "all")
-    longest = max(max(filmed.camera.width, filmed.camera.height) for filmed in cameras.values())
-    limit = max(1.0, config.points.pixels * longest / 1000)
+    freedom = Freedom(lens=lens is not None, center=False)
+    limits = Limits.for_pictures(max(max(filmed.camera.width, filmed.camera.height) for filmed in cameras.values()))
+    model = None
     for share in ROUNDS:
-        slack = config.slack_degrees * share
+        slack = SLACK_DEGREES * share
         focal = max(float(filmed.camera.K[0, 0]) for filmed in refined.values())
-        loose = max(limit, focal * float(np.radians(slack)))
+        loose = max(limits.pixels, focal * float(np.radians(slack)))
         model = posed_model(learning, refined, pixels=loose, slack_degrees=slack, models=models)
         adjust(model, freedom=freedom)
-        filtered(model, pixels=limit, degrees=config.points.degrees)
+        filtered(model, pixels=limits.pixels, degrees=limits.degrees)
         adjust(model, freedom=freedom)
         found = cameras_of(model)
         refined = {name: found[name] for name in cameras}
-        solved = model
-    assert solved is not None
-    points, observations = observed(solved, graph.keypoints, {name: index for index, name in enumerate(cameras)})
-    result = SolvedCalibration(refined, points, observations)
+    result = SolvedCalibration(refined, *observed(model, graph.keypoints, cameras))
     result = result.aligned(rig_alignment(refined, cameras), metres=metres)
     before, after = (_judged(graph, judges, which) for which in (cameras, result.cameras))
     count = sum(map(len, judges.values()))
     if after < before:
-        terms = _free_terms(free, lens)
-        if terms is not None:
-            everything = _completed(graph, result, terms, limits=Limits(limit, config.points.degrees), config=config)
-            everything = everything.aligned(rig_alignment(everything.cameras, cameras), metres=metres)
-            if _judged(graph, judges, everything.cameras) <= after:
-                result = everything
+        terms = (FOCAL, ASPECT, *(DISTORTION[lens] if lens else ()))
+        everything = _completed(graph, result, terms, limits=limits)
+        everything = everything.aligned(rig_alignment(everything.cameras, cameras), metres=metres)
+        if _judged(graph, judges, everything.cameras) <= after:
+            result = everything
         return Refinement(result, before, after, count, True)
     _log.warning(
-        "Refining does not help: matches that were held back are %.2f pixels off with the given cameras and %.2f with "
-        "refined ones; the given ones are kept.", before, after,
+        "Refining does not help: matches that were held out are %.2f pixels off with the given cameras and %.2f with "
+        "refined ones; the given ones stay.", before, after,
     )  # fmt: skip
-    model = posed_model(graph, cameras, pixels=limit, slack_degrees=config.points.slack_degrees)
-    points, observations = observed(model, graph.keypoints, {name: index for index, name in enumerate(cameras)})
-    return Refinement(
-        SolvedCalibration(dict(cameras), points, observations, metres=metres), before, after, count, False
-    )
-
-
-def _free_terms(free: Free, lens: LensModel | None) -> tuple[int, ...] | None:
-    """The terms of ``lens_terms.py`` that move; None where it depends on the lens that each camera has."""
-    if free == "poses":
-        return ()
-    if free == "focal":
-        return (FOCAL, ASPECT)
-    if lens is None:
-        return None
-    return (FOCAL, ASPECT, *((ACROSS, DOWN) if free == "all" else ()), *DISTORTION[lens])
+    given = triangulated(graph, cameras, limits=limits)
+    return Refinement(replace(given, metres=metres), before, after, count, False)
 
 
 def _completed(
-    graph: PosedGraph,
-    refined: SolvedCalibration,
-    terms: tuple[int, ...],
-    *,
-    limits: Limits,
-    config: RefinementConfig,
+    graph: PosedGraph, refined: SolvedCalibration, terms: tuple[int, ...], *, limits: Limits
 ) -> SolvedCalibration:
-    """``refined`` adjusted to all tracks, those that judged it included, with what alike lenses share."""
-    model = posed_model(graph, refined.cameras, pixels=limits.pixels, slack_degrees=config.points.slack_degrees)
-    filtered(model, pixels=limits.pixels, degrees=limits.degrees)
-    order = {name: index for index, name in enumerate(refined.cameras)}
-    points, observations = observed(model, graph.keypoints, order)
+    """``refined`` adjusted to all tracks, the held-out ones included, with what alike lenses share."""
+    count = len(refined.cameras)
     return adjust_together(
-        normalized(SolvedCalibration(refined.cameras, points, observations)),
-        lens=range(len(order)),
+        normalized(triangulated(graph, refined.cameras, limits=limits)),
+        lens=range(count),
         free=terms,
-        held=np.zeros(len(order), np.bool_),
+        fixed=np.zeros(count, np.bool_),
         limits=limits,
     )
 
 
-def _widened(config: RefinementConfig) -> TriangulationConfig:
-    return replace(config.points, slack_degrees=config.slack_degrees)
-
-
 def _check_connected(cameras: Mapping[str, LensCamera], graph: PosedGraph) -> None:
-    groups = connected(cameras, graph.matches)
+    groups = connected_groups(cameras, graph.matches)
     if len(groups) > 1:
         alone = ", ".join(repr(name) for group in groups[1:] for name in group)
         raise CalibrationError(
@@ -194,7 +142,7 @@ def _check_connected(cameras: Mapping[str, LensCamera], graph: PosedGraph) -> No
         )
 
 
-def _held_back(graph: PosedGraph) -> dict[Pair, NDArray[np.bool_]]:
+def _held_out(graph: PosedGraph) -> dict[Pair, NDArray[np.bool_]]:
     """Which matches belong to the tracks that judge; a track is all keypoints that matches connect."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -209,9 +157,9 @@ def _held_back(graph: PosedGraph) -> dict[Pair, NDArray[np.bool_]]:
     links = coo_array((np.ones(len(first)), (first, second)), shape=(total, total))
     _, track = connected_components(links, directed=False)
     # A track's number follows the order of its first keypoint; a shuffle spreads those that judge.
-    chosen = np.random.default_rng(0).permutation(track.max() + 1) % HELD_BACK == 0
+    chosen = np.random.default_rng(0).permutation(track.max() + 1) % HELD_OUT_TRACKS == 0
     judging = {pair: chosen[track[one]] for pair, (one, _) in zip(graph.matches, ends, strict=True)}
-    if sum(int(held.sum()) for held in judging.values()) < LEAST_HELD_BACK:
+    if sum(int(fixed.sum()) for fixed in judging.values()) < MIN_HELD_OUT:
         raise CalibrationError(
             f"Only {len(first)} matches agree with the given poses, too few to refine them: take more instants, or "
             "let neighbouring cameras see more of the same."

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.alignment import Alignment
+from structgstream.data.alignment import Alignment, alignment
 from structgstream.data.arrays import Floats
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import level_normal
@@ -84,9 +84,26 @@ class SolvedCalibration:
 def normalized(solved: SolvedCalibration) -> SolvedCalibration:
     """With the axes of the first camera, the mean camera at the origin and the farthest one unit away from it."""
     rotation = next(iter(solved.cameras.values())).camera.viewmat[:3, :3].numpy()
-    centers = _centers(solved)
+    centers = np.stack([filmed.camera.center.numpy() for filmed in solved.cameras.values()])
     scale = 1 / max(float(np.linalg.norm(centers - centers.mean(0), axis=1).max()), 1e-300)
     return solved.aligned(Alignment(scale, rotation, -scale * rotation @ centers.mean(0)))
+
+
+def rig_alignment(estimated: Mapping[str, LensCamera], reference: Mapping[str, LensCamera]) -> Alignment:
+    """The similarity from ``estimated`` to ``reference``, by the cameras that both have.
+
+    Raises:
+        CalibrationError: fewer than two cameras in common.
+    """
+    common = [name for name in estimated if name in reference]
+    if len(common) < 2:
+        raise CalibrationError(
+            f"Two calibrations need two cameras in common to be compared; they have {', '.join(common) or 'none'}."
+        )
+    return alignment(
+        {name: estimated[name].camera.viewmat.numpy() for name in common},
+        {name: reference[name].camera.viewmat.numpy() for name in common},
+    )
 
 
 def with_distance(solved: SolvedCalibration, first: str, second: str, *, metres: float) -> SolvedCalibration:
@@ -98,13 +115,14 @@ def with_distance(solved: SolvedCalibration, first: str, second: str, *, metres:
     for name in (first, second):
         if name not in solved.cameras:
             raise CalibrationError(
-                f"The distance is said from camera {name!r}, which is not among the placed ones "
+                f"The distance is given from camera {name!r}, which is not among the placed ones "
                 f"({', '.join(solved.cameras)})."
             )
-    apart = float(np.linalg.norm(np.diff([_center(solved, first), _center(solved, second)], axis=0)))
-    if not metres > 0 or first == second or apart == 0:
+    one, other = (solved.cameras[name].camera.center.numpy() for name in (first, second))
+    distance = float(np.linalg.norm(other - one))
+    if not metres > 0 or first == second or distance == 0:
         raise CalibrationError(f"A distance of {metres:g} m between {first!r} and {second!r} gives no scale.")
-    return solved.aligned(Alignment(metres / apart, np.eye(3), np.zeros(3)), metres=True)
+    return solved.aligned(Alignment(metres / distance, np.eye(3), np.zeros(3)), metres=True)
 
 
 def upright(solved: SolvedCalibration) -> SolvedCalibration:
@@ -123,11 +141,3 @@ def _turn(start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.fl
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + cross + cross @ cross / (1 + cosine)
-
-
-def _centers(solved: SolvedCalibration) -> NDArray[np.float64]:
-    return np.stack([filmed.camera.center.numpy() for filmed in solved.cameras.values()])
-
-
-def _center(solved: SolvedCalibration, name: str) -> NDArray[np.float64]:
-    return solved.cameras[name].camera.center.numpy()

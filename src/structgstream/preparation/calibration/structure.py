@@ -10,7 +10,7 @@ import logging
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera
-from structgstream.data.matching import Pair
+from structgstream.data.matching import Pair, connected_groups
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.adjustment import Limits, adjust_together
 from structgstream.preparation.calibration.colmap import (
@@ -30,7 +30,7 @@ from structgstream.preparation.calibration.colmap import (
     guessed_camera,
     pycolmap_module,
 )
-from structgstream.preparation.calibration.keypoints import KeypointConfig, Keypoints, all_keypoints
+from structgstream.preparation.calibration.keypoints import Keypoints, all_keypoints
 from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL
 from structgstream.preparation.calibration.mapping import (
     Freedom,
@@ -41,14 +41,11 @@ from structgstream.preparation.calibration.mapping import (
     observed,
     size_of,
 )
-from structgstream.preparation.calibration.matching import KeypointMatchConfig, all_matches
-from structgstream.preparation.calibration.pictures import checked_pictures
-from structgstream.preparation.calibration.rematching import RematchConfig, rematched
+from structgstream.preparation.calibration.matching import all_matches
 from structgstream.preparation.calibration.solved import SolvedCalibration, normalized
+from structgstream.preparation.calibration.triangulation import rematched
 from structgstream.preparation.calibration.view_graph import (
     Matches,
-    PairConfig,
-    connected,
     verified_pairs,
     write_database,
 )
@@ -56,7 +53,6 @@ from structgstream.preparation.calibration.view_graph import (
 _log = logging.getLogger(__name__)
 
 Pictures = Mapping[str, Sequence[NDArray[np.uint8]]]
-Masks = Mapping[str, Sequence[NDArray[np.bool_]]]
 Intrinsics = Literal["own", "shared"]
 
 FIELDS_OF_VIEW: Mapping[LensModel, tuple[float, ...]] = {
@@ -69,28 +65,6 @@ FIELDS_OF_VIEW: Mapping[LensModel, tuple[float, ...]] = {
 """Degrees across the longer side that are tried where none is given, until one places all cameras."""
 
 
-@dataclass(frozen=True)
-class StructureConfig:
-    """Configuration of structure from motion.
-
-    Args:
-        keypoints: what is found in a picture.
-        matching: which keypoints match.
-        pairs: which pairs of cameras are used.
-        pixels: largest reprojection error of the observations that remain, for pictures of 1000 pixels on the longer
-            side; never under 1.
-        degrees: least angle between the rays of a point.
-        rematching: how matches are found again with the first solution.
-    """
-
-    keypoints: KeypointConfig = field(default_factory=KeypointConfig)
-    matching: KeypointMatchConfig = field(default_factory=KeypointMatchConfig)
-    pairs: PairConfig = field(default_factory=PairConfig)
-    rematching: RematchConfig = field(default_factory=RematchConfig)
-    pixels: float = 3.0
-    degrees: float = 1.5
-
-
 def solve_structure(
     pictures: Pictures,
     *,
@@ -100,9 +74,6 @@ def solve_structure(
     focals: Mapping[str, float] | None = None,
     centers: bool = True,
     known: Mapping[str, LensCamera] | None = None,
-    masks: Masks | None = None,
-    seed: int = 0,
-    config: StructureConfig = StructureConfig(),
 ) -> SolvedCalibration:
     """Poses, intrinsics and lenses of still cameras from their own pictures.
 
@@ -117,8 +88,6 @@ def solve_structure(
         centers: whether principal points are estimated, as those of cameras that are alike (lens_prior.py, Note [Alike
             lenses]); otherwise they are the centres.
         known: cameras whose intrinsics and lens are known and stay; their poses are not read.
-        masks: camera name to a mask ``[H, W]`` per picture, True where it counts.
-        seed: of the robust estimation; equal input and seed give equal output.
 
     Returns:
         the calibration in arbitrary units: the mean camera is the origin and the farthest is one unit away, as the
@@ -129,27 +98,26 @@ def solve_structure(
         MissingExtraError: pycolmap or cv2 is not installed.
     """
     pycolmap_module()
-    checked_pictures(pictures, masks)
     if len(pictures) < 3:
         raise CalibrationError(
             f"Structure from motion needs three cameras or more, got {listed(pictures)}: two of them do not fix "
             "their focal lengths; film a board with both (structgstream board), or add a camera."
         )
     workers = max(1, min(len(pictures), os.cpu_count() or 1))
-    keypoints = all_keypoints(pictures, masks, workers=workers, config=config.keypoints)
-    matches = all_matches(keypoints, workers=workers, config=config.matching)
+    keypoints = all_keypoints(pictures, workers=workers)
+    matches = all_matches(keypoints, workers=workers)
     best: _Attempt | None = None
     sizes = {name: (shots[0].shape[1], shots[0].shape[0]) for name, shots in pictures.items()}
     degrees = _fields_of_view(sizes, lens, field_of_view, focals or {}, known or {})
     for cameras in _starts(sizes, lens, intrinsics, degrees, known or {}):
-        attempt = _attempt(keypoints, matches, cameras, known or {}, seed=seed, workers=workers, config=config)
+        attempt = _attempt(keypoints, matches, cameras, known or {}, workers=workers)
         best = attempt if best is None or attempt.size > best.size else best
         if best.size[0] == len(pictures):
             break
     assert best is not None
     if best.model is None or best.size[0] < 3:
         raise CalibrationError(_nothing(pictures, matches, best.pairs))
-    solved = _finished(best, keypoints, pictures, lens=lens, centers=centers, workers=workers, config=config)
+    solved = _finished(best, keypoints, pictures, lens=lens, centers=centers, workers=workers)
     if solved.missing:
         _log.warning("%s", missing_cameras(solved.missing, matches, best.pairs))
     return solved
@@ -157,7 +125,7 @@ def solve_structure(
 
 def missing_cameras(missing: Sequence[str], matches: Matches, pairs: Mapping[Pair, Any]) -> str:
     """One sentence for each camera that could not be placed: with whom it has how many matches."""
-    told = []
+    reasons = []
     for name in missing:
         others = {
             (two if name == one else one): _agreeing((one, two), matches, pairs)
@@ -165,10 +133,10 @@ def missing_cameras(missing: Sequence[str], matches: Matches, pairs: Mapping[Pai
             if name in (one, two)
         }
         best = sorted(others, key=lambda other: -others[other][0])[:2]
-        most = " and ".join(f"{others[other][0]} of {others[other][1]} matches with {other!r}" for other in best)
-        told.append(f"{name!r} ({most} agree)")
+        best_pairs = " and ".join(f"{others[other][0]} of {others[other][1]} matches with {other!r}" for other in best)
+        reasons.append(f"{name!r} ({best_pairs} agree)")
     return (
-        f"{listed(missing)} could not be placed: {'; '.join(told)}. Let neighbouring cameras see more of the same "
+        f"{listed(missing)} could not be placed: {'; '.join(reasons)}. Let neighbouring cameras see more of the same "
         "from at most 30 degrees apart, take more instants, or film a board (structgstream board)."
     )
 
@@ -242,12 +210,10 @@ def _attempt(
     cameras: Mapping[str, Any],
     known: Mapping[str, LensCamera],
     *,
-    seed: int,
     workers: int,
-    config: StructureConfig,
 ) -> _Attempt:
     """The incremental model, or the global one if that places more cameras."""
-    pairs = verified_pairs(keypoints, matches, cameras, seed=seed, workers=workers, config=config.pairs)
+    pairs = verified_pairs(keypoints, matches, cameras, workers=workers)
     fixed = frozenset(cameras[name].camera_id for name in known)
     every = len(known) == len(keypoints)
     freedom = Freedom(focal=not every, center=False, lens=not every)
@@ -257,9 +223,9 @@ def _attempt(
     with tempfile.TemporaryDirectory(prefix="structgstream-sfm-") as folder:
         database = Path(folder) / "database.db"
         write_database(database, keypoints, cameras, pairs)
-        reachable = len(connected(keypoints, pairs)[0])
+        reachable = len(connected_groups(keypoints, pairs)[0])
         for mapper in ("incremental", "global"):
-            found = mapped(database, mapper=mapper, freedom=freedom, fixed=fixed, seed=seed)
+            found = mapped(database, mapper=mapper, freedom=freedom, fixed=fixed)
             if found is not None and size_of(found) > attempt.size:
                 attempt = replace(attempt, model=found)
             if attempt.size[0] == reachable:
@@ -275,40 +241,31 @@ def _finished(
     lens: LensModel,
     centers: bool,
     workers: int,
-    config: StructureConfig,
 ) -> SolvedCalibration:
     """The model with all intrinsics adjusted, matched again, without outliers, in normalised coordinates."""
     model = attempt.model
     assert model is not None
     longest = max(max(shots[0].shape[:2]) for shots in pictures.values())
-    limit = max(1.0, config.pixels * longest / 1000)
+    limits = Limits.for_pictures(longest)
     for _ in range(2):
         adjust(model, freedom=attempt.freedom, fixed=attempt.fixed)
-        filtered(model, pixels=limit, degrees=config.degrees)
+        filtered(model, pixels=limits.pixels, degrees=limits.degrees)
     found = cameras_of(model)
     cameras = {name: found[name] for name in pictures if name in found}
-    points, observations = observed(model, keypoints, {name: index for index, name in enumerate(cameras)})
+    points, observations = observed(model, keypoints, cameras)
     missing = tuple(name for name in pictures if name not in found)
     rough = SolvedCalibration(cameras, points, observations, missing)
     numbers = {image.name: image.camera_id for image in map(model.image, model.reg_image_ids())}
     lenses = sorted(set(numbers.values()))
-    limits = Limits(limit, config.degrees)
     adjusted = partial(
         adjust_together,
         lens=[lenses.index(numbers[name]) for name in cameras],
         free=_free_terms(lens, freedom=attempt.freedom, centers=centers),
-        held=np.array([number in attempt.fixed for number in lenses]),
+        fixed=np.array([number in attempt.fixed for number in lenses]),
         limits=limits,
     )
     return normalized(
-        rematched(
-            normalized(adjusted(rough)),
-            keypoints,
-            limits=limits,
-            adjust=adjusted,
-            workers=workers,
-            config=config.rematching,
-        )
+        rematched(normalized(adjusted(rough)), keypoints, limits=limits, adjust=adjusted, workers=workers)
     )
 
 
@@ -325,7 +282,7 @@ def _agreeing(pair: Pair, matches: Matches, pairs: Mapping[Pair, Any]) -> tuple[
 def _nothing(pictures: Pictures, matches: Matches, pairs: Mapping[Pair, Any]) -> str:
     alone = [name for name in pictures if not any(name in pair for pair in pairs)]
     if not alone:
-        groups = connected(pictures, pairs)
+        groups = connected_groups(pictures, pairs)
         return (
             f"The pictures of {len(pictures)} cameras give no model: {len(pairs)} of {len(matches)} pairs have matches "
             f"that agree, in {len(groups)} groups ({'; '.join(', '.join(group) for group in groups[:4])}). Let "

@@ -3,7 +3,6 @@
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,22 +16,12 @@ from structgstream.preparation.calibration.keypoints import Keypoints
 Matches = Mapping[Pair, NDArray[np.uint32]]
 
 
-@dataclass(frozen=True)
-class PairConfig:
-    """When two cameras count as seeing the same.
-
-    Args:
-        pixels: largest epipolar distance of a match, for pictures of 1000 pixels on the longer side; never under 1.
-        least: fewest matches that agree.
-        least_share: least share of a pair's matches that agree. In rigs with repetitive walls nearly all pairs have
-            some matches that agree by chance; among those of 0.3 and more nearly all were right.
-        trials: most samples of the robust estimation.
-    """
-
-    pixels: float = 3.0
-    least: int = 20
-    least_share: float = 0.3
-    trials: int = 2000
+MAX_PIXELS = 3.0  # epipolar distance of a match, for pictures of 1000 pixels on the longer side; never under 1
+MIN_MATCHES = 20  # that agree
+MIN_SHARE = 0.3
+"""Smallest share of a pair's matches that agree. In rigs with repetitive walls nearly all pairs have some matches that
+agree by chance; among those of 0.3 and more nearly all were right."""
+MAX_TRIALS = 2000  # samples of the robust estimation
 
 
 def verified_pairs(
@@ -40,9 +29,7 @@ def verified_pairs(
     matches: Matches,
     cameras: Mapping[str, Any],
     *,
-    seed: int,
     workers: int,
-    config: PairConfig = PairConfig(),
 ) -> dict[Pair, Any]:
     """Two-view geometries of the pairs that pass, with the matches that agree.
 
@@ -54,23 +41,23 @@ def verified_pairs(
     def estimate(pair: Pair) -> Any:
         one, two = (cameras[name] for name in pair)
         options = pycolmap.TwoViewGeometryOptions()
-        options.min_num_inliers = config.least
+        options.min_num_inliers = MIN_MATCHES
         options.detect_watermark = False
         options.compute_relative_pose = True
-        options.ransac.random_seed = seed
-        options.ransac.max_num_trials = config.trials
-        options.ransac.max_error = max(1.0, config.pixels * max(one.width, one.height, two.width, two.height) / 1000)
+        options.ransac.random_seed = 0
+        options.ransac.max_num_trials = MAX_TRIALS
+        options.ransac.max_error = max(1.0, MAX_PIXELS * max(one.width, one.height, two.width, two.height) / 1000)
         return pycolmap.estimate_two_view_geometry(
             one, keypoints[pair[0]].pixels, two, keypoints[pair[1]].pixels, matches[pair], options
         )
 
-    pairs = [pair for pair, found in matches.items() if len(found) >= config.least]
+    pairs = [pair for pair, found in matches.items() if len(found) >= MIN_MATCHES]
     with ThreadPoolExecutor(workers) as pool:
         found = dict(zip(pairs, pool.map(estimate, pairs), strict=True))
     return {
         pair: geometry
         for pair, geometry in found.items()
-        if len(geometry.inlier_matches) >= max(config.least, config.least_share * len(matches[pair]))
+        if len(geometry.inlier_matches) >= max(MIN_MATCHES, MIN_SHARE * len(matches[pair]))
     }
 
 
@@ -100,15 +87,3 @@ def write_database(
             database.write_matches(number[one], number[two], geometry.inlier_matches)
             database.write_two_view_geometry(number[one], number[two], geometry)
     return number
-
-
-def connected(names: Mapping[str, object], pairs: Mapping[Pair, object]) -> list[tuple[str, ...]]:
-    """Groups of cameras that pairs connect, the largest first; each in the order of ``names``."""
-    group = {name: index for index, name in enumerate(names)}
-    for one, two in pairs:
-        old, new = max(group[one], group[two]), min(group[one], group[two])
-        group = {name: new if index == old else index for name, index in group.items()}
-    members: dict[int, list[str]] = {}
-    for name, index in group.items():
-        members.setdefault(index, []).append(name)
-    return sorted((tuple(found) for found in members.values()), key=lambda found: -len(found))

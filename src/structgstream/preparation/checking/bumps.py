@@ -15,22 +15,21 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.calibration import listed
-from structgstream.data.descriptor_matches import mutual_matches
 from structgstream.data.images import opencv
 from structgstream.data.matching import epipolar_errors, fundamental_matrix, sift_features
+from structgstream.data.pair_matches import KEYPOINT_SIDE, mutual_matches
 from structgstream.frames import MultiViewFrame
-from structgstream.pose_check.evidence import Evidence, gather
 from structgstream.pose_check.findings import Finding
-from structgstream.pose_check.tracks import AGREE_PIXELS
+from structgstream.pose_check.tracks import AGREE_PIXELS, Evidence, gather, pixel_scale
 
 KEYPOINTS = 1200
 RATIO = 0.8
-STILL_PIXELS = 1.0  # of pictures up to 1000 pixels wide, in proportion above
+STILL_PIXELS = 1.0  # times pixel_scale
 STILL_SHARE = 0.2
 MOVED_SHARE = 0.5
-LEAST_MATCHES = 30
+MIN_MATCHES = 30
 CLEAR = 0.5  # largest ratio of the errors of two explanations at which a match speaks for the better one
-LEAST_VOTES = 15
+MIN_VOTES = 15
 Judgement = Literal["bumped", "stood", "unknown"]
 
 
@@ -64,20 +63,20 @@ def picture_movement(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Moveme
     Raises:
         MissingExtraError: cv2 is not installed.
     """
-    before, after = (sift_features(picture, count=KEYPOINTS) for picture in (one, other))
-    if min(len(before.pixels), len(after.pixels)) < LEAST_MATCHES:
+    before, after = (sift_features(picture, count=KEYPOINTS, longest_side=KEYPOINT_SIDE) for picture in (one, other))
+    if min(len(before.pixels), len(after.pixels)) < MIN_MATCHES:
         return None
     rows, columns = mutual_matches(before.descriptors, after.descriptors, ratio=RATIO).T
-    if len(rows) < LEAST_MATCHES:
+    if len(rows) < MIN_MATCHES:
         return None
     start, end = before.pixels[rows], after.pixels[columns]
-    still = STILL_PIXELS * max(one.shape[1] / 1000, 1)
-    apart = np.linalg.norm(end - start, axis=1)
-    if (apart < still).mean() > STILL_SHARE:
+    still = STILL_PIXELS * pixel_scale(one.shape[1])
+    distances = np.linalg.norm(end - start, axis=1)
+    if (distances < still).mean() > STILL_SHARE:
         return STAYED
     homography, mask = opencv().findHomography(start, end, opencv().RANSAC, 2 * still)
     follows = np.zeros(len(rows), bool) if mask is None else mask.ravel().astype(bool)
-    shift = float(np.median(apart[follows])) if follows.any() else 0.0
+    shift = float(np.median(distances[follows])) if follows.any() else 0.0
     if follows.mean() <= MOVED_SHARE or shift <= still:
         return None
     return Movement(shift, np.asarray(homography, np.float64))
@@ -112,19 +111,19 @@ def bump_findings(
             findings.append(_bumped(name, movement, (first.index, last.index)))
         elif judged == "unknown":
             unknown.append(name)
-    return findings + ([_untold(unknown, (first.index, last.index))] if unknown else [])
+    return findings + ([_undecided(unknown, (first.index, last.index))] if unknown else [])
 
 
 def _judged(
     name: str, movement: Movement, instants: tuple[Evidence, Evidence], cameras: Mapping[str, Camera]
 ) -> Judgement:
-    """What matches with other cameras say at both instants."""
+    """The judgement by matches with other cameras at both instants."""
     back = np.asarray(np.linalg.inv(movement.homography), np.float64)
     votes = [
         _votes(name, change, evidence, cameras)
         for evidence, change in zip(instants, (movement.homography, back), strict=True)
     ]
-    enough = [(stood, bumped) for stood, bumped in votes if stood + bumped >= LEAST_VOTES]
+    enough = [(stood, bumped) for stood, bumped in votes if stood + bumped >= MIN_VOTES]
     if any(bumped > stood for stood, bumped in enough):
         return "bumped"
     # By its calibration at the first instant alone a camera that was bumped later would stand, too.
@@ -134,7 +133,7 @@ def _judged(
 def _votes(name: str, change: Floats, evidence: Evidence, cameras: Mapping[str, Camera]) -> tuple[int, int]:
     """Numbers of matches that fit a camera's pose as they are, and as they would be at the other instant."""
     stood = bumped = 0
-    limit = AGREE_PIXELS * max(cameras[name].width / 1000, 1)
+    limit = AGREE_PIXELS * pixel_scale(cameras[name].width)
     for pair in evidence.overlapping():
         if name not in pair:
             continue
@@ -162,7 +161,7 @@ def _bumped(name: str, movement: Movement, frames: tuple[int, int]) -> Finding:
     )
 
 
-def _untold(names: list[str], frames: tuple[int, int]) -> Finding:
+def _undecided(names: list[str], frames: tuple[int, int]) -> Finding:
     return Finding(
         "note",
         f"Whether {listed(names)} stood still between frame {frames[0]} and frame {frames[1]} cannot be told: nearly "

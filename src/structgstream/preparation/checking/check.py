@@ -11,10 +11,8 @@ from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import select_cameras
 from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.check import examine_poses
-from structgstream.pose_check.evidence import Evidence, pair_errors
-from structgstream.pose_check.explanations import explain
-from structgstream.pose_check.findings import worst_first
-from structgstream.pose_check.tracks import LEAST_VIEWS, Tracks
+from structgstream.pose_check.findings import explain, worst_first
+from structgstream.pose_check.tracks import MIN_VIEWS, Evidence, Tracks, pair_errors
 from structgstream.pose_check.verdicts import Suspects, Verdict
 from structgstream.preparation.checking.bumps import bump_findings
 from structgstream.preparation.checking.colors import Color, color_findings, compare_colors
@@ -33,11 +31,15 @@ from structgstream.preparation.checking.presence import (
     whole_frame,
 )
 from structgstream.preparation.checking.scales import nearest_depth, observed_depths, scale_findings
-from structgstream.preparation.checking.times import measure_times, time_findings
+from structgstream.preparation.checking.times import (
+    MIN_FRAMES,
+    SynchronizationCheck,
+    check_synchronization,
+    time_findings,
+)
 from structgstream.preparation.steps import Listener, Silent
-from structgstream.preparation.synchronization import SynchronizationCheck
 
-LEAST_TIMED = 3  # cameras, for times that can be compared
+MIN_TIMED = 3  # cameras, for times that can be compared
 FAR_AWAY = 30.0  # radii of the rig: a camera that stands further away is in another unit
 
 
@@ -104,7 +106,7 @@ def check_capture(
     listener: Listener | None = None,
     examination: Examination | None = None,
 ) -> Checked:
-    """Checks the first frame that all cameras have and the last; held-out cameras are looked at, too.
+    """Checks the first frame that all cameras have and the last; held-out cameras are checked, too.
 
     Args:
         source: the opened capture.
@@ -156,11 +158,11 @@ def check_capture(
 
 
 def _measured_times(source: FrameSource, suspects: Suspects) -> SynchronizationCheck | None:
-    """Of the cameras whose poses hold: epipolar lines of a wrong pose tell nothing of time."""
+    """Of the cameras whose poses are right: epipolar lines of a wrong pose give no times."""
     good = tuple(name for name in source.rig if name not in suspects.off)
-    if suspects.everything or len(good) < LEAST_TIMED:
+    if suspects.everything or len(good) < MIN_TIMED or len(source) < MIN_FRAMES:
         return None
-    return measure_times(select_cameras(source, good) if suspects.off else source)
+    return check_synchronization(select_cameras(source, good) if suspects.off else source)
 
 
 def _radius(cameras: Mapping[str, Camera], suspects: Suspects) -> float:
@@ -185,7 +187,7 @@ def _sound_centers(cameras: Mapping[str, Camera], suspects: Suspects) -> np.ndar
 def _solid_points(tracks: Tracks) -> np.ndarray:
     """Points that at least three cameras observed, or two where that is all there is."""
     views = tracks.views
-    solid = tracks.points[views >= LEAST_VIEWS]
+    solid = tracks.points[views >= MIN_VIEWS]
     return solid if len(solid) else tracks.points
 
 
@@ -199,7 +201,7 @@ def _camera_checks(
     for name in source.rig:
         color = examined.colors.get(name)
         own = np.zeros(len(tracks.point), bool) if name not in tracks.names else tracks.of(name)
-        residuals = tracks.residuals[own & (views[tracks.point] >= LEAST_VIEWS)]
+        residuals = tracks.residuals[own & (views[tracks.point] >= MIN_VIEWS)]
         residuals = residuals[np.isfinite(residuals)]
         found[name] = CameraCheck(
             reprojection_pixels=float(np.median(residuals)) if len(residuals) else None,

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv
-from structgstream.pose_check.evidence import Evidence
 from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.tracks import Evidence
 
 PATCH = 7
 DARK, BRIGHT = 12.0, 243.0
 ROUNDS = 20
-LEAST_MATCHES = 15
+MIN_MATCHES = 15
 EXPOSURE_STOPS, BALANCE_STOPS = 0.33, 0.2
 
 
@@ -46,7 +46,7 @@ def compare_colors(evidence: Evidence) -> dict[str, Color]:
     for pair in evidence.overlapping():
         one, other = (_samples(smooth[name], pixels) for name, pixels in zip(pair, evidence.pixels(pair)))
         valid = ((one > DARK) & (one < BRIGHT) & (other > DARK) & (other < BRIGHT)).all(1)
-        if valid.sum() < LEAST_MATCHES:
+        if valid.sum() < MIN_MATCHES:
             continue
         first.append(np.full(valid.sum(), names.index(pair[0])))
         second.append(np.full(valid.sum(), names.index(pair[1])))
@@ -75,25 +75,25 @@ def color_findings(colors: Mapping[str, Color]) -> list[Finding]:
     balance = {name: stops for name, stops in balance.items() if abs(stops) > BALANCE_STOPS}
     findings = []
     if exposed:
-        told = (
-            f"Exposure differs from the other cameras', in stops: {_told(exposed)}; lock exposure and gain to the same "
-            "values on all cameras (reconstruction equalises what is left)."
+        sentence = (
+            f"Exposure differs from the other cameras', in stops: {_worst(exposed)}; lock exposure and gain to the "
+            "same values on all cameras (reconstruction equalises what is left)."
         )
-        findings.append(Finding("warning", told, tuple(exposed)))
+        findings.append(Finding("warning", sentence, tuple(exposed)))
     if balance:
-        told = (
-            f"White balance differs from the other cameras', in stops of red or blue against green: {_told(balance)}; "
+        sentence = (
+            f"White balance differs from the other cameras', in stops of red or blue against green: {_worst(balance)}; "
             "lock it to the same value on all cameras."
         )
-        findings.append(Finding("warning", told, tuple(balance)))
+        findings.append(Finding("warning", sentence, tuple(balance)))
     return findings
 
 
-def _told(stops: Mapping[str, float], most: int = 6) -> str:
-    """The largest differences, in words."""
+def _worst(stops: Mapping[str, float], limit: int = 6) -> str:
+    """The largest differences, for messages."""
     worst = sorted(stops, key=lambda name: -abs(stops[name]))
-    rest = f" and {len(worst) - most} more" if len(worst) > most else ""
-    return ", ".join(f"{name!r} {stops[name]:+.2f}" for name in worst[:most]) + rest
+    rest = f" and {len(worst) - limit} more" if len(worst) > limit else ""
+    return ", ".join(f"{name!r} {stops[name]:+.2f}" for name in worst[:limit]) + rest
 
 
 def _samples(picture: NDArray[np.uint8], pixels: Floats) -> Floats:

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a check says."""
+"""The numbers and sentences of a check."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from structgstream.pose_check.findings import Finding
+from structgstream.preparation.checking.overlap import Coverage
 
 
 @dataclass(frozen=True)
@@ -57,21 +58,6 @@ class CameraCheck:
 
 
 @dataclass(frozen=True)
-class Coverage:
-    """How much of the scene how many cameras see.
-
-    Args:
-        points: number of points that were triangulated.
-        seen_by_three: share of them that at least three cameras see.
-        median_cameras: median number of cameras that see a point.
-    """
-
-    points: int
-    seen_by_three: float
-    median_cameras: float
-
-
-@dataclass(frozen=True)
 class CheckReport:
     """The numbers of a check; ``as_json`` is what ``report.json`` holds.
 
@@ -85,8 +71,8 @@ class CheckReport:
         rig_radius: in the capture's units.
         near: near plane, in the capture's units.
         nearest: depth that 0.5 % of the points fall below, in the capture's units; None without points.
-        unit: of length, where the capture says.
-        steps: of the preparation, where there was one: what each found, in words.
+        unit: of length, where the capture states it.
+        steps: summaries of the preparation's steps, where there was one.
     """
 
     capture: str

@@ -2,6 +2,7 @@
 """Which cameras see the same things, and how much of the scene how many of them see."""
 
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,10 +10,25 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.calibration import listed
-from structgstream.data.matching import Pair, inside, project
-from structgstream.preparation.checking.findings import Coverage, Finding
+from structgstream.data.matching import Pair, connected_groups, inside, project
+from structgstream.pose_check.findings import Finding
 
-LEAST_OVERLAPS = 2
+MIN_OVERLAPS = 2
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How much of the scene how many cameras see.
+
+    Args:
+        points: number of points that were triangulated.
+        seen_by_three: share of them that at least three cameras see.
+        median_cameras: median number of cameras that see a point.
+    """
+
+    points: int
+    seen_by_three: float
+    median_cameras: float
 
 
 def cameras_per_point(points: Floats, cameras: Mapping[str, Camera]) -> NDArray[np.intp]:
@@ -51,21 +67,19 @@ def overlap_findings(pairs: Collection[Pair], names: Collection[str]) -> list[Fi
             )
         ]
     findings = []
-    groups = _groups(pairs, names)
-    whole = max(groups, key=len)
-    alone = [name for group in groups if len(group) == 1 and group is not whole for name in group]
-    for group in ([alone] if alone else []) + [group for group in groups if len(group) > 1]:
-        if group is not whole:
-            findings.append(
-                Finding(
-                    "warning",
-                    f"The pictures of {listed(group)} have no matches with those of the others, so their poses are not "
-                    "checked; move them closer to the others, or film a calibration board there.",
-                    tuple(group),
-                )
+    whole, *others = connected_groups(names, pairs)
+    single = [group[0] for group in others if len(group) == 1]
+    for group in ([single] if single else []) + [group for group in others if len(group) > 1]:
+        findings.append(
+            Finding(
+                "warning",
+                f"The pictures of {listed(group)} have no matches with those of the others, so their poses are not "
+                "checked; move them closer to the others, or film a calibration board there.",
+                tuple(group),
             )
+        )
     for name, count in overlaps(pairs, names).items():
-        if name in whole and count < LEAST_OVERLAPS <= len(names) - 1:
+        if name in whole and count < MIN_OVERLAPS <= len(names) - 1:
             findings.append(
                 Finding(
                     "warning",
@@ -75,18 +89,3 @@ def overlap_findings(pairs: Collection[Pair], names: Collection[str]) -> list[Fi
                 )
             )
     return findings
-
-
-def _groups(pairs: Collection[Pair], names: Collection[str]) -> list[list[str]]:
-    group = {name: {name} for name in names}
-    for first, second in pairs:
-        if group[first] is not group[second]:
-            group[first] |= group[second]
-            for name in group[second]:
-                group[name] = group[first]
-    found: list[list[str]] = []
-    for name in names:
-        members = [other for other in names if group[other] is group[name]]
-        if members not in found:
-            found.append(members)
-    return found

@@ -15,13 +15,14 @@ from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.findings import Finding
 
 Presence = dict[str, NDArray[np.bool_]]
-MOST_TRIED = 4  # frames, where pictures that should be there cannot be decoded
-MOST_SINGLE = 2  # cameras that drop frames and get a sentence each
-LOST_SECONDS, LOST_SHARE, MOST_LOST_SHARE = 0.5, 0.05, 0.25  # at the end, of the take
+MAX_TRIED = 4  # frames, where pictures that should be there cannot be decoded
+MAX_SINGLE = 2  # cameras that drop frames and get a sentence each
+LOST_SECONDS, LOST_SHARE, MAX_LOST_SHARE = 0.5, 0.05, 0.25  # at the end, of the take
 
 
 def stated_presence(source: FrameSource) -> Presence:
-    """For each camera whether it has a picture of each frame ``[N]``, as far as files say so without being decoded."""
+    """For each camera whether it has a picture of each frame ``[N]``, as far as files state it without being
+    decoded."""
     inner = unwrapped(source)
     pictures: Mapping[str, tuple[object, ...]] = {}
     if isinstance(inner, VideoSource):
@@ -39,7 +40,7 @@ def stated_presence(source: FrameSource) -> Presence:
 def passed_frames(source: FrameSource) -> dict[str, NDArray[np.intp]]:
     """By camera of videos, the frames that it lacks although it dropped no picture.
 
-    A clock that runs slow makes pictures later and later beside the frames, so that now and then none is nearest to a
+    A clock that runs slow makes pictures later and later against the frames, so that now and then none is nearest to a
     frame: the pictures before and after it follow each other in the file at the usual interval.
     """
     inner = unwrapped(source)
@@ -61,7 +62,7 @@ def whole_frame(source: FrameSource, presence: Presence) -> MultiViewFrame:
     counts = np.sum(list(presence.values()), axis=0)
     fullest = np.flatnonzero(counts == counts.max())
     best: MultiViewFrame | None = None
-    for place in np.unique(np.linspace(0, len(fullest) - 1, MOST_TRIED).round().astype(int)):
+    for place in np.unique(np.linspace(0, len(fullest) - 1, MAX_TRIED).round().astype(int)):
         frame = _read(source, int(fullest[place]), presence)
         best = frame if best is None or len(frame.images) > len(best.images) else best
         if len(best.images) == counts.max():
@@ -86,7 +87,7 @@ def presence_findings(
     """A warning for each camera that ends early or has nothing, and for those that drop frames or lack frame 0.
 
     Where many drop frames, as phones do, one warning has them all. Cameras are never stopped in the same instant: those
-    that end within :func:`_slack` of the last one are told of in one note, which says what all have. Another one has
+    that end within :func:`_slack` of the last one are in one note, which states what all have. Another one has
     those whose clocks run slow.
 
     Args:
@@ -106,18 +107,18 @@ def presence_findings(
     lacking = {name: np.setdiff1d(gaps, passed.get(name, [])) for name, gaps in lacking.items()}
     dropping = {name: gaps for name, gaps in lacking.items() if len(gaps)}
     for name, present in presence.items():
-        told = []
+        sentences = []
         if not present.any():
-            told.append(
+            sentences.append(
                 f"Camera {name!r} has no picture of any frame that can be read; leave it out, or restore its files."
             )
-        if name in dropping and len(dropping) <= MOST_SINGLE:
-            told.append(_dropped(name, dropping[name], len(present), fps))
+        if name in dropping and len(dropping) <= MAX_SINGLE:
+            sentences.append(_dropped(name, dropping[name], len(present), fps))
         if 0 < ends.get(name, 0) < len(present):
-            told.append(_ended(name, ends[name], len(present), fps))
-        if told:
-            findings.append(Finding("warning", " ".join(told), (name,)))
-    if len(dropping) > MOST_SINGLE:
+            sentences.append(_ended(name, ends[name], len(present), fps))
+        if sentences:
+            findings.append(Finding("warning", " ".join(sentences), (name,)))
+    if len(dropping) > MAX_SINGLE:
         findings.append(_all_dropped(dropping, max(map(len, presence.values()))))
     if late := tuple(name for name, own in presence.items() if own.any() and not own[0]):
         findings.append(_without_start(late, presence))
@@ -150,7 +151,7 @@ def _slow(passed: Mapping[str, NDArray[np.intp]], fps: float) -> Finding:
 def _slack(frames: int, fps: float) -> int:
     """Frames that a camera may lack at the end: half a second or 5 % of the take, whichever is more, and never more
     than a quarter of it."""
-    return round(min(max(LOST_SECONDS * fps, LOST_SHARE * frames), MOST_LOST_SHARE * frames))
+    return round(min(max(LOST_SECONDS * fps, LOST_SHARE * frames), MAX_LOST_SHARE * frames))
 
 
 def _stopped(ends: Mapping[str, int], last: int, fps: float) -> Finding:

@@ -9,11 +9,11 @@ from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.matching import project
 from structgstream.pose_check.findings import Finding
-from structgstream.pose_check.tracks import LEAST_VIEWS, Tracks
+from structgstream.pose_check.tracks import MIN_VIEWS, Tracks
 from structgstream.preparation.checking.overlap import cameras_per_point
 
 NEAR_PERCENTILE = 0.5
-LEAST_POINTS = 30
+MIN_POINTS = 30
 CUT_SHARE = 0.02
 CLOSEST_NEAR = 0.0007  # of the depth of the nearest points: a near plane any closer looks like one in another unit
 PLAUSIBLE_METRES = (0.03, 60.0)  # of a rig's radius: a desk, a stadium's corner
@@ -22,18 +22,18 @@ UNITS = {1000.0: "1000 times too small (metres among millimetres)", 0.001: "1000
          "metres)", 100.0: "100 times too small (metres among centimetres)", 0.01: "100 times too large (centimetres "
          "among metres)"}  # fmt: skip
 FIT = 0.5
-LEAST_EXTENT = 0.03  # of the points that a rig sees, as a share of their depth
+MIN_EXTENT = 0.03  # of the points that a rig sees, as a share of their depth
 
 
 def observed_depths(tracks: Tracks, cameras: Mapping[str, Camera], *, off: Collection[str] = ()) -> Floats:
     """Depths of points in the cameras, of those not ``off``, that observed them; of three cameras, or else of two."""
     views = tracks.views
-    least = LEAST_VIEWS if (views >= LEAST_VIEWS).sum() >= LEAST_POINTS else 2
+    min_views = MIN_VIEWS if (views >= MIN_VIEWS).sum() >= MIN_POINTS else 2
     depths = []
     for number, name in enumerate(tracks.names):
         if name in off:
             continue
-        rows = (tracks.camera == number) & (views[tracks.point] >= least) & np.isfinite(tracks.residuals)
+        rows = (tracks.camera == number) & (views[tracks.point] >= min_views) & np.isfinite(tracks.residuals)
         depths.append(project(cameras[name], tracks.points[tracks.point[rows]])[1])
     return np.concatenate(depths) if depths else np.empty(0)
 
@@ -41,7 +41,7 @@ def observed_depths(tracks: Tracks, cameras: Mapping[str, Camera], *, off: Colle
 def nearest_depth(depths: Floats) -> float | None:
     """The depth that only few points fall below; None when there are too few."""
     depths = depths[depths > 0]
-    return float(np.percentile(depths, NEAR_PERCENTILE)) if len(depths) >= LEAST_POINTS else None
+    return float(np.percentile(depths, NEAR_PERCENTILE)) if len(depths) >= MIN_POINTS else None
 
 
 def scale_findings(
@@ -59,12 +59,12 @@ def scale_findings(
         points: ``[P, 3]`` that came with the capture, or None.
         cameras: of the rig.
         radius: of the rig.
-        unit: of length, where the capture says.
+        unit: of length, where the capture states it.
     """
     findings = []
     near = float(np.median([camera.near for camera in cameras.values()]))
     depths = depths[depths > 0]
-    if len(depths) >= LEAST_POINTS and (cut := float((depths < near).mean())) > CUT_SHARE:
+    if len(depths) >= MIN_POINTS and (cut := float((depths < near).mean())) > CUT_SHARE:
         typical = float(np.median(depths))
         hint = "; poses and near plane look like different units of length" if near > 50 * typical else ""
         findings.append(
@@ -93,27 +93,27 @@ def scale_findings(
                 f"look like {like}; convert them, or give a distance between two cameras.",
             )
         )
-    if points is not None and len(points) >= LEAST_POINTS and (told := _foreign(points, depths, cameras)):
-        findings.append(Finding("error", told))
+    if points is not None and len(points) >= MIN_POINTS and (sentence := _foreign(points, depths, cameras)):
+        findings.append(Finding("error", sentence))
     return findings
 
 
 def _foreign(points: Floats, depths: Floats, cameras: Mapping[str, Camera]) -> str | None:
     """A sentence when the points that came along are not of these cameras."""
     fits = _share_seen(points, cameras)
-    if len(depths) < LEAST_POINTS:
+    if len(depths) < MIN_POINTS:
         return None
     typical = float(np.median(depths))
     if fits >= FIT and 0.02 < _typical_depth(points, cameras) / typical < 50:
         return None
     extent = float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
-    apart = {
+    differences = {
         factor: abs(np.log(_typical_depth(points * factor, cameras) / typical))
         for factor in FACTORS
-        if factor * extent > LEAST_EXTENT * typical  # any points, made small enough, lie in the middle of a rig
+        if factor * extent > MIN_EXTENT * typical  # any points, made small enough, lie in the middle of a rig
     }
-    likely = min(apart, key=lambda factor: apart[factor], default=None)
-    if likely is not None and apart[likely] < np.log(5):
+    likely = min(differences, key=lambda factor: differences[factor], default=None)
+    if likely is not None and differences[likely] < np.log(5):
         return (
             f"The points that come with the capture lie at impossible depths: they look {UNITS[likely]}; convert "
             "points and positions of cameras to one unit, or leave the points out."

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Instants that pairs of cameras share, from what their microphones hear.
 
-Coarse: increases of energy in a few bands (onsets) are correlated over all lags; levels and tone of microphones do
-not matter. Onsets are smoothed, so that sounds from several places agree on one lag although their ways differ. Fine:
-in windows with many onsets phases are compared (``phases.py``), at the same frequencies in hertz, so that sample rates
-may differ. Windows that agree give the lag; where they do not, because each hears another place, the coarse one holds.
+Coarse: increases of energy in a few bands (onsets) are correlated over all lags; levels and tone of microphones do not
+matter. Onsets are smoothed, so that sounds from several places agree on one lag although their ways differ. Fine: in
+windows with many onsets phases are compared (``phases.py``), at the same frequencies in hertz, so that sample rates may
+differ. Windows that agree give the lag; where they do not, because each picks up another source, the coarse one is
+taken.
 
 Sound needs 2.9 ms a metre: a camera that stands a metre farther from it seems that much late. Rooms may be louder than
 the direct sound: what the other peaks of a pair leave open is part of its error, less so where lags close loops of
@@ -18,9 +19,7 @@ from itertools import combinations, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
-from structgstream.data.lenses import LensCamera
-from structgstream.data.matching import Pair
+from structgstream.data.matching import Pair, connected_groups
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.correlation import Signal, best_lag
 from structgstream.preparation.synchronization.phases import (
@@ -32,26 +31,26 @@ from structgstream.preparation.synchronization.phases import (
     ambiguity_seconds,
     phase_window,
 )
-from structgstream.preparation.synchronization.solving import Solution, Tie, connected, solve_clocks
+from structgstream.preparation.synchronization.solving import Solution, TimeCorrespondence, solve_clocks
 
 CLOSING_SECONDS = 3e-4  # by which the lags of a loop may miss each other
-DOUBT = 1 / 3  # that a closed loop leaves: its lags, if wrong, would be spread over several milliseconds
-MOST_LOOPS = 3
+LOOP_WEIGHT = 1 / 3  # that a closed loop leaves: its lags, if wrong, would be spread over several milliseconds
+MAX_LOOPS = 3
 SPEED_OF_SOUND = 343.0  # metres a second, at 20 degrees Celsius
 STEP_SECONDS = 0.004  # of onsets
 SMOOTHING_STEPS = 1.0  # standard deviation; ways of sound that differ by a metre are apart by less than a step
 BANDS_HERTZ = (LOW_HERTZ, 600.0, 1500.0, 3500.0, HIGH_HERTZ)
-LEAST_OVERLAP_SECONDS = 1.0
+MIN_OVERLAP_SECONDS = 1.0
 RIVAL_RATIO = 0.8  # of the second best lag to the best one
 SINGLE_RIVAL_RATIO = 0.5  # the same where one bang alone agrees, which any other may do
 SEVERAL_SHARE, SEVERAL_SECONDS = 0.3, 0.15  # of a second bang: its share of the first one, and its distance
 CHANCE_DEVIATIONS = 7.0  # that a coarse peak exceeds: the largest of 300000 normal numbers is at 4.5
 COARSE_SIGMA_SECONDS = 2.5e-3  # of a lag by onsets: claps from several places, echoes
-MOST_WINDOWS = 16
+MAX_WINDOWS = 16
 SLACK_SECONDS = 0.02  # what drift may make of a lag before rates are known
 FINE_SIGMA_SECONDS = 1e-4  # of a window's peak in a room that echoes
-AGREEING_SECONDS, MOST_DRIFT = 1.5e-4, 2e-4  # between windows
-LEAST_AGREEING, LEAST_AGREEING_SHARE = 4, 0.4
+AGREEING_SECONDS, MAX_DRIFT = 1.5e-4, 2e-4  # between windows
+MIN_AGREEING, MIN_AGREEING_SHARE = 4, 0.4
 STRIDES = (1, 2, 3, 5)  # between partners, where there are more cameras than the next number
 ALL_PAIRS = 12
 
@@ -67,7 +66,7 @@ class PairLag:
         sigma_seconds: standard error of each lag.
         ambiguity_seconds: standard error that all of them share, because another peak may be the right one.
         confidence: how distinct it is.
-        fine: whether phases tell the lag, so that loops close.
+        fine: whether the lag comes from phases, so that loops close.
     """
 
     first: str
@@ -91,7 +90,7 @@ class PairLag:
         return float(np.mean([at for at, _ in self.instants]))
 
 
-def doubts(lags: Sequence[PairLag]) -> list[float]:
+def ambiguity_weights(lags: Sequence[PairLag]) -> list[float]:
     """For each pair the share of its ambiguity that closed loops leave, 1 where there is none.
 
     Loops that share a pair support each other, so their number is that of all that hang together.
@@ -109,7 +108,7 @@ def doubts(lags: Sequence[PairLag]) -> list[float]:
             joined, count = joined | group[0], count + group[1]
         groups.append((joined, count))
     loops = {pair: count for pairs, count in groups for pair in pairs}
-    return [DOUBT ** min(loops.get((lag.first, lag.second), 0), MOST_LOOPS) for lag in lags]
+    return [LOOP_WEIGHT ** min(loops.get((lag.first, lag.second), 0), MAX_LOOPS) for lag in lags]
 
 
 def _closes(three: Sequence[str], known: dict[tuple[str, str], PairLag]) -> bool:
@@ -117,10 +116,10 @@ def _closes(three: Sequence[str], known: dict[tuple[str, str], PairLag]) -> bool
     a, b, c = three
     start = next(lag.middle for pair, lag in known.items() if set(pair) == {a, b})
     start = start if (a, b) in known else known[b, a].at(start)
-    return abs(_told(known, b, c, _told(known, a, b, start)) - _told(known, a, c, start)) < CLOSING_SECONDS
+    return abs(_mapped(known, b, c, _mapped(known, a, b, start)) - _mapped(known, a, c, start)) < CLOSING_SECONDS
 
 
-def _told(known: dict[tuple[str, str], PairLag], first: str, second: str, seconds: float) -> float:
+def _mapped(known: dict[tuple[str, str], PairLag], first: str, second: str, seconds: float) -> float:
     if (first, second) in known:
         return known[first, second].at(seconds)
     lag = known[second, first]
@@ -155,9 +154,9 @@ def sound_of(name: str, audio: tuple[NDArray[np.float32], float]) -> Sound:
         UnusableSoundError: silence, or less than a second.
     """
     samples, rate = audio
-    if len(samples) < LEAST_OVERLAP_SECONDS * rate:
+    if len(samples) < MIN_OVERLAP_SECONDS * rate:
         raise UnusableSoundError(
-            f"Camera {name!r} has {len(samples) / rate:.2f} s of sound, less than the {LEAST_OVERLAP_SECONDS:g} s "
+            f"Camera {name!r} has {len(samples) / rate:.2f} s of sound, less than the {MIN_OVERLAP_SECONDS:g} s "
             "that can be compared",
             "synchronise by motion or timestamps.csv",
         )
@@ -169,22 +168,13 @@ def sound_of(name: str, audio: tuple[NDArray[np.float32], float]) -> Sound:
     return Sound(samples, rate, _onsets(samples, rate))
 
 
-def distances_from(position: Floats, cameras: Mapping[str, LensCamera]) -> dict[str, float]:
-    """Metres from each camera to where a sound was made, ``[3]``, for a calibration in metres."""
-    return {name: float(np.linalg.norm(own.camera.center.numpy() - position)) for name, own in cameras.items()}
-
-
 def audio_lags(sounds: Mapping[str, Sound]) -> list[PairLag]:
     """Lags of the pairs of cameras that hear the same; pairs whose best lag is ambiguous have none."""
     return [lag for pair in _pairs(list(sounds)) if (lag := _pair_lag(*pair, sounds)) is not None]
 
 
 def solve_by_audio(
-    takes: Mapping[str, tuple[float, float]],
-    lags: Sequence[PairLag],
-    *,
-    drift: bool = True,
-    distances: Mapping[str, float] | None = None,
+    takes: Mapping[str, tuple[float, float]], lags: Sequence[PairLag], *, drift: bool = True
 ) -> Solution:
     """Clocks by sound.
 
@@ -192,30 +182,27 @@ def solve_by_audio(
         takes: camera to the first and last second of its take.
         lags: what :func:`audio_lags` gives; they must connect all cameras (:func:`connected_by`).
         drift: whether rates other than 1 are considered.
-        distances: camera to its distance from the source of the sound in metres, where it is known.
     """
-    delays = {name: (distances[name] / SPEED_OF_SOUND if distances else 0.0) for name in takes}
-    left = doubts(lags)
-    # A wrong peak is off by as much in all windows of a pair, so drift is told by windows, and offsets by pairs.
-    sharp = solve_clocks(takes, _ties(lags, [0.0] * len(lags), delays), drift=drift, slack_seconds=SLACK_SECONDS)
+    # A wrong peak is off by as much in all windows of a pair: drift is estimated from windows, offsets from pairs.
+    sharp = solve_clocks(takes, _matches(lags, [0.0] * len(lags)), drift=drift, slack_seconds=SLACK_SECONDS)
     rates = sharp.rates
-    ties = [
+    matches = [
         replace(
-            tie,
-            first_seconds=rates[tie.first] * tie.first_seconds,
-            second_seconds=rates[tie.second] * tie.second_seconds,
+            match,
+            first_seconds=rates[match.first] * match.first_seconds,
+            second_seconds=rates[match.second] * match.second_seconds,
         )
-        for tie in _ties(lags, left, delays)
+        for match in _matches(lags, ambiguity_weights(lags))
     ]
     spans = {name: (rates[name] * start, rates[name] * end) for name, (start, end) in takes.items()}
-    found = solve_clocks(spans, ties, drift=False, slack_seconds=SLACK_SECONDS)
+    found = solve_clocks(spans, matches, drift=False, slack_seconds=SLACK_SECONDS)
     sigmas = {name: float(np.hypot(found.sigmas[name], sharp.sigmas[name])) for name in takes}
     return replace(found, rates=rates, sigmas=sigmas)
 
 
-def connected_by(cameras: Sequence[str], lags: Sequence[PairLag]) -> tuple[tuple[str, ...], ...]:
+def connected_by(cameras: Sequence[str], lags: Sequence[PairLag]) -> list[tuple[str, ...]]:
     """Groups of cameras that lags connect, the largest first."""
-    return connected(cameras, _ties(lags, [0.0] * len(lags), dict.fromkeys(cameras, 0.0)))
+    return connected_groups(cameras, [(lag.first, lag.second) for lag in lags])
 
 
 def _pairs(names: list[str]) -> list[Pair]:
@@ -226,8 +213,8 @@ def _pairs(names: list[str]) -> list[Pair]:
 
 def _pair_lag(first: str, second: str, sounds: Mapping[str, Sound]) -> PairLag | None:
     one, other = sounds[first], sounds[second]
-    least = round(LEAST_OVERLAP_SECONDS / STEP_SECONDS)
-    coarse = best_lag(one.onsets, other.onsets, least_overlap=least)
+    min_overlap = round(MIN_OVERLAP_SECONDS / STEP_SECONDS)
+    coarse = best_lag(one.onsets, other.onsets, min_overlap=min_overlap)
     # The right lag is the one at which all sounds agree; another one has a clap agree with another clap.
     if coarse is None or coarse.rival > RIVAL_RATIO * coarse.judged:
         return None
@@ -257,23 +244,22 @@ def _several(one: Signal, other: Signal, lag: float) -> bool:
         at_one = one.start + one.step * np.arange(len(x)), other.start - lag + other.step * np.arange(len(y))
         both += np.interp(times, at_one[0], x) * np.interp(times, at_one[1], y)
     first = int(both.argmax())
-    apart = np.abs(times - times[first]) > SEVERAL_SECONDS
-    return bool(apart.any()) and float(both[apart].max()) > SEVERAL_SHARE * float(both[first])
+    elsewhere = np.abs(times - times[first]) > SEVERAL_SECONDS
+    return bool(elsewhere.any()) and float(both[elsewhere].max()) > SEVERAL_SHARE * float(both[first])
 
 
-def _ties(lags: Sequence[PairLag], left: Sequence[float], delays: Mapping[str, float]) -> list[Tie]:
-    """Ties whose errors are those of windows, and that of the peak that all windows of a pair share, as far as it is
-    ``left`` open."""
-    ties = []
-    for lag, doubt in zip(lags, left, strict=True):
-        shared = lag.ambiguity_seconds * doubt * len(lag.instants) ** 0.5 if lag.fine else 0.0
+def _matches(lags: Sequence[PairLag], weights: Sequence[float]) -> list[TimeCorrespondence]:
+    """Correspondences with the errors of windows and the ``weights`` share of the error that all windows of a pair have
+    in common because another peak may be the right one."""
+    matches = []
+    for lag, weight in zip(lags, weights, strict=True):
+        shared = lag.ambiguity_seconds * weight * len(lag.instants) ** 0.5 if lag.fine else 0.0
         sigma = float(np.hypot(lag.sigma_seconds, shared))
-        one, other = delays[lag.first], delays[lag.second]
-        ties += [
-            Tie(lag.first, lag.second, at - one, at + apart - other, sigma, lag.confidence)
-            for at, apart in lag.instants
+        matches += [
+            TimeCorrespondence(lag.first, lag.second, at, at + seconds, sigma, lag.confidence)
+            for at, seconds in lag.instants
         ]
-    return ties
+    return matches
 
 
 def _on_a_line(found: list[Window]) -> list[Window]:
@@ -281,7 +267,7 @@ def _on_a_line(found: list[Window]) -> list[Window]:
 
     Echoes and noise give lags that are spread over the range that is searched, so a few that agree are right.
     """
-    if len(found) < LEAST_AGREEING:
+    if len(found) < MIN_AGREEING:
         return []
     times = np.array([window.middle for window in found])
     lags = np.array([window.seconds for window in found])
@@ -289,10 +275,10 @@ def _on_a_line(found: list[Window]) -> list[Window]:
     for i, j in combinations(range(len(found)), 2):
         slope = (lags[j] - lags[i]) / (times[j] - times[i]) if times[i] != times[j] else np.inf
         for drift in (0.0, slope):
-            if abs(drift) <= MOST_DRIFT:
+            if abs(drift) <= MAX_DRIFT:
                 on = np.abs(lags - lags[i] - drift * (times - times[i])) < AGREEING_SECONDS
                 best = on if on.sum() > best.sum() else best
-    if best.sum() < max(LEAST_AGREEING, LEAST_AGREEING_SHARE * len(found)):
+    if best.sum() < max(MIN_AGREEING, MIN_AGREEING_SHARE * len(found)):
         return []
     return [window for window, agrees in zip(found, best, strict=True) if agrees]
 
@@ -322,7 +308,7 @@ def _windows(one: Signal, other: Signal, lag: float) -> list[float]:
     start, end = max(one.start, other.start - lag), min(one.end, other.end - lag)
     if end - start <= WINDOW_SECONDS:
         return [(start + end) / 2]
-    count = min(int(2 * (end - start) / WINDOW_SECONDS), MOST_WINDOWS)
+    count = min(int(2 * (end - start) / WINDOW_SECONDS), MAX_WINDOWS)
     times = np.arange(start + WINDOW_SECONDS / 2, end - WINDOW_SECONDS / 2, 0.1)
     totals = [np.concatenate([[0.0], np.cumsum(signal.values.sum(1))]) for signal in (one, other)]
     loudness = np.ones(len(times))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from structgstream.data.arrays import Floats
 from structgstream.errors import MissingExtraError
@@ -58,7 +58,7 @@ class Lag:
     middle: float
 
 
-def demand_scipy() -> None:
+def require_scipy() -> None:
     """
     Raises:
         MissingExtraError: scipy is not installed.
@@ -81,7 +81,7 @@ def resampled(values: Floats, stamps: Floats, *, step: float) -> Signal:
 
 
 def best_lag(
-    first: Signal, second: Signal, *, within: tuple[float, float] | None = None, least_overlap: int = 8
+    first: Signal, second: Signal, *, within: tuple[float, float] | None = None, min_overlap: int = 8
 ) -> Lag | None:
     """The lag of the largest correlation; None if there is no overlap, no change in
     it, or no peak.
@@ -89,10 +89,10 @@ def best_lag(
     Args:
         first: a signal.
         second: another, of the same step and channels.
-        within: least and largest lag in seconds; None for all.
-        least_overlap: least number of samples in common.
+        within: smallest and largest lag in seconds; None for all.
+        min_overlap: smallest number of samples in common.
     """
-    score, numerators, energy, counts, lags = _scores(first, second, least_overlap)
+    score, numerators, energy, counts, lags = _scores(first, second, min_overlap)
     seconds = second.start - first.start + lags * first.step
     if within is not None:
         score = np.where((seconds >= within[0]) & (seconds <= within[1]), score, -np.inf)
@@ -101,10 +101,10 @@ def best_lag(
     # A short overlap agrees by chance; correlations are judged by their significance.
     judged = score * np.sqrt(counts / counts.max())
     best = int(judged.argmax())
-    # A best lag beside those that are not considered is no peak.
+    # A best lag next to those that are not considered is no peak.
     if score[best] <= 0 or not 0 < best < len(score) - 1 or not np.isfinite(score[best - 1 : best + 2]).all():
         return None
-    shift = _vertex(score, best)
+    shift = float(np.clip(parabola_top(*score[best - 1 : best + 2], flat=0.0), -0.5, 0.5))
     sigma = _sigma(numerators, energy, best, first.step)
     rival = _rival(judged, best)
     overlap_start = max(first.start, second.start - seconds[best])
@@ -123,7 +123,7 @@ def best_lag(
 def lag_changes(first: Signal, second: Signal, lag_seconds: float, edges: Floats) -> Floats:
     """By how much the lag of the largest correlation grows without each block of the take, ``[K]`` seconds.
 
-    Blocks that all pairs of cameras share tell errors that all pairs of a camera share: of things that move for less
+    Blocks that all pairs of cameras share show errors that all pairs of a camera share: of things that move for less
     than a frame one camera's frames see other parts than another's. Leaving out channels does not show these.
 
     Args:
@@ -147,10 +147,7 @@ def lag_changes(first: Signal, second: Signal, lag_seconds: float, edges: Floats
     without = np.concatenate([whole, whole - sums], axis=2)  # all blocks, and all but each
     energy = np.sqrt(np.maximum(without[:, 1] * without[:, 2], 0.0))
     score = without[:, 0] / np.where(energy > 0, energy, np.inf)
-    curvature = score[0] - 2 * score[1] + score[2]
-    peaked = curvature < 0
-    top = np.clip((score[0] - score[2]) / np.where(peaked, 2 * curvature, 1.0), -1, 1)
-    top = np.where(peaked, top, 1.0)  # without a peak it may be anywhere
+    top = np.clip(parabola_top(*score, flat=1.0), -1, 1)  # without a peak it may be anywhere
     return (top[1:] - top[0]) * first.step
 
 
@@ -170,7 +167,7 @@ def chance_deviation(first: Signal, second: Signal) -> float:
 
 
 def _scores(
-    first: Signal, second: Signal, least: int
+    first: Signal, second: Signal, min_overlap: int
 ) -> tuple[Floats, Floats, Floats, NDArray[np.intp], NDArray[np.intp]]:
     """For each lag: correlation, its numerator by channel, energy, number of samples; and the lags."""
     from scipy.fft import irfft, next_fast_len, rfft
@@ -191,7 +188,9 @@ def _scores(
     energy_y = (squares_y - sums_y**2 / counts[:, None]).sum(1)
     energy = np.sqrt(np.maximum(energy_x * energy_y, 0.0))
     # Where hardly anything happens in an overlap, noise would agree with noise.
-    enough = (counts >= least) & (energy_x > 0.02 * energy_x.max()) & (energy_y > 0.02 * energy_y.max()) & (energy > 0)
+    enough = (
+        (counts >= min_overlap) & (energy_x > 0.02 * energy_x.max()) & (energy_y > 0.02 * energy_y.max()) & (energy > 0)
+    )
     score = np.where(enough, numerators.sum(1) / np.where(energy > 0, energy, 1.0), -np.inf)
     return score, numerators, energy, counts, lags
 
@@ -204,13 +203,13 @@ def _sums(values: Floats, starts: NDArray[np.intp], ends: NDArray[np.intp]) -> t
     return totals[ends] - totals[starts], squares[ends] - squares[starts]
 
 
-def _vertex(score: Floats, best: int) -> float:
-    """Position of the top of the parabola through three scores, in steps from ``best``."""
-    left, middle, right = score[best - 1 : best + 2]
-    curvature = left - 2 * middle + right
-    if curvature >= 0:
-        return 0.0
-    return float(np.clip((left - right) / (2 * curvature), -0.5, 0.5))
+def parabola_top(left: ArrayLike, middle: ArrayLike, right: ArrayLike, *, flat: float) -> Floats:
+    """Where the parabola through three equidistant values has its top, in steps from the middle one; ``flat`` where it
+    has none."""
+    left, right = np.asarray(left), np.asarray(right)
+    curvature = np.asarray(left - 2 * np.asarray(middle) + right)
+    peaked = curvature < 0
+    return np.where(peaked, (left - right) / (2 * np.where(peaked, curvature, -1.0)), flat)
 
 
 def _rival(score: Floats, best: int) -> float:
@@ -236,7 +235,6 @@ def _sigma(numerators: Floats, energy: Floats, best: int, step: float) -> float:
     peaks = []
     for low, high in pairwise(bounds):
         rest = (total - numerators[near, low:high].sum(1)) / energy[near]
-        curvature = rest[0] - 2 * rest[1] + rest[2]
-        peaks.append(np.clip((rest[0] - rest[2]) / (2 * curvature), -1, 1) if curvature < 0 else 1.0)
+        peaks.append(np.clip(parabola_top(*rest, flat=1.0), -1, 1))
     spread = np.sqrt((groups - 1) * np.var(peaks))
     return float(max(spread, 0.01)) * step

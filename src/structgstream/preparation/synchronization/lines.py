@@ -3,10 +3,10 @@
 
 A take is cut into blocks of time that all pairs of cameras share. In each block the cross-correlation near the expected
 lag is compared with what the signals' own autocorrelation, moved by a lag, would give; the lag changes in proportion to
-time, and all blocks are fitted together by least squares. So a block in which little happens says little, and a block
-whose best lag alone would be off by half a frame (sharp events between two frames) does not decide.
+time, and all blocks are fitted together by least squares. So a block in which little happens has little weight, and a
+block whose best lag alone would be off by half a frame (sharp events between two frames) does not decide.
 
-What the fit becomes without each of the blocks tells its error (jackknife), even one that all pairs of a camera share.
+What the fit becomes without each of the blocks gives its error (jackknife), even one that all pairs of a camera share.
 """
 
 from dataclasses import dataclass
@@ -15,14 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.preparation.synchronization.correlation import Signal
+from structgstream.data.arrays import Floats
+from structgstream.preparation.synchronization.correlation import Signal, parabola_top
 
-Floats = NDArray[np.float64]
-
-MOST_RATE = 2e-3  # between two clocks; 29.97 and 30 frames a second taken for each other are 1e-3
+MAX_RATE = 2e-3  # between two clocks; 29.97 and 30 frames a second taken for each other are 1e-3
 RATE_STEP, LAG_STEP = 1e-4, 0.05  # of the search; lags in samples
 NEAR_SAMPLES = 2  # on both sides of the expected lag
-LEAST_ENERGY = 0.05  # of a block, of the mean one: below it is no more reliable
+MIN_ENERGY = 0.05  # of a block, of the mean one: below it is no more reliable
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,7 @@ class Line:
     Args:
         middle: second by the first signal's time at which the lag is ``lag_seconds``.
         lag_seconds: time in the second signal minus time in the first.
-        rate: change of the lag a second; None where the signals do not tell.
+        rate: change of the lag a second; None where the signals do not determine it.
         spread_seconds: standard deviation of the blocks' times.
         lag_changes: ``[K]`` seconds, change of the lag without each of the blocks.
         rate_changes: ``[K]``, that of the rate.
@@ -81,28 +80,28 @@ def fitted_line(
         rates: whether the lag may change.
     """
     half = (edges[-1] - edges[0]) / 2
-    reach = NEAR_SAMPLES + (round(MOST_RATE * half / first.step) if rates else 0)
+    reach = NEAR_SAMPLES + (round(MAX_RATE * half / first.step) if rates else 0)
     blocks = _blocks(first, second, expected_seconds, edges, reach + 2)
     if blocks is None:
         return None
     count, step = len(edges) - 1, first.step
     middle = float(blocks.times.mean())
-    tried = np.arange(-MOST_RATE, MOST_RATE + RATE_STEP / 2, RATE_STEP) if rates else np.zeros(1)
+    tried = np.arange(-MAX_RATE, MAX_RATE + RATE_STEP / 2, RATE_STEP) if rates else np.zeros(1)
     lags = np.arange(-NEAR_SAMPLES, NEAR_SAMPLES + LAG_STEP / 2, LAG_STEP)
     gains = _gains(blocks, (blocks.times - middle) / step, tried, lags, reach)
     best = _best(gains, np.arange(len(blocks.times)), tried, lags)
     without = np.array(
         [_best(gains, np.delete(np.arange(len(blocks.times)), k), tried, lags) for k in range(len(blocks.times))]
     )
-    told = len(tried) > 1 and bool(np.abs([best[1], *without[:, 1]]).max() < MOST_RATE - RATE_STEP)
-    if not told and len(tried) > 1:
+    has_rate = len(tried) > 1 and bool(np.abs([best[1], *without[:, 1]]).max() < MAX_RATE - RATE_STEP)
+    if not has_rate and len(tried) > 1:
         return fitted_line(first, second, expected_seconds=expected_seconds, edges=edges, rates=False)
     changes = np.zeros((count, 2))
     changes[blocks.numbers] = without - best
     return Line(
         middle,
         blocks.lag_seconds + best[0] * step,
-        best[1] if told else None,
+        best[1] if has_rate else None,
         float(blocks.times.std()),
         changes[:, 0] * step,
         changes[:, 1],
@@ -138,11 +137,11 @@ def _blocks(first: Signal, second: Signal, expected: float, edges: Floats, reach
         return None
     own = own_x * np.sqrt(energy_y / energy_x) + own_y * np.sqrt(energy_x / energy_y)
     own = (own + own[:, ::-1]) / 4
-    kept = np.flatnonzero((counts > 0) & (own[:, reach] > 1e-3 * own[:, reach].max()))
-    if len(kept) < 3:
+    used = np.flatnonzero((counts > 0) & (own[:, reach] > 1e-3 * own[:, reach].max()))
+    if len(used) < 3:
         return None
-    middles = np.bincount(block[inside], times[inside], minlength=len(edges) - 1)[kept] / counts[kept]
-    return _Blocks(cross[kept] / 2, own[kept], middles, kept, second.start + shift * second.step - first.start)
+    middles = np.bincount(block[inside], times[inside], minlength=len(edges) - 1)[used] / counts[used]
+    return _Blocks(cross[used] / 2, own[used], middles, used, second.start + shift * second.step - first.start)
 
 
 def _gains(blocks: _Blocks, times: Floats, rates: Floats, lags: Floats, reach: int) -> Floats:
@@ -153,21 +152,21 @@ def _gains(blocks: _Blocks, times: Floats, rates: Floats, lags: Floats, reach: i
     top: sharp events make it, and noise, which the other signal does not have. Both are interpolated linearly, as the
     correlation of events is which fall on one of two frames. Blocks have the weight that makes their noise equal.
     """
-    most = blocks.own.shape[1] // 2
-    energy = blocks.own[:, most]
-    weights = 1 / np.maximum(energy, LEAST_ENERGY * energy.mean())
+    middle_lag = blocks.own.shape[1] // 2
+    energy = blocks.own[:, middle_lag]
+    weights = 1 / np.maximum(energy, MIN_ENERGY * energy.mean())
     seen = np.arange(-reach, reach + 1)
-    first, second = blocks.own[:, most + 1], blocks.own[:, most + 2]
+    first, second = blocks.own[:, middle_lag + 1], blocks.own[:, middle_lag + 2]
     smooth = blocks.own.copy()
-    smooth[:, most] = np.clip((4 * first - second) / 3, np.minimum(first, energy), energy)  # a parabola's top
+    smooth[:, middle_lag] = np.clip((4 * first - second) / 3, np.minimum(first, energy), energy)  # a parabola's top
     sums = np.empty((5, len(times), len(rates), len(lags)))
     for k, time in enumerate(times):
-        place = np.clip(seen[:, None, None] - lags - rates[:, None] * time + most, 0, 2 * most - 1e-9)
+        place = np.clip(seen[:, None, None] - lags - rates[:, None] * time + middle_lag, 0, 2 * middle_lag - 1e-9)
         left = place.astype(int)
         share = place - left
         wide = smooth[k][left] * (1 - share) + smooth[k][left + 1] * share
-        peak = (energy[k] - smooth[k, most]) * np.maximum(1 - np.abs(place - most), 0)
-        cross = blocks.cross[k][seen + most]
+        peak = (energy[k] - smooth[k, middle_lag]) * np.maximum(1 - np.abs(place - middle_lag), 0)
+        cross = blocks.cross[k][seen + middle_lag]
         products = np.tensordot(cross, wide, 1), np.tensordot(cross, peak, 1)
         sums[:, k] = weights[k] * np.stack([*products, (wide**2).sum(0), (wide * peak).sum(0), (peak**2).sum(0)])
     return sums
@@ -198,9 +197,7 @@ def _top(values: Floats, best: int, places: Floats) -> float:
     """Place of the top of the parabola around the best value; the best place at an end."""
     if not 0 < best < len(values) - 1:
         return float(places[best])
-    left, middle, right = values[best - 1 : best + 2]
-    curvature = left - 2 * middle + right
-    shift = (left - right) / (2 * curvature) if curvature < 0 else 0.0
+    shift = float(parabola_top(*values[best - 1 : best + 2], flat=0.0))
     return float(places[best] + shift * (places[1] - places[0]))
 
 

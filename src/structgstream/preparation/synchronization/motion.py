@@ -2,9 +2,9 @@
 """Instants that pairs of cameras share, from what moves in their pictures.
 
 Without geometry the activity of whole pictures is compared, which is good to a frame where enough happens. With
-epipolar geometry signals of corresponding lines are compared (``epipolar.py``), which is good to a tenth of a frame
-for one pair. A first round considers all lags; the second one looks near those that most pairs agree on, and, in takes
-that are long enough, for drift.
+epipolar geometry signals of corresponding lines are compared (``motion_signals.py``), which is good to a tenth of a
+frame for one pair. A first round considers all lags; the second one looks near those that most pairs agree on, and, in
+takes that are long enough, for drift.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,8 +14,9 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.matching import connected_groups
+from structgstream.data.timeline import period_seconds
 from structgstream.errors import CaptureError
-from structgstream.preparation.synchronization.changes import Changes
 from structgstream.preparation.synchronization.correlation import (
     Signal,
     best_lag,
@@ -23,24 +24,26 @@ from structgstream.preparation.synchronization.correlation import (
     lag_changes,
     resampled,
 )
-from structgstream.preparation.synchronization.epipolar import Geometry, line_signals
 from structgstream.preparation.synchronization.lines import Line, fitted_line
-from structgstream.preparation.synchronization.solving import Solution, Tie, connected, solve_clocks
-from structgstream.preparation.synchronization.streams import period_seconds
+from structgstream.preparation.synchronization.motion_signals import Changes, Geometry, line_signals
+from structgstream.preparation.synchronization.solving import Solution, TimeCorrespondence, camera_pairs, solve_clocks
 
-LEAST_SAMPLES = 6  # that two views must have in common, in frames
-LEAST_OVERLAP = 0.2  # of the shorter take
-LEAST_PEAK = 0.25  # correlation of views that see the same
+MIN_SAMPLES = 6  # that two views must have in common, in frames
+MIN_OVERLAP = 0.2  # of the shorter take
+MIN_PEAK = 0.25  # correlation of views that see the same
 # Of activities, and of lines whose geometry is an estimate from few features, a peak must stand out more.
 CHANCE_DEVIATIONS = 4.5
 ESTIMATED_PEAK, CONTROL_RATIO = 0.5, 1.2
 RIVAL_RATIO = 0.9  # another lag that is nearly as good makes a pair ambiguous
-LEAST_SUPPORT = 0.3  # share of a camera's pairs that agree with its clock
-LEAST_DRIFT_SECONDS = 6.0  # of the take, from which on drift is looked for
-BLOCK_SECONDS, MOST_BLOCKS = 1.0, 12
-NEAR_BLOCKS, NEAR_SAMPLES = 6, 8  # most blocks of shorter takes, left out one by one, and least samples of each
+MIN_SUPPORT = 0.3  # share of a camera's pairs that agree with its clock
+MIN_DRIFT_SECONDS = 6.0  # of the take, from which on drift is looked for
+BLOCK_SECONDS, MAX_BLOCKS = 1.0, 12
+NEAR_BLOCKS, NEAR_SAMPLES = (
+    6,
+    8,
+)  # largest number of blocks of shorter takes, left out one by one, and smallest number of samples of each
 NEAR_PERIODS = 2.0
-LEAST_LINE_SIGMA = 0.02  # periods: few blocks may agree by chance
+MIN_LINE_SIGMA = 0.02  # periods: few blocks may agree by chance
 # Standard deviation of a camera's own error, that all its pairs share because views see different parts of what moves;
 # in periods, with a known geometry, with one from static features, and by activities.
 BIAS_PERIODS, ESTIMATED_BIAS_PERIODS, ACTIVITY_BIAS_PERIODS = 0.06, 0.3, 1.0
@@ -80,27 +83,27 @@ def pair_signals(changes: Mapping[str, Changes], geometry: Geometry | None) -> l
     return found
 
 
-def motion_ties(pairs: Sequence[PairSignals], *, near: Solution | None = None) -> list[Tie]:
-    """Ties from signals of pairs.
+def motion_correspondences(pairs: Sequence[PairSignals], *, near: Solution | None = None) -> list[TimeCorrespondence]:
+    """Time correspondences from signals of pairs.
 
     Args:
         pairs: what :func:`pair_signals` gives.
         near: clocks near which lags and drift are looked for; None looks at all lags.
     """
     if near is None:
-        return [tie for pair in pairs for tie in _whole(pair)]
+        return [match for pair in pairs for match in _whole(pair)]
     bounds = [
         (near.offsets[pair.first] + pair.signals[0].start, near.offsets[pair.first] + pair.signals[0].end)
         for pair in pairs
     ]
     low, high = min(low for low, _ in bounds), max(high for _, high in bounds)
-    if high - low < LEAST_DRIFT_SECONDS:
+    if high - low < MIN_DRIFT_SECONDS:
         count = min(int((high - low) / max(pair.signals[0].step for pair in pairs)) // NEAR_SAMPLES, NEAR_BLOCKS)
         # Of a second, what is left without a block has no peak of its own.
         edges = np.linspace(low, high, count + 1) if count > 2 else None
-        return [tie for pair in pairs for tie in _near(pair, near, edges)]
-    edges = np.linspace(low, high, min(int((high - low) / BLOCK_SECONDS), MOST_BLOCKS) + 1)
-    return [tie for pair in pairs for tie in _along(pair, near, edges)]
+        return [match for pair in pairs for match in _near(pair, near, edges)]
+    edges = np.linspace(low, high, min(int((high - low) / BLOCK_SECONDS), MAX_BLOCKS) + 1)
+    return [match for pair in pairs for match in _along(pair, near, edges)]
 
 
 def solve_by_motion(
@@ -120,11 +123,11 @@ def solve_by_motion(
     group, coarse, good = agreeing_cameras(takes, pairs, slack_seconds=slack_seconds)
     if coarse is None or len(group) < len(takes):
         seconds = min(end - start for start, end in takes.values())
-        raise CaptureError(_apart([name for name in takes if name not in group], group, seconds))
-    ties = motion_ties(good, near=coarse)
-    if len(connected(list(takes), ties)) > 1:  # too little is left near the clocks of the first round
-        ties = motion_ties(good)
-    solution = solve_clocks(takes, ties, drift=drift, slack_seconds=slack_seconds)
+        raise CaptureError(_unconnected([name for name in takes if name not in group], group, seconds))
+    matches = motion_correspondences(good, near=coarse)
+    if len(connected_groups(takes, camera_pairs(matches))) > 1:  # too little is left near the clocks of the first round
+        matches = motion_correspondences(good)
+    solution = solve_clocks(takes, matches, drift=drift, slack_seconds=slack_seconds)
     errors = {
         name: float(np.hypot(solution.sigmas[name], _bias(name, good) * 2 * slack_seconds)) for name in solution.sigmas
     }
@@ -136,19 +139,19 @@ def agreeing_cameras(
 ) -> tuple[tuple[str, ...], Solution | None, list[PairSignals]]:
     """The largest group of cameras whose motion agrees, its clocks by whole takes, and the pairs that agree with
     these."""
-    ties = motion_ties(pairs)
-    group = connected(list(takes), ties)[0]
+    matches = motion_correspondences(pairs)
+    group = connected_groups(takes, camera_pairs(matches))[0]
     solution = None
     good: list[PairSignals] = []
     while len(group) > 1:
-        inside = [tie for tie in ties if tie.first in group and tie.second in group]
+        inside = [match for match in matches if match.first in group and match.second in group]
         own = {name: takes[name] for name in group}
         solution = solve_clocks(own, inside, drift=False, slack_seconds=slack_seconds)
-        agreeing = [tie for tie, agrees in zip(inside, solution.agreeing, strict=True) if agrees]
-        supported = [tie for tie in agreeing if _supported(tie, inside, agreeing)]
-        names = {(tie.first, tie.second) for tie in supported}
+        agreeing = [match for match, agrees in zip(inside, solution.agreeing, strict=True) if agrees]
+        supported = [match for match in agreeing if _supported(match, inside, agreeing)]
+        names = {(match.first, match.second) for match in supported}
         good = [pair for pair in pairs if (pair.first, pair.second) in names]
-        smaller = connected(list(group), supported)[0]
+        smaller = connected_groups(group, camera_pairs(supported))[0]
         if len(smaller) == len(group):
             return group, solution, good
         group = smaller
@@ -163,51 +166,55 @@ def _bias(name: str, pairs: Sequence[PairSignals]) -> float:
     return ESTIMATED_BIAS_PERIODS if any(pair.epipolar for pair in own) else ACTIVITY_BIAS_PERIODS
 
 
-def _supported(tie: Tie, ties: Sequence[Tie], agreeing: Sequence[Tie]) -> bool:
+def _supported(
+    match: TimeCorrespondence,
+    matches: Sequence[TimeCorrespondence],
+    agreeing: Sequence[TimeCorrespondence],
+) -> bool:
     """Whether enough pairs of both cameras agree with their clocks, so that it is no chance."""
-    for name in (tie.first, tie.second):
-        all_, own = (sum(name in (each.first, each.second) for each in some) for some in (ties, agreeing))
-        if own < LEAST_SUPPORT * all_ or (own == 1 and all_ > 1):
+    for name in (match.first, match.second):
+        all_, own = (sum(name in (each.first, each.second) for each in some) for some in (matches, agreeing))
+        if own < MIN_SUPPORT * all_ or (own == 1 and all_ > 1):
             return False
     return True
 
 
-def _apart(apart: Sequence[str], group: Sequence[str], seconds: float) -> str:
-    names = ", ".join(repr(name) for name in apart)
-    others = f"the cameras {', '.join(repr(name) for name in group)}" if len(group) > 1 else "any other camera"
+def _unconnected(others: Sequence[str], group: Sequence[str], seconds: float) -> str:
+    names = ", ".join(repr(name) for name in others)
+    rest = f"the cameras {', '.join(repr(name) for name in group)}" if len(group) > 1 else "any other camera"
     return (
-        f"What moves before {names} cannot be recognised in the motion before {others}, so their clocks are not "
+        f"What moves before {names} cannot be recognised in the motion before {rest}, so their clocks are not "
         f"connected; the shortest take has {seconds:.1f} s: film ten seconds of motion that all see (a person who "
         "walks and claps), give the calibration, or synchronise by audio or timestamps.csv."
     )
 
 
-def _whole(pair: PairSignals) -> list[Tie]:
+def _whole(pair: PairSignals) -> list[TimeCorrespondence]:
     one, other = pair.signals
-    least = max(LEAST_SAMPLES, round(LEAST_OVERLAP * min(len(one.values), len(other.values))))
-    lag = best_lag(one, other, least_overlap=least)
-    if lag is None or lag.peak < LEAST_PEAK or lag.rival > RIVAL_RATIO * lag.judged:
+    min_overlap = max(MIN_SAMPLES, round(MIN_OVERLAP * min(len(one.values), len(other.values))))
+    lag = best_lag(one, other, min_overlap=min_overlap)
+    if lag is None or lag.peak < MIN_PEAK or lag.rival > RIVAL_RATIO * lag.judged:
         return []
     if not pair.epipolar and lag.judged < CHANCE_DEVIATIONS * chance_deviation(one, other):
         return []
-    if pair.estimated and (lag.peak < ESTIMATED_PEAK or lag.judged < CONTROL_RATIO * _control(pair, least)):
+    if pair.estimated and (lag.peak < ESTIMATED_PEAK or lag.judged < CONTROL_RATIO * _control(pair, min_overlap)):
         return []
-    return [_tie(pair, lag.middle, lag.seconds, lag.sigma_seconds, lag.judged / max(lag.rival, 0.1))]
+    return [_match(pair, lag.middle, lag.seconds, lag.sigma_seconds, lag.judged / max(lag.rival, 0.1))]
 
 
-def _control(pair: PairSignals, least: int) -> float:
+def _control(pair: PairSignals, min_overlap: int) -> float:
     """The best correlation when lines are paired wrongly: a right geometry does better than that."""
     one, other = pair.signals
     half = other.values.shape[1] // 2
     wrong = (other.values[:, ::-1], np.roll(other.values, half, 1), np.roll(other.values[:, ::-1], half, 1))
-    lags = [best_lag(one, replace(other, values=values), least_overlap=least) for values in wrong]
+    lags = [best_lag(one, replace(other, values=values), min_overlap=min_overlap) for values in wrong]
     return max((lag.judged for lag in lags if lag is not None), default=0.0)
 
 
-def _near(pair: PairSignals, near: Solution, edges: NDArray[np.float64] | None) -> list[Tie]:
-    """The tie of a whole take near known clocks.
+def _near(pair: PairSignals, near: Solution, edges: NDArray[np.float64] | None) -> list[TimeCorrespondence]:
+    """The correspondence of a whole take near known clocks.
 
-    Where there are blocks it says how it changes without each of them and with the shapes of ``lines.py``: an event
+    Where there are blocks it has its changes without each of them and with the shapes of ``lines.py``: an event
     that is shorter than a frame lies on one of two frames, so that the peak of few such events is that of the majority,
     whichever block is left out.
     """
@@ -216,42 +223,42 @@ def _near(pair: PairSignals, near: Solution, edges: NDArray[np.float64] | None) 
     reach = NEAR_PERIODS * one.step
     start, end = max(one.start, other.start - expected), min(one.end, other.end - expected)
     cut = one.cut(start, end), other.cut(start + expected - reach, end + expected + reach)
-    if min(len(signal.values) for signal in cut) < LEAST_SAMPLES:
+    if min(len(signal.values) for signal in cut) < MIN_SAMPLES:
         return []
-    least = max(LEAST_SAMPLES, round(0.8 * len(cut[0].values) - 2 * NEAR_PERIODS))
-    lag = best_lag(*cut, within=(expected - reach, expected + reach), least_overlap=least)
-    if lag is None or lag.peak < LEAST_PEAK or abs(lag.seconds - expected) >= reach - one.step / 2:
+    min_overlap = max(MIN_SAMPLES, round(0.8 * len(cut[0].values) - 2 * NEAR_PERIODS))
+    lag = best_lag(*cut, within=(expected - reach, expected + reach), min_overlap=min_overlap)
+    if lag is None or lag.peak < MIN_PEAK or abs(lag.seconds - expected) >= reach - one.step / 2:
         return []
-    tie = _tie(pair, lag.middle, lag.seconds, lag.sigma_seconds, lag.peak)
+    match = _match(pair, lag.middle, lag.seconds, lag.sigma_seconds, lag.peak)
     if edges is None:
-        return [tie]
+        return [match]
     own = edges - near.offsets[pair.first]
     line = fitted_line(one, other, expected_seconds=expected, edges=own, rates=False)
-    apart = 0.0 if line is None else line.lag_seconds - lag.seconds
-    return [replace(tie, changes=(*lag_changes(*cut, lag.seconds, own).tolist(), apart))]
+    difference = 0.0 if line is None else line.lag_seconds - lag.seconds
+    return [replace(match, changes=(*lag_changes(*cut, lag.seconds, own).tolist(), difference))]
 
 
-def _along(pair: PairSignals, near: Solution, edges: NDArray[np.float64]) -> list[Tie]:
-    """Two ties that say what a line of lags over the take says: they are apart by as much as its blocks, so that their
-    errors are independent; one where the take does not tell the drift."""
+def _along(pair: PairSignals, near: Solution, edges: NDArray[np.float64]) -> list[TimeCorrespondence]:
+    """Two correspondences for a line of lags over the take: they are apart by as much as its blocks, so that their
+    errors are independent; one where the take does not determine the drift."""
     one, other = pair.signals
     line = fitted_line(one, other, expected_seconds=_expected(pair, near), edges=edges - near.offsets[pair.first])
     if line is None:
         return []
-    least = LEAST_LINE_SIGMA * one.step if pair.epipolar else one.step / 2
-    sigma = max(line.lag_sigma, least)
+    min_overlap = MIN_LINE_SIGMA * one.step if pair.epipolar else one.step / 2
+    sigma = max(line.lag_sigma, min_overlap)
     if line.rate is None:
-        return [_line_tie(pair, line, 0.0, sigma)]
+        return [_line_match(pair, line, 0.0, sigma)]
     sigma = max(sigma, line.rate_sigma * line.spread_seconds)
-    return [_line_tie(pair, line, side * line.spread_seconds, 2**0.5 * sigma) for side in (-1.0, 1.0)]
+    return [_line_match(pair, line, side * line.spread_seconds, 2**0.5 * sigma) for side in (-1.0, 1.0)]
 
 
-def _line_tie(pair: PairSignals, line: Line, after: float, sigma: float) -> Tie:
+def _line_match(pair: PairSignals, line: Line, after: float, sigma: float) -> TimeCorrespondence:
     at = line.middle + after
     changes = line.lag_changes + after * line.rate_changes
     lag = line.lag_seconds + after * (line.rate or 0.0)
     weight = 4.0 if pair.epipolar else 1.0
-    return Tie(pair.first, pair.second, at, at + lag, sigma, weight, tuple(changes.tolist()))
+    return TimeCorrespondence(pair.first, pair.second, at, at + lag, sigma, weight, tuple(changes.tolist()))
 
 
 def _expected(pair: PairSignals, near: Solution) -> float:
@@ -259,6 +266,6 @@ def _expected(pair: PairSignals, near: Solution) -> float:
     return near.offsets[pair.first] - near.offsets[pair.second]
 
 
-def _tie(pair: PairSignals, middle: float, seconds: float, sigma: float, confidence: float) -> Tie:
+def _match(pair: PairSignals, middle: float, seconds: float, sigma: float, confidence: float) -> TimeCorrespondence:
     weight = confidence * (4.0 if pair.epipolar else 1.0)
-    return Tie(pair.first, pair.second, middle, middle + seconds, OPTIMISM * sigma, weight)
+    return TimeCorrespondence(pair.first, pair.second, middle, middle + seconds, OPTIMISM * sigma, weight)

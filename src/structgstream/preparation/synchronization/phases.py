@@ -2,7 +2,7 @@
 """The lag of two sounds where the phases of their spectra agree (GCC-PHAT: Knapp and Carter, 1976).
 
 Echoes agree, too: where a room is louder than the direct sound, the highest peak may be one of echoes, in all windows
-alike. How high other peaks are tells how likely that is.
+alike. The height of other peaks gives the probability of that.
 """
 
 from dataclasses import dataclass
@@ -10,13 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from structgstream.data.arrays import Floats
+from structgstream.preparation.synchronization.correlation import parabola_top
 
 WINDOW_SECONDS = 2
 LOW_HERTZ, HIGH_HERTZ = 150.0, 8000.0
 GRID_HERTZ = 96000  # of the correlation
 REACH_SECONDS = 0.008  # on both sides of the expected lag
-LEAST_STANDING_OUT = 6.0  # of a peak, over the root mean square of the correlation
+MIN_STANDING_OUT = 6.0  # of a peak, over the root mean square of the correlation
 SMOOTHING_BINS = 101  # over which spectra are made white
 OTHER_SECONDS = 3e-4  # from the best peak, from where on a peak is another one
 RIVAL_POWER = 6  # of a peak's share of the best one: how likely it is the right one instead
@@ -24,7 +25,7 @@ RIVAL_POWER = 6  # of a peak's share of the best one: how likely it is the right
 
 @dataclass(frozen=True)
 class Window:
-    """What a window says.
+    """The lag of one window.
 
     Args:
         middle: its second by the first camera's clock.
@@ -65,10 +66,9 @@ def phase_window(one: Recording, other: Recording, middle: float, lag: float) ->
     reach = round(REACH_SECONDS * GRID_HERTZ)
     near = np.concatenate([curve[-reach:], curve[: reach + 1]]) / level
     best = int(near.argmax())
-    if not 0 < best < len(near) - 1 or near[best] < LEAST_STANDING_OUT:
+    if not 0 < best < len(near) - 1 or near[best] < MIN_STANDING_OUT:
         return None
-    left, top, right = near[best - 1 : best + 2]
-    vertex = (left - right) / (2 * (left - 2 * top + right))
+    vertex = float(parabola_top(*near[best - 1 : best + 2], flat=0.0))
     seconds = lag + (best - reach + vertex) / GRID_HERTZ + shift_second - shift_first
     moved = np.zeros_like(near)
     low, high = max(0, best - reach), min(len(near), best + reach + 1)
@@ -79,7 +79,7 @@ def phase_window(one: Recording, other: Recording, middle: float, lag: float) ->
 def ambiguity_seconds(windows: list[Window]) -> float:
     """Standard deviation of the lag that windows agree on, by the other peaks of the sum of their curves.
 
-    Each peak is as likely the right one as a power of its share of the best one says.
+    The probability of each peak is a power of its height relative to the best one.
     """
     total = np.sum([window.curve for window in windows], axis=0)
     middle = len(total) // 2
@@ -99,7 +99,7 @@ def _whitened(spectrum: NDArray[np.complex128]) -> NDArray[np.complex128]:
 
 
 def _spectrum(sound: Recording, middle: float) -> tuple[NDArray[np.complex128], float] | None:
-    """Spectrum, zero padded to twice the window, and by how many seconds the window starts later than asked for."""
+    """Spectrum, zero padded to twice the window, and by how many seconds the window starts later than requested."""
     from scipy.fft import rfft
 
     length = round(WINDOW_SECONDS * sound.rate)

@@ -8,10 +8,9 @@ from itertools import combinations
 import numpy as np
 
 from structgstream.data.arrays import Floats
-from structgstream.data.instants import counted_rate
-from structgstream.data.timeline import Clock
+from structgstream.data.calibration import listed
+from structgstream.data.timeline import Clock, counted_rate, period_seconds
 from structgstream.errors import CaptureError
-from structgstream.preparation.synchronization.streams import period_seconds
 
 WARNED_SECONDS = 5e-3
 
@@ -66,21 +65,23 @@ def synchronization(
         CaptureError: two cameras have no instant in common.
     """
     common = {name: clocks[name].common_seconds(own) for name, own in stamps.items()}
-    _demand_overlap(common)
-    left = frame_residuals(common)
-    estimates = {name: ClockEstimate(clocks[name], method, float(uncertainties[name]), left[name]) for name in stamps}
-    late = [name for name in stamps if abs(left[name]) > WARNED_SECONDS]
+    _require_overlap(common)
+    residuals = frame_residuals(common)
+    estimates = {
+        name: ClockEstimate(clocks[name], method, float(uncertainties[name]), residuals[name]) for name in stamps
+    }
+    late = [name for name in stamps if abs(residuals[name]) > WARNED_SECONDS]
     if late:
-        worst = max(late, key=lambda name: abs(left[name]))
+        worst = max(late, key=lambda name: abs(residuals[name]))
         warnings += (
-            f"Nearest frames of {_listed(late)} are up to {abs(left[worst]) * 1e3:.1f} ms off the common instants "
-            f"(camera {worst!r}): what moves fast is seen elsewhere there. Cameras that start by one signal have no "
-            "such rest.",
+            f"Nearest frames of {listed(late, 8)} are up to {abs(residuals[worst]) * 1e3:.1f} ms off the common "
+            f"instants (camera {worst!r}): what moves fast is seen elsewhere there. Cameras that start by one signal "
+            "have no such rest.",
         )
     vague = [name for name in stamps if uncertainties[name] > period_seconds(stamps[name]) / 4]
     if vague:
         warnings += (
-            f"The clocks of {_listed(vague)} are known to {max(uncertainties[name] for name in vague) * 1e3:.0f} ms "
+            f"The clocks of {listed(vague, 8)} are known to {max(uncertainties[name] for name in vague) * 1e3:.0f} ms "
             "only, so a frame may be wrong by one.",
         )
     return Synchronization(estimates, method, reason, warnings)
@@ -100,7 +101,7 @@ def frame_residuals(common: Mapping[str, Floats]) -> dict[str, float]:
     phase = float(np.angle(np.sum(turns))) / (2 * np.pi) * period
     first = np.ceil((start - phase) / period - 0.5)
     instants = phase + period * np.arange(first, first + max(int((end - start) / period), 1))
-    left = {}
+    residuals = {}
     for name, times in common.items():
         nearest = np.clip(np.searchsorted(times, instants), 1, len(times) - 1) if len(times) > 1 else np.zeros(1, int)
         before = np.maximum(nearest - 1, 0)
@@ -108,16 +109,16 @@ def frame_residuals(common: Mapping[str, Floats]) -> dict[str, float]:
         late = times[chosen] - instants
         # A frame that a camera lacks is absent, not late.
         late = late[np.abs(late) <= period / 2 + 1e-9]
-        left[name] = float(late[np.abs(late).argmax()]) if len(late) else 0.0
-    return left
+        residuals[name] = float(late[np.abs(late).argmax()]) if len(late) else 0.0
+    return residuals
 
 
 def _inside(times: Floats, start: float, end: float) -> Floats:
-    kept = times[(times >= start - 1e-9) & (times <= end + 1e-9)]
-    return kept if len(kept) else times
+    inside = times[(times >= start - 1e-9) & (times <= end + 1e-9)]
+    return inside if len(inside) else times
 
 
-def _demand_overlap(common: Mapping[str, Floats]) -> None:
+def _require_overlap(common: Mapping[str, Floats]) -> None:
     for first, second in combinations(common, 2):
         one, other = common[first], common[second]
         if one[-1] < other[0] or other[-1] < one[0]:
@@ -126,12 +127,3 @@ def _demand_overlap(common: Mapping[str, Floats]) -> None:
                 f"no instant in common: their clocks are {abs(one[0] - other[0]):.2f} s apart, more than the shorter "
                 "video is long. Give videos of one take, all running before it begins."
             )
-
-
-def _listed(names: list[str]) -> str:
-    shown = ", ".join(repr(name) for name in names[:8])
-    return (
-        ("camera " if len(names) == 1 else "cameras ")
-        + shown
-        + (f" and {len(names) - 8} more" if len(names) > 8 else "")
-    )

@@ -1,30 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """Clocks of all cameras from instants that pairs of cameras share.
 
-A tie says that the second ``first_seconds`` of one camera's clock was the second ``second_seconds`` of another's. With
-``common = offset + rate * stamp`` it is linear in both clocks, so all ties are solved by one weighted least squares.
-Wrong ties do not agree around loops of cameras: a start is chosen among spanning trees of the graph of cameras by how
-many ties it explains, and the weights are those of Tukey's biweight (iteratively reweighted least squares).
+A time correspondence states that second ``first_seconds`` of one camera's clock was second ``second_seconds`` of
+another's. With ``common = offset + rate * stamp`` it is linear in both clocks, so all of them are solved by one
+weighted least squares. Wrong ones do not agree around loops of cameras: a start is chosen among spanning trees of the
+graph of cameras by how many correspondences it explains, and the weights are those of Tukey's biweight (iteratively
+reweighted least squares).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
+from structgstream.data.matching import Pair
 
 TREES = 200
 ITERATIONS = 30
 # Standard deviation of rates: quartz clocks are within 1e-4, but 29.97 and 30 frames a second are 1e-3 apart.
 RATE_PRIOR = 5e-4
-RATE_SIGMAS, RATE_EFFECT_SECONDS = 3.0, 1e-3  # a rate other than 1 is kept if it exceeds both
-SIGMAS = 5.0  # ties further off than this many standard deviations are wrong
+RATE_SIGMAS, RATE_EFFECT_SECONDS = 3.0, 1e-3  # a rate other than 1 is taken if it exceeds both
+SIGMAS = 5.0  # correspondences further off than this many standard deviations are wrong
 
 
 @dataclass(frozen=True)
-class Tie:
+class TimeCorrespondence:
     """One instant by the clocks of two cameras.
 
     Args:
@@ -33,9 +35,9 @@ class Tie:
         first_seconds: the instant by the first camera's clock.
         second_seconds: the same instant by the second camera's.
         sigma_seconds: standard error of their difference.
-        confidence: how distinct the match is, larger is better; only orders ties.
+        confidence: how distinct the match is, larger is better; only orders correspondences.
         changes: by how much the second camera's second grows without each block of the take, the same blocks for all
-            ties; empty where it is not known. They tell errors that ties of a camera share.
+            correspondences; empty where it is not known. They show errors that those of a camera share.
     """
 
     first: str
@@ -49,15 +51,15 @@ class Tie:
 
 @dataclass(frozen=True)
 class Solution:
-    """Clocks that agree with most ties.
+    """Clocks that agree with most correspondences.
 
     Args:
         offsets: camera to seconds; the first camera's is 0.
         rates: camera to rate; the first camera's is 1.
         sigmas: camera to the standard error of its common time at the ends of its take, relative to the mean of all
             cameras.
-        agreeing: for each tie whether it agrees.
-        residuals: for each tie the difference of its two common times, seconds.
+        agreeing: for each correspondence whether it agrees.
+        residuals: for each correspondence the difference of its two common times, seconds.
     """
 
     offsets: Mapping[str, float]
@@ -69,8 +71,8 @@ class Solution:
 
 @dataclass(frozen=True)
 class _Graph:
-    """Ties as arrays; ``times`` are relative to the middle of each camera's take, ``changes`` ``[K, ties]`` are those
-    of the differences without each block."""
+    """Correspondences as arrays; ``times`` are relative to the middle of each camera's take, ``changes`` ``[K, M]`` are
+    those of the differences without each block."""
 
     first: NDArray[np.intp]
     second: NDArray[np.intp]
@@ -82,23 +84,14 @@ class _Graph:
     cameras: int
 
 
-def connected(cameras: Sequence[str], ties: Sequence[Tie]) -> tuple[tuple[str, ...], ...]:
-    """Groups of cameras that ties connect, the largest first."""
-    group = {name: {name} for name in cameras}
-    for tie in ties:
-        one, other = group[tie.first], group[tie.second]
-        if one is not other:
-            one |= other
-            for name in other:
-                group[name] = one
-    unique = {id(members): members for members in group.values()}
-    groups = [tuple(name for name in cameras if name in members) for members in unique.values()]
-    return tuple(sorted(groups, key=len, reverse=True))
+def camera_pairs(matches: Iterable[TimeCorrespondence]) -> list[Pair]:
+    """The cameras of each correspondence."""
+    return [(match.first, match.second) for match in matches]
 
 
 def solve_clocks(
     takes: Mapping[str, tuple[float, float]],
-    ties: Sequence[Tie],
+    matches: Sequence[TimeCorrespondence],
     *,
     drift: bool,
     slack_seconds: float,
@@ -107,15 +100,15 @@ def solve_clocks(
 
     Args:
         takes: camera to the first and last second of its take, by its own clock.
-        ties: instants of pairs; they must connect all cameras (:func:`connected`).
+        matches: instants of pairs; they must connect all cameras.
         drift: whether rates other than 1 are considered.
-        slack_seconds: how far right ties may be off before rates are known.
+        slack_seconds: how far right correspondences may be off before rates are known.
     """
     names = list(takes)
     middles = np.array([(start + end) / 2 for start, end in takes.values()])
     halves = np.array([(end - start) / 2 for start, end in takes.values()])
-    graph = _graph(names, ties, middles)
-    offsets = _consensus(graph, [tie.confidence for tie in ties], slack_seconds)
+    graph = _graph(names, matches, middles)
+    offsets = _consensus(graph, [match.confidence for match in matches], slack_seconds)
     corrections = np.zeros(len(names))
     free = np.zeros(len(names), bool)
     unknown = np.zeros(len(names))
@@ -137,16 +130,16 @@ def solve_clocks(
     )
 
 
-def _graph(names: list[str], ties: Sequence[Tie], middles: Floats) -> _Graph:
+def _graph(names: list[str], matches: Sequence[TimeCorrespondence], middles: Floats) -> _Graph:
     position = {name: index for index, name in enumerate(names)}
-    first = np.array([position[tie.first] for tie in ties], np.intp)
-    second = np.array([position[tie.second] for tie in ties], np.intp)
-    at_first = np.array([tie.first_seconds for tie in ties])
-    at_second = np.array([tie.second_seconds for tie in ties])
-    sigmas = np.array([tie.sigma_seconds for tie in ties])
-    changes = np.zeros((max((len(tie.changes) for tie in ties), default=0), len(ties)))
-    for number, tie in enumerate(ties):
-        changes[: len(tie.changes), number] = np.negative(tie.changes)
+    first = np.array([position[match.first] for match in matches], np.intp)
+    second = np.array([position[match.second] for match in matches], np.intp)
+    at_first = np.array([match.first_seconds for match in matches])
+    at_second = np.array([match.second_seconds for match in matches])
+    sigmas = np.array([match.sigma_seconds for match in matches])
+    changes = np.zeros((max((len(match.changes) for match in matches), default=0), len(matches)))
+    for number, match in enumerate(matches):
+        changes[: len(match.changes), number] = np.negative(match.changes)
     return _Graph(
         first,
         second,
@@ -160,42 +153,42 @@ def _graph(names: list[str], ties: Sequence[Tie], middles: Floats) -> _Graph:
 
 
 def _residuals(graph: _Graph, offsets: Floats, corrections: Floats) -> Floats:
-    """Common time by the first camera minus that by the second, for each tie."""
+    """Common time by the first camera minus that by the second, for each correspondence."""
     one = offsets[graph.first] + corrections[graph.first] * graph.first_times
     other = offsets[graph.second] + corrections[graph.second] * graph.second_times
     return one - other + graph.differences
 
 
 def _consensus(graph: _Graph, confidences: Sequence[float], slack_seconds: float) -> Floats:
-    """Offsets along the spanning tree that leaves the least truncated residuals.
+    """Offsets along the spanning tree that leaves the smallest truncated residuals.
 
-    The first tree takes ties by confidence, the others by confidence times a random factor.
+    The first tree takes correspondences by confidence, the others by confidence times a random factor.
     """
     generator = np.random.default_rng(0)
     reach = SIGMAS * np.hypot(graph.sigmas, slack_seconds / 2)
     share = np.array(confidences) / np.bincount(_pair_numbers(graph))[_pair_numbers(graph)]
-    best, least = np.zeros(graph.cameras), np.inf
+    best, best_cost = np.zeros(graph.cameras), np.inf
     for trial in range(TREES if len(graph.first) >= graph.cameras else 1):
         chance = generator.exponential(size=len(share)) if trial else np.ones(len(share))
         offsets = _along_tree(graph, np.argsort(-share * chance))
         off = np.abs(_residuals(graph, offsets, np.zeros(graph.cameras)))
         cost = float((share * np.minimum(off / reach, 1.0)).sum())
-        if cost < least:
-            best, least = offsets, cost
+        if cost < best_cost:
+            best, best_cost = offsets, cost
     return best
 
 
 def _along_tree(graph: _Graph, order: NDArray[np.intp]) -> Floats:
-    """Offsets that satisfy the ties of a spanning tree, taken greedily in ``order`` (Kruskal)."""
+    """Offsets that satisfy the correspondences of a spanning tree, taken greedily in ``order`` (Kruskal)."""
     group = np.arange(graph.cameras)
     offsets = np.zeros(graph.cameras)
-    for tie in order:
-        one, other = graph.first[tie], graph.second[tie]
+    for match in order:
+        one, other = graph.first[match], graph.second[match]
         if group[one] == group[other]:
             continue
         moved = group == group[other]
-        # The whole group of the second camera moves, so that ties that joined it stay satisfied.
-        offsets[moved] += offsets[one] + graph.differences[tie] - offsets[other]
+        # The whole group of the second camera moves, so that correspondences that joined it stay satisfied.
+        offsets[moved] += offsets[one] + graph.differences[match] - offsets[other]
         group[moved] = group[one]
     return offsets
 
@@ -203,9 +196,10 @@ def _along_tree(graph: _Graph, order: NDArray[np.intp]) -> Floats:
 def _reweighted(
     graph: _Graph, offsets: Floats, corrections: Floats, free: NDArray[np.bool_], slack_seconds: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Offsets, rate corrections of the cameras that are ``free``, weights of ties, and the covariance of both.
+    """Offsets, rate corrections of the cameras that are ``free``, weights of correspondences, and the covariance of
+    both.
 
-    The slack shrinks to the spread that the ties show.
+    The slack shrinks to the spread that the correspondences show.
     """
     slack = slack_seconds
     weights = np.ones(len(graph.first))
@@ -248,12 +242,12 @@ def _step(
     prior = np.concatenate([np.zeros(count), np.full(count, 1 / RATE_PRIOR**2)])
     normal += np.diag(prior)
     right -= prior * np.concatenate([np.zeros(count), corrections])
-    kept = np.flatnonzero(used)
-    inverse = np.linalg.pinv(normal[np.ix_(kept, kept)], rcond=1e-13, hermitian=True)
+    free_columns = np.flatnonzero(used)
+    inverse = np.linalg.pinv(normal[np.ix_(free_columns, free_columns)], rcond=1e-13, hermitian=True)
     moved, covariance = np.zeros(2 * count), np.zeros((2 * count, 2 * count))
-    moved[kept] = inverse @ right[kept]
-    shared = _shared(inverse @ (design * weights[:, None]).T[kept] @ graph.changes.T)
-    covariance[np.ix_(kept, kept)] = inverse * _inflation(graph, off, weights, scale) + shared
+    moved[free_columns] = inverse @ right[free_columns]
+    shared = _shared(inverse @ (design * weights[:, None]).T[free_columns] @ graph.changes.T)
+    covariance[np.ix_(free_columns, free_columns)] = inverse * _inflation(graph, off, weights, scale) + shared
     return moved, covariance
 
 
@@ -267,17 +261,17 @@ def _shared(changes: Floats) -> Floats:
 
 
 def _inflation(graph: _Graph, off: Floats, weights: Floats, scale: Floats) -> float:
-    """How much larger variances are than stated: the larger one of the reduced chi-squares of ties and of pairs, at
-    least 1.
+    """How much larger variances are than stated: the larger one of the reduced chi-squares of correspondences and of
+    pairs, at least 1.
 
-    Ties of one pair share its error (sound reaches both microphones by the same ways), so pairs are judged by their
-    means.
+    Correspondences of one pair share its error (sound reaches both microphones by the same ways), so pairs are judged
+    by their means.
     """
     inliers = weights > 0
-    ties, pairs = int(inliers.sum()), np.unique(_pair_numbers(graph)[inliers])
+    matches, pairs = int(inliers.sum()), np.unique(_pair_numbers(graph)[inliers])
     factor = 1.0
-    if ties > graph.cameras:
-        factor = max(factor, float(((off / scale)[inliers] ** 2).sum()) / (ties - graph.cameras + 1))
+    if matches > graph.cameras:
+        factor = max(factor, float(((off / scale)[inliers] ** 2).sum()) / (matches - graph.cameras + 1))
     if len(pairs) > graph.cameras - 1:
         numbers = _pair_numbers(graph)
         total = np.bincount(numbers, weights)[pairs]

@@ -4,13 +4,13 @@
 import logging
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.lenses import LensCamera
-from structgstream.data.timeline import Clock
+from structgstream.data.timeline import Clock, period_seconds
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.preparation.synchronization.audio import (
     SPEED_OF_SOUND,
@@ -20,30 +20,58 @@ from structgstream.preparation.synchronization.audio import (
     solve_by_audio,
     sound_of,
 )
-from structgstream.preparation.synchronization.changes import Changes, picture_changes
-from structgstream.preparation.synchronization.correlation import demand_scipy
-from structgstream.preparation.synchronization.epipolar import (
-    CalibratedGeometry,
-    Geometry,
-    StaticGeometry,
-    static_features,
-)
+from structgstream.preparation.synchronization.correlation import require_scipy
 from structgstream.preparation.synchronization.motion import (
     pair_signals,
     solve_by_motion,
 )
+from structgstream.preparation.synchronization.motion_signals import (
+    CalibratedGeometry,
+    Changes,
+    Geometry,
+    StaticGeometry,
+    picture_changes,
+    static_features,
+)
 from structgstream.preparation.synchronization.result import Synchronization, synchronization
-from structgstream.preparation.synchronization.streams import StatesMetadata, Streams, period_seconds
-from structgstream.preparation.synchronization.timestamps import read_timestamps
-from structgstream.preparation.synchronization.wall_clocks import wall_clocks
+from structgstream.preparation.synchronization.stated_clocks import read_timestamps, wall_clocks
 
 _log = logging.getLogger(__name__)
 
 Method = Literal["auto", "csv", "stamps", "audio", "motion", "none"]
 METHODS: tuple[Method, ...] = ("auto", "csv", "stamps", "audio", "motion", "none")
 
-SOUND_SPREAD_METRES = 1.0  # standard deviation of the cameras' distances from the sound, where these are not known
+SOUND_SPREAD_METRES = 1.0  # standard deviation of the cameras' distances from the sound
 STATIC_PICTURES = 9
+MOTION_SECONDS = 60.0  # of the beginning of each take, in which motion is compared
+
+
+class Streams(Protocol):
+    """The files of each camera as filmed. Names of cameras are arguments of every function."""
+
+    @property
+    def cameras(self) -> tuple[str, ...]: ...
+
+    def stamps(self, name: str, /) -> NDArray[np.float64]:
+        """Seconds ``[T]`` of every frame by the camera's own clock, ascending."""
+        ...
+
+    def pictures(self, name: str, indices: NDArray[np.intp], /) -> Iterator[NDArray[np.uint8]]:
+        """The pictures ``[H, W, 3]`` sRGB of these frames (ascending), one after another."""
+        ...
+
+    def audio(self, name: str, /) -> tuple[NDArray[np.float32], float] | None:
+        """Mono samples ``[N]`` and their rate in hertz, the first sample at the second 0 of :meth:`stamps`; None
+        without sound."""
+        ...
+
+    def size(self, name: str, /) -> tuple[int, int]:
+        """Width and height of the pictures, pixels."""
+        ...
+
+    def metadata(self, name: str, /) -> Mapping[str, str]:
+        """What the camera's file states as text, by lower-case key: ``creation_time``, ``timecode``."""
+        ...
 
 
 def synchronize(
@@ -52,24 +80,19 @@ def synchronize(
     method: Method = "auto",
     timestamps: Path | None = None,
     cameras: Mapping[str, LensCamera] | None = None,
-    sound_distances: Mapping[str, float] | None = None,
-    motion_seconds: float = 60.0,
 ) -> Synchronization:
     """The clocks of the cameras.
 
     Args:
         streams: the files of each camera.
-        method: ``csv`` (``timestamps``), ``stamps`` (of the files, which the caller says share a clock), ``audio``,
-        ``motion``,
+        method: ``csv`` (``timestamps``), ``stamps`` (of the files, which share a clock), ``audio``, ``motion``,
             ``none`` (the cameras were started by one signal: stamps hold as they are), or ``auto``: csv if given,
             else audio if all cameras have sound in which something is common, else motion.
         timestamps: a table of times (``timestamps.py``).
         cameras: the calibration, if it is known; motion is exact with it and coarse without.
-        sound_distances: camera to its distance in metres from where the sound was made (a clap), if it is known.
-        motion_seconds: how much of the beginning of each take motion is looked for in.
 
     Raises:
-        CaptureError: the cameras cannot be synchronised so; says which camera and why.
+        CaptureError: the cameras cannot be synchronised so; the message names camera and reason.
         ConfigError: ``method`` is unknown, or csv without a table.
         MissingExtraError: scipy or cv2 is not installed.
     """
@@ -89,29 +112,27 @@ def synchronize(
         return _unchanged(stamps)
     if method == "stamps":
         return _by_stamps(streams, stamps)
-    demand_scipy()
+    require_scipy()
     if method == "motion":
-        return _by_motion(streams, stamps, cameras, motion_seconds, "motion was asked for")
+        return _by_motion(streams, stamps, cameras, "motion was requested")
     if method == "audio":
-        return _by_audio(streams, stamps, sound_distances, "audio was asked for")
-    return _automatic(streams, stamps, cameras, sound_distances, motion_seconds)
+        return _by_audio(streams, stamps, "audio was requested")
+    return _automatic(streams, stamps, cameras)
 
 
 def _automatic(
     streams: Streams,
     stamps: Mapping[str, NDArray[np.float64]],
     cameras: Mapping[str, LensCamera] | None,
-    distances: Mapping[str, float] | None,
-    motion_seconds: float,
 ) -> Synchronization:
     try:
-        return _by_audio(streams, stamps, distances, "all cameras have sound")
+        return _by_audio(streams, stamps, "all cameras have sound")
     except CaptureError as problem:
         unusable = problem.reason if isinstance(problem, UnusableSoundError) else str(problem).rstrip(".")
     reason = f"sound cannot be used ({unusable})"
     _log.info("synchronised by motion: %s", reason)
     try:
-        return _by_motion(streams, stamps, cameras, motion_seconds, reason)
+        return _by_motion(streams, stamps, cameras, reason)
     except CaptureError as problem:
         raise CaptureError(f"{problem} Nor can sound be used: {unusable}.") from None
 
@@ -121,7 +142,7 @@ def _by_csv(file: Path, stamps: Mapping[str, NDArray[np.float64]]) -> Synchroniz
     return synchronization(
         stamps,
         {name: own.clock for name, own in stated.items()},
-        {name: own.spread_seconds for name, own in stated.items()},
+        {name: own.sigma_seconds for name, own in stated.items()},
         method="csv",
         reason=f"{file.name} states times",
     )
@@ -133,8 +154,7 @@ def _unchanged(stamps: Mapping[str, NDArray[np.float64]]) -> Synchronization:
 
 
 def _by_stamps(streams: Streams, stamps: Mapping[str, NDArray[np.float64]]) -> Synchronization:
-    stated = {name: streams.metadata(name) for name in stamps} if isinstance(streams, StatesMetadata) else {}
-    found = wall_clocks(stamps, stated)
+    found = wall_clocks(stamps, {name: streams.metadata(name) for name in stamps})
     return synchronization(
         stamps,
         {name: own.clock for name, own in found.items()},
@@ -144,9 +164,7 @@ def _by_stamps(streams: Streams, stamps: Mapping[str, NDArray[np.float64]]) -> S
     )
 
 
-def _by_audio(
-    streams: Streams, stamps: Mapping[str, NDArray[np.float64]], distances: Mapping[str, float] | None, reason: str
-) -> Synchronization:
+def _by_audio(streams: Streams, stamps: Mapping[str, NDArray[np.float64]], reason: str) -> Synchronization:
     recorded = {name: streams.audio(name) for name in stamps}
     mute = next((name for name, sound in recorded.items() if sound is None), None)
     if mute is not None:
@@ -156,25 +174,23 @@ def _by_audio(
     takes = {name: (0.0, len(sound.samples) / sound.rate) for name, sound in sounds.items()}
     groups = connected_by(list(takes), lags)
     if len(groups) > 1:
-        apart = ", ".join(repr(name) for group in groups[1:] for name in group)
+        others = ", ".join(repr(name) for group in groups[1:] for name in group)
         raise UnusableSoundError(
-            f"The sound of {apart} has nothing in common with that of {groups[0][0]!r}: no lag stands out, or the "
+            f"The sound of {others} has nothing in common with that of {groups[0][0]!r}: no lag stands out, or the "
             "videos are shorter than the time between their starts",
             "film a clap that all hear, or synchronise by motion or timestamps.csv",
         )
-    solution = solve_by_audio(takes, lags, distances=distances)
-    way = 0.0 if distances else SOUND_SPREAD_METRES / SPEED_OF_SOUND
-    warnings = () if distances else (
-        f"Sound takes {1e3 / SPEED_OF_SOUND:.1f} ms a metre, and the distances of the cameras from it are not known: "
-        "clap in the middle of the cameras.",
-    )  # fmt: skip
+    solution = solve_by_audio(takes, lags)
     return synchronization(
         stamps,
         {name: Clock(solution.offsets[name], solution.rates[name]) for name in stamps},
-        {name: float(np.hypot(solution.sigmas[name], way)) for name in stamps},
+        {name: float(np.hypot(solution.sigmas[name], SOUND_SPREAD_METRES / SPEED_OF_SOUND)) for name in stamps},
         method="audio",
         reason=reason,
-        warnings=warnings,
+        warnings=(
+            f"Sound takes {1e3 / SPEED_OF_SOUND:.1f} ms a metre, and the distances of the cameras from it are not "
+            "known: clap in the middle of the cameras.",
+        ),
     )
 
 
@@ -182,14 +198,13 @@ def _by_motion(
     streams: Streams,
     stamps: Mapping[str, NDArray[np.float64]],
     cameras: Mapping[str, LensCamera] | None,
-    seconds: float,
     reason: str,
 ) -> Synchronization:
     if len(stamps) < 2:
         return _unchanged(stamps)
-    used = {name: own[own <= own[0] + seconds] for name, own in stamps.items()}
-    changes = {name: picture_changes(_pictures(streams, name, len(own)), own) for name, own in used.items()}
-    demand_motion(changes)
+    used = {name: own[own <= own[0] + MOTION_SECONDS] for name, own in stamps.items()}
+    changes = {name: picture_changes(streams.pictures(name, np.arange(len(own))), own) for name, own in used.items()}
+    require_motion(changes)
     geometry: Geometry = CalibratedGeometry(cameras) if cameras else _static_geometry(streams, used)
     period = max(period_seconds(own) for own in stamps.values())
     takes = {name: (float(own[0]), float(own[-1])) for name, own in used.items()}
@@ -204,7 +219,7 @@ def _by_motion(
     )
 
 
-def demand_motion(changes: Mapping[str, Changes]) -> None:
+def require_motion(changes: Mapping[str, Changes]) -> None:
     """
     Raises:
         CaptureError: in a camera hardly anything moves.
@@ -216,10 +231,6 @@ def demand_motion(changes: Mapping[str, Changes]) -> None:
             "motion; film people "
             "who move, a clap for audio, or give timestamps.csv."
         )
-
-
-def _pictures(streams: Streams, name: str, count: int) -> Iterator[NDArray[np.uint8]]:
-    return streams.pictures(name, np.arange(count))
 
 
 def _static_geometry(streams: Streams, stamps: Mapping[str, NDArray[np.float64]]) -> StaticGeometry:

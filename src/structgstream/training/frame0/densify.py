@@ -22,7 +22,7 @@ from structgstream.training.losses import GradientStatistics
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import ANCHOR_ROWS, values_of_rows
 
-MOST_ANCHORS = 400_000
+MAX_ANCHORS = 400_000
 """Bound of what larger pictures may have: about 1 GB of memory while frame 0 is trained."""
 
 
@@ -49,7 +49,7 @@ class GrowthConfig:
     max_anchors: int = 1_000_000
     """Largest number of anchors for pictures of the reference size (:meth:`for_pictures`); proposals with the largest
     gradients are taken first (paper: no bound)."""
-    least_growth: float = 0.0
+    min_growth: float = 0.0
     """At least this share of the number of seeds may be added, even beyond ``max_anchors``."""
     room_until: int = 0
     """The allowed number of anchors rises linearly from ``start`` to this iteration; 0: all are allowed at once."""
@@ -63,9 +63,9 @@ class GrowthConfig:
         """The same for pictures whose sides are ``enlarged`` times those of the reference size (``View.enlargement``).
 
         Their detail has as many times the anchors: in proportion to the pictures' sides, since edges and not areas have
-        most of it, and at most :data:`MOST_ANCHORS` (docs/scaling.md).
+        most of it, and at most :data:`MAX_ANCHORS` (lab/notes/scaling.md).
         """
-        most = min(round(self.max_anchors * enlarged), MOST_ANCHORS)
+        most = min(round(self.max_anchors * enlarged), MAX_ANCHORS)
         return replace(self, max_anchors=max(self.max_anchors, most))
 
     def room_at(self, iteration: int, seeds: int) -> int:
@@ -74,8 +74,8 @@ class GrowthConfig:
         Few anchors are cheap while the pictures are coarse, and late ones are placed where gradients are still large.
         """
         most = self.max_anchors
-        if self.least_growth:
-            most = max(most, seeds + round(self.least_growth * seeds))
+        if self.min_growth:
+            most = max(most, seeds + round(self.min_growth * seeds))
         if iteration >= self.room_until:
             return most
         share = max(0.0, (iteration - self.start) / (self.room_until - self.start))

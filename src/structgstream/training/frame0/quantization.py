@@ -34,7 +34,7 @@ from structgstream.training.parameters import RoundingConfig
 SENSITIVITY_FIELDS: tuple[FieldName, ...] = tuple(row.name for row in STATE_TABLE if row.init_step == "sensitivity")
 FINEST, COARSEST = -1, 2
 """Bounds of an anchor's step relative to the mean one, as powers of two: occluded anchors may become visible later."""
-_LEAST_SHARE = 1e-4  # of the largest eigenvalue: features are not scaled by more than 100
+_MIN_SHARE = 1e-4  # of the largest eigenvalue: features are not scaled by more than 100
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def _whitening_matrices(features: Tensor, products: Tensor, mlps: MLPWeights) ->
     if not len(features) or not float(values.max()) > 0.0:
         same = torch.eye(len(products)).to(products)
         return same, same
-    stretched = vectors * values.clamp(min=_LEAST_SHARE * float(values.max())).sqrt()
+    stretched = vectors * values.clamp(min=_MIN_SHARE * float(values.max())).sqrt()
     centred = features.double() - features.double().mean(0)
     turn = torch.linalg.eigh((centred @ stretched).T @ (centred @ stretched)).eigenvectors.flip(1)
     forward = stretched @ turn

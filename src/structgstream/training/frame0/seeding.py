@@ -119,7 +119,7 @@ def seeded_scene(
 
 
 _STRIDE = 4  # pixels between samples: enough for a few coefficients
-_LEAST_GAIN = 0.1
+_MIN_GAIN = 0.1
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class EnvironmentConfig:
     """Degree of the spherical harmonics, 0 to 2."""
     SMOOTHNESS: ClassVar[float] = 1e-3
     """Ridge penalty: for a coefficient of degree l, l (l + 1) times this times the mean weight of the pixels."""
-    LEAST_WEIGHT: ClassVar[float] = 1e-2
+    MIN_WEIGHT: ClassVar[float] = 1e-2
     """Added to a pixel's transparency (1 - coverage) to give its weight, so that covered pixels count a little."""
     STEP: ClassVar[float] = 1 / 256
     """Quantization step of the coefficients with the codec ``compact``, full scale 1."""
@@ -158,8 +158,8 @@ def fit_environment(scene: Scene, views: Sequence[View], *, config: EnvironmentC
         rows, columns = (torch.arange(0, size, _STRIDE, device=alpha.device) for size in alpha.shape)
         pixels = (rows[:, None] * alpha.shape[1] + columns).reshape(-1)
         gains, biases = (value[view.index].cpu().double() for value in (color.gains, color.biases))
-        colors = (view.image.reshape(-1, 3)[pixels].cpu().double() / 255.0 - biases) / gains.clamp(min=_LEAST_GAIN)
-        weights = (1.0 - alpha.reshape(-1)[pixels]).cpu().double() + config.LEAST_WEIGHT
+        colors = (view.image.reshape(-1, 3)[pixels].cpu().double() / 255.0 - biases) / gains.clamp(min=_MIN_GAIN)
+        weights = (1.0 - alpha.reshape(-1)[pixels]).cpu().double() + config.MIN_WEIGHT
         if view.mask is not None:
             weights = weights * view.mask.reshape(-1)[pixels].cpu()
         basis = sh_basis(pixel_directions(view.camera, pixels).cpu().double(), config.DEGREE)

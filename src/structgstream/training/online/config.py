@@ -21,7 +21,7 @@ class FlowConfig:
 
     finest_level: int = 1
     """Of the search's pyramid: 0 is the size of the pictures, 1 half of it."""
-    least_width: int = 240
+    min_width: int = 240
     """Pixels. If the finest level is narrower than this, the search goes on to a finer one: in small pictures what
     moves is small, too."""
     apart: bool = False
@@ -31,16 +31,16 @@ class FlowConfig:
     """Where flow is inconsistent, search again for motion by more than things are large (``flow.block_search``)."""
 
     def __post_init__(self) -> None:
-        if self.finest_level < 0 or self.least_width < 0:
+        if self.finest_level < 0 or self.min_width < 0:
             raise ConfigError(
-                f"The flow search has finest level {self.finest_level} and least width {self.least_width}; "
+                f"The flow search has finest level {self.finest_level} and least width {self.min_width}; "
                 "expected neither below 0."
             )
 
     def level_of(self, width: int) -> int:
         """The finest level for pictures ``width`` pixels wide."""
         level = self.finest_level
-        while level > 0 and width >> level < self.least_width:
+        while level > 0 and width >> level < self.min_width:
             level -= 1
         return level
 
@@ -63,7 +63,7 @@ class MotionConfig:
     """Factor (hysteresis) on the thresholds of pixels and shares for primitives that the last frame changed. 1:
     none."""
     occluded_share: float = 0.0
-    """An anchor that fewer than ``LEAST_VIEWS`` views show is trained if at least this share of its nearest shown ones
+    """An anchor that fewer than ``MIN_VIEWS`` views show is trained if at least this share of its nearest shown ones
     is: it lies in or behind what moves. 0: none."""
     picture_scale: float = 0.25
     """Scale of width and height, relative to the reference size, of the pictures on which coverage is computed."""
@@ -78,11 +78,11 @@ class MotionConfig:
     (full scale 1) exceeds this; above the sensors' noise."""
     REACH_PIXELS: ClassVar[int] = 3
     """Changed pixels are dilated by this many pixels."""
-    LEAST_PIXELS: ClassVar[float] = 0.3
+    MIN_PIXELS: ClassVar[float] = 0.3
     """Least number of changed pixels, summed by blending weight, that a primitive covers in a view to get its vote."""
-    LEAST_SHARE: ClassVar[float] = 0.3
+    MIN_SHARE: ClassVar[float] = 0.3
     """Least share of changed pixels among all that a primitive covers in a view to get its vote."""
-    LEAST_VIEWS: ClassVar[int] = 2
+    MIN_VIEWS: ClassVar[int] = 2
     """Least number of votes of a primitive that is trained: two, because one view may have changed by noise."""
     MARGIN_PIXELS: ClassVar[int] = 8
     """Tiles within this many pixels of dynamic Gaussians are drawn too, so that these get gradients where they move."""
@@ -141,19 +141,19 @@ class SpawnRules:
     """Distance in pixels, across and down, between missing pixels whose rays are swept."""
     planes: int = 48
     """Number of depths of a ray."""
-    least_supports: int = 2
+    min_supports: int = 2
     """Least number of other views that support a point: there a missing pixel lies at its projection."""
-    most_contradictions: float = 0.34
+    max_contradictions: float = 0.34
     """Largest share of contradicting views, which would see the point but miss nothing, among those that can judge."""
-    most_cost: float = 0.12
+    max_cost: float = 0.12
     """Largest mean colour difference of the supporting views, 0 to 1."""
-    least_hits: int = 4
+    min_hits: int = 4
     """Least number of ray points within 1.8 voxels of a new Gaussian."""
     most: int = 5000
     """Largest number of new Gaussians: more than who walks in needs, since below that number all of it is haze."""
     overflow: Literal["coarser", "none", "small-clusters"] = "coarser"
     """Where there would be more than ``most``: Gaussians in larger voxels, none, or those in the smallest clusters."""
-    most_missing_share: float = 0.25
+    max_missing_share: float = 0.25
     """If a larger share of the pictures is missing nothing is spawned: the light changed, or a camera moved."""
     size: float = 0.7
     """Standard deviation of a new Gaussian, in units of the distance between neighbouring swept rays."""
@@ -185,11 +185,11 @@ class ThinSpawnConfig:
         picture_width=480,
         missing_threshold=0.04,
         pixel_step=1,
-        most_contradictions=0.5,
-        most_cost=0.2,
-        least_hits=3,
+        max_contradictions=0.5,
+        max_cost=0.2,
+        min_hits=3,
         most=150,
-        most_missing_share=0.02,
+        max_missing_share=0.02,
     )
     """Of the pictures 0.0005 lack something where a pitcher pours; more than 0.02 is light that changed."""
 
@@ -262,12 +262,12 @@ class ExposureConfig:
     SAME_THRESHOLD: ClassVar[float] = 0.03
     """Largest mean difference over the channels (full scale 1), beyond the light followed so far, of a pixel that shows
     the same as in frame 0."""
-    LEAST_SHARE: ClassVar[float] = 0.2
+    MIN_SHARE: ClassVar[float] = 0.2
     """Least share of such pixels, weighted by what they tell (black and white ones little), in a view that counts."""
-    LEAST_CHANGE: ClassVar[float] = 1 / 256
+    MIN_CHANGE: ClassVar[float] = 1 / 256
     """Smallest change of a bias that is followed at first, at most a quarter of an 8-bit level: flicker below it costs
     no bits."""
-    LEAST_FURTHER_CHANGE: ClassVar[float] = 1 / 1024
+    MIN_FURTHER_CHANGE: ClassVar[float] = 1 / 1024
     """Smallest change of a bias that is made once the light differs from that of frame 0."""
 
 

@@ -13,7 +13,7 @@ F_c's colours are c = sigmoid(x), so a change d of the biases changes a picture 
 leaves out cameras that correct their own exposure. The fit is against the pictures of frame 0, not against renderings
 or the last frame, so errors do not accumulate and renderings' own errors do not enter.
 
-Where the light is steady, the estimate still wavers by up to half of ``LEAST_CHANGE``, and what would follow that
+Where the light is steady, the estimate still wavers by up to half of ``MIN_CHANGE``, and what would follow that
 flickers. Where it fades, coarse steps show and lag behind. So the first step takes a large change, and later ones small
 changes.
 """
@@ -31,7 +31,7 @@ from structgstream.scene.scene import Scene
 from structgstream.training.online.config import ExposureConfig
 from structgstream.training.views import View
 
-LEAST_VIEWS = 3
+MIN_VIEWS = 3
 """Fewer views have no median that leaves one out."""
 REACH_PIXELS = 2
 """Pixels of the reduced pictures around one that shows something else do not count."""
@@ -71,7 +71,7 @@ def with_exposure_of(
     head = scene.mlps.color
     so_far = (head.b2 - reference.biases).reshape(-1, 3)[0]
     found = _light_change(scene, views, reference, so_far, config)
-    least = config.LEAST_FURTHER_CHANGE if bool(so_far.any()) else config.LEAST_CHANGE
+    least = config.MIN_FURTHER_CHANGE if bool(so_far.any()) else config.MIN_CHANGE
     wanted = torch.where((found - so_far).abs() < least, so_far, found)
     biases = reference.biases + wanted.repeat(len(head.b2) // 3)
     if step is not None:
@@ -93,7 +93,7 @@ def _light_change(
                 now, then = view.evidence(config.PICTURE_SCALE), reference.views[view.index]
                 change = _view_change(now, then, gains, biases, so_far, config)
                 found += [] if change is None else [change]
-    return torch.stack(found).quantile(0.5, dim=0) if len(found) >= LEAST_VIEWS else so_far
+    return torch.stack(found).quantile(0.5, dim=0) if len(found) >= MIN_VIEWS else so_far
 
 
 def _view_change(
@@ -110,6 +110,6 @@ def _view_change(
     same = max_pool2d(other[None].float(), width, stride=1, padding=REACH_PIXELS)[0] < 0.5
     squares = sensitivity.square()
     weight = (squares * same[..., None]).sum((0, 1))
-    if not bool((weight > config.LEAST_SHARE * squares.sum((0, 1))).all()):
+    if not bool((weight > config.MIN_SHARE * squares.sum((0, 1))).all()):
         return None
     return (difference * sensitivity * same[..., None]).sum((0, 1)) / weight

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import CameraRig
-from structgstream.frames import LEAST_CAMERAS, MultiViewFrame
+from structgstream.frames import MIN_CAMERAS, MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
@@ -69,7 +69,7 @@ def fit_next_frame(
     if pictures is None:
         pictures = preprocess(frame, rig, before=None, motion=config.motion, start=config.scene_flow, backend=backend)
     views = pictures.views
-    if len(views) < min(LEAST_CAMERAS, len(rig.training)):
+    if len(views) < min(MIN_CAMERAS, len(rig.training)):
         return held(scene)
     if config.patching.lifetime == "frame":
         scene = scene.without_free()
@@ -105,7 +105,7 @@ def fit_next_frame(
             first_birth=frame.index * IDS_PER_FRAME,
             floor=floor,
             room=config.patching.max_free - len(split.static.free),
-            least_pixels=config.motion.LEAST_PIXELS,
+            min_pixels=config.motion.MIN_PIXELS,
             config=config.spawn,
             backend=backend,
         )

@@ -77,7 +77,7 @@ def sum_by_primitive(sums: Tensor, primitives: Tensor, scene: Scene) -> Tensor:
     return found.index_add_(0, primitives, sums)
 
 
-FLOW_LEAST_PIXELS, FLOW_MOST_PIXELS = 0.3, 20.0
+FLOW_MIN_PIXELS, FLOW_MAX_PIXELS = 0.3, 20.0
 """Bounds of a primitive's flow weight in a view, in pixels of a picture of the reference size: below the first it is 0,
 above the second it is clamped."""
 
@@ -91,7 +91,7 @@ def flow_evidence(sums: Sequence[Tensor]) -> FlowEvidence:
     stacked = torch.stack(list(sums))
     weights, moved, coverage, colors = stacked[..., 0], stacked[..., 1:3], stacked[..., 3], stacked[..., 4:]
     flows = moved / weights.clamp(min=1e-6)[..., None]
-    weights = torch.where(weights < FLOW_LEAST_PIXELS, 0.0, weights.clamp(max=FLOW_MOST_PIXELS))
+    weights = torch.where(weights < FLOW_MIN_PIXELS, 0.0, weights.clamp(max=FLOW_MAX_PIXELS))
     return FlowEvidence(weights, flows, colors.sum(0) / coverage.sum(0).clamp(min=1e-6)[:, None])
 
 

@@ -27,10 +27,10 @@ from structgstream.kernels.backend import Backend
 from structgstream.training.online.config import USUAL_FLOW, FlowConfig, MotionConfig, SceneFlowConfig
 from structgstream.training.views import View, area_mean, blackened, mean_of_counting, training_views
 
-CONTEXT_SHARE, LEAST_CONTEXT_PIXELS = 1 / 40, 16
+CONTEXT_SHARE, MIN_CONTEXT_PIXELS = 1 / 40, 16
 """Margin around the bounding box of the changed pixels, in which flow is estimated: share of the picture's longer side,
 but at least so many pixels (Note [Lengths of the flow search])."""
-LEAST_SAVING = 0.8
+MIN_SAVING = 0.8
 """Boxes around parts have to be together smaller than this share of the box around all."""
 CELLS, REACH_CELLS = 80, 12
 """The search for large motion matches cells, of which so many make the longer side, and finds what has moved by so many
@@ -101,7 +101,7 @@ def preprocess(
     earlier = training_views(before, rig, backend.device)
     known = {view.index for view in earlier}
     compared = [view for view in views if view.index in known]
-    if len(compared) < min(motion.LEAST_VIEWS, len(rig.training)):
+    if len(compared) < min(motion.MIN_VIEWS, len(rig.training)):
         return FramePictures(views, None)
     flow_from = flow_views(compared, frame.index, start)
     changes = detect_changes(views, earlier, config=motion, backend=backend, flow_from=flow_from, flow=start.FLOW)
@@ -223,7 +223,7 @@ def flow_map(
     maps = torch.zeros(3, *changed.shape)
     where = changed.numpy(force=True)
     longer, level = max(where.shape), config.level_of(where.shape[1])
-    context = max(LEAST_CONTEXT_PIXELS, round(CONTEXT_SHARE * longer))
+    context = max(MIN_CONTEXT_PIXELS, round(CONTEXT_SHARE * longer))
     search = dis_search("capture", refined=False, finest_level=level)
 
     def consistent(box: Box, flow: NDArray[np.float32], back: NDArray[np.float32]) -> Tensor:
@@ -285,7 +285,7 @@ def _boxes(mask: Mask, context: int) -> list[Box]:
     high = padded.reshape(rows, context, -1).any(1)
     cells = np.logical_or.reduce(high.reshape(rows, columns, context), axis=2)
     found = [_within((context * a, context * b, context * c, context * d), mask.shape) for a, b, c, d in _parts(cells)]
-    if not one or sum(map(_area, found)) > LEAST_SAVING * _area(one[0]):
+    if not one or sum(map(_area, found)) > MIN_SAVING * _area(one[0]):
         return one
     return [box for box in found if min(span.stop - span.start for span in box) >= 2 * context]
 

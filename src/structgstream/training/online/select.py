@@ -134,18 +134,18 @@ def select_dynamic(
     votes, shown = (torch.zeros_like(ease, dtype=torch.int64) for _ in range(2))
     for of_view in (measured[number] for number in inliers):
         if of_view.covered_changed is not None:
-            enough = of_view.covered_changed > config.LEAST_PIXELS * ease
-            votes += enough & (of_view.covered_changed > config.LEAST_SHARE * ease * of_view.covered)
-            shown += of_view.covered > config.LEAST_PIXELS
-    dynamic = votes >= config.LEAST_VIEWS
+            enough = of_view.covered_changed > config.MIN_PIXELS * ease
+            votes += enough & (of_view.covered_changed > config.MIN_SHARE * ease * of_view.covered)
+            shown += of_view.covered > config.MIN_PIXELS
+    dynamic = votes >= config.MIN_VIEWS
     occluded = occluded_dynamic(
-        scene.anchors.positions, dynamic[:anchors], shown[:anchors] >= config.LEAST_VIEWS, share=config.occluded_share
+        scene.anchors.positions, dynamic[:anchors], shown[:anchors] >= config.MIN_VIEWS, share=config.occluded_share
     )
 
     found = DynamicSelection(
         anchors=dynamic[:anchors] | occluded,
         free=dynamic[anchors:],
-        visible={measured[n].view.index: measured[n].coverage > config.LEAST_PIXELS for n in inliers},
+        visible={measured[n].view.index: measured[n].coverage > config.MIN_PIXELS for n in inliers},
         inliers=tuple(inliers),
         scene_cut=is_scene_cut(view_changes),
         changed={measured[n].view.index: changed for n in inliers if (changed := measured[n].changed) is not None},

@@ -100,16 +100,16 @@ def view_residual(
     return ViewResidual(small, off > rules.residual_threshold, missing if small.mask is None else missing * small.mask)
 
 
-def outlier_mask(coverage: Tensor, wrong: Tensor, *, least_pixels: float, rules: SpawnRules) -> Tensor:
+def outlier_mask(coverage: Tensor, wrong: Tensor, *, min_pixels: float, rules: SpawnRules) -> Tensor:
     """Mask ``[F]`` of the free Gaussians to remove, as outliers in several views.
 
     Args:
         coverage: ``[V, F]`` pixels that each covers, by blending weight.
         wrong: ``[V, F]`` wrong pixels among them.
-        least_pixels: views where a Gaussian covers fewer pixels do not count.
+        min_pixels: views where a Gaussian covers fewer pixels do not count.
         rules: the rule.
     """
-    seen = coverage > least_pixels
+    seen = coverage > min_pixels
     bad = (seen & (wrong > rules.outlier_share * coverage)).sum(0)
     return (bad >= rules.outlier_views) & (2 * bad >= seen.sum(0))
 
@@ -168,10 +168,10 @@ def spawn_by_sweep(
             torch.stack([columns, rows], -1),
             farthest,
             planes=rules.planes,
-            least_supports=rules.least_supports,
-            most_contradictions=rules.most_contradictions,
+            min_supports=rules.min_supports,
+            max_contradictions=rules.max_contradictions,
         )
-        good = swept.costs < rules.most_cost
+        good = swept.costs < rules.max_cost
         z, x, y = swept.depths[good], columns[good] + 0.5, rows[good] + 0.5
         K, viewmat = view.K, view.viewmat
         local = torch.stack([(x - K[0, 2]) / K[0, 0] * z, (y - K[1, 2]) / K[1, 1] * z, z], -1)
@@ -203,7 +203,7 @@ def _strided_mask(step: int, like: Tensor) -> Tensor:
 
 
 def _merge_points(points: Tensor, colors: Tensor, spacings: Tensor, *, first_birth: int, rules: SpawnRules) -> Spawned:
-    """One free Gaussian per voxel of the points, if at least ``least_hits`` points lie around it."""
+    """One free Gaussian per voxel of the points, if at least ``min_hits`` points lie around it."""
     try:
         from scipy.spatial import KDTree
     except ImportError as error:
@@ -213,7 +213,7 @@ def _merge_points(points: Tensor, colors: Tensor, spacings: Tensor, *, first_bir
     finest = None
     while True:
         means, hits = _cells(values, tree, voxel)
-        enough = hits >= rules.least_hits
+        enough = hits >= rules.min_hits
         wanted = int(enough.sum())
         finest = wanted if finest is None else finest
         if wanted <= rules.most or voxel > COARSEST * float(spacings.median()):
@@ -271,7 +271,7 @@ def _cells(values: Tensor, tree: Any, voxel: float) -> tuple[Tensor, Tensor]:
     return means, torch.from_numpy(np.asarray(hits)).to(values.device)
 
 
-LEAST_COVERAGE = 0.5
+MIN_COVERAGE = 0.5
 """Pixels with less coverage have no depth."""
 DEPTH_WIDTH = 240
 """Depth maps are drawn at most this wide, pixels, and enlarged: they cost most of a frame without births."""
@@ -364,7 +364,7 @@ class Sweep:
 
     def _enough(self, missing: Sequence[Missing]) -> bool:
         """Whether enough views have missing pixels for a birth."""
-        return sum(entry.any for entry in missing) > self.rules.least_supports
+        return sum(entry.any for entry in missing) > self.rules.min_supports
 
     def _before(self, view: View, *, wrong: bool) -> Missing:
         """By the picture that is drawn already; ``wrong`` pixels make their tiles suspect, too."""
@@ -419,8 +419,8 @@ class Sweep:
         viewmat = camera.viewport(gaussians.means).viewmat
         z = gaussians.means @ viewmat[2, :3] + viewmat[2, 3]
         rendering = draw(replace(gaussians, colors=z[:, None].expand(-1, 3).contiguous()), camera, self.backend)
-        depth = rendering.image[..., 0] / rendering.alpha.clamp(min=LEAST_COVERAGE)
-        depth = torch.where(rendering.alpha > LEAST_COVERAGE, depth, torch.inf)
+        depth = rendering.image[..., 0] / rendering.alpha.clamp(min=MIN_COVERAGE)
+        depth = torch.where(rendering.alpha > MIN_COVERAGE, depth, torch.inf)
         return interpolate(depth[None, None], size=(view.camera.height, view.camera.width))[0, 0]
 
 
@@ -469,7 +469,7 @@ def prune_and_spawn(
     first_birth: int,
     floor: ResidualFloor | None,
     room: int,
-    least_pixels: float,
+    min_pixels: float,
     config: SpawnConfig,
     backend: Backend,
 ) -> SpawnResult:
@@ -482,7 +482,7 @@ def prune_and_spawn(
         first_birth: identity of the first birth.
         floor: residuals of frame 0; None for none.
         room: largest number of births.
-        least_pixels: views where a Gaussian covers fewer pixels do not count.
+        min_pixels: views where a Gaussian covers fewer pixels do not count.
         config: the rules.
         backend: the compute back-end.
     """
@@ -497,13 +497,11 @@ def prune_and_spawn(
             eased = floor.eased(split.selection.changed, medians=config.CHANGED_FLOOR_MEDIANS)
         sweep = Sweep(dynamic, static, views, active_tiles, eased, rules, backend)
         missing = sweep.missing()
-        if missing_share(missing) > rules.most_missing_share:
+        if missing_share(missing) > rules.max_missing_share:
             return replace(none, refused=True)
         kept = everything
         if len(dynamic.free):
-            kept = ~_outlier_mask(
-                dynamic, missing, active_tiles, least_pixels=least_pixels, rules=rules, backend=backend
-            )
+            kept = ~_outlier_mask(dynamic, missing, active_tiles, min_pixels=min_pixels, rules=rules, backend=backend)
         if not kept.all():
             sweep = replace(sweep, dynamic=replace(dynamic, free=dynamic.free.select(kept)))
             missing = sweep.drawn(missing)
@@ -521,7 +519,7 @@ def prune_and_spawn(
 def _thin_births(sweep: Sweep, *, first_birth: int, room: int) -> Spawned:
     """Spawn thin content, where nothing large is spawned."""
     missing = sweep.missing(blames=False)
-    if missing_share(missing) > sweep.rules.most_missing_share:
+    if missing_share(missing) > sweep.rules.max_missing_share:
         return Spawned(FreeGaussians.empty(sweep.dynamic.free.means))
     return sweep.births(missing, first_birth=first_birth, room=room)
 
@@ -531,7 +529,7 @@ def _outlier_mask(
     missing: Sequence[Missing],
     active_tiles: Mapping[int, ActiveTiles],
     *,
-    least_pixels: float,
+    min_pixels: float,
     rules: SpawnRules,
     backend: Backend,
 ) -> Tensor:
@@ -551,4 +549,4 @@ def _outlier_mask(
         of_free = sums[len(sums) - len(dynamic.free) :]  # Free Gaussians are the last, and all there.
         coverage.append(of_free[:, 0])
         wrong.append(of_free[:, 1])
-    return outlier_mask(torch.stack(coverage), torch.stack(wrong), least_pixels=least_pixels, rules=rules)
+    return outlier_mask(torch.stack(coverage), torch.stack(wrong), min_pixels=min_pixels, rules=rules)

@@ -5,7 +5,7 @@ import { CHECKSUM_BYTES, HEAD_BYTES, periodAt, RecordType, recordBytes, recordIn
 
 const FRAME_BYTES = 12;
 const INDEX_ENTRY_BYTES = 13;
-const LEAST_PACKET_BYTES = HEAD_BYTES + FRAME_BYTES + CHECKSUM_BYTES;
+const MIN_PACKET_BYTES = HEAD_BYTES + FRAME_BYTES + CHECKSUM_BYTES;
 const WORK = 4;
 /** Offset of the description in an init record, and its first bytes: it is a zstd frame. */
 const ZSTD = [HEAD_BYTES + 4, 0xfd2fb528] as const;
@@ -39,7 +39,7 @@ export interface Following {
 
 /** Largest possible frame of a packet at byte `offset`, because lost frames took bytes, too. */
 export function lastFrame({ expected, since }: Standing, offset: number): number {
-  return expected + Math.floor((offset - since) / LEAST_PACKET_BYTES);
+  return expected + Math.floor((offset - since) / MIN_PACKET_BYTES);
 }
 
 /**

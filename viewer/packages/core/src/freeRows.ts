@@ -7,7 +7,7 @@ import { FREE_COLUMNS } from "./fields.js";
 import { type Change, decodedChange, type Group, noChange, placesOf } from "./rows.js";
 
 /** Largest number of free Gaussians: a symbol can take less than a bit, so bytes do not bound their number. */
-export const MOST_FREE = 2 ** 18;
+export const MAX_FREE = 2 ** 18;
 
 const GROUPS: readonly Group[] = [
   { name: "free.means", first: 0, end: 3 },
@@ -75,9 +75,9 @@ function rowsOf(values: Int32Array, rows: Int32Array): Int32Array {
 /** The spawned Gaussians, given the indices of the remaining ones. */
 function decodedBirths(decoder: AdaptiveDecoder, alive: Int32Array, where: string): Pick<FreeBins, "births" | "bins"> {
   const count = decoder.numbers("free_births.count", new Int32Array(1), [1])[0]!;
-  if (count < 0 || count > MOST_FREE - alive.length / FREE_COLUMNS) {
+  if (count < 0 || count > MAX_FREE - alive.length / FREE_COLUMNS) {
     throw new StreamError(
-      `${where} adds ${count} free Gaussians, which makes more than ${MOST_FREE}, or fewer than none.`,
+      `${where} adds ${count} free Gaussians, which makes more than ${MAX_FREE}, or fewer than none.`,
     );
   }
   if (!count) return noFree();

@@ -13,7 +13,7 @@ import { AS_THEY_ARE, decodedFields } from "./staticFields.js";
 const LENGTH_BYTES = 4;
 const MAX_IMAGE_SIDE = 65535;
 const MAX_IMAGE_PIXELS = 2 ** 26;
-const LEAST_STEP = 2 ** -64;
+const MIN_STEP = 2 ** -64;
 const RIGID = 1e-3;
 
 /**
@@ -163,7 +163,7 @@ function stepsOf(value: unknown, what: string): Map<string, number> {
 
 function stepOf(value: unknown, what: string): number {
   const step = number(value, what);
-  if (step < LEAST_STEP || step > 1 / LEAST_STEP || Math.fround(step) !== step) {
+  if (step < MIN_STEP || step > 1 / MIN_STEP || Math.fround(step) !== step) {
     throw wrong(what, "a float32 number from 2^-64 to 2^64");
   }
   return step;

@@ -7,7 +7,7 @@ import { StreamError } from "./errors.js";
 export const RESIDUAL_ALPHABET = 16;
 const LARGEST = 7;
 const ESCAPE = 15;
-const MOST_ZEROS = 28;
+const MAX_ZEROS = 28;
 
 /**
  * Residuals int32 `[n]`: symbols 0 to 14 are 0, -1, 1 ... 7; the value of a symbol 15 is in `escapes`.
@@ -29,7 +29,7 @@ export function residualsOf(symbols: Uint8Array, escapes: Uint8Array, where: str
   }
   const reader = new BitReader(escapes, where);
   for (const place of places) {
-    const magnitude = reader.golomb(2, MOST_ZEROS) + LARGEST + 1;
+    const magnitude = reader.golomb(2, MAX_ZEROS) + LARGEST + 1;
     const negative = reader.fixed(1);
     if (magnitude > 2 ** 31 - 1 + negative) {
       throw new StreamError(`${where} holds a value beyond 32 bits; it is damaged.`);

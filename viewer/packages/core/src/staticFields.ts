@@ -7,11 +7,11 @@ import { StreamError } from "./errors.js";
 import { FIELD_NAMES, type FieldName, type Tensor } from "./fields.js";
 
 const WHERE = "The init record";
-export const MOST_ANCHORS = 2 ** 22;
-const MOST_WEIGHTS = 2 ** 20;
+export const MAX_ANCHORS = 2 ** 22;
+const MAX_WEIGHTS = 2 ** 20;
 const FREE_NUMBERS = 2 ** 20;
 const NUMBERS_A_BYTE = 64;
-const MOST_COLUMNS: readonly (readonly [FieldName, number])[] = [
+const MAX_COLUMNS: readonly (readonly [FieldName, number])[] = [
   ["offset_scales", 3],
   ["base_scales", 3],
   ["anchor_offsets", 3 * 64],
@@ -78,7 +78,7 @@ function decodedBins(
   const rows = positions.length / 3;
   const found = new Map<FieldName, Bins>([["anchor_positions", { shape: [rows, 3], bins: positions }]]);
   let shifts: Int32Array = new Int32Array(rows);
-  for (const [name, most] of MOST_COLUMNS) {
+  for (const [name, most] of MAX_COLUMNS) {
     if (!coded.has(name)) continue;
     const { columns, ...field } = decodedRows(decoder, name, shifts, most, budget);
     shifts = field.shifts;
@@ -108,7 +108,7 @@ function decodedBins(
 
 /** Cells `[M, 3]` by how far each is from the one before along a Z-order curve. */
 function decodedPositions(decoder: Decoder, budget: Budget): Int32Array {
-  const rows = bounded(decoder.number("anchor_positions.rows"), MOST_ANCHORS, "anchors");
+  const rows = bounded(decoder.number("anchor_positions.rows"), MAX_ANCHORS, "anchors");
   budget.take(3 * rows);
   if (!rows) return new Int32Array(0);
   const origin = [0, 1, 2].map(() => signedNumber(decoder, "anchor_positions.origin"));
@@ -208,7 +208,7 @@ function decodedValues(decoder: Decoder, name: FieldName, contexts: Uint8Array):
 
 /** Numbers `[n]` of any size. */
 function decodedNumbers(decoder: Decoder, name: FieldName, budget: Budget): Int32Array {
-  const count = bounded(decoder.number(`${name}.count`), MOST_WEIGHTS, `numbers of ${name}`);
+  const count = bounded(decoder.number(`${name}.count`), MAX_WEIGHTS, `numbers of ${name}`);
   budget.take(count);
   const values = decoder.naturals(`${name}.value`, new Uint8Array(count), 1);
   return values.map((value) => checkedBin(signed(value)));

@@ -10,8 +10,8 @@ import { StreamError } from "./errors.js";
 
 export const TOTAL = 4096;
 const FREQUENCY_BITS = 12;
-const MOST_ROW_BYTES = 72;
-const MOST_ZEROS = 8;
+const MAX_ROW_BYTES = 72;
+const MAX_ZEROS = 8;
 
 /** One row of frequencies, which sum to 4096, for each context: `rows` is `[contexts, alphabet]`. */
 export interface FrequencyTables {
@@ -69,7 +69,7 @@ export function geometric(number: number, contexts: number, alphabet: number): F
  */
 export function decodedTables(data: Uint8Array, previous: FrequencyTables, where: string): FrequencyTables {
   const { contexts, alphabet } = previous;
-  if (data.length > MOST_ROW_BYTES * contexts) {
+  if (data.length > MAX_ROW_BYTES * contexts) {
     throw new StreamError(`${where} has ${data.length} bytes for ${contexts} contexts; it is damaged.`);
   }
   if (!data.length) return previous; // usual if little has changed
@@ -102,7 +102,7 @@ function explicitRow(reader: BitReader, row: Uint16Array, where: string): void {
   const weights = new Float64Array(row.length);
   for (const symbol of present) {
     let level = levelOf(row[symbol]!, precision);
-    if (present.length > 1) level += reader.signedGolomb(order, MOST_ZEROS);
+    if (present.length > 1) level += reader.signedGolomb(order, MAX_ZEROS);
     if (level < 1 || level > (FREQUENCY_BITS + 1) << precision) {
       throw new StreamError(`${where} holds a frequency out of bounds; it is damaged.`);
     }

@@ -5,14 +5,15 @@ import { afterEach, beforeEach, describe, expect, test, vi } from "vitest";
 import { AdaptiveDecoder } from "../src/adaptive.ts";
 import { Models } from "../src/decisions.ts";
 import { StreamError } from "../src/errors.ts";
-import { decodedFree, MOST_FREE, noFree } from "../src/freeRows.ts";
+import { decodedFree, MAX_FREE, noFree } from "../src/freeRows.ts";
 import { readStream } from "../src/reader.ts";
 import { bytesOf, FIXTURES, joined, piecesOf, record, VECTORS } from "./streams.ts";
 
-const MOST_BYTES = 2 ** 20;
-const STREAMS: [string, Uint8Array][] = [
-  ["raw", bytesOf(VECTORS, "version-2.sgs")],
-  ["compact", bytesOf(FIXTURES, "tiny.sgs")],
+const MAX_BYTES = 2 ** 20;
+/** A stream, and the distance of the bytes that are tried. */
+const STREAMS: [string, Uint8Array, number][] = [
+  ["raw", bytesOf(VECTORS, "version-2.sgs"), 3],
+  ["compact", bytesOf(FIXTURES, "tiny.sgs"), 5],
 ];
 const ARRAYS = { Uint8Array, Uint16Array, Int32Array, Float32Array, Float64Array, BigInt64Array };
 let largest = 0;
@@ -53,39 +54,39 @@ function framesOf(stream: Uint8Array): number | undefined {
   }
 }
 
-describe.each(STREAMS)("the %s stream", (_, stream) => {
+describe.each(STREAMS)("the %s stream", (_, stream, step) => {
   const records = readStream(stream).packets.length;
 
-  test("cut at every byte", async () => {
+  test("cut", async () => {
     let before = 0;
-    for (let end = 0; end <= stream.length; end++) {
+    for (let end = 0; end < stream.length; end += step) {
       await pause(end);
       const frames = framesOf(stream.subarray(0, end)) ?? 0;
       expect(frames).toBeGreaterThanOrEqual(before);
       before = frames;
     }
-    expect(before).toBe(records);
-    expect(largest).toBeLessThan(MOST_BYTES);
+    expect(framesOf(stream)).toBe(records);
+    expect(largest).toBeLessThan(MAX_BYTES);
   });
 
-  test("with every byte changed", async () => {
-    for (let at = 0; at < stream.length; at++) {
+  test("with a byte changed", async () => {
+    for (let at = 0; at < stream.length; at += step) {
       await pause(at);
       const damaged = stream.slice();
       damaged[at]! ^= 1 << (at & 7);
       const frames = framesOf(damaged);
       expect(frames === undefined || frames <= records).toBe(true);
     }
-    expect(largest).toBeLessThan(MOST_BYTES);
+    expect(largest).toBeLessThan(MAX_BYTES);
   });
 
-  test("with every byte changed and a checksum that says it is right", async () => {
+  test("with a byte changed and a checksum that says it is right", async () => {
     const pieces = piecesOf(stream);
     let decoded = 0;
     let refused = 0;
     for (const [place, piece] of pieces.entries()) {
       if (place === 0) continue;
-      for (let at = 8; at < piece.length - 4; at++) {
+      for (let at = 8; at < piece.length - 4; at += step) {
         await pause(at);
         for (const change of [1 << (at & 7), 0xff]) {
           const payload = piece.slice(8, -4);
@@ -96,8 +97,8 @@ describe.each(STREAMS)("the %s stream", (_, stream) => {
         }
       }
     }
-    expect(refused).toBeGreaterThan(300);
-    expect(decoded).toBeGreaterThan(300);
+    expect(refused).toBeGreaterThan(60);
+    expect(decoded).toBeGreaterThan(60);
     expect(largest).toBeLessThan(2 ** 24);
   });
 
@@ -105,13 +106,13 @@ describe.each(STREAMS)("the %s stream", (_, stream) => {
     const pieces = piecesOf(stream);
     for (const [place, piece] of pieces.entries()) {
       if (place === 0 || place === pieces.length - 1) continue;
-      for (let end = 0; end < piece.length - 12; end++) {
+      for (let end = 0; end < piece.length - 12; end += step) {
         await pause(end);
         const cut = record(piece[0]!, piece.slice(8, 8 + end));
         expect(framesOf(joined(...pieces.slice(0, place), cut, ...pieces.slice(place + 1)))).toBeUndefined();
       }
     }
-    expect(largest).toBeLessThan(MOST_BYTES);
+    expect(largest).toBeLessThan(MAX_BYTES);
   });
 });
 
@@ -133,7 +134,7 @@ test("more births than a scene may have are refused before anything is allocated
   expect(most).toThrow("ends too early in free_births");
   largest = 0;
   const more = () => decodedFree(bornOf(64, 62, 189, 124, 228), noFree(), "It");
-  expect(more).toThrow(`adds ${MOST_FREE + 1} free Gaussians`);
+  expect(more).toThrow(`adds ${MAX_FREE + 1} free Gaussians`);
   const huge = () => decodedFree(bornOf(64, 62, 143, 66, 0, 2, 244), noFree(), "It");
   expect(huge).toThrow("adds 2147483647 free Gaussians");
   expect(() => decodedFree(bornOf(33), noFree(), "It")).toThrow("adds -1 free Gaussians");

@@ -5,7 +5,7 @@ import { describe, expect, test } from "vitest";
 import { blocksIn } from "../src/blocks.ts";
 import { checkShapes, type FieldName } from "../src/fields.ts";
 import { viewOf } from "../src/records.ts";
-import { decodedFields, MOST_ANCHORS } from "../src/staticFields.ts";
+import { decodedFields, MAX_ANCHORS } from "../src/staticFields.ts";
 import { bytesOf, FIXTURES, joined, piecesOf } from "./streams.ts";
 
 /** The coded blocks of a fixture's init record. */
@@ -26,7 +26,7 @@ const steps = new Map([...coded.keys()].map((name) => [name as string, 0.5]));
 const replaced = (name: FieldName, data: Uint8Array) => () => decodedFields(new Map(coded).set(name, data), steps);
 
 describe.each<[FieldName, number, string]>([
-  ["anchor_positions", MOST_ANCHORS, "anchors"],
+  ["anchor_positions", MAX_ANCHORS, "anchors"],
   ["base_scales", 3, "columns of base_scales"],
   ["anchor_offsets", 192, "columns of anchor_offsets"],
   ["anchor_features", 256, "columns of anchor_features"],

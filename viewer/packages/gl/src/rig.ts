@@ -6,9 +6,9 @@ import { eigen, outerSum, type Symmetric } from "./symmetric.js";
 import type { Camera } from "./types.js";
 import { along, dot, length, mean, scaled, unit, type Vector } from "./vectors.js";
 
-const LEAST_PARALLAX = 1e-3;
+const MIN_PARALLAX = 1e-3;
 /** Smallest share of the cameras' right axes in every direction of a plane for which the plane counts as level. */
-const LEAST_TURN = 0.02;
+const MIN_TURN = 0.02;
 
 type View = Pick<Camera, "viewmat">;
 
@@ -25,7 +25,7 @@ export function focusPoint(cameras: readonly View[]): Vector {
     0, 0, 0,
   ] as Vector);
   const pairs = eigen(normal as unknown as Symmetric);
-  if (pairs[0]!.value > LEAST_PARALLAX * cameras.length) {
+  if (pairs[0]!.value > MIN_PARALLAX * cameras.length) {
     const point = pairs.reduce((total, { value, vector }) => along(total, vector, dot(vector, sum) / value), [
       0, 0, 0,
     ] as Vector);
@@ -44,7 +44,7 @@ export function focusPoint(cameras: readonly View[]): Vector {
 export function upAxis(cameras: readonly View[]): Vector {
   const ups = mean(cameras.map((camera) => scaled(axes(camera)[1], -1)));
   const [least, middle] = eigen(outerSum(cameras.map((camera) => axes(camera)[0])));
-  const level = middle!.value > LEAST_TURN * cameras.length && least!.value < 0.5 * middle!.value;
+  const level = middle!.value > MIN_TURN * cameras.length && least!.value < 0.5 * middle!.value;
   if (level) return dot(least!.vector, ups) < 0 ? scaled(least!.vector, -1) : least!.vector;
   if (length(ups) > 1e-6) return unit(ups);
   return scaled(axes(cameras[0]!)[1], -1);

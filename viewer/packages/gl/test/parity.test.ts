@@ -10,9 +10,9 @@ import { chromiumPath } from "./support/chromium.ts";
 import type { Lesser } from "./support/page.ts";
 import { compared } from "./support/references.ts";
 
-const LEAST_DECIBELS = 50;
-const MOST_BLOCK_LEVELS = 8;
-const MOST_OFF: Readonly<Record<MlpPath, number>> = { "transform-feedback": 1e-4, mrt: 2e-3 };
+const MIN_DECIBELS = 50;
+const MAX_BLOCK_LEVELS = 8;
+const MAX_OFF: Readonly<Record<MlpPath, number>> = { "transform-feedback": 1e-4, mrt: 2e-3 };
 /** Gaussians of an anchor: of the clip, and of the scene of random numbers. */
 const OFFSETS = { patch: 3, odd: 7 } as const;
 const executable = chromiumPath();
@@ -52,10 +52,10 @@ describe.skipIf(!executable)("in a browser", () => {
       for await (const view of compared(stage, name, folder(name), path, OFFSETS[name], device)) {
         const where = `${name} ${view.name}`;
         // Eight bits a blend lose more: the fall-back is held to less, and says so to its user.
-        const least = device.withoutExtensions ? 36 : LEAST_DECIBELS;
+        const least = device.withoutExtensions ? 36 : MIN_DECIBELS;
         expect(view.psnrDecibels, where).toBeGreaterThanOrEqual(least);
-        expect(view.blockLevels, where).toBeLessThanOrEqual(MOST_BLOCK_LEVELS);
-        expect(view.mlp, where).toBeLessThanOrEqual(MOST_OFF[path]);
+        expect(view.blockLevels, where).toBeLessThanOrEqual(MAX_BLOCK_LEVELS);
+        expect(view.mlp, where).toBeLessThanOrEqual(MAX_OFF[path]);
         expect(view.gaussians, where).toBeGreaterThan(50);
         expect(view.stats.frameIndex, where).toBeDefined();
         console.log(`${where} by ${path}: ${view.psnrDecibels.toFixed(1)} dB, block ${view.blockLevels.toFixed(2)}`);

@@ -5,19 +5,20 @@
  * | attribute | meaning |
  * |---|---|
  * | `src` | address of a stream, of a manifest of segments (`.json`), or `#id` of an element of the page that holds one as base64 |
- * | `autoplay`, `loop` | as for a video |
+ * | `autoplay`, `loop`, `poster` | as for a video |
  * | `controls="off"` | no controls; the picture can still be turned |
  * | `embed` | few controls |
  * | `theme` | `dark` or `light`; default: that of the system |
  * | `truth` | address of a list of cameras with pictures, `truth.json`; pictures are at `truth/CAMERA/FRAME.jpg` next to it |
  * | `isolated` | the player ignores the page's address (`?src=&t=&view=&embed=1`) |
  *
- * It dispatches the player's events by the same names; they do not bubble, and `detail` has the event's data.
+ * It dispatches the player's events by the same names, and those of a `<video>` (`mediaEvents.ts`); they do not bubble, and
+ * `detail` has the event's data. Children are shown over the picture; those with `slot="controls"` in the bar.
  */
 
 import { type Camera, type RenderStats, type ResourceCounts, SplatRenderer } from "@structgstream/gl";
 import type { Engine } from "./engine/engine.js";
-import type { TimeRange } from "./engine/events.js";
+import { type MediaEvents, MediaState, Ranges } from "./mediaEvents.js";
 import { startedPipeline } from "./pipeline.js";
 import { Player, type PlayerEvents } from "./player.js";
 import { startedWorker } from "./scripts.js";
@@ -28,19 +29,27 @@ import { type Link, linkOf, viewFrom } from "./view/link.js";
 import { viewOf } from "./view/navigator.js";
 import { QualityControl } from "./view/quality.js";
 
+/** As `MediaError.code` has it: the stream cannot be fetched or decoded. */
+const MEDIA_ERR_SRC_NOT_SUPPORTED = 4;
+
 interface Running {
   readonly player: Player;
   readonly ui: PlayerUi;
+  readonly media: MediaState;
   readonly observer: ResizeObserver;
 }
 
+/** All events of the element, and their data. */
+export type ElementEvents = PlayerEvents & MediaEvents;
+
 export class StructgstreamPlayer extends HTMLElement {
-  static readonly observedAttributes = ["src", "loop", "controls", "embed"];
+  static readonly observedAttributes = ["src", "loop", "controls", "embed", "poster"];
   private running: Running | undefined;
   private ticking: number | undefined;
   private link: Link | undefined;
   /** The stream's address, if a link can contain it. */
   private linked: string | undefined;
+  private source = "";
 
   connectedCallback(): void {
     this.link ??= this.hasAttribute("isolated") ? undefined : linkOf(new URL(location.href));
@@ -69,8 +78,28 @@ export class StructgstreamPlayer extends HTMLElement {
     else this.open({ kind: "blob", blob: source, name: source instanceof File ? source.name : "The stream" }, seconds);
   }
 
-  play(): void {
+  /** Plays; resolves when frames follow each other, and rejects as a video does if it is paused before or fails. */
+  play(): Promise<void> {
     this.engine?.play();
+    const { engine } = this;
+    if (engine && !engine.paused && !engine.seeking && !engine.stalled) return Promise.resolve();
+    const started = new Promise<void>((resolve, reject) => {
+      const waiting = new AbortController();
+      const once = (name: string, settle: () => void) => {
+        const heard = () => {
+          waiting.abort();
+          settle();
+        };
+        this.addEventListener(name, heard, { signal: waiting.signal });
+      };
+      const interrupted = () =>
+        reject(new DOMException(this.error?.message ?? "Paused before it played.", "AbortError"));
+      once("playing", resolve);
+      once("pause", interrupted);
+      once("loadstart", interrupted);
+    });
+    started.catch(() => undefined); // who does not wait for it hears of an error by its event
+    return started;
   }
 
   pause(): void {
@@ -139,8 +168,69 @@ export class StructgstreamPlayer extends HTMLElement {
     return this.engine?.paused ?? true;
   }
 
-  get buffered(): readonly TimeRange[] {
-    return this.engine?.stored.times ?? [];
+  get ended(): boolean {
+    return this.engine?.ended ?? false;
+  }
+
+  get seeking(): boolean {
+    return this.engine?.seeking ?? false;
+  }
+
+  /** 0 nothing, 1 metadata, 2 the present frame, 4 enough to play, as of a video. */
+  get readyState(): number {
+    return this.running?.media.readyState ?? 0;
+  }
+
+  /** Why nothing can be played; null without a fatal error. */
+  get error(): { readonly code: number; readonly message: string } | null {
+    const message = this.running?.media.error;
+    return message === undefined ? null : { code: MEDIA_ERR_SRC_NOT_SUPPORTED, message };
+  }
+
+  get buffered(): Ranges {
+    return new Ranges(this.engine?.stored.times ?? []);
+  }
+
+  get seekable(): Ranges {
+    const frames = this.engine?.frames;
+    return new Ranges(frames?.count ? [[frames.start, frames.duration]] : []);
+  }
+
+  /** The address of the stream that is open; "" for a file or bytes. */
+  get currentSrc(): string {
+    return this.source;
+  }
+
+  get src(): string {
+    return this.getAttribute("src") ?? "";
+  }
+
+  set src(address: string) {
+    this.setAttribute("src", address);
+  }
+
+  get poster(): string {
+    return this.getAttribute("poster") ?? "";
+  }
+
+  set poster(address: string) {
+    this.setAttribute("poster", address);
+  }
+
+  get autoplay(): boolean {
+    return this.hasAttribute("autoplay");
+  }
+
+  set autoplay(autoplay: boolean) {
+    this.toggleAttribute("autoplay", autoplay);
+  }
+
+  get controls(): boolean {
+    return this.getAttribute("controls") !== "off";
+  }
+
+  set controls(shown: boolean) {
+    this.setAttribute("controls", shown ? "" : "off");
   }
 
   /** The camera of the picture, in scene units; setting it takes effect without a flight. */
@@ -182,11 +272,11 @@ export class StructgstreamPlayer extends HTMLElement {
   }
 
   /** Adds a listener and returns a function that removes it. Listeners remain when another stream is loaded. */
-  on<EventName extends keyof PlayerEvents>(
+  on<EventName extends keyof ElementEvents>(
     name: EventName,
-    listener: (event: PlayerEvents[EventName]) => void,
+    listener: (event: ElementEvents[EventName]) => void,
   ): () => void {
-    const heard = (event: Event) => listener((event as CustomEvent<PlayerEvents[EventName]>).detail);
+    const heard = (event: Event) => listener((event as CustomEvent<ElementEvents[EventName]>).detail);
     this.addEventListener(name, heard);
     return () => this.removeEventListener(name, heard);
   }
@@ -208,7 +298,7 @@ export class StructgstreamPlayer extends HTMLElement {
   }
 
   private start(): void {
-    const root = this.shadowRoot ?? this.attachShadow({ mode: "open" });
+    const root = this.shadowRoot ?? this.attachShadow({ mode: "open", delegatesFocus: true });
     const style = document.createElement("style");
     style.textContent = STYLES;
     const canvas = document.createElement("canvas");
@@ -237,8 +327,16 @@ export class StructgstreamPlayer extends HTMLElement {
     root.replaceChildren(style, ui.root);
     const observer = new ResizeObserver(() => this.resized());
     observer.observe(this);
-    this.running = { player, ui, observer };
-    player.relay = this.tell;
+    const media = new MediaState(
+      player,
+      () => performance.now() / 1000,
+      (name) => this.tell(name, {}),
+    );
+    this.running = { player, ui, media, observer };
+    player.relay = (name, detail) => {
+      media.take(name, detail);
+      this.tell(name, detail);
+    };
     player.still = matchMedia("(prefers-reduced-motion: reduce)").matches;
     player.setLoop(this.hasAttribute("loop"));
     this.applyAttributes(ui);
@@ -285,6 +383,7 @@ export class StructgstreamPlayer extends HTMLElement {
   private applyAttributes(ui: PlayerUi): void {
     ui.controls = this.getAttribute("controls") !== "off";
     ui.embed = this.hasAttribute("embed") || this.link?.embed === true;
+    ui.poster = this.poster === "" ? undefined : new URL(this.poster, document.baseURI).href;
   }
 
   private openAttribute(): void {
@@ -331,11 +430,13 @@ export class StructgstreamPlayer extends HTMLElement {
   private open(source: SourceDescription, seconds?: number): void {
     const { running, link } = this;
     if (!running) return;
-    const { player, ui } = running;
+    const { player, ui, media } = running;
     const at = seconds ?? link?.seconds;
     const view = link?.view;
     this.link = undefined; // a link applies only to the first stream
     this.linked = this.linkable(source);
+    this.source = "url" in source ? source.url : "";
+    media.begin();
     const engine = player.load(source, at, view && ((rig) => viewFrom(view, rig.first.camera)));
     ui.begin(source.name);
     if (this.hasAttribute("autoplay")) engine.play();

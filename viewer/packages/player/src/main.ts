@@ -1,10 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 
-import { StructgstreamPlayer } from "./element.js";
+import { type ElementEvents, StructgstreamPlayer } from "./element.js";
 
 export type { EngineEvents, TimeRange } from "./engine/events.js";
+export type { MediaEvents, Ranges } from "./mediaEvents.js";
 export type { PlayerEvents } from "./player.js";
-export { StructgstreamPlayer };
+export { type ElementEvents, StructgstreamPlayer };
 
 // A page may contain the module twice, as notebooks do.
 if (!customElements.get("structgstream-player")) customElements.define("structgstream-player", StructgstreamPlayer);

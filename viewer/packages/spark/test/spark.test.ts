@@ -9,7 +9,7 @@ import { bytesOf, difference } from "../../gl/test/support/compare.ts";
 import type { Beside } from "./page.ts";
 
 /** Spark packs centres into half floats and colours into bytes. */
-const LEAST_DECIBELS = 40;
+const MIN_DECIBELS = 40;
 const executable = chromiumPath();
 const patch = fileURLToPath(new URL("../../gl/test/fixtures/patch.sgs", import.meta.url));
 
@@ -39,7 +39,7 @@ describe.skipIf(!executable)("in a browser", () => {
     ] as const) {
       const view = await compared(index, camera);
       console.log(`frame ${index}, ${camera}: ${view.psnrDecibels.toFixed(1)} dB`);
-      expect(view.psnrDecibels).toBeGreaterThan(LEAST_DECIBELS);
+      expect(view.psnrDecibels).toBeGreaterThan(MIN_DECIBELS);
       seen.push(view);
     }
     const [before, after] = seen;
@@ -54,7 +54,7 @@ describe.skipIf(!executable)("in a browser", () => {
   test("smaller pictures of another camera look alike too", async () => {
     const view = await compared(0, "cam00", 0.5);
     console.log(`0.5x: ${view.psnrDecibels.toFixed(1)} dB`);
-    expect(view.psnrDecibels).toBeGreaterThan(LEAST_DECIBELS);
+    expect(view.psnrDecibels).toBeGreaterThan(MIN_DECIBELS);
   }, 120_000);
 
   test("it is given back", async () => {

@@ -5,8 +5,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 from structgstream.errors import ConfigError
-from structgstream.presets import StreamConfig
 from structgstream.scene.state import FieldName
+from structgstream.session.presets import StreamConfig
 from structgstream.training.frame0.regularizers import PerturbationConfig
 from structgstream.training.losses import LossWeights
 from structgstream.training.online.config import MotionConfig, OnlineConfig

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from structgstream.errors import ConfigError
-from structgstream.presets import StreamConfig
+from structgstream.session.presets import StreamConfig
 from structgstream.training.online.config import OnlineConfig
 from structgstream_studies.experiments.effects import WHOLE, require_compact
 from structgstream_studies.experiments.variants import Variant

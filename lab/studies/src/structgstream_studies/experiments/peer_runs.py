@@ -6,15 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from structgstream.presets import to_json
+from structgstream.session.presets import to_json
 from structgstream_studies.experiments.captures import CapturePart
 from structgstream_studies.experiments.results import write_result
 from structgstream_studies.experiments.tasks import is_result_of, score_recording
 
 if TYPE_CHECKING:
     from structgstream.evaluation.recording import Recording
-    from structgstream.frame_report import FrameReport
     from structgstream.kernels.backend import Backend
+    from structgstream.session.frame_report import FrameReport
 
 PEER_TITLES: Mapping[str, str] = {
     "3dgstream": "3DGStream's method",

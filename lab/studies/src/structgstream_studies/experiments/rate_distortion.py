@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from structgstream.errors import ConfigError
-from structgstream.presets import StreamConfig
+from structgstream.session.presets import StreamConfig
 from structgstream_studies.experiments.bd_rate import bd_psnr, bd_rate, psnr_at, rate_at
 from structgstream_studies.experiments.effects import WHOLE, require_compact
 from structgstream_studies.experiments.results import Result

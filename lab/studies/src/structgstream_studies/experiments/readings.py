@@ -8,7 +8,7 @@ choice.
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
-from structgstream.presets import StreamConfig
+from structgstream.session.presets import StreamConfig
 from structgstream.training.frame0.fit import InitialConfig
 from structgstream.training.losses import LossWeights
 from structgstream.training.online.config import OnlineConfig

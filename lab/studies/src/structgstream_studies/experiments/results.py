@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from structgstream.atomic_files import atomic_write
 from structgstream.errors import StorageError
-from structgstream.whole_files import write_whole
 
 if TYPE_CHECKING:
     from structgstream.evaluation.report import Report
@@ -110,7 +110,7 @@ def write_result(path: Path, result: Result) -> None:
         StorageError: the file cannot be written.
     """
     content = json.dumps(round_floats(vars(result)), allow_nan=False, separators=(",", ":")) + "\n"
-    write_whole(path, content.encode(), called="The result", new_folder=True)
+    atomic_write(path, content.encode(), called="The result", new_folder=True)
 
 
 def round_floats(value: Any) -> Any:

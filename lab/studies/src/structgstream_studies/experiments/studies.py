@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from structgstream.errors import ConfigError
-from structgstream.presets import PAPER_DATA, PAPER_METHOD_PRESET, PRESETS, StreamConfig
+from structgstream.session.presets import PAPER_DATA, PAPER_METHOD_PRESET, PRESETS, StreamConfig
 from structgstream_studies.experiments.captures import CapturePart
 from structgstream_studies.experiments.effects import EFFECTS_TABLE, effects, effects_sheet
 from structgstream_studies.experiments.figures import Picture, write_comparison, write_curves, write_details

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from structgstream.errors import ConfigError
-from structgstream.presets import StreamConfig, to_json
-from structgstream.rate_control import RateConfig
+from structgstream.session.presets import StreamConfig, to_json
+from structgstream.session.rate_control import RateConfig
 from structgstream.training.frame0.seeding import EnvironmentConfig
 from structgstream.training.online.config import OnlineConfig
 from structgstream_studies.errors import ExperimentError
@@ -19,9 +19,9 @@ from structgstream_studies.experiments.results import Result, read_result, resul
 
 if TYPE_CHECKING:
     from structgstream.evaluation.recording import Recording
-    from structgstream.frame_report import FrameReport
     from structgstream.kernels.backend import Backend
     from structgstream.scene.scene import Scene
+    from structgstream.session.frame_report import FrameReport
     from structgstream.training.result import FitResult
 
 
@@ -199,10 +199,10 @@ def _reconstruct(
     capture: CapturePart, config: StreamConfig, stream: Path, backend: "Backend", *, first: FirstFrameRun | None
 ) -> None:
     """Reconstructs into ``stream``, going on after the frames that it holds."""
-    from structgstream.evaluation.capture import part_metadata
     from structgstream.evaluation.environment import environment
+    from structgstream.evaluation.recording import part_metadata
     from structgstream.recorder import record
-    from structgstream.struct_gstream import stream_pipeline
+    from structgstream.session.struct_gstream import stream_pipeline
 
     source = capture.open()
     stream.parent.mkdir(parents=True, exist_ok=True)

@@ -9,8 +9,8 @@ compared, not the values.
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from structgstream.presets import StreamConfig
 from structgstream.scene.state import FieldName
+from structgstream.session.presets import StreamConfig
 from structgstream.training.online.config import OnlineConfig, PatchingConfig
 
 PaperFigures = Mapping[str, float]

@@ -12,9 +12,9 @@ from structgstream.codec.container.byte_source import FileBytes
 from structgstream.codec.container.records import PREFIX, read_record
 from structgstream.codec.encoder import Encoded
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
-from structgstream.pipeline import FrameTask, Memory, Pipeline, State, StreamFacts
-from structgstream.presets import RIG, to_json
 from structgstream.scene.state import STATE_TABLE
+from structgstream.session.pipeline import FrameTask, Memory, Pipeline, State, StreamFacts
+from structgstream.session.presets import RIG, to_json
 from structgstream_studies.peers.container import PeerReader, PeerSink, arrays_of, check_prefix, parse_packet
 from structgstream_studies.peers.method import PeerMethod
 

@@ -37,7 +37,7 @@ from structgstream.codec.decoder import FRAME
 from structgstream.codec.header import pack_header, unpack_header
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.errors import StorageError, StreamError
-from structgstream.pipeline import State
+from structgstream.session.pipeline import State
 from structgstream_studies.peers.method import Arrays, PeerMethod
 
 MAGIC = b"\x89SGP\r\n\x1a\n"

@@ -13,7 +13,7 @@ from torch import Tensor
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
-from structgstream.pipeline import FrameTask, Memory, Method, Past, State
+from structgstream.session.pipeline import FrameTask, Memory, Method, Past, State
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.result import FitResult
 from structgstream.training.views import training_views

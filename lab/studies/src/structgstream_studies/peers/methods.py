@@ -9,7 +9,7 @@ from typing import Any
 from structgstream.codec.container.byte_source import FileBytes
 from structgstream.codec.packets import StreamHeader
 from structgstream.errors import StreamError
-from structgstream.presets import TINY
+from structgstream.session.presets import TINY
 from structgstream_studies.peers.additions import AdditionsConfig
 from structgstream_studies.peers.container import PeerReader
 from structgstream_studies.peers.densify import DensifyConfig

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from structgstream.codec.header import check_shapes
 from structgstream.errors import StreamError
-from structgstream.pipeline import FrameTask
-from structgstream.presets import RIG
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import STATE_TABLE, FieldName, on_device, scene_of, state_of
+from structgstream.session.pipeline import FrameTask
+from structgstream.session.presets import RIG
 from structgstream.training.frame0.fit import InitialConfig, fit_first_frame
 from structgstream.training.losses import InitialLossWeights
 from structgstream.training.result import FitResult

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from numpy.typing import NDArray
 
-from structgstream.pipeline import FrameTask
+from structgstream.session.pipeline import FrameTask
 from structgstream.training.result import FitResult
 from structgstream_studies.peers.gaussians import GaussiansConfig, fit_gaussians
 from structgstream_studies.peers.method import Arrays, IndependentFrames

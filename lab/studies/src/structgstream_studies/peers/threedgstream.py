@@ -21,8 +21,8 @@ from structgstream.cameras import Camera
 from structgstream.errors import StreamError
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
-from structgstream.pipeline import FrameTask, Past
 from structgstream.scene.color import CameraColor
+from structgstream.session.pipeline import FrameTask, Past
 from structgstream.training.frame0.fit import rig_extent
 from structgstream.training.losses import GradientStatistics, ViewLoss, picture_loss
 from structgstream.training.optim import Adam, Hooks, LastPass, Schedule, leaves, minimize

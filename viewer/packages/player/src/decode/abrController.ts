@@ -20,7 +20,7 @@ const TRIAL_LIMIT_SECONDS = 15;
 /** Upper bound of the throughput, as a multiple of that measured with small packets. */
 const UNDERESTIMATED = 16;
 const TRIAL_SECONDS = 10;
-const MOST_TRIAL_SECONDS = 320;
+const MAX_TRIAL_SECONDS = 320;
 /** Seconds after which a rendition with a temporary failure is tried again. */
 const RETRY_SECONDS = 2;
 
@@ -91,7 +91,7 @@ export class AbrController {
     const now = this.now();
     this.fell = step < this.at;
     // A step that was used for long has not failed.
-    if (this.fell && now - this.changed > MOST_TRIAL_SECONDS) this.trialSeconds = TRIAL_SECONDS;
+    if (this.fell && now - this.changed > MAX_TRIAL_SECONDS) this.trialSeconds = TRIAL_SECONDS;
     else if (this.fell) this.giveUp();
     this.at = step;
     this.tryingSince = undefined;
@@ -105,7 +105,7 @@ export class AbrController {
 
   private giveUp(): void {
     this.tried = this.now();
-    this.trialSeconds = Math.min(2 * this.trialSeconds, MOST_TRIAL_SECONDS);
+    this.trialSeconds = Math.min(2 * this.trialSeconds, MAX_TRIAL_SECONDS);
   }
 
   private granted(step: number): number {

@@ -20,7 +20,7 @@ import type { ByteClient } from "./byteClient.js";
 const HEAD_BYTES = 4096;
 const TAIL_BYTES = 4096;
 /** Largest number of entries of an index: 3 hours at 100 frames per second. */
-const MOST_INDEX_BYTES = 2 ** 24;
+const MAX_INDEX_BYTES = 2 ** 24;
 
 /** Events of opening, in this order: progress, the header, the index if there is one, then packets. */
 export interface OpeningEvents {
@@ -89,7 +89,7 @@ export class Opening {
   private lookAtTail(tail: Uint8Array, start: number, fileBytes: number): void {
     const footer = tail.subarray(-FOOTER_BYTES);
     const offset = start + tail.length === fileBytes ? indexOffset(footer, fileBytes) : undefined;
-    if (offset === undefined || fileBytes - offset > MOST_INDEX_BYTES) this.scan();
+    if (offset === undefined || fileBytes - offset > MAX_INDEX_BYTES) this.scan();
     else if (offset < start) this.readTail(offset, fileBytes);
     else this.useIndex(indexEntries(tail.subarray(offset - start, -FOOTER_BYTES), offset), offset);
   }

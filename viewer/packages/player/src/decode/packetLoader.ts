@@ -8,9 +8,9 @@ import type { PacketStore } from "./packetStore.js";
 import { Throughput } from "./throughput.js";
 
 /** Largest size of a request, so that a seek never waits long. */
-const MOST_RUN_BYTES = 2 ** 22;
+const MAX_RUN_BYTES = 2 ** 22;
 /** Number of concurrent requests of files: at the edge of a live stream every packet is a file. */
-const MOST_RUNS = 4;
+const MAX_RUNS = 4;
 /** Share of the store for packets ahead; the remainder is for packets that were shown. */
 const AHEAD_SHARE = 0.6;
 
@@ -69,10 +69,9 @@ export class PacketLoader {
       const urgent = missing < needed;
       if (urgent && this.runs.some((run) => run.next < missing && run.end > first)) {
         // The packets before it are being fetched.
-        if (!files || this.runs.length >= MOST_RUNS) return;
+        if (!files || this.runs.length >= MAX_RUNS) return;
       } else if (urgent) this.cancel();
-      else if (files ? this.runs.length >= MOST_RUNS : this.runs.length || missing - first > (ahead - first) / 2)
-        return;
+      else if (files ? this.runs.length >= MAX_RUNS : this.runs.length || missing - first > (ahead - first) / 2) return;
       const end = this.runEnd(missing, first, files && !urgent ? Number.POSITIVE_INFINITY : Math.max(ahead, needed));
       if (end <= missing) return;
       this.begin(missing, end);
@@ -106,7 +105,7 @@ export class PacketLoader {
   private runEnd(from: number, first: number, end: number): number {
     let room = AHEAD_SHARE * this.store.budgetBytes;
     for (let i = first; i < from; i++) room -= this.bytesOf(i);
-    room = Math.min(room, MOST_RUN_BYTES);
+    room = Math.min(room, MAX_RUN_BYTES);
     const file = this.catalog.place(from)?.entry?.file;
     let next = from;
     let at = this.catalog.place(from)?.start;

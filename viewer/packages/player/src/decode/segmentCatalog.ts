@@ -6,7 +6,7 @@ import { Catalog, type Place } from "./catalog.js";
 import type { CatalogFacts, LiveFacts } from "./messages.js";
 
 /** Largest number of cached pages; the ones used last are retained. */
-const MOST_PAGES = 12;
+const MAX_PAGES = 12;
 /** Minimum number of last frames over which the pace of the media is measured, as writers do. */
 const PACE_FRAMES = 8;
 
@@ -56,7 +56,7 @@ export class SegmentCatalog extends Catalog {
 
   takePage(entry: PageEntry, content: PageContent): void {
     this.pages.set(entry.file, content);
-    while (this.pages.size > MOST_PAGES) this.pages.delete(this.pages.keys().next().value as string);
+    while (this.pages.size > MAX_PAGES) this.pages.delete(this.pages.keys().next().value as string);
   }
 
   /** The period of a frame, if known. */

@@ -19,7 +19,7 @@ export class Chapter {
 }
 
 /** Largest number of cached headers of periods. */
-const MOST_CHAPTERS = 3;
+const MAX_CHAPTERS = 3;
 
 /** The chapters that were used last, by key of their period. */
 export class Chapters {
@@ -37,7 +37,7 @@ export class Chapters {
 
   put(period: number, header: StreamHeader): void {
     if (!this.kept.has(period)) this.kept.set(period, new Chapter(header));
-    if (this.kept.size > MOST_CHAPTERS) this.kept.delete(this.kept.keys().next().value as number);
+    if (this.kept.size > MAX_CHAPTERS) this.kept.delete(this.kept.keys().next().value as number);
   }
 }
 

@@ -6,7 +6,7 @@ const REMEMBERED_SECONDS = 6;
 /** Half-life of a measurement in wall-clock seconds, because small streams rarely wait for packets. */
 const HALF_LIFE_SECONDS = 10;
 /** Smallest number of bytes of a measurement, unless they took long. */
-const LEAST_BYTES = 30_000;
+const MIN_BYTES = 30_000;
 const ENOUGH_SECONDS = 10;
 
 export class Throughput {
@@ -59,7 +59,7 @@ export class Throughput {
     this.scale(0.5 ** (passed / HALF_LIFE_SECONDS));
     this.wallSeconds += passed;
     if (this.active) this.seconds += passed;
-    this.known ||= this.bytes >= LEAST_BYTES || this.seconds > REMEMBERED_SECONDS / 2;
+    this.known ||= this.bytes >= MIN_BYTES || this.seconds > REMEMBERED_SECONDS / 2;
     this.known ||= this.bytes > 0 && now - this.began > ENOUGH_SECONDS;
     if (this.seconds > REMEMBERED_SECONDS) this.scale(REMEMBERED_SECONDS / 2 / this.seconds);
   }

@@ -7,8 +7,8 @@ import type { Timeline } from "./timeline.js";
 const AHEAD_SECONDS = 10;
 /** Decoded frames in the queue: few are sufficient to even out decoding, and each needs memory. */
 const LEAD_SECONDS = 0.15;
-const LEAST_LEAD = 3;
-const MOST_LEAD = 8;
+const MIN_LEAD = 3;
+const MAX_LEAD = 8;
 
 /**
  * The demand of a stream whose clock is at frame `at`.
@@ -26,7 +26,7 @@ export function demandOf(
   if (rate === undefined) return { serial, at, until: at + 1, ahead: at + 1 };
   const { count, first, duration, start } = timeline;
   const lead = Math.ceil((LEAD_SECONDS * rate * (count - first)) / Math.max(duration - start, 1e-3));
-  const until = at + 1 + Math.min(Math.max(lead, LEAST_LEAD), MOST_LEAD);
+  const until = at + 1 + Math.min(Math.max(lead, MIN_LEAD), MAX_LEAD);
   const ahead = Math.max(timeline.frameAt(timeline.ptsOf(at) + aheadSeconds * rate) + 1, until);
   return { serial, at, until, ahead };
 }

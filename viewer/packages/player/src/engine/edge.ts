@@ -13,16 +13,16 @@ const QUICK_AGAIN = 1.1;
 const STEPS = 1.5;
 const SPARE_SECONDS = 0.25;
 /** A longer step counts as an outage. */
-const MOST_STEP_SECONDS = 10;
+const MAX_STEP_SECONDS = 10;
 /** Increase of the target distance with each stall. */
 const STALL_SECONDS = 0.5;
-const MOST_STALL_SECONDS = 4;
+const MAX_STALL_SECONDS = 4;
 /** Deviation from the target distance above which the clock runs faster until it has caught up. */
 const SLACK_SECONDS = 0.75;
 const FASTEST = 1.1;
 /** Deviation above which the clock jumps to a key frame, if that is nearer to the target. */
 const JUMP_SECONDS = 5;
-const LEAST_GAIN_SECONDS = 1;
+const MIN_GAIN_SECONDS = 1;
 
 /** Frames with at least this spacing in media time are shown on arrival, because motion is not smooth anyway. */
 const SPARSE_SECONDS = 0.8;
@@ -92,7 +92,7 @@ export class Edge {
   get distance(): number {
     if (!this.flows) return 0;
     const step = this.arrivals.reduce((most, at, i) => Math.max(most, i ? at - this.arrivals[i - 1]! : 0), 0);
-    const needed = STEPS * Math.min(step, MOST_STEP_SECONDS) + SPARE_SECONDS;
+    const needed = STEPS * Math.min(step, MAX_STEP_SECONDS) + SPARE_SECONDS;
     return Math.max(this.timeline.live!.targetSeconds, needed) + this.stalls;
   }
 
@@ -114,7 +114,7 @@ export class Edge {
     if (!this.following || rate !== 1) return { rate };
     if (this.sparse && this.seconds > seconds) return { to: timeline.count - 1 };
     const behind = this.seconds - this.distance - seconds;
-    if (behind > JUMP_SECONDS && timeline.ptsOf(this.start) > seconds + LEAST_GAIN_SECONDS)
+    if (behind > JUMP_SECONDS && timeline.ptsOf(this.start) > seconds + MIN_GAIN_SECONDS)
       return { to: this.start, why: "Playback was too slow and continues with the newest frames." };
     this.catching = behind > (this.catching ? 0 : SLACK_SECONDS);
     return { rate: this.catching ? Math.min(1 + behind / 10, FASTEST) : 1 };
@@ -122,7 +122,7 @@ export class Edge {
 
   /** The clock had to wait. */
   stalled(): void {
-    if (this.following && this.flows) this.stalls = Math.min(this.stalls + STALL_SECONDS, MOST_STALL_SECONDS);
+    if (this.following && this.flows) this.stalls = Math.min(this.stalls + STALL_SECONDS, MAX_STALL_SECONDS);
   }
 
   /** Seconds until the next frame; undefined if unknown, or if none will come. */

@@ -7,7 +7,7 @@ import type { Timeline } from "./timeline.js";
 
 /** Buffer to wait for after a stall, so that the next one does not follow immediately. */
 const REBUFFER_SECONDS = 0.5;
-const MOST_REBUFFER_SECONDS = 3;
+const MAX_REBUFFER_SECONDS = 3;
 
 export class Rebuffering {
   /** Time since which it could continue. */
@@ -36,7 +36,7 @@ export class Rebuffering {
     const frame = timeline.frameAt(time);
     if (reached <= frame) return frame >= timeline.count - 1 && timeline.complete;
     this.since ??= now;
-    if (now - this.since > MOST_REBUFFER_SECONDS) return true;
+    if (now - this.since > MAX_REBUFFER_SECONDS) return true;
     if (edge.flows) return edge.seconds - time >= Math.min(edge.distance, REBUFFER_SECONDS);
     const enough = Math.min(timeline.frameAt(time + REBUFFER_SECONDS * rate), ahead - 1);
     // The store may be too small for this buffer.

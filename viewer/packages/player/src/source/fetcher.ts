@@ -6,7 +6,7 @@ import { type ByteSource, SourceError } from "./byteSource.js";
 import type { ReadReply, ReadRequest, SourceDescription, StoredPlace } from "./description.js";
 import { HttpSource } from "./httpSource.js";
 import { joined } from "./joined.js";
-import { type Manifest, MOST_MANIFEST_BYTES, pageIn, type Quality } from "./manifest.js";
+import { MAX_MANIFEST_BYTES, type Manifest, pageIn, type Quality } from "./manifest.js";
 import { ManifestFeed } from "./manifestFeed.js";
 import { pause } from "./pause.js";
 import type { Port } from "./port.js";
@@ -14,7 +14,7 @@ import { RETRY_POLICY, type RetryPolicy } from "./retryPolicy.js";
 import { besides, verify } from "./storedFile.js";
 
 /** Largest accepted size of an init record or a packet. */
-const MOST_HELD_BYTES = 2 ** 28;
+const MAX_HELD_BYTES = 2 ** 28;
 
 export class Fetcher {
   private description: SourceDescription | undefined;
@@ -62,7 +62,7 @@ export class Fetcher {
     if (message.type === "manifests") await this.feed(message, signal);
     else if (message.type === "page") {
       const { url, entry } = message;
-      const bytes = await this.wholeOf(id, { url, entry, small: true }, MOST_MANIFEST_BYTES, signal);
+      const bytes = await this.wholeOf(id, { url, entry, small: true }, MAX_MANIFEST_BYTES, signal);
       if (!signal.aborted) this.port.postMessage({ type: "page", id, content: pageIn(bytes, entry) }, []);
     } else if (message.type === "follow") await this.follow(id, message.start, signal);
     else if (message.of) await this.readStored(id, message.of, message.start, message.end, signal);
@@ -100,7 +100,7 @@ export class Fetcher {
     end: number,
     signal: AbortSignal,
   ): Promise<void> {
-    if (of.small) return this.give(id, await this.wholeOf(id, of, MOST_HELD_BYTES, signal), signal);
+    if (of.small) return this.give(id, await this.wholeOf(id, of, MAX_HELD_BYTES, signal), signal);
     const parts: Uint8Array[] = [];
     const whole = start === 0 && end === of.entry.bytes;
     const give = (bytes: Uint8Array) => {

@@ -18,14 +18,14 @@ import {
   whole,
 } from "./checks.js";
 
-export const MOST_MANIFEST_BYTES = 2 ** 22;
+export const MAX_MANIFEST_BYTES = 2 ** 22;
 const FORMAT = "structgstream-segments";
 const QUALITIES = "structgstream-qualities";
-const MOST_ENTRIES = 4096;
-const MOST_GROUP_FRAMES = 65_536;
-const MOST_RECORD_BYTES = 2 ** 33;
-const MOST_QUALITIES = 8;
-const MOST_LIST_BYTES = 2 ** 16;
+const MAX_ENTRIES = 4096;
+const MAX_GROUP_FRAMES = 65_536;
+const MAX_RECORD_BYTES = 2 ** 33;
+const MAX_QUALITIES = 8;
+const MAX_LIST_BYTES = 2 ** 16;
 
 const count = whole(1);
 const storedFile = {
@@ -36,7 +36,7 @@ const storedFile = {
 const period = shaped({ ...storedFile, period: whole(), first_frame: whole(), first_segment: whole() });
 const page = shaped({
   ...storedFile,
-  bytes: whole(1, MOST_MANIFEST_BYTES),
+  bytes: whole(1, MAX_MANIFEST_BYTES),
   level: whole(0, 8),
   first_segment: whole(),
   segments: count,
@@ -49,10 +49,10 @@ const anySegment = shaped({
   segment: whole(),
   period: whole(),
   first_frame: whole(),
-  frames: whole(1, MOST_GROUP_FRAMES),
+  frames: whole(1, MAX_GROUP_FRAMES),
   pts_seconds: span,
-  key_bytes: whole(1, MOST_RECORD_BYTES),
-  frame_bytes: list(whole(1, MOST_RECORD_BYTES), MOST_GROUP_FRAMES),
+  key_bytes: whole(1, MAX_RECORD_BYTES),
+  frame_bytes: list(whole(1, MAX_RECORD_BYTES), MAX_GROUP_FRAMES),
 });
 const part = shaped({
   ...storedFile,
@@ -60,7 +60,7 @@ const part = shaped({
   period: whole(),
   kind: like(/^(key|delta)$/, '"key" or "delta"'),
   pts_seconds: number(),
-  bytes: whole(1, MOST_RECORD_BYTES),
+  bytes: whole(1, MAX_RECORD_BYTES),
 });
 const segment: Check<SegmentEntry> = (value, where) => {
   const found = anySegment(value, where);
@@ -84,10 +84,10 @@ const manifest = shaped({
     published_unix_seconds: number(),
   }),
   window: shaped({ first_frame: whole(), first_segment: whole(), seconds: orNull(number()) }),
-  periods: list(period, MOST_ENTRIES),
-  history: list(page, MOST_ENTRIES),
-  segments: list(segment, MOST_ENTRIES),
-  parts: list(part, MOST_GROUP_FRAMES),
+  periods: list(period, MAX_ENTRIES),
+  history: list(page, MAX_ENTRIES),
+  segments: list(segment, MAX_ENTRIES),
+  parts: list(part, MAX_GROUP_FRAMES),
 });
 const qualities = list(
   shaped({
@@ -95,7 +95,7 @@ const qualities = list(
     bits_per_second: number(1),
     name: text,
   }),
-  MOST_QUALITIES,
+  MAX_QUALITIES,
 );
 
 /** Facts that every entry states about its file. */
@@ -118,7 +118,7 @@ export type Quality = ReturnType<typeof qualities>[number];
 export function manifestIn(bytes: Uint8Array, name: string): Manifest | readonly Quality[] {
   const value = parsedJson(bytes, name);
   const listed = (value as { format?: unknown } | null)?.format === QUALITIES;
-  const most = listed ? MOST_LIST_BYTES : MOST_MANIFEST_BYTES;
+  const most = listed ? MAX_LIST_BYTES : MAX_MANIFEST_BYTES;
   if (bytes.length > most) throw new SourceError(`${name} has ${bytes.length} bytes; expected at most ${most}.`);
   if (listed) {
     const found = shaped({ version: only(1), qualities })(value, name).qualities;
@@ -139,8 +139,8 @@ export function pageIn(bytes: Uint8Array, entry: PageEntry): PageContent {
   const { file, level } = entry;
   const value = parsedJson(bytes, file);
   checkHead(value, file);
-  const pages = level ? shaped({ history: list(page, MOST_ENTRIES) })(value, file).history : [];
-  const segments = level ? [] : shaped({ segments: list(segment, MOST_ENTRIES) })(value, file).segments;
+  const pages = level ? shaped({ history: list(page, MAX_ENTRIES) })(value, file).history : [];
+  const segments = level ? [] : shaped({ segments: list(segment, MAX_ENTRIES) })(value, file).segments;
   if (pages.some((one) => one.level !== level - 1)) throw new SourceError(`${file} lists pages of a wrong level.`);
   const end = runEnd(segments, runEnd(pages, [entry.first_segment, entry.first_frame], file), file);
   if (end[0] !== entry.first_segment + entry.segments || end[1] !== entry.first_frame + entry.frames)

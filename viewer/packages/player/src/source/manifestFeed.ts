@@ -9,7 +9,7 @@
 import { SourceError } from "./byteSource.js";
 import { answered, refusal } from "./httpSource.js";
 import { joined } from "./joined.js";
-import { type Manifest, MOST_MANIFEST_BYTES, manifestIn, type Quality } from "./manifest.js";
+import { MAX_MANIFEST_BYTES, type Manifest, manifestIn, type Quality } from "./manifest.js";
 import { pause } from "./pause.js";
 import type { RetryPolicy } from "./retryPolicy.js";
 
@@ -113,7 +113,7 @@ export class ManifestFeed {
       const response = await answered(this.request, url.href, this.name, headers, this.sameOrigin, late.signal);
       if (response.status === 304) return undefined;
       if (response.status !== 200) throw refusal(this.name, response.status);
-      const bytes = await limited(response, MOST_MANIFEST_BYTES, this.name);
+      const bytes = await limited(response, MAX_MANIFEST_BYTES, this.name);
       const found = manifestIn(bytes, this.name);
       this.etag = response.headers.get("ETag") ?? undefined;
       return "sequence" in found ? this.newer(found) : found;

@@ -52,7 +52,7 @@ export class Bar {
     };
     this.root = made(
       "div",
-      { class: "bar glass", role: "group", "aria-label": "Player controls" },
+      { class: "bar glass", part: "controls", role: "group", "aria-label": "Player controls" },
       this.timeline.root,
       made(
         "div",
@@ -66,6 +66,7 @@ export class Bar {
         this.rate,
         this.loop,
         this.compare,
+        made("slot", { name: "controls" }),
         panel("cameras", "cameras", "Cameras", "noembed"),
         panel("statistics", "chart", "Statistics", "noembed wide"),
         panel("settings", "settings", "Picture", "noembed"),

@@ -30,7 +30,17 @@ export function icon(name: IconName): SVGSVGElement {
 }
 
 export function button(face: IconName, label: string, action: () => void, extra = ""): HTMLButtonElement {
-  const element = made("button", { type: "button", "aria-label": label, title: label, class: extra }, icon(face));
+  const element = made(
+    "button",
+    {
+      type: "button",
+      part: "button",
+      "aria-label": label,
+      title: label,
+      class: extra,
+    },
+    icon(face),
+  );
   element.addEventListener("click", action);
   return element;
 }

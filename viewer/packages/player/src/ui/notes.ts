@@ -8,9 +8,9 @@ const NOTE_SECONDS = 6;
 
 export class Notes {
   readonly root = made("div");
-  private readonly note = made("div", { class: "note glass", role: "status", hidden: true });
+  private readonly note = made("div", { class: "note glass", part: "note", role: "status", hidden: true });
   private readonly text = made("span");
-  private readonly middle = made("div", { class: "middle" });
+  private readonly middle = made("div", { class: "middle", part: "message" });
   private readonly spoken = made("div", { class: "quiet", role: "status", "aria-live": "polite" });
   private until = 0;
   private readonly later: string[] = [];

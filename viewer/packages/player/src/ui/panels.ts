@@ -10,7 +10,7 @@ import { KEYS } from "./keyboard.js";
 
 export function panel(title: string, close: () => void, ...children: Node[]): HTMLElement {
   const head = made("h2", {}, title, button("close", "Close", close));
-  return made("section", { class: "panel glass", "aria-label": title }, head, ...children);
+  return made("section", { class: "panel glass", part: "panel", "aria-label": title }, head, ...children);
 }
 
 function choice<Value extends string>(

@@ -46,6 +46,7 @@ export class PlayerUi {
   private readonly statistics: Statistics;
   private readonly gestures: Gestures;
   private readonly keyboard: Keyboard;
+  private readonly posterImage = made("img", { class: "poster", part: "poster", alt: "", hidden: true });
   private readonly drop = made("div", { class: "drop", hidden: true }, "Drop a stream to play it");
   private opened:
     | { readonly name: PanelName; readonly root: HTMLElement; readonly button: Element | undefined }
@@ -79,10 +80,18 @@ export class PlayerUi {
       fullscreen: () => this.fullscreen(),
     });
     const label = "Scene: drag to turn around it, wheel or pinch to come closer";
-    const stage = made("div", { class: "stage", tabindex: "0", role: "application", "aria-label": label });
-    stage.append(canvas, this.overlay.root, this.compare.root);
+    const stage = made("div", {
+      class: "stage",
+      part: "stage",
+      tabindex: "0",
+      role: "application",
+      "aria-label": label,
+    });
+    canvas.setAttribute("part", "picture");
+    stage.append(canvas, this.posterImage, this.overlay.root, this.compare.root);
     this.gestures = new Gestures(stage, player, () => this.tapped());
-    this.root = made("div", { class: "root" }, stage, this.notes.root, this.bar.root, this.drop);
+    const children = made("div", { class: "children" }, made("slot"));
+    this.root = made("div", { class: "root" }, stage, children, this.notes.root, this.bar.root, this.drop);
     this.keyboard = new Keyboard(this.root, player, {
       fullscreen: () => this.fullscreen(),
       help: () => this.toggle("help"),
@@ -103,10 +112,23 @@ export class PlayerUi {
     this.bar.root.hidden = !shown;
   }
 
+  /** The address of a picture that is shown until the first of the stream is drawn. */
+  set poster(address: string | undefined) {
+    if (address === undefined) this.posterImage.removeAttribute("src");
+    else if (this.posterImage.src !== address) this.posterImage.src = address;
+    this.showPoster(!this.options.player.stats?.drawn && !this.playButton);
+  }
+
+  private showPoster(shown: boolean): void {
+    this.posterImage.hidden = !shown || !this.posterImage.hasAttribute("src");
+    this.root.classList.toggle("posted", !this.posterImage.hidden);
+  }
+
   /** Shows that another stream is being opened. */
   begin(name: string): void {
     this.closePanel();
     this.playButton = undefined;
+    this.showPoster(true);
     this.notes.say("", 0);
     this.notes.loading(0, undefined, `Opening ${name.replace(/^The /, "the ")}`);
     if (this.options.player.engine) this.bar.timeline.attach(this.options.player.engine);
@@ -204,6 +226,7 @@ export class PlayerUi {
   /** Shows a large play button over the first picture of a paused stream. */
   private pictureCame(): void {
     if (this.playButton) return;
+    this.showPoster(false);
     const { engine } = this.options.player;
     this.playButton = button("play", "Play", () => engine?.play(), "big glass");
     if (engine?.paused && (!engine.edge.grows || engine.edge.live) && engine.frames.count > 1)

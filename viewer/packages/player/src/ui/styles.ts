@@ -21,6 +21,8 @@ export const STYLES = `
 .stage { touch-action: none; cursor: grab; outline: none; user-select: none; -webkit-user-select: none; }
 .stage:active { cursor: grabbing; }
 canvas { display: block; }
+.poster { position: absolute; inset: 0; width: 100%; height: 100%; object-fit: contain; pointer-events: none; }
+.children { position: absolute; inset: 0; pointer-events: none; } ::slotted(*) { pointer-events: auto; }
 .overlay { pointer-events: none; }
 .frustum path { fill: rgb(0 0 0 / 1%); stroke: #fff; stroke-opacity: .75; stroke-width: 1.25; pointer-events: all; cursor: pointer;
   paint-order: stroke; vector-effect: non-scaling-stroke; }
@@ -80,6 +82,7 @@ kbd { font: 11px/1.2 ui-monospace, monospace; border: 1px solid var(--line); bor
 .middle p { margin: 0; max-width: 46ch; }
 .middle.bad, .middle[data-is="loading"] { background: var(--ground); }
 .middle.bad { pointer-events: auto; }
+.posted .middle[data-is="loading"] { background: none; place-content: end center; }
 .middle .soft { color: var(--soft); font-variant-numeric: tabular-nums; }
 progress { appearance: none; width: min(220px, 60vw); height: 3px; border: 0; border-radius: 2px; background: var(--rail); overflow: hidden; }
 progress::-webkit-progress-bar { background: var(--rail); } progress::-webkit-progress-value { background: var(--accent); }

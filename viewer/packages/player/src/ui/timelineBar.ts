@@ -17,7 +17,7 @@ export class TimelineBar {
   constructor(private readonly seek: (seconds: number) => void) {
     this.root = made(
       "div",
-      { class: "timeline", role: "slider", tabindex: "0", "aria-label": "Time" },
+      { class: "timeline", part: "timeline", role: "slider", tabindex: "0", "aria-label": "Time" },
       this.canvas,
       this.tip,
     );

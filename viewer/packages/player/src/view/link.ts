@@ -12,7 +12,7 @@ import type { View } from "./navigator.js";
 const FAR = 1e6;
 const FOCAL: readonly [number, number] = [0.05, 50];
 const DIGITS = 5;
-const MOST_SECONDS = 1e7;
+const MAX_SECONDS = 1e7;
 
 /** A view as text, in units of the scene, whatever the picture's size. */
 export interface LinkedView {
@@ -101,7 +101,7 @@ function linkedView(text: string): LinkedView | undefined {
 
 function secondsOf(text: string): number | undefined {
   const value = /^\d{1,9}(\.\d{1,9})?$/.test(text) ? Number(text) : Number.NaN;
-  return value <= MOST_SECONDS ? value : undefined;
+  return value <= MAX_SECONDS ? value : undefined;
 }
 
 function ownAddress(text: string, page: URL): string | undefined {

@@ -26,14 +26,14 @@ export interface View {
 
 /** Smallest angle to the vertical, at which left and right would be swapped. */
 const POLE_RADIANS = 0.03;
-const LEAST_DISTANCE = 1e-3;
+const MIN_DISTANCE = 1e-3;
 
 /** A camera with its pivot on the optical axis at the depth of `focus`. */
 export function viewOf(camera: Camera, focus: Vector): View {
   const eye = center(camera);
   const forward = axes(camera)[2];
   const depth = dot(along(focus, eye, -1), forward);
-  const distance = depth > LEAST_DISTANCE ? depth : Math.max(length(along(focus, eye, -1)), LEAST_DISTANCE);
+  const distance = depth > MIN_DISTANCE ? depth : Math.max(length(along(focus, eye, -1)), MIN_DISTANCE);
   return { camera, pivot: along(eye, forward, distance) };
 }
 
@@ -76,7 +76,7 @@ export function looked({ camera, pivot }: View, yaw: number, pitch: number, up: 
 export function panned(view: View, x: number, y: number): View {
   const { camera, pivot } = view;
   const [right, down] = axes(camera);
-  const depth = Math.max(dot(along(pivot, center(camera), -1), axes(camera)[2]), LEAST_DISTANCE);
+  const depth = Math.max(dot(along(pivot, center(camera), -1), axes(camera)[2]), MIN_DISTANCE);
   const shift = along(scaled(right, (-x * depth) / camera.K.fx), down, (-y * depth) / camera.K.fy);
   return moved(view, shift);
 }
@@ -84,7 +84,7 @@ export function panned(view: View, x: number, y: number): View {
 /** Scales the distance to the pivot by `factor`. */
 export function dollied({ camera, pivot }: View, factor: number): View {
   const arm = along(center(camera), pivot, -1);
-  const distance = Math.max(length(arm) * factor, LEAST_DISTANCE);
+  const distance = Math.max(length(arm) * factor, MIN_DISTANCE);
   return { camera: placed(camera, along(pivot, unit(arm), distance), axes(camera)), pivot };
 }
 

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Atomic writes of files.
+
+Note [Atomic files]
+~~~~~~~~~~~~~~~~~~
+A file is written as ``PATH.partial`` and renamed, so a reader of ``PATH`` gets the old or the complete new content,
+even if the process is killed. The content is synced before the renaming; otherwise the file may be empty after a power
+cut. The folder is synced after it; otherwise the name may refer to the old file. The next writer overwrites the partial
+file of a killed process. The partial file is locked, because concurrent writers would mix their content.
+"""
+
+import errno
+import os
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from structgstream.errors import StorageError
+from structgstream.file_locks import lock_file, open_lockable
+
+_WITHOUT_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EACCES, errno.EPERM, errno.EBADF, errno.ENOSYS)
+"""Errors of file systems that cannot sync a folder, and of folders without read permission."""
+_ADVICE = {
+    errno.ENOSPC: "; make room",
+    errno.EDQUOT: "; make room",
+    errno.EACCES: "; correct its permissions, or choose another place",
+    errno.EPERM: "; correct its permissions, or choose another place",
+    errno.EROFS: "; choose another place",
+}
+
+
+def partial_path(path: Path) -> Path:
+    """The name of a file while it is written."""
+    return path.with_name(f"{path.name}.partial")
+
+
+def side_path(stream: Path, ending: str) -> Path:
+    """A side file of a stream, by its name without ``.sgs``: ``a.b.log.jsonl`` for ``a.b`` and ``a.b.sgs``."""
+    return stream.with_name(f"{stream.name.removesuffix('.sgs')}{ending}")
+
+
+def atomic_write(
+    path: Path,
+    content: bytes | Iterable[bytes | memoryview],
+    *,
+    called: str = "",
+    new_folder: bool = False,
+    sync: bool = True,
+) -> None:
+    """Writes or replaces the file ``path`` atomically (Note [Atomic files]).
+
+    Args:
+        path: the file.
+        content: its bytes, or an iterable of pieces, whose errors are passed on.
+        called: name of the file in messages, before its path: "The picture".
+        new_folder: create its folder if it is missing.
+        sync: return only when the file is on the disk and survives a power cut.
+
+    Raises:
+        StorageError: it cannot be written, or another process writes it; an existing file is not affected.
+    """
+    with _as_storage_error(path, called):
+        if new_folder:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path, sync=sync) as file:
+            file.writelines([content] if isinstance(content, bytes) else content)
+
+
+@contextmanager
+def atomic_file(path: Path, *, check: Callable[[Path], object] | None = None) -> Iterator[BinaryIO]:
+    """A file that is renamed to ``path`` at the end of the block, unless it raises (Note [Atomic files]).
+
+    Args:
+        path: the file.
+        check: called with the path of the complete partial file before it is renamed; if it raises, an existing file is
+            not affected.
+
+    Raises:
+        StorageError: see :func:`atomic_write`.
+    """
+    with _as_storage_error(path, ""), replacing(path) as file:
+        yield file
+        if check is not None:
+            file.flush()
+            check(partial_path(path.resolve() if path.is_symlink() else path))
+
+
+@contextmanager
+def replacing(path: Path, *, partial: Path | None = None, sync: bool = True) -> Iterator[BinaryIO]:
+    """As :func:`atomic_file`, but raises errors of the system unchanged.
+
+    Args:
+        path: the file.
+        partial: its path while it is written; None for that of :func:`partial_path`.
+        sync: sync the file to the disk before the block ends.
+
+    Raises:
+        OSError: it cannot be written; an existing file is not affected.
+        StorageError: another process writes it.
+    """
+    if path.exists() and not path.is_file() and not path.is_dir():
+        with path.open("wb") as file:  # a pipe or a device, such as /dev/stdout, which must not become a file
+            yield file
+        return
+    path = path.resolve() if path.is_symlink() else path  # The link is retained.
+    partial = partial or partial_path(path)
+    file = open_exclusive(partial, of=path)
+    try:
+        file.truncate()  # remains of a killed process
+        yield file
+        file.flush()
+        if sync:
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except BaseException:
+        with suppress(OSError):
+            partial.unlink()
+        with suppress(OSError):  # Closing raises the error of a full disk again.
+            file.close()
+        raise
+    file.close()
+    if sync:
+        sync_folder(path.parent)
+
+
+def open_exclusive(partial: Path, *, of: Path, buffering: int = -1) -> BinaryIO:
+    """Opens the file ``partial`` exclusively for writing, at its beginning and without truncation.
+
+    Args:
+        partial: the file; created if it is missing.
+        of: final path of the file, for the message.
+        buffering: as of :func:`open`.
+
+    Raises:
+        OSError: it cannot be opened.
+        StorageError: another process writes it.
+    """
+    while True:
+        file = open_lockable(partial, buffering=buffering)
+        if not lock_file(file):
+            file.close()
+            raise StorageError(f"Another process writes {of}; wait for its end, or choose another name.")
+        if _is_at(file, partial):
+            return file
+        file.close()  # The former lock holder has renamed or removed the file since it was opened here.
+
+
+def give_name(partial: Path, path: Path) -> None:
+    """Syncs the complete file ``partial``, renames it, and syncs the folder (Note [Atomic files]).
+
+    Raises:
+        OSError: one of these operations failed.
+    """
+    _sync(partial)
+    partial.replace(path)
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Syncs a folder, which makes new names in it durable, if the file system supports it.
+
+    Raises:
+        OSError: the disk has failed.
+    """
+    try:
+        _sync(folder)
+    except OSError as error:
+        if error.errno not in _WITHOUT_SYNC:
+            raise
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _is_at(file: BinaryIO, path: Path) -> bool:
+    """Whether ``path`` is the name of the open file."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except FileNotFoundError:
+        return False
+
+
+@contextmanager
+def _as_storage_error(path: Path, called: str) -> Iterator[None]:
+    """Converts errors of the system in the block to StorageError."""
+    try:
+        yield
+    except OSError as error:
+        reason = f"{path.parent} is a file" if os.path.isfile(path.parent) else error.strerror or str(error)
+        name = f"{called} {path}".lstrip()
+        raise StorageError(f"{name} cannot be written ({reason}){_ADVICE.get(error.errno or 0, '')}.") from error

@@ -1,0 +1,308 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The frame loop: fit, encode, write; the next frame starts from the decoded one (Note [Closed loop]).
+
+While a frame is fitted, the next one is read and its pictures are preprocessed (``lookahead``). A live source that
+returns its newest frame is read only after the previous frame is stored.
+"""
+
+from collections import deque
+from collections.abc import Generator, Iterable, Iterator, Mapping
+from contextlib import suppress
+from functools import partial
+from typing import Generic
+
+from structgstream.codec.container.index import Period
+from structgstream.codec.container.records import MAX_PERIODS
+from structgstream.codec.contents import PacketInfo
+from structgstream.codec.encoder import Encoded
+from structgstream.codec.header import check_picture_sizes
+from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
+from structgstream.data.denoising import denoised
+from structgstream.data.source import FrameStream, frame_count, is_recording, retain_frames
+from structgstream.errors import StorageError
+from structgstream.frames import MultiViewFrame
+from structgstream.kernels.backend import Backend
+from structgstream.lookahead import Lookahead
+from structgstream.session.frame_report import FrameReport, metered
+from structgstream.session.initialization import check_enough_pictures, frame_seed, initial_points_of, shows_enough
+from structgstream.session.key_frames import KeyFrames
+from structgstream.session.periods import PeriodPlan
+from structgstream.session.pipeline import (
+    FrameCoder,
+    FrameTask,
+    Memory,
+    Past,
+    Pipeline,
+    State,
+    StoredStream,
+    StreamFacts,
+)
+from structgstream.session.rate_control import RateController
+from structgstream.session.resuming import check_resumable
+from structgstream.similarity import normalizing_similarity
+from structgstream.training.online.preprocess import FramePictures
+from structgstream.training.result import StepListener
+
+
+class Session(Generic[State, Memory]):
+    """Reconstructs a capture into a sink, frame by frame.
+
+    Args:
+        source: the capture, or a live one, which is read until it ends or the loop is stopped.
+        sink: receives the packets.
+        pipeline: fits and stores frames, such as ``stream_pipeline(PRESETS["compact"])``.
+        backend: the compute back-end.
+        resumed: a reader of the sink's existing frames, to continue after them; None for a new stream.
+        metadata: plain JSON values for the header; must be equal in all runs of a stream.
+        on_step: called after every optimisation step.
+
+    Raises:
+        CalibrationError: the pictures of a camera are larger than a stream allows.
+        ConfigError: the stream to resume was made with another configuration or from another capture, or a target rate
+            is not possible.
+    """
+
+    def __init__(
+        self,
+        source: FrameStream,
+        sink: PacketSink,
+        pipeline: Pipeline[State, Memory],
+        backend: Backend,
+        *,
+        resumed: StoredStream[State] | None = None,
+        metadata: Mapping[str, object] | None = None,
+        on_step: StepListener | None = None,
+    ) -> None:
+        check_picture_sizes(source.rig)
+        self._source = denoised(source, pipeline.denoising, at=pipeline.denoised)
+        self._sink = sink
+        self._pipeline = pipeline
+        self._backend = backend
+        self._resumed = resumed if resumed is not None and len(resumed) else None
+        self._on_step = on_step
+        self._similarity = normalizing_similarity(source.rig, radius=pipeline.normalised_radius)
+        self._rig = self._similarity.rig(source.rig)
+        self._facts = StreamFacts(
+            codec=pipeline.codec.name,
+            rig=source.rig,
+            similarity=self._similarity,
+            fps=source.fps,
+            config=pipeline.config,
+            metadata={"capture": source.name, **pipeline.metadata, **(metadata or {})},
+        )
+        self._keys = KeyFrames(pipeline.codec.key_interval(source.fps), source.fps)
+        self._plan = PeriodPlan(pipeline.period, most=MAX_PERIODS)
+        self._controller = RateController(pipeline.rate, source.fps, keys=self._keys)
+        self._coder: FrameCoder[State] | None = None
+        self._steps: Mapping[str, float] = {}
+        self._first = 0  # frame of the period
+        self._shown: deque[tuple[int, float | None]] = deque(maxlen=2)  # its last two frames that show something
+        if resumed is not None:
+            check_resumable(resumed.header, self._facts)
+
+    def run(self) -> Generator[FrameReport, None, None]:
+        """Fit, encode and write every frame that the sink does not have yet; yields a report for each.
+
+        A complete stream is not changed. Otherwise the sink is closed, with its index, whenever the loop ends for any
+        reason except a failed write.
+        """
+        resumed, total = self._resumed, frame_count(self._source)
+        if resumed is not None and resumed.complete and total is not None and len(resumed) >= total:
+            return
+        try:
+            if resumed is None:
+                yield from self._frames(None, 0)
+            else:
+                self._reopen(resumed)
+                if total is None or len(resumed) < total:
+                    yield from self._frames(self._restore_past(resumed), len(resumed))
+        except BaseException:
+            with suppress(StorageError):  # The first error is the one to report.
+                self._sink.close()
+            raise
+        self._sink.close()
+
+    def _frames(self, past: Past[State, Memory] | None, start: int) -> Iterator[FrameReport]:
+        method = self._pipeline.method
+        with Lookahead(self._observe_frames(start), depth=int(is_recording(self._source))) as observed:
+            for meter, task in metered(self._tasks(observed), self._backend.device):
+                fit = method.first(task) if past is None else method.next(past, task)
+                meter.end("fit", peak="fit")
+                encoded = self._encode(fit.scene, task)
+                meter.end("encode")
+                size = self._write(encoded.packet, task)
+                meter.end("write", peak="store")
+                past = self._advance(past, encoded.reconstruction, task)
+                meter.end("prepare", peak="prepare" if task.frame.index == 0 else None)
+                yield meter.report(fit, encoded, size, remarks=task.remarks)
+
+    def _observe_frames(self, start: int) -> Iterator[tuple[MultiViewFrame, FramePictures]]:
+        """Each frame from ``start`` on with its preprocessed pictures."""
+        method = self._pipeline.method
+        # Changes are relative to the previous frame, so a resumed stream reads that one again.
+        again = start > 0 and method.needs_before
+        frames = self._source.frames(start - again)
+        before = self._showing_from(next(frames)) if again else None
+        for frame in frames:
+            check_enough_pictures(frame, self._rig, self._source.name)
+            yield frame, method.observe(frame, before, rig=self._rig, backend=self._backend)
+            if method.needs_before and (frame.index == 0 or shows_enough(frame, self._rig)):
+                before = frame
+
+    def _showing_from(self, frame: MultiViewFrame) -> MultiViewFrame:
+        """``frame``, or the last one before it with pictures that are not blank."""
+        while frame.index > 0 and not shows_enough(frame, self._rig):
+            frame = next(self._source.frames(frame.index - 1))
+        return frame
+
+    def _tasks(self, observed: Iterator[tuple[MultiViewFrame, FramePictures]]) -> Iterator[FrameTask]:
+        """The tasks of frames; each is created after the previous frame is written, on which its pressure depends."""
+        for frame, pictures in observed:
+            key = self._keys.kind(frame.index, frame.pts_seconds) is PacketKind.KEY
+            begins = self._plan.due(frame.index, frame.pts_seconds) if key and shows_enough(frame, self._rig) else None
+            yield self._task(frame, pictures, begins=begins)
+
+    def _task(self, frame: MultiViewFrame, pictures: FramePictures, *, begins: str | None = None) -> FrameTask:
+        pipeline = self._pipeline
+        points = partial(
+            initial_points_of,
+            self._source,
+            frame,
+            config=pipeline.points,
+            seed=pipeline.seed,
+            similarity=self._similarity,
+        )
+        return FrameTask(
+            frame,
+            pictures,
+            self._rig,
+            points,
+            self._backend,
+            seed=frame_seed(pipeline.seed, frame.index),
+            steps=self._steps,
+            pressure=self._controller.pressure,
+            begins=begins,
+            on_step=self._on_step,
+        )
+
+    def _encode(self, fitted: State, task: FrameTask) -> Encoded[State]:
+        """The packet of a frame; writes the header before the first packet of a period."""
+        if self._coder is None or task.begins is not None:
+            fitted, header = self._pipeline.codec.prepare(fitted, task, self._facts)
+            self._coder = self._open(header)
+        index, pts_seconds = task.frame.index, task.frame.pts_seconds
+        kind = self._keys.kind(index, pts_seconds)
+        return self._coder.encode(fitted, index=index, pts_seconds=pts_seconds, kind=kind)
+
+    def _write(self, packet: Packet, task: FrameTask) -> int:
+        size = self._sink.write(packet)
+        self._note(packet, size, begins=task.begins is not None)
+        return size
+
+    def _note(self, packet: Packet | PacketInfo, size: int, *, begins: bool) -> None:
+        """Record a written packet for key frames, periods and rate control."""
+        index, pts_seconds = packet.index, packet.pts_seconds
+        if packet.kind is PacketKind.KEY:
+            self._keys.begin(index, pts_seconds)
+        self._controller.add(size, packet.kind, index=index, pts_seconds=pts_seconds, begins=begins)
+
+    def _open(self, header: StreamHeader) -> FrameCoder[State]:
+        """The coder of the period with this header."""
+        self._steps = header.steps
+        coder = self._pipeline.codec.coder(header, self._backend.device)
+        if self._coder is None:
+            self._sink.open(header)
+        else:
+            self._sink.begin(header)
+        return coder
+
+    def _advance(self, past: Past[State, Memory] | None, state: State, task: FrameTask) -> Past[State, Memory]:
+        """The state from which the next frame is fitted."""
+        method = self._pipeline.method
+        index, shows = task.frame.index, shows_enough(task.frame, self._rig)
+        if past is not None and task.begins is None:
+            self._measure(state, task)
+            if shows:
+                self._shown.append((index, task.frame.pts_seconds))
+            self._keep(index)
+            older = past.state if shows else past.older  # the scene of a held frame is the one before it
+            return Past(state, past.memory, older if method.needs_older else None, self._seconds_shown)
+        self._begin(index, [(index, task.frame.pts_seconds)])
+        self._plan.begin(index, task.frame.pts_seconds)
+        self._keep(index)
+        self._measure(state, task)
+        return Past(state, method.prepare(state, lambda: task))
+
+    def _begin(self, first: int, shown: Iterable[tuple[int, float | None]]) -> None:
+        """A period has begun with frame ``first``; ``shown`` are its last frames that show something."""
+        self._first = first
+        self._shown.clear()
+        self._shown.extend(shown)
+
+    def _keep(self, index: int) -> None:
+        """Ask for the pictures that a run reads again which is resumed after this frame."""
+        retain_frames(self._source, self._first, last=max(self._plan.remembered, index + 1 - self._shown[0][0]))
+
+    @property
+    def _seconds_shown(self) -> tuple[float, float] | None:
+        """Presentation times of the last two frames that show something; None unless both are known."""
+        match [seconds for _, seconds in self._shown if seconds is not None]:
+            case [before, last]:
+                return before, last
+        return None
+
+    def _measure(self, state: State, task: FrameTask) -> None:
+        """Add the residual of a decoded frame to the plan of periods, if the plan needs it."""
+        index = task.frame.index
+        if self._pipeline.residual is None or (index > 0 and not shows_enough(task.frame, self._rig)):
+            return
+        if self._plan.measures(index, task.frame.pts_seconds, self._keys):
+            self._plan.add(index, self._pipeline.residual(state, task))
+
+    def _reopen(self, resumed: StoredStream[State]) -> None:
+        """Continue an existing stream."""
+        self._coder = self._open(resumed.header_of(len(resumed) - 1))
+        for info in resumed.packets:
+            begins = info.index > 0 and resumed.period(info.index).first_frame == info.index
+            self._note(info, info.bytes, begins=begins)
+
+    def _restore_past(self, resumed: StoredStream[State]) -> Past[State, Memory]:
+        """The state from which the next frame is fitted, decoded from the existing stream."""
+        assert self._coder is not None, "reopened before"
+        method, count = self._pipeline.method, len(resumed)
+        state = deque(map(self._coder.replay, resumed.group(count - 1)), maxlen=1).pop()
+        period = resumed.period(count - 1)
+        first = period.first_frame
+        shown = self._last_shown(count, first) if method.needs_older else [*range(max(count - 2, first), count)]
+        seconds = {info.index: info.pts_seconds for info in resumed.packets}
+        # A group of frames has packets of its own frames only: when those before were shown is not known.
+        self._begin(first, ((index, seconds.get(index)) for index in shown))
+        older = resumed.scene(shown[0]) if method.needs_older and len(shown) == 2 else None
+        self._keep(count - 1)
+        if self._pipeline.period.enabled:
+            self._restore_plan(resumed, period)
+        memory = method.prepare(resumed.scene(first), partial(self._task_again, first))
+        return Past(state, memory, older, self._seconds_shown)
+
+    def _last_shown(self, count: int, first: int) -> list[int]:
+        """The last two frames, of those from ``first`` to ``count``, whose pictures show something; the first does."""
+        found: list[int] = []
+        for index in range(count - 1, first, -1):
+            if shows_enough(next(self._source.frames(index)), self._rig):
+                found.append(index)
+            if len(found) == 2:
+                break
+        return [first, *reversed(found)][-2:]
+
+    def _restore_plan(self, resumed: StoredStream[State], period: Period) -> None:
+        """Restore the plan of periods: the start of the last period, and residuals, which are measured again."""
+        seconds = [info.pts_seconds for info in resumed.packets]
+        self._plan.begin(period.first_frame, seconds[period.first_frame], number=period.number)
+        for index in self._plan.needed(seconds, self._keys):
+            self._measure(resumed.scene(index), self._task_again(index))
+
+    def _task_again(self, index: int) -> FrameTask:
+        """The task of an existing frame; reads its pictures again."""
+        frame = next(self._source.frames(index))
+        check_enough_pictures(frame, self._rig, self._source.name)
+        return self._task(frame, self._pipeline.method.observe(frame, None, rig=self._rig, backend=self._backend))

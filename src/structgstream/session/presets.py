@@ -1,0 +1,434 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Configurations as values. Paper mode is a preset; the paper's ablations are edits of a preset."""
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, ClassVar, Literal
+
+from structgstream.cameras import CameraRig
+from structgstream.config_fields import (
+    check_numbers,
+    holds,
+    plain_value,
+    read_value,
+    unknown_fields,
+    with_present_names,
+    without_constants,
+    without_fields,
+)
+from structgstream.data.denoising import DenoisingConfig
+from structgstream.data.points import PointsConfig
+from structgstream.errors import ConfigError
+from structgstream.session.periods import PeriodConfig
+from structgstream.session.rate_control import RateConfig
+from structgstream.training.frame0.densify import GrowthConfig
+from structgstream.training.frame0.fit import InitialConfig, InitialRates
+from structgstream.training.frame0.regularizers import DepthDistortionConfig, FreeSpaceConfig, PerturbationConfig
+from structgstream.training.frame0.seeding import EnvironmentConfig
+from structgstream.training.online.config import (
+    ExposureConfig,
+    MotionConfig,
+    OnlineConfig,
+    OnlineRates,
+    PatchingConfig,
+    SceneFlowConfig,
+    SmoothnessConfig,
+    SpawnConfig,
+    ThinSpawnConfig,
+)
+from structgstream.training.parameters import RoundingConfig
+
+MAX_QUALITY = 6.0  # steps 64 times as small, or as large
+
+
+@dataclass(frozen=True)
+class StreamConfig:
+    """Everything that determines a reconstruction, apart from the capture and the machine."""
+
+    initial: InitialConfig = field(default_factory=InitialConfig)
+    online: OnlineConfig = field(default_factory=OnlineConfig)
+    points: PointsConfig = field(default_factory=PointsConfig)
+    """Initial points from frame 0, for captures without points."""
+    denoising: DenoisingConfig = field(default_factory=DenoisingConfig)
+    """Means over frames of what stands still in frame 0."""
+    environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
+    """Background of unobserved directions."""
+    key_interval_seconds: float = 1.0
+    """Interval of key packets, at which a viewer can start, in seconds of media time."""
+    codec: Literal["raw", "compact"] = "raw"
+    """Coding of frames: ``raw`` float32, or ``compact``, quantized (``online.rounding``) and entropy coded."""
+    rate: RateConfig = field(default_factory=RateConfig)
+    """Rate control; only with the codec ``compact``."""
+    period: PeriodConfig = field(default_factory=PeriodConfig)
+    """When the stream goes on with another header; while off, it is left out of headers."""
+    seed: int = 0
+    """Random seed, from 0 on."""
+
+    NORMALISED_RADIUS: ClassVar[float] = 1.0
+    """Largest distance of a training camera to their mean in normalised units, to which learning rates and voxel sizes
+    refer (paper: not stated)."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self)
+
+
+def to_json(config: StreamConfig) -> dict[str, Any]:
+    """The resolved configuration as plain JSON values: what a stream's header stores."""
+
+    found = plain_value(config)
+    if found.get("period") == asdict(PeriodConfig()):
+        del found["period"]
+    return found
+
+
+WITHDRAWN = frozenset(
+    {
+        "initial.disturbance.view_noise",
+        "initial.disturbance.view_noise_left",
+        "initial.growth.contribution_at",
+        "initial.growth.least_contribution",
+        "initial.rates.positions",
+        "online.least_gain",
+        "online.losses.offset_distance",
+        "online.losses.offset_distance_reading",
+        "online.losses.offset_distance_reduction",
+        "online.motion.full_every_frames",
+        "online.motion.least_views_share",
+        "online.motion.tiles",
+        "online.motion.unseen_pixels",
+    }
+)
+"""Fields of earlier versions whose mechanisms are gone. A stream that has them goes on by this version's method."""
+
+
+RENAMED: Mapping[str, str] = {
+    "initial.disturbance": "perturbation",
+    "initial.free_space": "floaters",
+    "initial.solidity": "depth_distortion",
+    "online.births": "spawn",
+    "online.births.blame_share": "outlier_share",
+    "online.births.blame_views": "outlier_views",
+    "online.births.crowded": "overflow",
+    "online.births.thin.crowded": "overflow",
+    "online.coherence": "smoothness",
+    "online.light": "exposure",
+    "online.motion.carried_share": "occluded_share",
+    "online.motion.moved_ease": "hysteresis",
+    "online.start": "scene_flow",
+}
+"""The names that fields of earlier versions, by their whole path, have now; beside them ``least_`` is ``min_`` and
+``most_`` is ``max_``."""
+
+
+def present_name(path: str) -> str:
+    """The present name of the field or group that had ``path`` in an earlier version."""
+    name = path.rpartition(".")[2]
+    return RENAMED.get(path) or re.sub("^most_", "max_", re.sub("^least_", "min_", name))
+
+
+def renamed(path: str) -> str:
+    """The present path of a field or a group that had ``path`` in an earlier version."""
+    parts = path.split(".")
+    return ".".join(present_name(".".join(parts[: n + 1])) for n in range(len(parts)))
+
+
+def from_json(values: Mapping[str, Any]) -> StreamConfig:
+    """The configuration that :func:`to_json` turned into ``values``, such as a stream's header has.
+
+    Fields that ``values`` lacks, as those of an older version do, have their defaults; renamed ones are read by their
+    earlier names (:func:`present_name`). :data:`WITHDRAWN` ones are ignored, and so
+    are those that are constants now and have the constant's value.
+
+    Raises:
+        ConfigError: there is a field that this version does not have, another value than that of a constant, or a value
+            that no field can have.
+    """
+    values = without_constants(StreamConfig, with_present_names(without_fields(values, WITHDRAWN), present_name))
+    if unknown := [*unknown_fields(StreamConfig, values)]:
+        raise ConfigError(
+            f"The header's configuration has the field {unknown[0]}, which this version of structgstream does not "
+            "have; continue the stream with the version that began it."
+        )
+    try:
+        config = read_value(StreamConfig, values)
+        if holds(to_json(config), dict(values)):
+            return config
+    except (TypeError, ValueError, KeyError, AttributeError) as error:
+        raise ConfigError("The header's configuration has a value of another kind than its field.") from error
+    raise ConfigError("The header's configuration has a value of another kind than its field.")
+
+
+def completed(values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """``values`` with the defaults of the fields that they lack; another method's as they are."""
+    try:
+        return to_json(from_json(values)) if values else values
+    except ConfigError:
+        return values
+
+
+def preset_named(name: str) -> StreamConfig:
+    """The configuration of a preset.
+
+    Raises:
+        ConfigError: there is no such preset.
+    """
+    if name not in PRESETS:
+        raise ConfigError(f"there is no preset {name!r}; there are {', '.join(PRESETS)}.")
+    return PRESETS[name]
+
+
+def with_budget(config: StreamConfig, *, name: str | None, quality: float | None, mbits: float | None) -> StreamConfig:
+    """``config`` with another quality and a target rate, if they are given.
+
+    Args:
+        config: of a compact stream.
+        name: of its preset, for messages.
+        quality: every quantization step is multiplied by 2^-quality; 0 is the preset's own.
+        mbits: target rate in Mbit/s.
+
+    Raises:
+        ConfigError: the codec is not ``compact``, or a value is out of range.
+    """
+    if quality is None and mbits is None:
+        return config
+    if config.codec != "compact":
+        option = "--mbits" if quality is None else "--quality"
+        made = "this configuration" if name is None else f"the preset {name!r}"
+        raise ConfigError(
+            f"{option} is for streams with the codec compact; {made} makes one with the codec {config.codec}. "
+            "Add --preset compact."
+        )
+    if quality is not None:
+        if not abs(quality) <= MAX_QUALITY:
+            raise ConfigError(
+                f"--quality {quality:g} is not one of {-MAX_QUALITY:g} to {MAX_QUALITY:g}: 0 is the preset's own, "
+                "and 1 more makes every step half as large."
+            )
+        rounding = replace(config.online.rounding, quality=quality)
+        config = replace(config, online=replace(config.online, rounding=rounding))
+    if mbits is not None:
+        if not 0 < mbits < math.inf:
+            raise ConfigError(f"--mbits {mbits:g} is no rate; it is in megabits a second, such as --mbits 5.")
+        config = replace(config, rate=replace(config.rate, target_mbits=mbits))
+    return config
+
+
+def with_decay(rates: InitialRates, share: float) -> InitialRates:
+    """The same initial learning rates, each decaying to ``share`` of itself over the schedule."""
+    return InitialRates(**{name: (first, first * share) for name, (first, _) in vars(rates).items()})
+
+
+PAPER = StreamConfig()
+"""The paper's constants with the readings of docs/method.md, for rigs of equal exposure.
+
+Section Implementations gives one set of them for all data sets; what differs is :data:`PAPER_DATA`."""
+
+
+@dataclass(frozen=True)
+class PaperData:
+    """The paper's properties of one data set (section Datasets), which are all that differs between its experiments.
+
+    Args:
+        width: of the pictures that are trained on and scored, pixels, after reduction.
+        height: the same.
+        cameras: number of cameras of the rig.
+        held_out: number of held-out cameras; None if the paper does not state it.
+        held_out_camera: the camera that published results hold out.
+        scale: of the pictures relative to the stored ones; ``--scale`` of ``reconstruct``.
+        undistorted: whether fisheye pictures were undistorted first.
+    """
+
+    width: int
+    height: int
+    cameras: int
+    held_out: int | None
+    held_out_camera: str
+    scale: float = 1.0
+    undistorted: bool = False
+
+
+PAPER_DATA: Mapping[str, PaperData] = {
+    "paper-n3dv": PaperData(1352, 1014, cameras=21, held_out=None, held_out_camera="cam00", scale=0.5),
+    "paper-meetroom": PaperData(1280, 720, cameras=13, held_out=1, held_out_camera="cam_0"),
+    "paper-immersive": PaperData(
+        1280, 960, cameras=46, held_out=1, held_out_camera="camera_0001", scale=0.5, undistorted=True
+    ),
+}
+"""By the preset named after the data set. They are properties of the capture, so they are not in the configuration."""
+
+
+def departures(preset: str, rig: CameraRig) -> list[str]:
+    """Differences of a rig to that of the paper's data set, a few words each; empty for presets of no data set."""
+    data = PAPER_DATA.get(preset)
+    if data is None:
+        return []
+    found = []
+    sizes = sorted({(rig[name].width, rig[name].height) for name in rig})
+    if sizes != [(data.width, data.height)]:
+        theirs = ", ".join(f"{width}x{height}" for width, height in sizes)
+        reduced = "" if data.scale == 1 else f" (--scale {data.scale:g} of the stored)"
+        found.append(f"pictures of {theirs} instead of {data.width}x{data.height}{reduced}")
+    if len(rig.cameras) != data.cameras:
+        found.append(f"{len(rig.cameras)} cameras instead of {data.cameras}")
+    if data.held_out is not None and len(rig.testing) != data.held_out:
+        found.append(f"{len(rig.testing)} held out instead of {data.held_out}")
+    if data.held_out_camera in rig.training:
+        found.append(f"{data.held_out_camera} trained on instead of held out")
+    return found
+
+
+RIG = StreamConfig(
+    initial=InitialConfig(
+        iterations=4000,
+        voxel_size=0.0067,
+        schedule_iterations=4000,
+        camera_color=True,
+        coarse_iterations=2500,
+        rates=with_decay(InitialRates(), 0.05),
+        growth=GrowthConfig(collect_from=500, start=800, stop=3400, max_anchors=120_000),
+    ),
+    online=OnlineConfig(patching=PatchingConfig(max_free=100_000)),
+)
+"""The paper's online method on any rig: exposures are equalised, frame 0's learning rates decay and it starts on
+reduced pictures, and the number of free Gaussians, unbounded in the paper, is bounded."""
+
+MOTION = replace(
+    RIG,
+    online=replace(RIG.online, motion=MotionConfig(enabled=True)),
+)
+"""As RIG, but only dynamic primitives are trained. F_Sigma is fixed, because static anchors depend on it."""
+
+COMPACT = replace(
+    MOTION,
+    initial=replace(
+        MOTION.initial,
+        iterations=2600,
+        schedule_iterations=2600,
+        coarse_iterations=1700,
+        medium_iterations=500,
+        seed_voxels=3,
+        offsets_per_anchor=3,
+        all_drawn=True,
+        rates=replace(
+            MOTION.initial.rates,
+            offsets=(0.02, 0.001),
+            features=(0.02, 0.001),
+            scales=(0.021, 0.001),
+            opacity_mlp=(0.004, 2e-4),
+        ),
+        growth=GrowthConfig(
+            collect_from=110,
+            start=200,
+            stop=2200,
+            grad_threshold=6e-5,
+            eligible_count=30,
+            prune_visits=60,
+            max_anchors=50_000,
+            min_growth=0.25,
+            room_until=1600,
+        ),
+        losses=replace(MOTION.initial.losses, l1=0.6, ssim=0.45),
+        perturbation=PerturbationConfig(dropped_share=0.2, noise_scales=0.5),
+        depth_distortion=DepthDistortionConfig(weight=0.05),
+        floaters=FreeSpaceConfig(enabled=True),
+        random_background=True,
+        sampling_filter=True,
+    ),
+    denoising=DenoisingConfig(frames=8),
+    environment=EnvironmentConfig(enabled=True),
+    codec="compact",
+    online=replace(
+        MOTION.online,
+        iterations=140,
+        mean_of_last=0.25,
+        rates=OnlineRates(final_share=0.4),
+        patching=replace(MOTION.online.patching, spawn="off"),
+        dynamic=MOTION.online.dynamic.difference(["covariance_mlp"]).union(["base_scales", "appearance", "color_mlp"]),
+        exposure=ExposureConfig(enabled=True),
+        motion=replace(
+            MOTION.online.motion,
+            hysteresis=0.5,
+            occluded_share=0.4,
+            residual_threshold=0.05,
+            picture_scale=0.5,
+            tiles_around=1,
+            rest_every=3,
+        ),
+        scene_flow=SceneFlowConfig(enabled=True),
+        spawn=SpawnConfig(enabled=True, thin=ThinSpawnConfig(enabled=True)),
+        motion_prior=0.7,
+        sampling_filter=True,
+        smoothness=SmoothnessConfig(weight=8e-4),
+        rounding=RoundingConfig(free_priced=True),
+    ),
+)
+"""As MOTION, with small packets: dynamic fields are quantized and predicted from the previous frame, and appearance is
+dynamic. Frame 0 starts from few seeds and grows where gradients are large, with dropout and perturbation against
+overfitting, the depth regulariser, an environment, and means of eight frames where they stand still."""
+
+FINE = replace(
+    COMPACT,
+    initial=replace(
+        COMPACT.initial,
+        iterations=5200,
+        schedule_iterations=5200,
+        coarse_iterations=3400,
+        medium_iterations=1000,
+        growth=replace(COMPACT.initial.growth, stop=4400, room_until=3200),
+    ),
+    online=replace(COMPACT.online, iterations=280),
+)
+"""As COMPACT with twice the iterations, for a GPU or for patience."""
+
+FAST = replace(
+    COMPACT,
+    initial=replace(
+        COMPACT.initial,
+        iterations=1200,
+        schedule_iterations=1200,
+        coarse_iterations=800,
+        medium_iterations=220,
+        growth=replace(
+            COMPACT.initial.growth,
+            collect_from=80,
+            start=150,
+            stop=1000,
+            room_until=720,
+            eligible_count=20,
+            prune_visits=40,
+        ),
+    ),
+)
+"""As COMPACT with a shorter frame 0, for a first result in minutes on a laptop."""
+
+TINY = replace(
+    FAST,
+    initial=replace(
+        FAST.initial,
+        iterations=60,
+        schedule_iterations=60,
+        coarse_iterations=30,
+        medium_iterations=10,
+        growth=GrowthConfig(collect_from=10, start=20, stop=50, interval=20, eligible_count=2, prune_visits=4),
+    ),
+    online=replace(FAST.online, iterations=10, patching=replace(FAST.online.patching, iteration=5)),
+)
+"""As FAST with few iterations, for tests; low quality."""
+
+PRESETS: dict[str, StreamConfig] = {
+    "paper-n3dv": PAPER,
+    "paper-meetroom": PAPER,
+    "paper-immersive": PAPER,
+    "rig": RIG,
+    "motion": MOTION,
+    "compact": COMPACT,
+    "fine": FINE,
+    "fast": FAST,
+    "tiny": TINY,
+}
+DEFAULT_PRESET = "compact"
+PAPER_METHOD_PRESET = "rig"
+"""The preset that the paper's ablations edit, and that is compared with other methods."""
+DEMO_PRESET = "fast"

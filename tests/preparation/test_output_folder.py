@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whose folder a capture is, and who works on it."""
+
+import errno
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from structgstream.errors import CaptureError, StorageError
+from structgstream.preparation.output_folder import (
+    LOCK,
+    SOURCE,
+    Link,
+    link,
+    lock_output,
+    mark_output,
+    remove_others,
+    unlink,
+)
+from structgstream.preparation.steps import FOLDER
+from tests.support.killed import folders_of_the_killed
+
+
+@pytest.fixture
+def videos(tmp_path: Path) -> Path:
+    (tmp_path / "take").mkdir()
+    return tmp_path / "take"
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_a_new_or_an_empty_folder_is_claimed_for_good(tmp_path: Path, videos: Path, there: bool) -> None:
+    capture = tmp_path / "out" / "capture"
+    if there:
+        capture.mkdir(parents=True)
+    mark_output(capture, videos)
+    marker = capture / FOLDER / SOURCE
+    written = marker.read_bytes()
+    (capture / "capture.json").write_text("{}")
+    mark_output(capture, videos)
+    mark_output(tmp_path / "out" / ".." / "out" / "capture", tmp_path / "take" / ".." / "take")
+    assert marker.read_bytes() == written
+
+
+@pytest.mark.parametrize("broken", ["{", "[]", '{"other": 1}'])
+def test_a_capture_of_other_videos_is_left_alone(tmp_path: Path, videos: Path, broken: str) -> None:
+    mark_output(tmp_path / "capture", videos)
+    (tmp_path / "other").mkdir()
+    with pytest.raises(CaptureError, match=rf"was prepared from {videos}, not from {tmp_path / 'other'}"):
+        mark_output(tmp_path / "capture", tmp_path / "other")
+    (tmp_path / "capture" / FOLDER / SOURCE).write_text(broken)
+    with pytest.raises(CaptureError, match="was prepared from None"):
+        mark_output(tmp_path / "capture", videos)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda folder: folder.write_text("notes"), "is a file"),
+        (lambda folder: (folder / "notes").mkdir(parents=True), "is not empty and was not made by prepare"),
+    ],
+)
+def test_what_was_made_by_hand_is_left_alone(
+    tmp_path: Path, videos: Path, make: Callable[[Path], object], message: str
+) -> None:
+    make(tmp_path / "capture")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(CaptureError, match=message):
+        mark_output(tmp_path / "capture", videos)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_the_videos_own_folder_is_no_capture(videos: Path) -> None:
+    with pytest.raises(CaptureError, match="cannot be the folder of the videos itself"):
+        mark_output(videos / ".." / "take", videos)
+
+
+def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, videos: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match="cannot be written"):
+        mark_output(tmp_path / "file" / "capture", videos)
+
+
+def test_a_full_disk_leaves_the_folder_free_for_the_next_time(
+    tmp_path: Path, videos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.fsync", full)
+        with pytest.raises(StorageError, match=r"cannot be written \(No space left on device\)"):
+            mark_output(tmp_path / "capture", videos)
+    mark_output(tmp_path / "capture", videos)
+
+
+def test_killed_at_any_step_it_leaves_the_folder_free_for_the_next_time(tmp_path: Path, videos: Path) -> None:
+    killed = folders_of_the_killed(
+        tmp_path,
+        lambda folder: mark_output(folder / "capture", videos),
+        begin=lambda folder: (folder / "capture").mkdir(),
+    )
+    for folder in killed:
+        mark_output(folder / "capture", videos)
+        assert [path.name for path in (folder / "capture").rglob("*")] == [FOLDER, SOURCE]
+
+
+def test_one_process_at_a_time(tmp_path: Path, videos: Path) -> None:
+    mark_output(tmp_path / "capture", videos)
+    mark_output(tmp_path / "other", videos)
+    with lock_output(tmp_path / "capture"), lock_output(tmp_path / "other"):
+        with pytest.raises(StorageError, match="Another process prepares .*capture now; wait for its end"):
+            lock_output(tmp_path / "capture").__enter__()
+        code = "import sys, pathlib; from structgstream.preparation.output_folder import lock_output\n"
+        code += "with lock_output(pathlib.Path(sys.argv[1])): pass"
+        command = [sys.executable, "-c", code, str(tmp_path / "capture")]
+        assert "Another process prepares" in subprocess.run(command, capture_output=True, text=True, check=False).stderr
+    with lock_output(tmp_path / "capture"):
+        pass
+
+
+def test_who_fails_leaves_the_capture_free(tmp_path: Path, videos: Path) -> None:
+    mark_output(tmp_path / "capture", videos)
+    with pytest.raises(KeyError), lock_output(tmp_path / "capture"):
+        raise KeyError
+    with lock_output(tmp_path / "capture"):
+        assert (tmp_path / "capture" / FOLDER / LOCK).exists()
+
+
+def test_a_file_system_without_locks_has_none(tmp_path: Path, videos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def unknown(file: object, how: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    mark_output(tmp_path / "capture", videos)
+    monkeypatch.setattr("fcntl.flock", unknown)
+    with lock_output(tmp_path / "capture"), lock_output(tmp_path / "capture"):
+        pass
+
+
+def test_a_folder_that_was_not_claimed_cannot_be_held(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="cannot be written"):
+        lock_output(tmp_path / "capture").__enter__()
+
+
+def test_each_kind_of_link(tmp_path: Path) -> None:
+    source = tmp_path / "a.mp4"
+    source.write_text("film")
+    link(source, tmp_path / "hard" / "a.mp4", how="hard")
+    link(source, tmp_path / "soft" / "a.mp4", how="symlink")
+    link(source, tmp_path / "copy" / "a.mp4", how="copy")
+    assert (tmp_path / "hard" / "a.mp4").samefile(source)
+    assert (tmp_path / "soft" / "a.mp4").is_symlink()
+    assert (tmp_path / "copy" / "a.mp4").read_text() == "film"
+    assert not (tmp_path / "copy" / "a.mp4").samefile(source)
+
+
+def test_what_is_there_stays_and_what_changed_is_renewed(tmp_path: Path) -> None:
+    source, target = tmp_path / "a.mp4", tmp_path / "copy" / "a.mp4"
+    source.write_text("film")
+    link(source, target, how="copy")
+    inode = target.stat().st_ino
+    link(source, target, how="copy")
+    assert target.stat().st_ino == inode
+    source.write_text("another film")
+    link(source, target, how="copy")
+    assert target.read_text() == "another film"
+    link(source, target, how="hard")
+    assert target.read_text() == "another film"
+
+
+def test_a_link_that_cannot_be_made_is_a_copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(source: Path, target: Path) -> None:
+        raise OSError(18, "Invalid cross-device link")
+
+    monkeypatch.setattr(os, "link", refused)
+    (tmp_path / "a").write_text("film")
+    link(tmp_path / "a", tmp_path / "b" / "a", how="hard")
+    assert (tmp_path / "b" / "a").read_text() == "film"
+
+
+def test_folders_come_file_by_file(tmp_path: Path) -> None:
+    (tmp_path / "cam").mkdir()
+    for number in range(3):
+        (tmp_path / "cam" / f"{number}.png").write_text(str(number))
+    link(tmp_path / "cam", tmp_path / "out" / "cam", how="hard")
+    assert sorted(file.name for file in (tmp_path / "out" / "cam").iterdir()) == ["0.png", "1.png", "2.png"]
+
+
+def test_no_room_is_told(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("film")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match=r"cannot be linked or copied to .*--link symlink"):
+        link(tmp_path / "a", tmp_path / "file" / "a", how="hard")
+
+
+@pytest.mark.parametrize("kind", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_a_copy_that_is_broken_off_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: BaseException
+) -> None:
+    def cut(source: Path, target: Path) -> None:
+        target.write_bytes(source.read_bytes()[:2])
+        raise kind
+
+    monkeypatch.setattr(shutil, "copy2", cut)
+    (tmp_path / "a").write_text("film")
+    with pytest.raises((StorageError, KeyboardInterrupt)):
+        link(tmp_path / "a", tmp_path / "b" / "a", how="copy")
+    assert not list((tmp_path / "b").iterdir())
+
+
+def test_what_was_brought_and_is_no_more_goes(tmp_path: Path) -> None:
+    for name in ("0.png", "1.png"):
+        (tmp_path / name).write_text("film")
+    remove_others(tmp_path, ["1.png"])
+    assert [file.name for file in tmp_path.iterdir()] == ["1.png"]
+
+
+@pytest.mark.parametrize("how", ["hard", "symlink", "copy"])
+def test_what_was_brought_can_be_taken_back(tmp_path: Path, how: Link) -> None:
+    (tmp_path / "cam").mkdir()
+    (tmp_path / "cam" / "0.png").write_text("mask")
+    link(tmp_path / "cam", tmp_path / "out" / "cam", how=how)
+    (tmp_path / "out" / "cam" / "1.png").write_text("by hand")
+    unlink(tmp_path / "cam", tmp_path / "out" / "cam")
+    assert [file.name for file in (tmp_path / "out" / "cam").iterdir()] == ["1.png"]
+    (tmp_path / "out" / "cam" / "1.png").unlink()
+    unlink(tmp_path / "cam", tmp_path / "out" / "cam")
+    assert not (tmp_path / "out" / "cam").exists()
+    assert (tmp_path / "cam" / "0.png").is_file()

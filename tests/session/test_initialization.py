@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a frame starts that has nothing before it: its seed and its points."""
+
+import numpy as np
+import pytest
+import torch
+
+from structgstream.data.points import PointsConfig
+from structgstream.session import initialization
+from structgstream.session.initialization import frame_seed, initial_points_of
+from structgstream.similarity import Similarity
+from tests.support.memory_captures import MemoryCapture
+from tests.support.worlds import moving_world
+
+WORLD = moving_world(1, cameras=4)
+SIMILARITY = Similarity((0.0, 0.1, 0.0), 2.0)
+
+
+def source(points: np.ndarray | None = None) -> MemoryCapture:
+    return MemoryCapture(WORLD.rig, WORLD.frames, fps=25.0, points=points)
+
+
+def test_seeds_of_frames_and_of_streams_are_apart() -> None:
+    assert frame_seed(0, 7) == 7
+    assert frame_seed(2, 7) == 2_000_013
+    assert frame_seed(-1, 0) == 2**63 - 1_000_003, "never negative"
+
+
+def test_points_of_the_capture_are_taken_and_normalised(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    def found(frame, rig, *, config, seed):
+        asked.append(seed)
+        return type("Points", (), {"positions": np.ones((4, 3))})
+
+    monkeypatch.setattr(initialization, "initial_points", found)
+    given = np.array([[0.0, 0.1, 0.0], [1.0, 0.1, -1.0]])
+    options = {"config": PointsConfig(), "seed": 5, "similarity": SIMILARITY}
+    points = initial_points_of(source(given), WORLD.frames[0], **options)
+    torch.testing.assert_close(points.double(), torch.tensor([[0.0, 0.0, 0.0], [2.0, 0.0, -2.0]]).double())
+    assert not asked
+    points = initial_points_of(source(), WORLD.frames[0], **options)
+    torch.testing.assert_close(points.double(), torch.tensor([[2.0, 1.8, 2.0]]).double().expand(4, 3))
+    assert asked == [5]

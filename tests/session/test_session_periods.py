@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sessions that begin other periods: by time, and where the scene is another one; resumed, the bytes are the same."""
+
+from dataclasses import replace
+from functools import cache
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from structgstream.codec.container.records import RecordType, scan_records
+from structgstream.codec.reader import StreamReader
+from structgstream.codec.segments.stored_bytes import write_archive
+from structgstream.codec.sinks import FileSink, MemorySink, resume_segments
+from structgstream.frames import MultiViewFrame
+from structgstream.scene.scene import Scene
+from structgstream.session import struct_gstream as method
+from structgstream.session.loop import FrameReport, Session
+from structgstream.session.periods import PeriodConfig
+from structgstream.session.presets import StreamConfig, to_json
+from structgstream.session.rate_control import RateConfig
+from structgstream.session.struct_gstream import stream_pipeline
+from tests.session.test_session_compact import CONFIG as COMPACT_CONFIG
+from tests.session.test_session_compact import WORLD
+from tests.support.backends import quickest_backend
+from tests.support.memory_captures import MemoryCapture
+from tests.support.segment_streams import Hands, Killed, KilledStore, folder
+from tests.support.streams import same
+
+FRAMES = 8
+CHANGE = 3
+"""From this frame on the cameras see other colours."""
+INITIAL = replace(COMPACT_CONFIG.initial, iterations=60, schedule_iterations=60, coarse_iterations=20)
+BASE = replace(COMPACT_CONFIG, initial=INITIAL)
+SCHEDULED = replace(
+    BASE, period=PeriodConfig(seconds=4 / 30, start="scene", share=0.3), rate=RateConfig(target_mbits=0.5)
+)
+BY_RESIDUAL = replace(BASE, period=PeriodConfig(residual=1.3, frames=2, start="scene", share=0.5))
+ANEW = replace(BASE, period=PeriodConfig(residual=1.3, frames=2))
+CONFIGS = {"scheduled": (SCHEDULED, [0, 4]), "residual": (BY_RESIDUAL, [0, 6]), "points": (ANEW, [0, 6])}
+
+
+def frames() -> list[MultiViewFrame]:
+    """The moving world, there and back, whose colours are inverted from frame :data:`CHANGE` on."""
+    found = []
+    for index in range(FRAMES):
+        shown = WORLD.frames[[0, 1, 2, 3, 2, 1, 0, 1][index]]
+        images = shown.images if index < CHANGE else {name: 255 - image for name, image in shown.images.items()}
+        found.append(MultiViewFrame(index, index / 30.0, images))
+    return found
+
+
+def capture(length: int = FRAMES) -> MemoryCapture:
+    return MemoryCapture(WORLD.rig, frames()[:length], points=WORLD.scene.anchors.positions.numpy())
+
+
+def run(sink, config: StreamConfig, *, resumed=None, length: int = FRAMES) -> list[FrameReport]:
+    session = Session(capture(length), sink, stream_pipeline(config), quickest_backend(), resumed=resumed)
+    return list(session.run())
+
+
+@cache
+def whole(case: str) -> tuple[bytes, list[FrameReport], dict[int, Scene]]:
+    """The stream, the reports, and by frame the scene from which its fit started."""
+    started: dict[int, Scene] = {}
+    fit, again, number = method.fit_next_frame, method.fit_first_frame_again, count(1)
+
+    def following(scene, *arguments, **options):
+        started[next(number)] = scene
+        return fit(scene, *arguments, **options)
+
+    def anew(frame, rig, scene, **options):
+        started[next(number)] = scene
+        return again(frame, rig, scene, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(method, "fit_next_frame", following)
+        patch.setattr(method, "fit_first_frame_again", anew)
+        reports = run(sink := MemorySink(), CONFIGS[case][0])
+    return sink.data, reports, started
+
+
+@pytest.mark.parametrize("case", CONFIGS)
+def test_periods_begin_where_they_should_and_say_why(case: str) -> None:
+    data, reports, _ = whole(case)
+    reader = StreamReader(data)
+    firsts = CONFIGS[case][1]
+    assert [period.first_frame for period in reader.periods] == firsts
+    assert [report.index for report in reports if report.begins] == firsts[1:]
+    why = reports[firsts[1]].begins or ""
+    assert why.startswith("after 0.133 s" if case == "scheduled" else "residual ")
+    assert reader.header.periods
+    assert reader.header_of(FRAMES - 1).config == reader.header.config == to_json(CONFIGS[case][0])
+
+
+@pytest.mark.parametrize("case", CONFIGS)
+def test_stopped_it_goes_on_to_the_same_bytes(case: str, tmp_path: Path) -> None:
+    """Stopped before the second period, in its init record, and after its first frame."""
+    data = whole(case)[0]
+    records = [record for record in scan_records(data) if record.type != RecordType.INDEX]
+    (second,) = (number for number, record in enumerate(records) if number and record.type == RecordType.INIT)
+    path = tmp_path / "a.sgs"
+    for cut in (records[second - 1].offset, records[second].offset + 100, records[second + 1].end):
+        path.write_bytes(data[:cut])
+        sink, resumed = FileSink.resume(path)
+        run(sink, CONFIGS[case][0], resumed=resumed)
+        assert path.read_bytes() == data, cut
+
+
+def test_a_killed_writer_of_segments_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+    """Killed when the second period is named and has no frame; other operations: codec/segments/test_periods.py."""
+    store = folder(tmp_path / "store")
+    with pytest.raises(Killed):
+        run(
+            resume_segments(KilledStore(store, at="put part-00000006", done=False), clocks=Hands().clocks())[0],
+            BY_RESIDUAL,
+        )
+    sink, resumed = resume_segments(store)
+    run(sink, BY_RESIDUAL, resumed=resumed)
+    write_archive(store, tmp_path / "out.sgs")
+    assert (tmp_path / "out.sgs").read_bytes() == whole("residual")[0]
+
+
+def test_each_frame_starts_from_what_a_reader_sees() -> None:
+    """The next frame after a period has begun starts from that period's scene, and the period from the one before."""
+    data, _, started = whole("scheduled")
+    reader = StreamReader(data)
+    assert all(same(started[index], reader.scene(index - 1)) for index in range(1, FRAMES))
+
+
+def test_without_periods_nothing_is_measured_and_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(method, "mean_residual", lambda *_, **__: pytest.fail("measured"))
+    run(sink := MemorySink(), COMPACT_CONFIG, length=2)
+    data = sink.data
+    assert {record.period for record in scan_records(data)} == {0}
+    assert "period" not in StreamReader(data).header.config
+
+
+def test_a_new_period_shows_the_changed_scene_better() -> None:
+    """The mean error of the last frame, with and without: the reason that there are periods."""
+    with_period = whole("residual")[0]
+    run(sink := MemorySink(), BASE)
+    errors = [error_of(StreamReader(data)) for data in (sink.data, with_period)]
+    assert errors[1] < 0.8 * errors[0]
+
+
+def error_of(reader: StreamReader) -> float:
+    frame = frames()[FRAMES - 1]
+    pictures = {name: reader.render(FRAMES - 1, name, backend=quickest_backend()) for name in WORLD.rig.training}
+    return float(np.mean([np.abs(image.astype(float) - frame.images[name]).mean() for name, image in pictures.items()]))

@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Preparation without what takes most of its time, for tests that look at something else."""
+
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from structgstream.data.points import initial_points
+from structgstream.preparation import capture_steps
+from structgstream.preparation.report import page
+from tests.support.small_presets import FEW_POINTS
+
+
+def quicken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One coarse sweep for initial points, and empty files for the pictures of reports.
+
+    What is left out: tests/data/test_points.py and tests/preparation/report.
+    """
+    monkeypatch.setattr(capture_steps, "initial_points", partial(initial_points, config=FEW_POINTS))
+    for name in ("draw_overlay", "draw_epipolar", "draw_matrix", "draw_coverage", "draw_times", "draw_colors"):
+        monkeypatch.setattr(page, name, _nothing_drawn)
+
+
+def _nothing_drawn(path: Path, *_: object, **__: object) -> None:
+    path.touch()

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``tests/support/senders/send.py`` for tests: what cameras send, in memory or on the loopback."""
+
+import importlib
+import sys
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FOLDER = Path(__file__).parent / "senders"
+
+
+def sender() -> ModuleType:
+    """The module, which lies outside of any package."""
+    return _of_the_tool("send")
+
+
+def mpeg_ts() -> ModuleType:
+    """The module beside it that makes MPEG-TS."""
+    return _of_the_tool("mpeg_ts")
+
+
+def _of_the_tool(name: str) -> ModuleType:
+    if str(FOLDER) not in sys.path:
+        sys.path.append(str(FOLDER))
+    return importlib.import_module(name)
+
+
+class Collected:
+    """A line that keeps what is written."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+
+    def write(self, data: bytes) -> int:
+        self.data += data
+        return len(data)
+
+    def close(self) -> None:
+        return None
+
+
+def moving_pictures(count: int = 12, *, width: int = 128, height: int = 96) -> list[NDArray[np.uint8]]:
+    """A bright block that moves over a smooth ground, so that every picture can be told from the others."""
+    down, across = np.mgrid[:height, :width]
+    ground = (40 + 60 * np.sin(across / 20) + 40 * np.cos(down / 15)).clip(0, 255)
+    pictures = []
+    for number in range(count):
+        picture = np.repeat(ground[..., None], 3, 2).astype(np.uint8)
+        left = 4 + number * (width - 28) // count
+        picture[20:44, left : left + 20] = (230, 40 + 10 * number, 30)
+        pictures.append(picture)
+    return pictures
+
+
+@cache
+def sent_loops() -> dict[str, Any]:
+    """The loops of a camera that films :func:`moving_pictures`."""
+    return sender().loops_of(moving_pictures())
+
+
+def sent_stream(*troubles: str, frames: int = 60, fps: float = 30.0, begun: float = 1000.0) -> bytes:
+    """What a camera sends in ``frames`` pictures with the troubles ``FAULT:START:LENGTH``, as MPEG-TS."""
+    module, line = sender(), Collected()
+    parsed = [module.Trouble.parsed(f"a:{trouble}") for trouble in troubles]
+    camera = module.SentCamera("a", sent_loops(), line, fps, parsed)
+    for number in range(frames):
+        camera.send(number, begun=begun, now=begun)
+    return bytes(line.data)

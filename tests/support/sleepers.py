@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands for executors: quick ones, without this package."""
+
+from pathlib import Path
+
+from structgstream.executors.executor import Executor
+from structgstream.executors.task import PYTHON, Task, TaskResult
+
+PATIENCE_SECONDS = 60.0
+
+
+def writes(name: str, folder: Path, *, then: str = "true", retries: int = 5) -> Task:
+    """Notes in ``folder/begun`` that it has begun, does ``then``, and makes ``folder/NAME``."""
+    script = f'echo {name} >> "$0/begun"; {then} && echo {name} > "$0/{name}"'
+    return Task(name, ("sh", "-c", script, str(folder)), str(folder / name), retries=retries)
+
+
+def module(name: str, *arguments: str) -> Task:
+    """Runs a module of Python."""
+    return Task(name, (PYTHON, "-m", *arguments))
+
+
+def all_endings(executor: Executor) -> dict[str, TaskResult]:
+    """What came of all tasks that can run."""
+    endings = {}
+    while True:
+        endings |= {ending.name: ending for ending in executor.wait(PATIENCE_SECONDS)}
+        if not executor.running:
+            return endings
+
+
+def begun(folder: Path) -> list[str]:
+    """Names of the tasks in the order in which they began, again each time."""
+    return (folder / "begun").read_text().split()

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parallel runs of commands that only look like the real ones (``tests/support/stand_in.py``)."""
+
+import hashlib
+from pathlib import Path
+
+from structgstream.executors.executor import TaskQueue
+from structgstream.executors.local import LocalEngine
+from structgstream.executors.task import PYTHON, WorkerSlot
+from structgstream.parallel.driver import Job
+from structgstream.parallel.unit import Unit
+from tests.support import stand_in
+
+PROGRAM = (PYTHON, "-I", "-S", stand_in.__file__)
+
+
+def job(folder: Path, *, frames: int = 12, group: int = 4, program: tuple[str, ...] = PROGRAM) -> Job:
+    """Three groups of four frames."""
+    unit = Unit("capture", frames, track=("--groups", str(group)), program=program, starts=stand_in.starts)
+    return Job(unit, folder / "out.sgs")
+
+
+def workers(count: int = 2) -> TaskQueue:
+    return TaskQueue(LocalEngine([WorkerSlot(1)] * count))
+
+
+def sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
