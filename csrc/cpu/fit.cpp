@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The iterations of a later frame, as training/online/optimize.py has them in torch: generate, project, bin, draw, compare, and
+// The iterations of a later frame, as training/online/iterations.py has them in torch: generate, project, bin, draw, compare, and
 // back; prices of changes and of incoherent motion; Adam; sums for the mean of the last ones. Their order and the order of
 // all sums is that of the torch loop.
 
