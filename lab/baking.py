@@ -15,9 +15,9 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # Read once, when torch loa
 
 from structgstream.codec.reader import open_stream
 from structgstream.data.wrappers import select_cameras
-from structgstream.evaluation.capture import capture_of
 from structgstream.evaluation.evaluate import rendered
 from structgstream.evaluation.metrics import decibels, mean_of_squares, squared_errors
+from structgstream.evaluation.recording import capture_of
 from structgstream.evaluation.scoring import Picture
 from structgstream.exporters.bake import BakingConfig, bake
 from structgstream.kernels.backend import select_backend

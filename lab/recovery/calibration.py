@@ -19,8 +19,8 @@ import torch
 from numpy.typing import NDArray
 
 from structgstream.data import bundled_clip, open_capture
+from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import LensCamera, Pinhole
-from structgstream.data.posed import rotation_matrix
 from structgstream.preparation.calibration.refinement import refine
 from structgstream.preparation.calibration.structure import solve_structure
 from tests.support.calibration_errors import CameraError, calibration_errors

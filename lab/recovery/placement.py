@@ -20,9 +20,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.open import open_capture
-from structgstream.data.posed import rotation_matrix
 from structgstream.data.prepared import read_prepared, write_prepared
 from structgstream.preparation.calibration.solved import rig_alignment
 
@@ -139,9 +139,9 @@ def held_out_scores(stream: Path, capture: Path, rig: Rig, truth: Rig, *, work: 
         work: folder for the capture with exact held-out cameras; replaced.
     """
     from structgstream.codec.reader import open_stream
-    from structgstream.evaluation.capture import capture_of
     from structgstream.evaluation.evaluate import rendered
-    from structgstream.evaluation.masks import blackened
+    from structgstream.evaluation.metrics import blackened
+    from structgstream.evaluation.recording import capture_of
     from structgstream.kernels.backend import select_backend
 
     backend, reader = select_backend("auto"), open_stream(stream)

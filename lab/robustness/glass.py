@@ -2,7 +2,6 @@
 """From a picture that is filmed to one that is shown: cameras, trainer, server and player on this machine, by stage.
 
     python -m lab.robustness.glass build/glass --minutes 16 --json lab/results/glass.json
-    python -m lab.robustness.glass build/glass-every --policy every --minutes 4 --json lab/results/glass.json
     python -m lab.robustness.glass table lab/results/glass.json
     python -m lab.robustness.glass plot lab/results/glass.json docs/images/glass.png
 
@@ -143,7 +142,7 @@ def measured(folder: Path, options: argparse.Namespace) -> dict[str, Any]:
     (folder / "streams").mkdir(parents=True)
     with ExitStack() as stack:
         stack.enter_context(sending(folder / "rig", "--transport", options.transport, "--fps", str(options.fps)))
-        reconstruct = (*TRAINING, "--policy", options.policy, *options.training)
+        reconstruct = (*TRAINING, *options.training)
         trainer = stack.enter_context(training(folder, *reconstruct))
         began = time.monotonic()
         manifest = folder / "streams" / NAME / "manifest.json"
@@ -164,15 +163,13 @@ def measured(folder: Path, options: argparse.Namespace) -> dict[str, Any]:
     entries = [json.loads(line) for line in (folder / "streams" / f"{NAME}.log.jsonl").read_text().splitlines()]
     return {
         "transport": options.transport,
-        "policy": options.policy,
         "fps": options.fps,
         "minutes": options.minutes,
         "training": list(reconstruct),
         "first_frame_seconds": first_after,
-        "frames": frames_of(entries, edges.found, page.events, reads_ahead=options.policy == "every"),
+        "frames": frames_of(entries, edges.found, page.events),
         "sets": entries[-1]["run"]["live"]["sets"],
         "skipped_sets": entries[-1]["run"]["live"]["skipped_sets"],
-        "waiting_sets": entries[-1]["run"]["live"]["waiting_sets"],
         "errors": page.errors,
         "notices": page.notices,
         "busy_seconds": busy,
@@ -204,7 +201,6 @@ def parsed(arguments: list[str]) -> argparse.Namespace:
     )
     parser.add_argument("folder", type=Path, help="is made; the stream and its log stay there")
     parser.add_argument("--transport", choices=("udp", "tcp", "http", "rtsp"), default="http")
-    parser.add_argument("--policy", choices=("latest", "every"), default="latest")
     parser.add_argument("--fps", type=float, default=10.0, help="pictures a second of each camera")
     parser.add_argument("--minutes", type=float, default=16.0, help="after frame 0")
     parser.add_argument("--server-nice", type=int, default=5)

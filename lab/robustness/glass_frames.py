@@ -16,8 +16,6 @@ def frames_of(
     entries: Sequence[Mapping[str, Any]],
     edges: Mapping[int, Mapping[str, float]],
     events: Iterable[tuple[str, int, float]],
-    *,
-    reads_ahead: bool,
 ) -> list[dict[str, float | None]]:
     """Seconds from being filmed to each stage, None for what did not happen or is not known; and ``frame``, ``filmed``.
 
@@ -25,17 +23,14 @@ def frames_of(
         entries: lines of the run's log.
         edges: ``edge`` of the manifests, by frame.
         events: what the page told: stage, frame, Unix time; in the order of time.
-        reads_ahead: whether the trainer had the next frame's pictures when it wrote a line.
     """
     told = _first(events)
     found: list[dict[str, float | None]] = []
-    before: Mapping[str, Any] | None = None
     for entry in entries:
         edge = edges.get(entry["index"])
-        ages, before = (before if reads_ahead else entry), entry
-        if edge is None or ages is None or edge["captured_unix_seconds"] is None:
+        if edge is None or edge["captured_unix_seconds"] is None:
             continue
-        live, seconds = ages["run"]["live"], entry["seconds"]
+        live, seconds = entry["run"]["live"], entry["seconds"]
         filmed = edge["captured_unix_seconds"]
         encoded = edge["published_unix_seconds"] - filmed
         fitted = encoded - seconds["encode"]

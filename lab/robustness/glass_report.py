@@ -14,14 +14,13 @@ Run = Mapping[str, Any]
 
 def table(runs: Sequence[Run]) -> str:
     """Delays by stage, and frames, of all runs."""
-    heads = ("stage", *(f"{run['transport']}, {run['policy']}" for run in runs))
+    heads = ("stage", *(run["transport"] for run in runs))
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for stage in STAGES:
         lines.append(_line(f"until {stage}", [_delay(run, stage) for run in runs]))
     facts = {
         "sets that were filmed": [f"{run['sets']:,}" for run in runs],
         "frames written; shown": [f"{len(run['frames'])}; {len(_shown(run))}" for run in runs],
-        "sets that wait in the end": [f"{run['waiting_sets']:,}" for run in runs],
         "seconds from frame to frame": [f"{_step(run):.2f}" for run in runs],
         "the segments sink, ms a frame": [_writing(run) for run in runs],
         "errors of the page": [str(len(run["errors"])) for run in runs],

@@ -27,12 +27,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from structgstream.data.clip import bundled_clip_path
+from structgstream.data.json_videos import bundled_clip_path
 from structgstream.errors import StorageError, TaskError
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.local import LocalEngine
-from structgstream.executors.task import PYTHON
-from structgstream.executors.worker_slots import WorkerSlot
+from structgstream.executors.task import PYTHON, WorkerSlot
 from structgstream.parallel.driver import Job, drive
 from structgstream.parallel.exchange import ObjectStore
 from structgstream.parallel.object_folder import ObjectFolder
@@ -81,7 +80,7 @@ def driven(folder: Path, engine: LocalEngine, *, real: bool, url: str | None = N
         StorageError: another driver is at work.
     """
     given, parts = job_in(folder, real=real), Parts(folder / "parts")
-    with parts.held(), TaskQueue(engine) as executor:
+    with parts.locked(), TaskQueue(engine) as executor:
         exchange = None if url is None else ObjectStore(ObjectFolder(url), parts, cut=given.unit.cut)
         drive(given, parts, executor, exchange=exchange)
     return hashlib.sha256(given.output.read_bytes()).hexdigest()

@@ -21,7 +21,7 @@ import time
 from collections import defaultdict
 from pathlib import Path
 
-from structgstream.data.clip import bundled_clip_path
+from structgstream.data.json_videos import bundled_clip_path
 from structgstream.executors.opening import ExecutorName, ExecutorOptions, open_executor
 from structgstream.executors.task import PYTHON, Task
 from structgstream.parallel.driver import Job, Status, drive
@@ -103,11 +103,11 @@ def whole_run(row: str, folder: Path) -> dict[str, object]:
     )
     parts = Parts(folder / "parts")
     begun = time.monotonic()
-    with Memory() as memory, open_executor(options_of(row), cores=2) as executor, parts.held():
+    with Memory() as memory, open_executor(options_of(row), cores=2) as executor, parts.locked():
         opened = time.monotonic() - begun
         drive(Job(unit, folder / "out.sgs"), parts, executor)
         seconds = time.monotonic() - begun
-    notes = parts.notes
+    notes = parts.completed
     groups = sum(note.seconds for name, note in notes.items() if name.startswith("group"))
     return {
         "seconds": seconds,
@@ -168,7 +168,7 @@ def planned(row: str, folder: Path) -> dict[str, object]:
 
     with Memory() as memory:
         try:
-            with open_executor(options_of(row), cores=2) as executor, parts.held():
+            with open_executor(options_of(row), cores=2) as executor, parts.locked():
                 drive(Job(unit, folder / "out.sgs"), parts, executor, listener=tell)
         except Enough:
             time.sleep(0.5)

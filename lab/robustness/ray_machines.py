@@ -114,7 +114,7 @@ def in_the_cluster(folder: Path) -> dict[str, object]:
         result["tasks by machine"] = dict(Counter(match[1] for match in found if match))
         parts, given = Parts(folder / "ray" / "parts"), job_in(folder / "ray", real=False)
         begun = time.monotonic()
-        with parts.held():
+        with parts.locked():
             drive(given, parts, executor)
         result["seconds of the run"] = round(time.monotonic() - begun, 2)
         result["bytes equal"] = given.output.read_bytes() == (folder / "local" / "out.sgs").read_bytes()

@@ -13,13 +13,13 @@ from typing import Literal
 
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.retention import SegmentsOptions
-from structgstream.data.clip import bundled_clip_path
+from structgstream.data.json_videos import bundled_clip_path
 from structgstream.data.open import open_capture
 from structgstream.data.source import FrameSource, FrameStream
 from structgstream.errors import ConfigError
-from structgstream.evaluation.capture import capture_of, part_metadata, stored_capture
 from structgstream.evaluation.evaluate import evaluate as evaluate_recording
 from structgstream.evaluation.optional_metrics import MetricSelection
+from structgstream.evaluation.recording import capture_of, part_metadata, stored_capture
 from structgstream.evaluation.report import Report
 from structgstream.evaluation.run_log import read_log
 from structgstream.exporters.formats import Format, FrameOptions, PageFormat

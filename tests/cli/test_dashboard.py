@@ -17,8 +17,6 @@ STATUS = LiveStatus(
     {"cam00": CameraStatus(True, 1234, 2), "cam01": CameraStatus(False, 7, 0, {"stuck": 3, "gone": 1})},
     sets=900,
     skipped_sets=880,
-    waiting_sets=4,
-    waiting_bytes=5_000_000,
     delay_seconds=0.25,
 )
 REPORT = frame_report(4, bytes=2000, train_psnr=31.2, anchors=10, moving=10, free=0, seconds={"fit": 2.0, "total": 3.0})
@@ -45,7 +43,7 @@ def test_the_place_decides_how_a_live_run_looks(tmp_path: Path) -> None:
     assert isinstance(live_display(values, frames=None, console=console(terminal=True)), Dashboard)
 
 
-def test_a_line_tells_of_cameras_and_queues(tmp_path: Path) -> None:
+def test_a_line_has_cameras_and_skipped_sets(tmp_path: Path) -> None:
     out = console(terminal=False)
     with live_display(metrics(tmp_path).values, frames=None, console=out) as shown:
         shown.step(Step(1, 100, 0.5, 10, 0))
@@ -53,7 +51,7 @@ def test_a_line_tells_of_cameras_and_queues(tmp_path: Path) -> None:
     (line,) = text(out).splitlines()
     assert line.startswith("frame 5  train 31.20 dB")
     assert "1/2 cameras" in line
-    assert "skipped 880  waiting 4 (5.0 MB)  pictures 0.25 s old" in line
+    assert "skipped 880  pictures 0.25 s old" in line
 
 
 def test_the_dashboard_names_each_camera_with_its_faults(tmp_path: Path) -> None:
@@ -107,7 +105,7 @@ def test_on_a_narrow_terminal_no_value_is_broken(tmp_path: Path) -> None:
     with live_display(metrics(tmp_path).values, frames=None, console=out) as shown:
         shown.frame(REPORT)
     lines = text(out).splitlines()
-    for part in ("skipped 880", "waiting 4 (5.0 MB)", "pictures 0.25 s old", "train 31.20 dB", "10 anchors", "stuck 3"):
+    for part in ("skipped 880", "pictures 0.25 s old", "train 31.20 dB", "10 anchors", "stuck 3"):
         assert any(part in line for line in lines), part
 
 

@@ -10,7 +10,7 @@ from contextlib import suppress
 
 import pytest
 
-from structgstream.cli.interruption import interruptible
+from structgstream.cli.signals import interruptible
 
 LONG = 60.0
 

@@ -7,7 +7,7 @@ import pytest
 
 from structgstream.cli import main
 from structgstream.cli.options import CaptureOptions
-from structgstream.cli.parallel import Parallel, WorkerOptions, _job, join_words
+from structgstream.cli.parallel import Parallel, WorkerOptions, _job, join_arguments
 from structgstream.codec.reader import open_stream
 from structgstream.evaluation.environment import usable_cores
 from structgstream.executors.task import TaskResult
@@ -113,9 +113,9 @@ def test_folders_and_stores_of_others_are_refused_with_every_option_and_nothing_
         parts.folder.mkdir()
         (parts.folder / "plan.json").write_text("{}")
     else:
-        with parts.held():
+        with parts.locked():
             parts.header.write_bytes(b"mine")
-            parts.note(TaskResult("header", 0, 1.0), "key", parts.header, frames=1)
+            parts.record(TaskResult("header", 0, 1.0), "key", parts.header, frames=1)
     (store / "segments").mkdir()
     (store / "segments" / "group-000000-000004.sgs").write_bytes(b"mine")
     if whose in ("ours", "other run"):
@@ -144,8 +144,8 @@ def test_a_wrong_capture_leaves_nothing_behind(tmp_path: Path, capsys: pytest.Ca
 def test_joining_takes_no_more_processes_than_the_run_has_threads(
     options: WorkerOptions, words: tuple[str, ...]
 ) -> None:
-    assert join_words(options, "cpu") == words
+    assert join_arguments(options, "cpu") == words
 
 
 def test_joining_takes_all_cores_that_the_workers_have() -> None:
-    assert join_words(WorkerOptions(), "cpu") == ("--workers", str(usable_cores()))
+    assert join_arguments(WorkerOptions(), "cpu") == ("--workers", str(usable_cores()))

@@ -14,7 +14,7 @@ from structgstream.parallel.driver import State, Status
 STATUS = Status(
     "groups",
     [(0, 30), (30, 60), (60, 90), (90, 100)],
-    (State.DONE, State.RUNNING, State.READY, State.TRACKED_LATER),
+    (State.DONE, State.RUNNING, State.READY, State.UNTRACKED),
     tracked=3,
 )
 

@@ -27,9 +27,9 @@ def test_prepare_then_check_and_a_mistake(
     out = tmp_path / "out"
     command = ["prepare", str(tmp_path / "videos"), "-o", str(out), "--synchronize", "none", "--held-out", "cam02"]
     assert main(command) == 0
-    told = capsys.readouterr().out
-    assert "calibrate    cameras.json: 5 cameras" in told
-    assert "found nothing that would spoil a stream" in told
+    message = capsys.readouterr().out
+    assert "calibrate    cameras.json: 5 cameras" in message
+    assert "found nothing that would spoil a stream" in message
     file = out / "capture.json"
     content = json.loads(file.read_text())
     assert content["held_out"] == ["cam02"]
@@ -53,11 +53,11 @@ def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
 
 
 @pytest.mark.parametrize(
-    ("told", "arguments"),
+    ("message", "arguments"),
     [("prepare.prepare_capture", ["-o", "out"]), ("prepare.check_folder", ["--check"])],
 )
 def test_ctrl_c_that_a_library_loses(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: str, arguments: list[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: str, arguments: list[str]
 ) -> None:
     """It comes while one is loaded, which makes an error of its own of it."""
 
@@ -68,7 +68,7 @@ def test_ctrl_c_that_a_library_loses(
         except KeyboardInterrupt:
             raise ImportError("cannot be loaded") from None
 
-    monkeypatch.setattr(f"structgstream.preparation.{told}", lost)
+    monkeypatch.setattr(f"structgstream.preparation.{message}", lost)
     monkeypatch.chdir(tmp_path)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # Runs in the background may ignore it.
     try:
@@ -161,9 +161,9 @@ def test_a_board_that_cannot_be_is_told_before_anything_takes_time(
     command = ["prepare", str(tmp_path / "videos"), "-o", str(tmp_path / "out"), "--calibration", "board"]
     capsys.readouterr()
     assert main([*command, "--board", board]) in (1, 2)
-    told = capsys.readouterr()
-    assert said in told.err
-    assert "synchronize" not in told.out
+    message = capsys.readouterr()
+    assert said in message.err
+    assert "synchronize" not in message.out
 
 
 def test_two_at_once_on_one_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,7 +12,7 @@ from structgstream.cli import main
 from structgstream.cli.progress import Lines
 from structgstream.codec.reader import open_stream
 from structgstream.data.open import open_capture
-from structgstream.evaluation.capture import capture_of
+from structgstream.evaluation.recording import capture_of
 from structgstream.session.loop import FrameReport
 from structgstream.training.parameters import RoundingConfig
 from tests.support.backends import QUICKEST

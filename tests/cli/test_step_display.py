@@ -6,8 +6,8 @@ import io
 import pytest
 from rich.console import Console
 
-from structgstream.cli import step_display as module
-from structgstream.cli.step_display import StepDisplay, step_display
+from structgstream.cli import progress as module
+from structgstream.cli.progress import StepDisplay
 
 
 class Clock:
@@ -34,7 +34,7 @@ def text(of: Console) -> str:
 
 def test_a_line_for_each_step_with_its_time(clock: Clock) -> None:
     to = console()
-    with step_display(to) as display:
+    with StepDisplay(to) as display:
         for step, skipped, seconds, summary in (
             ("find", False, 0.01, "5 videos"),
             ("calibrate", False, 12.34, "sfm: [5] cameras"),

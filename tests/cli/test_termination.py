@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from structgstream.cli.termination import Terminated, Termination
+from structgstream.cli.signals import Terminated, Termination
 
 
 def send() -> None:

@@ -15,7 +15,7 @@ from structgstream.atomic_files import partial_path
 from structgstream.cli import main
 from structgstream.codec.sinks import FileSink
 from structgstream.groups import pictures, track_pass
-from structgstream.groups.group_list import groups_path
+from structgstream.groups.boundaries import groups_path
 from structgstream.groups.track_file import TrackHead, TrackWriter
 from structgstream.session.presets import TINY, to_json
 from tests.support.quick_streams import CLIP, error_of

@@ -7,8 +7,8 @@ import torch
 
 from structgstream.cameras import Camera
 from structgstream.data.alignment import Alignment, alignment
+from structgstream.data.calibration import rotation_matrix
 from structgstream.data.matching import project
-from structgstream.data.posed import rotation_matrix
 from tests.support.rigs import arc_rig
 
 TURNED = Alignment(2.5, rotation_matrix(np.array([0.4, -1.2, 2.0])), np.array([3.0, -1.0, 0.5]))

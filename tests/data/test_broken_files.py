@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 
 from structgstream.data.colmap import read_model
-from structgstream.data.exif import read_exif
 from structgstream.data.found_calibrations import read_calibration
 from structgstream.data.images import read_picture
 from structgstream.data.lenses import Fisheye, LensCamera, Pinhole, RadialTangential
 from structgstream.data.open import open_capture
-from structgstream.data.picture_size import picture_size
+from structgstream.data.picture_headers import picture_size, read_exif
 from structgstream.data.posed_capture import filmed_by
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
 from structgstream.data.rectilinear import rectilinear

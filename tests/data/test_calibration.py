@@ -73,4 +73,4 @@ def test_pictures_and_calibration_must_be_of_the_same_cameras() -> None:
 
 
 def test_long_lists_are_cut() -> None:
-    assert listed("abcdefg", most=3) == "cameras 'a', 'b', 'c' and 4 more"
+    assert listed("abcdefg", limit=3) == "cameras 'a', 'b', 'c' and 4 more"

@@ -9,9 +9,8 @@ import pytest
 
 from structgstream import cameras
 from structgstream.data.denoising import MAX_FRAMES, Denoised, DenoisingConfig, denoised, mean_of_still
-from structgstream.data.prefetch import Prefetch
 from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import section
+from structgstream.data.wrappers import Prefetch, section
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MultiViewFrame
 from tests.support.memory_captures import MemoryCapture

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from structgstream.data.exif import Stated, read_exif
+from structgstream.data.picture_headers import StatedOptics, read_exif
 from structgstream.errors import CaptureError, MissingExtraError
 
 FOCAL, FILM, RESOLUTION, UNIT, ACROSS, DOWN = 0x920A, 0xA405, 0xA20E, 0xA210, 0xA002, 0xA003
@@ -78,7 +78,7 @@ def test_orientation(tmp_path: Path, stated: int, taken: int) -> None:
 
 def test_files_that_cannot_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.jpg").write_bytes(b"nothing")
-    assert read_exif(tmp_path / "a.jpg") == Stated(None, 1)
+    assert read_exif(tmp_path / "a.jpg") == StatedOptics(None, 1)
     with pytest.raises(CaptureError, match=r"b\.jpg cannot be read"):
         read_exif(tmp_path / "b.jpg")
     monkeypatch.setitem(sys.modules, "PIL", None)

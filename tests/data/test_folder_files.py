@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.data.folder_files import REPORT, by_stem, files_of
+from structgstream.data.camera_files import REPORT, by_stem, files_of
 from structgstream.data.open import open_capture
 from structgstream.errors import CaptureError
 from tests.support.captures import numbers, picture, write_clip, write_n3dv, write_picture, write_text_model

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from structgstream.cameras import Camera
-from structgstream.data.immersive import open_immersive, read_models
+from structgstream.data.dataset_layouts import open_immersive, read_models
 from structgstream.data.lenses import Fisheye, LensCamera
 from structgstream.data.open import open_capture
 from structgstream.data.undistortion import UndistortedSource, Undistortion

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.data.instants import STEADY, measured_rate, origin_of, place
+from structgstream.data.timeline import STEADY, measured_rate, origin_of, place
 from tests.support.properties import examples
 
 TIMES = st.lists(st.floats(-3, 60), min_size=1, max_size=60).map(lambda times: np.array(sorted(times)))

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from structgstream.data import clip
-from structgstream.data.clip import bundled_clip
-from structgstream.data.n3dv import open_n3dv
+from structgstream.data import json_videos as clip
+from structgstream.data.dataset_layouts import open_n3dv
+from structgstream.data.json_videos import bundled_clip
 from structgstream.errors import CalibrationError
 from tests.support.captures import (
     all_numbers,

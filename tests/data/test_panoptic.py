@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from structgstream.data.panoptic import PANOPTIC_FPS, TEST, TRAIN, open_panoptic
+from structgstream.data.dataset_layouts import PANOPTIC_FPS, TEST, TRAIN, open_panoptic
 from structgstream.errors import CalibrationError, CaptureError
 from tests.support.captures import all_numbers, write_panoptic
 

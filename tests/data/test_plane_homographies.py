@@ -5,8 +5,7 @@ import numpy as np
 import torch
 
 from structgstream.data.matching import back_project, project
-from structgstream.data.plane_homographies import plane_homographies
-from structgstream.data.plane_sweep import sweep_view
+from structgstream.data.plane_sweep import plane_homographies, sweep_view
 from structgstream.kernels.backend import processor_backend
 from tests.support.planes import room_depth, room_frame, room_rig
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.data.posed import PosedCamera, intrinsics, rigid, rotation_matrix
+from structgstream.data.calibration import PosedCamera, intrinsics, rigid, rotation_matrix
 from tests.support.properties import examples
 
 VECTOR = st.tuples(*[st.floats(-4.0, 4.0)] * 3)

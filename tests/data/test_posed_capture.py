@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from structgstream.data.calibration import Calibration, PosedCamera
 from structgstream.data.lenses import RadialTangential
-from structgstream.data.posed import Calibration, PosedCamera
 from structgstream.data.posed_capture import filmed_by
 from structgstream.errors import CalibrationError
 from tests.support.captures import HEIGHT, WIDTH, small_rig

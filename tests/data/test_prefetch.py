@@ -9,7 +9,7 @@ import pytest
 
 from structgstream.cameras import CameraRig
 from structgstream.data.json_videos import open_json_videos
-from structgstream.data.prefetch import Prefetch
+from structgstream.data.wrappers import Prefetch
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MultiViewFrame
 from tests.support.captures import picture, small_rig, write_clip

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from structgstream.data.folder_files import files_of
+from structgstream.data.calibration import Calibration, PosedCamera
+from structgstream.data.camera_files import files_of
 from structgstream.data.images import ImageSource, common_pictures, read_picture, turned
-from structgstream.data.posed import Calibration, PosedCamera
 from structgstream.data.posed_capture import _orientation
 from structgstream.data.timeline import picture_slots
 from structgstream.data.transfer import HLG, PQ, high_range_to_srgb

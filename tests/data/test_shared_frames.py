@@ -11,7 +11,7 @@ import pytest
 
 from structgstream.cameras import CameraRig
 from structgstream.data.shared_frames import SharedFrames
-from structgstream.data.source import frame_count, keep_frames, may_read_ahead
+from structgstream.data.source import frame_count, is_recording, retain_frames
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
 from tests.support.rigs import arc_rig
@@ -22,7 +22,6 @@ class Filmed:
     """Frames that say when they were read, and what is to be kept."""
 
     count: int = 6
-    newest_only: bool = True
     fails_at: int | None = None
     rig: CameraRig = field(default_factory=lambda: arc_rig(3, width=8, height=6))
     fps: float = 30.0
@@ -34,7 +33,7 @@ class Filmed:
         self.closed = 0
         self.kept: list[tuple[tuple[int, ...], int]] = []
 
-    def keep(self, *first: int, last: int) -> None:
+    def retain(self, *first: int, last: int) -> None:
         self.kept.append((first, last))
 
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
@@ -72,13 +71,13 @@ def test_each_frame_is_read_once_and_given_to_all() -> None:
     assert source.read == [*range(6)]
 
 
-def test_what_all_have_is_let_go() -> None:
+def test_frames_that_all_readers_had_are_dropped() -> None:
     shared = SharedFrames(Filmed(), starts=[0, 0], first=[0, 0])
     fast, slow = (reader.frames(0) for reader in shared.readers)
     assert indices(fast, 3) == [0, 1, 2]
-    assert sorted(shared._held) == [0, 1, 2]
+    assert sorted(shared._cached) == [0, 1, 2]
     assert indices(slow, 3) == [0, 1, 2]
-    assert sorted(shared._held) == [2]
+    assert sorted(shared._cached) == [2]
 
 
 def test_one_that_lacks_a_frame_begins_before_the_others() -> None:
@@ -113,18 +112,17 @@ def test_older_frames_are_read_again_and_the_reading_goes_on() -> None:
 def test_what_is_to_be_kept_is_what_any_of_them_needs() -> None:
     source = Filmed()
     shared = SharedFrames(source, starts=[5, 5], first=[0, 3])
-    keep_frames(shared.readers[0], 4, last=2)
-    keep_frames(shared.readers[1], 4, last=1)
+    retain_frames(shared.readers[0], 4, last=2)
+    retain_frames(shared.readers[1], 4, last=1)
     assert source.kept == [((0, 3), 0), ((4, 3), 2), ((4,), 2)]
 
 
 @pytest.mark.parametrize("kind", [Filmed, Recorded])
-@pytest.mark.parametrize("newest_only", [False, True])
-def test_a_reader_is_the_kind_of_stream_that_the_source_is(kind: type[Filmed], newest_only: bool) -> None:
-    source = kind(newest_only=newest_only)
+def test_a_reader_is_the_kind_of_stream_that_the_source_is(kind: type[Filmed]) -> None:
+    source = kind()
     for reader in SharedFrames(source, starts=[0, 0], first=[0, 0]).readers:
         assert frame_count(reader) == frame_count(source)
-        assert may_read_ahead(reader) == may_read_ahead(source)
+        assert is_recording(reader) == is_recording(source)
         assert (reader.fps, reader.name, reader.points) == (30.0, "filmed", None)
         assert reader.rig is source.rig
 

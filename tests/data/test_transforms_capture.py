@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from structgstream.data.open import open_capture
-from structgstream.data.transforms_capture import open_transforms
+from structgstream.data.transforms import open_transforms
 from structgstream.errors import CalibrationError, CaptureError
 from tests.support.calibrations import Truth, truths, write_transforms
 from tests.support.captures import HEIGHT, WIDTH, all_numbers, picture, write_picture, write_videos

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import pytest
 
-from structgstream.data.clip import bundled_clip_path
+from structgstream.data.json_videos import bundled_clip_path
 from structgstream.data.open import open_capture
 from structgstream.errors import CaptureError
-from structgstream.evaluation.capture import capture_of, stored_capture
+from structgstream.evaluation.recording import capture_of, stored_capture
 from tests.support.streams import header_for, small_scene
 
 

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from structgstream.evaluation.masks import changed_pixels, dilate
+from structgstream.evaluation.metrics import changed_pixels, dilate
 
 
 def test_nothing_changed() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from structgstream.errors import StorageError
-from structgstream.evaluation.png import png_bytes, write_png
+from structgstream.evaluation.pictures import png_bytes, write_png
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (5, 3, 3), (64, 97, 3)])

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from structgstream.cameras import Camera
-from structgstream.evaluation.flow import FlowField, dis_flow
-from structgstream.evaluation.temporal import difference_of_change, flicker, warping_error
+from structgstream.evaluation.temporal import FlowField, difference_of_change, dis_flow, flicker, warping_error
 from structgstream.flow import inside
 from tests.support.rigs import look_at
 

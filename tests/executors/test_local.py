@@ -13,8 +13,7 @@ import pytest
 from structgstream.errors import ConfigError
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.local import LocalEngine
-from structgstream.executors.task import Task
-from structgstream.executors.worker_slots import WorkerSlot
+from structgstream.executors.task import Task, WorkerSlot
 from tests.support.sleepers import PATIENCE_SECONDS, all_endings, begun, module, writes
 
 

@@ -10,8 +10,7 @@ from structgstream.errors import ConfigError, MissingExtraError
 from structgstream.executors import opening, ray_cluster
 from structgstream.executors.opening import ExecutorName, ExecutorOptions, open_executor
 from structgstream.executors.ray_cluster import RayOptions
-from structgstream.executors.task import Task
-from structgstream.executors.worker_slots import WorkerSlot
+from structgstream.executors.task import Task, WorkerSlot
 from tests.support.sleepers import all_endings
 
 

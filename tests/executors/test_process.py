@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.executors import process
-from structgstream.executors.process import CommandProcess, opened_log, tail_of, waited_for
+from structgstream.executors import local as process
+from structgstream.executors.local import CommandProcess, opened_log, tail_of, waited_for
 from structgstream.executors.task import PYTHON, TAIL_BYTES, Task, TaskResult
 from tests.support.properties import examples
 from tests.support.sleepers import PATIENCE_SECONDS

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from structgstream.executors import ray_worker
-from structgstream.executors.process import CommandProcess
+from structgstream.executors.local import CommandProcess
 from structgstream.executors.ray_worker import CommandKilled, run_task
 from structgstream.executors.task import Task, TaskResult
 

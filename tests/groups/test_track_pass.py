@@ -10,7 +10,7 @@ import torch
 from structgstream.atomic_files import partial_path
 from structgstream.errors import ConfigError
 from structgstream.groups.base import GroupBase
-from structgstream.groups.group_list import groups_path
+from structgstream.groups.boundaries import groups_path
 from structgstream.groups.segment_file import open_segment
 from structgstream.groups.segment_sink import GroupSoFar
 from structgstream.groups.track_file import open_track

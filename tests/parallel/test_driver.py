@@ -24,7 +24,7 @@ GROUPS = [(0, 4), (4, 8), (8, 12)]
 def run(given: Job, parts: Parts, executor: TaskQueue | None = None) -> list[Status]:
     """Drives to the end, and returns what was told."""
     told: list[Status] = []
-    with parts.held(), workers() if executor is None else executor as queue:
+    with parts.locked(), workers() if executor is None else executor as queue:
         assert list(drive(given, parts, queue, listener=told.append)) == GROUPS
     return told
 
@@ -42,7 +42,7 @@ def test_it_ends_with_all_frames_in_their_order(undisturbed: Path) -> None:
 
 
 def test_notes_say_what_each_task_took(undisturbed: Path) -> None:
-    notes = Parts(undisturbed / "parts").notes
+    notes = Parts(undisturbed / "parts").completed
     assert set(notes) == {"header", "track", "join", *(group_name(*group) for group in GROUPS)}
     assert [*notes][-1] == "join"
     assert notes["track"].frames == 12
@@ -115,7 +115,7 @@ def test_a_segment_that_is_not_what_it_was_is_made_again(undisturbed: Path, tmp_
 def test_a_group_that_fails_is_told_and_the_others_are_kept(undisturbed: Path, tmp_path: Path) -> None:
     given = job(tmp_path)
     bad = replace(given, unit=replace(given.unit, device=("--fail", "4")))
-    with pytest.raises(TaskError, match=r"The task group-000004-000008 failed: There was no power\. \(all of it"):
+    with pytest.raises(TaskError, match=r"The task group-000004-000008 failed: There was no power\. \(complete output"):
         run(bad, Parts(tmp_path / "parts"))
     assert set(modified(tmp_path)) == {"group-000000-000004.sgs", "group-000008-000012.sgs"}
     assert not (tmp_path / "out.sgs").exists()
@@ -138,11 +138,11 @@ def test_a_track_that_fails_ends_the_run(tmp_path: Path) -> None:
 
 def test_of_two_drivers_one_is_refused(tmp_path: Path) -> None:
     parts = Parts(tmp_path / "parts")
-    with parts.held():
+    with parts.locked():
         code = f"""
 from pathlib import Path
 from structgstream.parallel.parts import Parts
-with Parts(Path({str(parts.folder)!r})).held():
+with Parts(Path({str(parts.folder)!r})).locked():
     pass
 """
         paths = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
@@ -160,5 +160,5 @@ def test_the_log_has_what_the_last_attempt_on_another_machine_has_printed(tmp_pa
     parts = Parts(tmp_path / "parts")
     drive = _Drive(job(tmp_path), parts, workers(), SharedFolder(), print)
     for said in ("first failure\n", "second failure\n", "second failure\n"):
-        drive._keep_words(TaskResult("header", 1, 1.0, 1, 0, said))
+        drive._store_output(TaskResult("header", 1, 1.0, 1, 0, said))
     assert parts.log("header").read_text() == "first failure\nsecond failure\n"

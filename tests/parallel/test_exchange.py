@@ -19,7 +19,7 @@ from tests.support.stand_ins import job, sha256, workers
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The stream of a run without a store."""
     folder = tmp_path_factory.mktemp("plain")
-    with Parts(folder / "plain").held(), workers() as executor:
+    with Parts(folder / "plain").locked(), workers() as executor:
         drive(job(folder), Parts(folder / "plain"), executor)
     return folder / "out.sgs"
 
@@ -28,7 +28,7 @@ def stored(folder: Path, url: str) -> Path:
     """The stream of a run with one."""
     parts = Parts(folder / "parts")
     (folder / "b").mkdir(exist_ok=True)
-    with parts.held(), workers() as executor:
+    with parts.locked(), workers() as executor:
         exchange = ObjectStore(ObjectFolder(url), parts, cut=stand_in.cut)
         drive(job(folder / "b"), parts, executor, exchange=exchange)
     return folder / "b" / "out.sgs"

@@ -33,7 +33,7 @@ def test_costs_are_those_that_went_in(folder: Path) -> None:
 def test_a_group_that_was_killed_is_not_measured(folder: Path) -> None:
     parts = Parts(folder)
     parts.segment(4, 8).write_bytes(b"again")
-    parts.note(TaskResult(group_name(4, 8), 0, 1.0, attempts=2), "", parts.segment(4, 8), frames=4)
+    parts.record(TaskResult(group_name(4, 8), 0, 1.0, attempts=2), "", parts.segment(4, 8), frames=4)
     assert measured_in(folder).groups == 1
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from structgstream.data.calibration import Calibration, PosedCamera
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
-from structgstream.data.posed import Calibration, PosedCamera
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
 from structgstream.preparation.camera_steps import check_enough, check_used, chosen_method

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from structgstream.data.posed import Calibration
+from structgstream.data.calibration import Calibration
 from structgstream.data.timeline import Clock
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.solved import SolvedCalibration

@@ -58,18 +58,18 @@ def test_a_capture_of_other_videos_is_left_alone(tmp_path: Path, videos: Path, b
 
 
 @pytest.mark.parametrize(
-    ("make", "told"),
+    ("make", "message"),
     [
         (lambda folder: folder.write_text("notes"), "is a file"),
         (lambda folder: (folder / "notes").mkdir(parents=True), "is not empty and was not made by prepare"),
     ],
 )
 def test_what_was_made_by_hand_is_left_alone(
-    tmp_path: Path, videos: Path, make: Callable[[Path], object], told: str
+    tmp_path: Path, videos: Path, make: Callable[[Path], object], message: str
 ) -> None:
     make(tmp_path / "capture")
     before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(CaptureError, match=told):
+    with pytest.raises(CaptureError, match=message):
         mark_output(tmp_path / "capture", videos)
     assert sorted(tmp_path.rglob("*")) == before
 

@@ -19,7 +19,7 @@ from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.quality_list import read_list
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest, write_archive
-from structgstream.data.live.kept import KeptFrames, kept_folder
+from structgstream.data.live.resume_cache import ResumeCache, resume_folder
 from structgstream.errors import ConfigError, StorageError
 from structgstream.evaluation.run_log import read_log
 from structgstream.frames import MultiViewFrame
@@ -27,7 +27,8 @@ from structgstream.qualities.ladder import configured, qualities_in
 from structgstream.qualities.recording import QualitiesRun, QualityReport, record_qualities
 from structgstream.recorder import record, segments_at, segments_folder
 from structgstream.run_metrics import RunMetrics
-from structgstream.session.loop import Session, loop, struct_gstream
+from structgstream.session import loop, struct_gstream
+from structgstream.session.loop import Session
 from structgstream.session.presets import StreamConfig
 from structgstream.session.struct_gstream import stream_pipeline
 from tests.support.backends import quickest_backend
@@ -64,24 +65,24 @@ class Live:
 
     rig, fps, name = RIG, 30.0, "now"
 
-    def __init__(self, folder: Path, *, resume: bool = False, newest_only: bool = True) -> None:
-        self.newest_only, self._resume = newest_only, resume
+    def __init__(self, folder: Path, *, resume: bool = False) -> None:
+        self._resume = resume
         self.points = Recorded().points
-        self._kept = KeptFrames(kept_folder(folder), cameras=self.rig.training, resume=resume)
+        self._cache = ResumeCache(resume_folder(folder), cameras=self.rig.training, resume=resume)
         self.filmed: list[int] = []
 
-    def keep(self, *first: int, last: int) -> None:
-        self._kept.need(*first, last=last)
+    def retain(self, *first: int, last: int) -> None:
+        self._cache.retain(*first, last=last)
 
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
         index = start
-        for frame in self._kept.following(start) if self._resume else ():
+        for frame in self._cache.frames(start) if self._resume else ():
             yield frame
             index = frame.index + 1
         while index < FRAMES:
             self.filmed.append(index)
             frame = MultiViewFrame(index, index / 4, filmed(index))
-            self._kept.keep(frame, origin_seconds=0.0)
+            self._cache.store(frame, origin_seconds=0.0)
             yield frame
             index += 1
 
@@ -219,11 +220,11 @@ def left_by_a_kill(run: QualitiesRun, folder: Path, *, after: tuple[str, int]) -
         if (one.quality, one.report.index) == after:
             copy = folder.with_name("killed")
             shutil.copytree(folder, copy / "out")
-            if kept_folder(folder).exists():
-                shutil.copytree(kept_folder(folder), kept_folder(copy / "out"))
+            if resume_folder(folder).exists():
+                shutil.copytree(resume_folder(folder), resume_folder(copy / "out"))
             run.reports.close()
             shutil.rmtree(folder)
-            shutil.rmtree(kept_folder(folder), ignore_errors=True)
+            shutil.rmtree(resume_folder(folder), ignore_errors=True)
             for path in copy.iterdir():
                 path.rename(folder.parent / path.name)
             return
@@ -260,15 +261,13 @@ def periods_alone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     return {name: alone(folder / f"{name}.sgs", name, PERIODS) for name in NAMES}
 
 
-@pytest.mark.parametrize(
-    ("after", "newest_only"), [(("low", 2), True), (("low", 3), True), (("low", 3), False), (("high", 3), True)]
-)
+@pytest.mark.parametrize("after", [("low", 2), ("low", 3), ("high", 3)])
 def test_periods_of_a_live_run_that_was_killed(
-    periods_alone: dict[str, bytes], tmp_path: Path, after: tuple[str, int], newest_only: bool
+    periods_alone: dict[str, bytes], tmp_path: Path, after: tuple[str, int]
 ) -> None:
     """At the frame that begins another one in one quality and not yet in the other."""
     folder = tmp_path / "out"
-    left_by_a_kill(begun(folder, Live(folder, newest_only=newest_only), PERIODS), folder, after=after)
+    left_by_a_kill(begun(folder, Live(folder), PERIODS), folder, after=after)
     list(begun(folder, Live(folder, resume=True), PERIODS, resume=True).reports)
     for name in NAMES:
         with open_stream(folder / name) as reader:

@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -25,17 +26,20 @@ from numpy.typing import NDArray
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.sinks import FileSink, resume_segments
-from structgstream.data.clip import bundled_clip_path
+from structgstream.data.json_videos import bundled_clip_path
 from structgstream.data.open import open_capture
 from structgstream.evaluation.evaluate import rendered
+from structgstream.exporters.write import write_gaussians
 from structgstream.kernels.backend import reference_backend
 from structgstream.notebook import Player
+from structgstream.sequence_import import import_sequence
 from structgstream.serve.pages import bundle_path, linked_page
 from structgstream.serve.play import Truth
 from structgstream.serve.stream_file import StreamFile, write_page, write_site
 from tests.support.chromium import Browser, Tab, opened_browser
 from tests.support.pictures import decoded_picture
-from tests.support.rigs import random_scene
+from tests.support.plain import some
+from tests.support.rigs import arc_rig, random_scene
 from tests.support.serving import served
 from tests.support.streams import compact_header, moved, write_stream
 
@@ -112,6 +116,21 @@ def test_a_page_opens_from_the_disk(tab: Tab, stream: Path, tmp_path: Path) -> N
     assert tab.evaluate(f"{PLAYER}.duration") == pytest.approx(FRAMES / 30)
     assert not tab.complaints
     assert {address.split(":")[0] for address in tab.requests} <= {"file", "blob", "data"}
+
+
+def test_an_imported_sequence_plays(tab: Tab, tmp_path: Path) -> None:
+    """A stream without anchors: free Gaussians only."""
+    parts = [replace(some(200), means=some(200).means + 0.1 * t) for t in range(3)]
+    files = [write_gaussians(tmp_path / f"frame_{t}.ply", part, format="ply") for t, part in enumerate(parts)]
+    stream, page = tmp_path / "imported.sgs", tmp_path / "page.html"
+    import_sequence(files, stream, fps=30.0, backend=reference_backend(), rig=arc_rig())
+    write_page(page, StreamFile(stream))
+    tab.open(page.as_uri(), width=WIDTH, height=HEIGHT)
+    for frame in (2, 0):
+        paused_at(tab, frame)
+        looked_through_first(tab)
+        assert decibels(tab.screenshot(), stream, frame) > 40
+    assert not tab.complaints
 
 
 def test_the_server_plays_and_compares_and_follows(tab: Tab, stream: Path, tmp_path: Path) -> None:

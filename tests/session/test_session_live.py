@@ -11,7 +11,7 @@ import pytest
 from structgstream.cameras import CameraRig
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
-from structgstream.data.live.kept import KeptFrames, kept_folder
+from structgstream.data.live.resume_cache import ResumeCache, resume_folder
 from structgstream.frames import MultiViewFrame
 from structgstream.recorder import record
 from structgstream.session.loop import Session
@@ -36,7 +36,6 @@ class Now:
     folder: Path
     frames_to_come: int
     resume: bool = False
-    newest_only: bool = True
     rig: CameraRig = RIG
     fps: float = 30.0
     name: str = "now"
@@ -45,21 +44,21 @@ class Now:
 
     def __post_init__(self) -> None:
         self.instant = 0
-        self._kept = KeptFrames(self.folder, cameras=self.rig.training, resume=self.resume)
+        self._cache = ResumeCache(self.folder, cameras=self.rig.training, resume=self.resume)
 
-    def keep(self, *first: int, last: int) -> None:
-        self._kept.need(*first, last=last)
+    def retain(self, *first: int, last: int) -> None:
+        self._cache.retain(*first, last=last)
 
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
         index = start
-        for frame in self._kept.following(start) if self.resume else ():
+        for frame in self._cache.frames(start) if self.resume else ():
             yield frame
             index = frame.index + 1
         while index < self.frames_to_come:
             self.asked.append(self.instant)
             # The film of frame ``index`` is given by its number, so that two runs see the same.
             frame = MultiViewFrame(index, index / 4, filmed(index))
-            self._kept.keep(frame, origin_seconds=0.0)
+            self._cache.store(frame, origin_seconds=0.0)
             yield frame
             index += 1
 
@@ -76,44 +75,33 @@ def test_the_newest_frame_is_asked_for_when_the_one_before_is_stored(tmp_path: P
         assert [info.pts_seconds for info in reader.packets] == [0.0, 0.25, 0.5, 0.75]
 
 
-def test_a_queue_of_all_frames_may_be_read_ahead(tmp_path: Path) -> None:
-    source = Now(tmp_path / "x.live", 3, newest_only=False)
-    reports = Session(source, FileSink(tmp_path / "x.sgs"), stream_pipeline(QUICK), quickest_backend()).run()
-    next(reports)
-    source.instant = 1
-    assert len(list(reports)) == 2
-    assert source.asked[:2] == [0, 0]
-
-
 @pytest.mark.parametrize(
-    ("killed_after", "newest_only", "config"),
-    [(1, True, QUICK), (3, True, QUICK), (1, False, QUICK), (3, False, QUICK)]
-    + [(killed_after, True, PERIODS) for killed_after in (3, 4, 5)],
+    ("killed_after", "config"), [(1, QUICK), (3, QUICK), *((killed_after, PERIODS) for killed_after in (3, 4, 5))]
 )
 def test_a_live_stream_that_was_killed_goes_on_to_the_same_bytes(
-    tmp_path: Path, killed_after: int, newest_only: bool, config: StreamConfig
+    tmp_path: Path, killed_after: int, config: StreamConfig
 ) -> None:
     pipeline, backend = stream_pipeline(config), quickest_backend()
     assert pipeline.method.needs_before, "otherwise no picture is needed again"
     whole = tmp_path / "whole.sgs"
-    list(record(whole, Now(kept_folder(whole), 6), pipeline, backend).reports)
+    list(record(whole, Now(resume_folder(whole), 6), pipeline, backend).reports)
     with open_stream(whole) as reader:
         assert [period.first_frame for period in reader.periods] == [0, 3][: 1 + config.period.enabled]
     path = tmp_path / "x.sgs"
-    run = record(path, Now(kept_folder(path), 6, newest_only=newest_only), pipeline, backend)
+    run = record(path, Now(resume_folder(path), 6), pipeline, backend)
     killed, kept = b"", {}
     for report in run.reports:
         if report.index + 1 == killed_after:
             killed = path.read_bytes()  # what a kill -9 leaves: no index
-            kept = {file.name: file.read_bytes() for file in kept_folder(path).iterdir()}
+            kept = {file.name: file.read_bytes() for file in resume_folder(path).iterdir()}
             run.reports.close()
             break
     path.write_bytes(killed)
-    for file in kept_folder(path).iterdir():
+    for file in resume_folder(path).iterdir():
         file.unlink()
     for name, content in kept.items():
-        (kept_folder(path) / name).write_bytes(content)
-    again = record(path, Now(kept_folder(path), 6, resume=True), pipeline, backend, resume=True)
+        (resume_folder(path) / name).write_bytes(content)
+    again = record(path, Now(resume_folder(path), 6, resume=True), pipeline, backend, resume=True)
     assert again.done == killed_after
     assert [report.index for report in again.reports] == list(range(killed_after, 6))
     assert path.read_bytes() == whole.read_bytes()
@@ -121,8 +109,8 @@ def test_a_live_stream_that_was_killed_goes_on_to_the_same_bytes(
 
 def test_a_finished_live_stream_can_go_on(tmp_path: Path) -> None:
     pipeline, backend, path = stream_pipeline(QUICK), quickest_backend(), tmp_path / "x.sgs"
-    list(record(path, Now(kept_folder(path), 2), pipeline, backend).reports)
-    again = record(path, Now(kept_folder(path), 4, resume=True), pipeline, backend, resume=True)
+    list(record(path, Now(resume_folder(path), 2), pipeline, backend).reports)
+    again = record(path, Now(resume_folder(path), 4, resume=True), pipeline, backend, resume=True)
     assert [report.index for report in again.reports] == [2, 3]
     with open_stream(path) as reader:
         assert reader.complete

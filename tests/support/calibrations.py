@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from structgstream.data.arrays import Floats
-from structgstream.data.posed import PosedCamera
+from structgstream.data.calibration import PosedCamera
 from tests.support.captures import HEIGHT, WIDTH, small_rig
 
 POINTS = np.random.default_rng(3).uniform(-0.6, 0.6, (30, 3))

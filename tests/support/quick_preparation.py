@@ -8,7 +8,7 @@ import pytest
 
 from structgstream.data.points import initial_points
 from structgstream.preparation import capture_steps
-from structgstream.preparation.report import write
+from structgstream.preparation.report import page
 from tests.support.small_presets import FEW_POINTS
 
 
@@ -19,7 +19,7 @@ def quicken(monkeypatch: pytest.MonkeyPatch) -> None:
     """
     monkeypatch.setattr(capture_steps, "initial_points", partial(initial_points, config=FEW_POINTS))
     for name in ("draw_overlay", "draw_epipolar", "draw_matrix", "draw_coverage", "draw_times", "draw_colors"):
-        monkeypatch.setattr(write, name, _nothing_drawn)
+        monkeypatch.setattr(page, name, _nothing_drawn)
 
 
 def _nothing_drawn(path: Path, *_: object, **__: object) -> None:

@@ -5,8 +5,8 @@ import numpy as np
 import torch
 
 from structgstream.cameras import Camera
+from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import LensCamera, Pinhole
-from structgstream.data.posed import rotation_matrix
 from structgstream.preparation.calibration.keypoints import Keypoints
 
 POINTS, LOOKS, NOISE_PIXELS = 600, 60, 0.3

@@ -6,8 +6,7 @@ from pathlib import Path
 
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.local import LocalEngine
-from structgstream.executors.task import PYTHON
-from structgstream.executors.worker_slots import WorkerSlot
+from structgstream.executors.task import PYTHON, WorkerSlot
 from structgstream.parallel.driver import Job
 from structgstream.parallel.unit import Unit
 from tests.support import stand_in

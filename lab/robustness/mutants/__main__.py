@@ -14,7 +14,8 @@ import time
 import tomllib
 from pathlib import Path
 
-import numpy  # noqa: F401  (loaded once for all)
+import av  # noqa: F401  (loaded once for all, as the next two)
+import cv2  # noqa: F401
 import pytest
 import torch  # noqa: F401
 

@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 
 from lab.recovery.perturbed import main
-from structgstream.data.calibration_files import multical
-from structgstream.data.clip import bundled_clip, bundled_clip_path
+from structgstream.data.calibration_files.tools import MULTICAL
+from structgstream.data.json_videos import bundled_clip, bundled_clip_path
 
 
 def test_every_camera_of_the_file_is_as_far_off_as_asked(tmp_path: Path) -> None:
     file = tmp_path / "perturbed.json"
     main([str(bundled_clip_path()), str(file), "--degrees", "0.5", "--percent", "2"])
-    truth, read = bundled_clip().rig, multical.read((file,)).cameras
+    truth, read = bundled_clip().rig, MULTICAL.read((file,)).cameras
     centers = np.stack([truth[name].center.numpy() for name in truth])
     radius = np.linalg.norm(centers - centers.mean(0), axis=1).max()
     assert {camera.name for camera in read} == set(truth)

@@ -7,8 +7,8 @@ import torch
 
 from lab.recovery.placement import exactly_placed, own_errors
 from structgstream.data.alignment import Alignment
+from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import LensCamera
-from structgstream.data.posed import rotation_matrix
 from tests.support.repetitive import ring
 
 

@@ -28,7 +28,7 @@ EVENTS = [
 
 def test_stages_follow_each_other() -> None:
     edges = {0: edge(0, 100.0), 1: edge(1, 105.0), 2: edge(2, 110.0)}
-    found = frames_of([entry(index, delay=0.5) for index in range(3)], edges, EVENTS, reads_ahead=False)
+    found = frames_of([entry(index, delay=0.5) for index in range(3)], edges, EVENTS)
     first = [found[0][stage] for stage in STAGES]
     assert first == pytest.approx([0.3, 0.4, 0.5, 0.7, 2.7, 3.0, 3.1, 3.2, 3.3, 3.4, 3.5, 3.6])
     # The page heard of frames 1 and 2 at once, and decoded only the second.
@@ -36,23 +36,17 @@ def test_stages_follow_each_other() -> None:
     assert (found[2]["decoded"], found[2]["drawn"]) == (pytest.approx(3.4), None)
 
 
-def test_a_trainer_that_reads_ahead_tells_of_the_next_frame() -> None:
-    edges = {0: edge(0, 100.0), 1: edge(1, 105.0)}
-    found = frames_of([entry(0, delay=0.5), entry(1, delay=0.7)], edges, [], reads_ahead=True)
-    assert [(one["frame"], one["handed over"]) for one in found] == [(1, 0.5)]
-
-
 def test_frames_of_which_it_is_not_known_when_they_were_filmed_are_left_out() -> None:
-    found = frames_of([entry(0, delay=0.5), entry(1, delay=0.5)], {0: edge(0, None)}, [], reads_ahead=False)
+    found = frames_of([entry(0, delay=0.5), entry(1, delay=0.5)], {0: edge(0, None)}, [])
     assert found == []
 
 
 def test_results_are_shown(tmp_path: Path) -> None:
     edges = {0: edge(0, 100.0), 1: edge(1, 105.0), 2: edge(2, 110.0)}
-    frames = frames_of([entry(index, delay=0.5) for index in range(3)], edges, EVENTS, reads_ahead=False)
+    frames = frames_of([entry(index, delay=0.5) for index in range(3)], edges, EVENTS)
     memory = [(10.0 + n, 600_000_000) for n in range(200)]
     run = {
-        "transport": "http", "policy": "latest", "frames": frames, "sets": 1234, "waiting_sets": 1, "errors": [],
+        "transport": "http", "frames": frames, "sets": 1234, "errors": [],
         "memory": {"trainer": memory, "server": memory}, "busy_seconds": {"trainer": 9.0, "server": 1.0},
     }  # fmt: skip
     text = table([run])

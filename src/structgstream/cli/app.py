@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import ModuleType
 
-from structgstream.cli.termination import Terminated
+from structgstream.cli.signals import Terminated
 from structgstream.errors import ConfigError, StructGStreamError
 
 COMMANDS = {
@@ -33,6 +33,7 @@ COMMANDS = {
     "token": "make an access token for a served stream",
     "render": "render a camera or a camera path to mp4 or PNG",
     "export": "write a page with a player, or frames as plain 3D Gaussians: .ply, .spz, .sog, .glb, .usd ...",
+    "import": "make a stream of a numbered .ply sequence of another trainer",
     "archive": "turn a folder of segments into one stream file",
     "inspect": "show the content of a stream file",
     "doctor": "show available back-ends and packages, and how to install missing ones",
@@ -84,16 +85,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return DONE
     try:
         _run(given[0], given[1:])
-    except SystemExit as ending:  # from the parser, after it has printed help or an error
-        return ending.code if isinstance(ending.code, int) else DONE if ending.code is None else PROBLEM
+    except SystemExit as exit_:  # from the parser, after it has printed help or an error
+        return exit_.code if isinstance(exit_.code, int) else DONE if exit_.code is None else PROBLEM
     except UsageError as error:
-        _say(f"structgstream: {error}")
+        _print_error(f"structgstream: {error}")
         return USAGE
     except Terminated as error:
-        _say(f"\nTerminated. {error}")
+        _print_error(f"\nTerminated. {error}")
         return TERMINATED
     except (KeyboardInterrupt, Interrupted) as error:
-        _say(f"\nInterrupted. {error}".rstrip())
+        _print_error(f"\nInterrupted. {error}".rstrip())
         return INTERRUPTED
     except BrokenPipeError:
         # The reader of our output has exited (`| head`). Python would raise again while it closes stdout.
@@ -102,41 +103,43 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except StructGStreamError as error:
         if debug:
             traceback.print_exc()
-        _say(f"structgstream: {error}")
+        _print_error(f"structgstream: {error}")
         return PROBLEM
     except OSError as error:
         if debug:
             traceback.print_exc()
-        _say(f"structgstream: {_trouble_with_files(error)}")
+        _print_error(f"structgstream: {_file_error(error)}")
         return PROBLEM
     except MemoryError as error:
         if debug:
             traceback.print_exc()
-        said = f" ({error})" if str(error) else ""
-        _say(f"structgstream: not enough memory{said}; close other programs, or use smaller pictures (--scale 0.5).")
+        detail = f" ({error})" if str(error) else ""
+        _print_error(
+            f"structgstream: not enough memory{detail}; close other programs, or use smaller pictures (--scale 0.5)."
+        )
         return PROBLEM
     except Exception as error:
         if debug:
             traceback.print_exc()
-        _say(f"structgstream: {_unexpected(error)}")
+        _print_error(f"structgstream: {_unexpected_error(error)}")
         return PROBLEM
     return DONE
 
 
-def _unexpected(error: Exception) -> str:
+def _unexpected_error(error: Exception) -> str:
     return (
         f"unexpected error, {type(error).__name__}: {error}. Run the command again with --debug and report the output."
     )
 
 
-def _trouble_with_files(error: OSError) -> str:
-    """What the system refuses anywhere: a folder that may not be entered, a disk without room."""
+def _file_error(error: OSError) -> str:
+    """The message of an error of the operating system: missing permissions, a full disk."""
     if isinstance(error, PermissionError) and error.filename is not None:
         return f"no permission for {error.filename}; change its permissions or its owner, or use another place."
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         where = "" if error.filename is None else f" of {error.filename}"
         return f"the disk{where} is full ({error.strerror}); make room, and run the command again."
-    return _unexpected(error)
+    return _unexpected_error(error)
 
 
 def overview() -> str:
@@ -165,14 +168,14 @@ examples:
 
 
 def _run(command: str, arguments: list[str]) -> None:
-    homes = dict.fromkeys(COMMANDS, "structgstream.cli")
-    if command not in homes:
-        homes |= {name: package.__name__ for package in _packages() for name in package.COMMANDS}
-    if command not in homes:
-        near = difflib.get_close_matches(command, homes, n=1)
+    packages = dict.fromkeys(COMMANDS, "structgstream.cli")
+    if command not in packages:
+        packages |= {name: package.__name__ for package in _packages() for name in package.COMMANDS}
+    if command not in packages:
+        near = difflib.get_close_matches(command, packages, n=1)
         hint = f" Did you mean {near[0]!r}?" if near else ""
-        raise UsageError(f"there is no command {command!r}.{hint} Commands: {', '.join(homes)}.")
-    importlib.import_module(f"{homes[command]}.{command.replace('-', '_')}").main(arguments)
+        raise UsageError(f"there is no command {command!r}.{hint} Commands: {', '.join(packages)}.")
+    importlib.import_module(f"{packages[command]}.{command.replace('-', '_')}").main(arguments)
 
 
 def _packages() -> list[ModuleType]:
@@ -182,5 +185,5 @@ def _packages() -> list[ModuleType]:
     return [point.load() for point in entry_points(group=ENTRY_POINTS)]
 
 
-def _say(text: str) -> None:
+def _print_error(text: str) -> None:
     print(text, file=sys.stderr, flush=True)

@@ -10,8 +10,7 @@ from rich.console import Console
 
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import Flag, Folder, check_ending, parse_options
-from structgstream.cli.plain_text import say
-from structgstream.cli.progress import human_bytes
+from structgstream.cli.progress import human_bytes, print_lines
 
 
 @dataclass(frozen=True)
@@ -44,4 +43,4 @@ def main(arguments: list[str]) -> None:
     frames = write_archive(FolderStore(options.segments), output)
     what = "1 frame" if frames == 1 else f"{frames} frames"
     text = f"Wrote {output}: {what}, {human_bytes(output.stat().st_size)}"
-    say(Console(), text)
+    print_lines(Console(), text)

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from structgstream.cli.app import usage_errors
 from structgstream.cli.options import check_ending, parse_options
-from structgstream.cli.plain_text import say
+from structgstream.cli.progress import print_lines
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,6 @@ def main(arguments: list[str]) -> None:
     told = (
         f"Wrote {options.output}: {board.text}, on {options.paper}. Print it at 100 %, and check its bar with a ruler."
     )
-    say(console, told)
+    print_lines(console, told)
     use = f"Then: structgstream prepare VIDEOS -o CAPTURE --calibration board --board {board_text(board)}"
-    say(console, use)
+    print_lines(console, use)

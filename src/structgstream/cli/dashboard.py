@@ -141,8 +141,6 @@ def state_parts(values: Mapping[str, Any]) -> list[str]:
             f"in {_number(values['frames_in_per_second'])}/s out {_number(values['frames_out_per_second'], 2)}/s",
             f"skipped {live['skipped_sets']:,}",
         ]
-        if live["waiting_bytes"]:
-            parts.append(f"waiting {live['waiting_sets']:,} ({human_bytes(live['waiting_bytes'])})")
         if live["delay_seconds"] is not None:
             parts.append(f"pictures {live['delay_seconds']:.2f} s old")
     if values["bits_per_second"] is not None:

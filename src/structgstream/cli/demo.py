@@ -12,7 +12,7 @@ from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError
 from structgstream.cli.options import Device, check_ending, parse_known_options, resolve_config
-from structgstream.cli.plain_text import say
+from structgstream.cli.progress import print_lines
 from structgstream.cli.tables import quality_text, report_tables
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def main(arguments: list[str]) -> None:
     check_ending(options.output, command="demo", folder=True)
     if options.output.exists() and not options.output.is_dir():
         raise UsageError(f"--output is a folder, and {options.output} is a file.")
-    from structgstream.data.clip import bundled_clip_path
+    from structgstream.data.json_videos import bundled_clip_path
     from structgstream.data.open import open_capture
     from structgstream.kernels.backend import select_backend
     from structgstream.recorder import check_output
@@ -68,7 +68,7 @@ def main(arguments: list[str]) -> None:
     report, files = _look_at(stream, source, backend)
     _print_results(console, report, files, seconds=time.perf_counter() - began)
     player = options.output / PLAYER
-    say(
+    print_lines(
         console,
         f"\nWatch it from any angle: open {player} in a browser,\n{player.resolve().as_uri()}\n"
         f"or, beside what the cameras took: structgstream play {stream} --capture {bundled_clip_path()}",
@@ -134,7 +134,7 @@ def _print_results(console: Console, report: "Report", files: Mapping[str, Path 
     console.print(report_tables(report, title="bundled clip, held-out camera"))
     console.print()
     for name, path in files.items():
-        say(console, f"{name:<14}  {path}")
+        print_lines(console, f"{name:<14}  {path}")
     console.print(
         f"\nHeld-out PSNR {quality_text(report)} over {len(report.frames)} frames, everything in {seconds:.0f} s.",
         highlight=False,

@@ -17,7 +17,7 @@ from structgstream.cli.options import (
     parse_options,
     write_json_output,
 )
-from structgstream.cli.plain_text import say
+from structgstream.cli.progress import print_lines
 from structgstream.cli.tables import quality_text, report_tables
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def main(arguments: list[str]) -> None:
     check_ending(options.json, ".json", command="evaluate", option="--json")
     check_ending(options.report, command="evaluate", option="--report", folder=True)
     from structgstream.codec.reader import open_stream
-    from structgstream.evaluation.capture import capture_of, stored_capture
+    from structgstream.evaluation.recording import capture_of, stored_capture
     from structgstream.evaluation.report import as_json
     from structgstream.kernels.backend import select_backend
 
@@ -85,7 +85,7 @@ def main(arguments: list[str]) -> None:
     console = write_json_output(options.json, as_json(report))
     console.print(report_tables(report, title=options.stream.name))
     if options.report is not None:
-        say(console, f"Report: {options.report}")
+        print_lines(console, f"Report: {options.report}")
 
 
 def run_evaluation(

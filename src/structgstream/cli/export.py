@@ -12,8 +12,7 @@ from rich.table import Table
 
 from structgstream.cli.app import usage_errors
 from structgstream.cli.options import EXPORTS, Device, Flag, StreamFile, check_ending, parse_options
-from structgstream.cli.plain_text import say
-from structgstream.cli.progress import human_bytes
+from structgstream.cli.progress import human_bytes, print_lines
 from structgstream.exporters.formats import FORMATS, Format, FrameOptions, PageFormat, SpzVersion
 
 
@@ -125,16 +124,16 @@ def main(arguments: list[str]) -> None:
     what = "1 frame" if len(numbers) == 1 else f"{len(numbers)} frames"
     size_bytes = sum(path.stat().st_size for path in files)
     console = Console()
-    say(console, f"Wrote {output}: {what}, {gaussians:,} Gaussians, {human_bytes(size_bytes)}")
+    print_lines(console, f"Wrote {output}: {what}, {gaussians:,} Gaussians, {human_bytes(size_bytes)}")
     if loss is not None:
         held_out = "" if loss.held_out is None else f", {loss.held_out:.1f} dB at the held-out ones"
-        say(
+        print_lines(
             console,
             f"Plain Gaussians of frame {numbers[0]}, against the stream's own pictures: PSNR {loss.training:.1f} dB at "
             f"the training cameras{held_out}.",
         )
     if reader.damage:
-        say(console, f"The stream is damaged: {reader.cut_reason}.")
+        print_lines(console, f"The stream is damaged: {reader.cut_reason}.")
 
 
 def _list_formats(console: Console) -> None:
@@ -160,4 +159,4 @@ def _export_page(path: Path, output: Path, format: PageFormat) -> None:
         size_bytes = write_site(output, stream)
         then = "put the folder on any web server"
     text = f"Wrote {output}, {human_bytes(size_bytes)}; {then}"
-    say(Console(), text)
+    print_lines(Console(), text)

@@ -13,9 +13,8 @@ from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError
 from structgstream.cli.options import Device, Flag, Folder, StreamFile, check_ending, parse_options
-from structgstream.cli.plain_text import say
-from structgstream.cli.progress import display
-from structgstream.cli.termination import Terminated, Termination
+from structgstream.cli.progress import display, print_lines
+from structgstream.cli.signals import Terminated, Termination
 
 if TYPE_CHECKING:
     from structgstream.groups.unit import SegmentTask
@@ -71,7 +70,7 @@ def main(arguments: list[str]) -> None:
     task = SegmentTask(options.scene, options.init, options.track, first, end, start)
     written = _fit(options, task)
     text = f"Wrote {options.output}" if written else f"{options.output} is finished."
-    say(Console(), text)
+    print_lines(Console(), text)
 
 
 def _fit(options: FitGroup, task: "SegmentTask") -> bool:

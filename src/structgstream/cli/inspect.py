@@ -11,7 +11,7 @@ import tyro
 
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import Flag, JsonPath, StreamFile, check_ending, parse_options, write_json_output
-from structgstream.cli.plain_text import say
+from structgstream.cli.progress import print_lines
 from structgstream.cli.stream_tables import bit_rate_text, facts_table, header_table, packet_table, period_table
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def main(arguments: list[str]) -> None:
         console.print(part)
         console.print()
     if plot is not None:
-        say(console, f"Wrote {plot}")
+        print_lines(console, f"Wrote {plot}")
 
 
 def _print_capture(options: Inspect) -> None:

@@ -10,8 +10,7 @@ from rich.console import Console
 
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import Device, Flag, check_ending, parse_options
-from structgstream.cli.plain_text import say
-from structgstream.cli.progress import human_bytes
+from structgstream.cli.progress import human_bytes, print_lines
 
 if TYPE_CHECKING:
     from structgstream.groups.blending import Border
@@ -69,7 +68,9 @@ def main(arguments: list[str]) -> None:
         on_border=lambda border: _tell(border, console),
     )
     what = "1 frame" if frames == 1 else f"{frames} frames"
-    say(console, f"Wrote {output}: {what} of {len(options.segments)} groups, {human_bytes(output.stat().st_size)}")
+    print_lines(
+        console, f"Wrote {output}: {what} of {len(options.segments)} groups, {human_bytes(output.stat().st_size)}"
+    )
 
 
 def _workers(asked: int | None, backend: "Backend | None") -> int:
@@ -81,7 +82,7 @@ def _workers(asked: int | None, backend: "Backend | None") -> int:
 
 
 def _tell(border: "Border", console: Console) -> None:
-    say(
+    print_lines(
         console,
         f"Border at frame {border.frame}: {border.blended:,} anchors keep their values of the frame before; "
         f"{border.withdrawn:,} do not, as two fits side by side would show there.",

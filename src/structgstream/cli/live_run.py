@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``reconstruct --live`` adds: its options, the opened cameras, how they are watched and how they end."""
+"""``reconstruct --live``: its options, opening the cameras, the display, and the end of a run."""
 
 import signal
 import sys
@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Protocol
 
 import tyro
 
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
 
 
 class Stoppable(Protocol):
-    """What can be asked to end after the frame that is being made, such as a ``LiveSource``."""
+    """A run that can be stopped after the frame being fitted, such as a ``LiveSource``."""
 
     @property
     def stopped(self) -> bool:
-        """Whether it was asked."""
+        """Whether :meth:`stop` was called."""
         ...
 
     def stop(self) -> None:
-        """Asks; may be called by a signal's handler."""
+        """Stops after this frame; may be called by a signal's handler."""
         ...
 
 
@@ -42,14 +42,10 @@ class LiveChoice:
     """Options of live cameras."""
 
     live: Flag = False
-    """FOLDER is a rig file of cameras that send now; the stream ends after --frames, or with Ctrl-C."""
-    policy: Literal["latest", "every"] = "latest"
-    """Live only, when training is slower than the cameras: latest takes the newest pictures, every keeps all of them in
-    a queue on the disk."""
-    queue_gigabytes: float = 10.0
-    """Live only: disk space for the queue of --policy every."""
+    """FOLDER is a rig file of cameras that send now; what they send while a frame is fitted is skipped. The stream ends
+    after --frames, or with Ctrl-C."""
     record: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
-    """Live only: record what the cameras send, as a capture that can be reconstructed again."""
+    """Live only: record all that the cameras send, as a capture that can be reconstructed with every frame."""
 
     def check(self, scene: Path) -> None:
         """Check the options of a run that is not live.
@@ -58,9 +54,7 @@ class LiveChoice:
             UsageError: one is for live runs, or the scene is a rig file.
         """
         if self != LiveChoice():
-            raise UsageError(
-                "--policy, --queue-gigabytes and --record are for live cameras: give --live and a rig file."
-            )
+            raise UsageError("--record is for live cameras: give --live and a rig file.")
         if scene.suffix == ".toml":
             raise UsageError(f"{scene} is a rig file of live cameras: give --live, too.")
 
@@ -88,12 +82,10 @@ def open_live(
     if capture.frames is not None and capture.frames < 1:
         raise UsageError(f"--frames must be at least 1, got {capture.frames}.")
     options = LiveOptions(
-        policy=live.policy,
         frames=capture.frames,
         held_out=capture.held_out,
         scale=capture.scale,
         near=capture.near,
-        queue_gigabytes=live.queue_gigabytes,
         record=live.record,
         resume=resume,
         denoising=denoising,
@@ -114,16 +106,16 @@ def run_metrics(source: "FrameStream", stream: Path, *, qualities: Sequence[str]
     return RunMetrics(stream, fps=source.fps, total=frame_count(source), qualities=qualities)
 
 
-def ending_of(source: "FrameStream") -> Callable[[], object]:
-    """What wakes a run that waits for live cameras, so that it ends; nothing for a recording."""
+def stop_of(source: "FrameStream") -> Callable[[], object]:
+    """Ends a run that waits for live cameras; for a recording, does nothing."""
     from structgstream.data.live.source import LiveSource
 
     return source.stop if isinstance(source, LiveSource) else lambda: None
 
 
 @contextmanager
-def watched(source: "FrameStream", metrics: "RunMetrics | None", *, done: int) -> Iterator[Display]:
-    """Shows a run and writes its metrics; Ctrl-C ends a live one after the frame that is fitted."""
+def monitored(source: "FrameStream", metrics: "RunMetrics | None", *, done: int) -> Iterator[Display]:
+    """Shows a run and writes its metrics; Ctrl-C ends a live one after the frame being fitted."""
     from structgstream.cli.dashboard import live_display
     from structgstream.data.live.source import LiveSource
     from structgstream.data.source import frame_count
@@ -133,15 +125,15 @@ def watched(source: "FrameStream", metrics: "RunMetrics | None", *, done: int) -
             stack.enter_context(metrics.running())
         if isinstance(source, LiveSource) and metrics is not None:
             stack.enter_context(source)
-            stack.enter_context(stopping(source))
+            stack.enter_context(stop_on_interrupt(source))
             yield stack.enter_context(live_display(metrics.values, frames=None, done=done))
         else:
             yield stack.enter_context(display(frame_count(source), done=done))
 
 
 @contextmanager
-def stopping(source: Stoppable) -> Iterator[None]:
-    """The first Ctrl-C ends the stream after the frame that is fitted, the second one at once."""
+def stop_on_interrupt(source: Stoppable) -> Iterator[None]:
+    """The first Ctrl-C ends the stream after the frame being fitted, the second one at once."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

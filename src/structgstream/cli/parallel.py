@@ -20,8 +20,7 @@ from structgstream.cli.options import (
     resolve_config,
 )
 from structgstream.cli.parallel_display import ParallelDisplay
-from structgstream.cli.plain_text import say
-from structgstream.cli.progress import human_bytes
+from structgstream.cli.progress import human_bytes, print_lines
 from structgstream.executors.opening import ExecutorName, ExecutorOptions
 
 if TYPE_CHECKING:
@@ -95,7 +94,7 @@ class Parallel:
     overwrite: Flag = False
     """Replace OUT and its parts when they exist."""
     store: Annotated[str | None, tyro.conf.arg(metavar="URL", help_behavior_hint="")] = None
-    """Where the parts meet if the machines share no folder, such as s3://bucket/runs/ball. Needs the extra cloud."""
+    """Object store of the parts if machines share no folder, such as s3://bucket/runs/ball. Needs the extra cloud."""
     capture: CaptureOptions = field(default_factory=CaptureOptions)
     run: WorkerOptions = field(default_factory=WorkerOptions)
 
@@ -118,33 +117,33 @@ def main(arguments: list[str]) -> None:
     from structgstream.parallel.parts import PURPOSE, Parts
 
     parts, console = Parts(parts_folder(options.output)), Console()
-    # All that can be refused is refused before anything is made or removed.
+    # Errors are raised before anything is made or removed.
     _check(options, config, parts)
     with usage_errors():
-        executor = opened(chosen, options.device)
+        executor = open_tasks(chosen, options.device)
     with executor:
         job = _job(options, rest)
         store = None if options.store is None else ObjectStore(ObjectFolder(options.store), parts, cut=job.unit.cut)
-        there = None if store is None else store.claim(job.key)
-        owner = parts.check() or there or replace(Owner.new(PURPOSE), key=job.key)
-        with parts.held(owner=owner):
-            if store is not None and there is None:
+        stored = None if store is None else store.check_owner(job.key)
+        owner = parts.check() or stored or replace(Owner.new(PURPOSE), key=job.key)
+        with parts.locked(owner=owner):
+            if store is not None and stored is None:
                 store.mark(owner)
             if options.overwrite:
-                # Killed in between, the folder still has the old plan, with which no other run goes on.
+                # If this is killed in between, the folder still has the old plan, which other runs refuse.
                 if store is not None:
                     store.clear()
                 parts.clear()
             _drive(job, parts, executor, store, console)
     size = human_bytes(options.output.stat().st_size)
-    say(console, f"Wrote {options.output}: {size}. Its parts are in {parts.folder}; they are needed no more.")
+    print_lines(console, f"Wrote {options.output}: {size}. Its parts in {parts.folder} are no longer needed.")
 
 
 def _check(options: Parallel, config: "StreamConfig", parts: "Parts") -> None:
     """Check the options against the capture, and that the output and its parts may be written.
 
     Raises:
-        StructGStreamError: the capture cannot be read, the groups do not fit it, or something is there already.
+        StructGStreamError: the capture cannot be read, the groups do not fit it, or the output exists.
     """
     from structgstream.groups.boundaries import check_length
     from structgstream.recorder import check_output
@@ -154,16 +153,16 @@ def _check(options: Parallel, config: "StreamConfig", parts: "Parts") -> None:
     if options.groups is not None and not options.allow_unaligned:
         check_length(options.groups, key_interval=stream_pipeline(config).codec.key_interval(source.fps))
     parts.check()
-    check_output(options.output, may_exist=options.overwrite or bool(parts.notes), resume=False)
+    check_output(options.output, may_exist=options.overwrite or bool(parts.completed), resume=False)
 
 
 def parts_folder(output: Path) -> Path:
-    """Where the parts of a stream are."""
+    """The folder of the parts of a stream."""
     return output.with_name(f"{output.name}.parts").absolute()
 
 
-def opened(options: ExecutorOptions, device: Device) -> "TaskQueue":
-    """The executor that was asked for, on this machine's cores and GPUs.
+def open_tasks(options: ExecutorOptions, device: Device) -> "TaskQueue":
+    """The executor of the options, on this machine's cores and GPUs.
 
     Raises:
         ConfigError: less than one worker, or a cluster that cannot be joined.
@@ -176,7 +175,7 @@ def opened(options: ExecutorOptions, device: Device) -> "TaskQueue":
 
 
 def gpus_of(device: Device) -> int:
-    """How many GPUs of this machine the tasks use."""
+    """Number of GPUs of this machine that the tasks use."""
     if device not in ("auto", "cuda"):
         return 0
     import torch
@@ -184,16 +183,16 @@ def gpus_of(device: Device) -> int:
     return torch.cuda.device_count()
 
 
-def join_words(options: WorkerOptions, device: Device) -> tuple[str, ...]:
-    """As many processes as the workers have threads; where these are elsewhere, or GPUs, what ``join`` takes itself."""
+def join_arguments(options: WorkerOptions, device: Device) -> tuple[str, ...]:
+    """As many processes as the workers have threads; on a cluster and with GPUs the default of ``join``."""
     from structgstream.evaluation.environment import usable_cores
-    from structgstream.executors.worker_slots import allocate_slots
+    from structgstream.executors.task import allocate_slots
 
     if options.executor == "ray" or gpus_of(device):
         return ()
     cores = usable_cores()
-    places = allocate_slots(workers=options.workers, cores=cores, threads=options.threads)
-    threads = 1 if options.executor == "inline" else min(cores, sum(place.threads for place in places))
+    slots = allocate_slots(workers=options.workers, cores=cores, threads=options.threads)
+    threads = 1 if options.executor == "inline" else min(cores, sum(slot.threads for slot in slots))
     return ("--workers", str(threads))
 
 
@@ -202,13 +201,13 @@ def _job(options: Parallel, rest: list[str]) -> "Job":
     from structgstream.parallel.unit import Unit
 
     capture = options.capture
-    header = [*_words("preset", options.preset), *_words("quality", options.quality), *_words("seed", options.seed)]
-    header += [*_words("start", capture.start or None), *_words("near", capture.near)]
-    header += _words("every", None if capture.every == 1 else capture.every)
-    header += _words("scale", None if capture.scale == 1.0 else capture.scale)
+    header = [*_option("preset", options.preset), *_option("quality", options.quality), *_option("seed", options.seed)]
+    header += [*_option("start", capture.start or None), *_option("near", capture.near)]
+    header += _option("every", None if capture.every == 1 else capture.every)
+    header += _option("scale", None if capture.scale == 1.0 else capture.scale)
     header += [] if capture.held_out is None else ["--held-out", *capture.held_out]
     track = [
-        *_words("groups", options.groups),
+        *_option("groups", options.groups),
         *(["--split-at-low-motion"] if options.split_at_low_motion else []),
         *(["--allow-unaligned"] if options.allow_unaligned else []),
     ]
@@ -219,12 +218,12 @@ def _job(options: Parallel, rest: list[str]) -> "Job":
         tuple(track),
         options.run.track_threads,
         ("--device", options.device),
-        join_words(options.run, options.device),
+        join_arguments(options.run, options.device),
     )
     return Job(unit, options.output.absolute(), int(options.device == "cuda" or gpus_of(options.device) > 0))
 
 
-def _words(name: str, value: object) -> list[str]:
+def _option(name: str, value: object) -> list[str]:
     return [] if value is None else [f"--{name}", str(value)]
 
 
@@ -236,4 +235,4 @@ def _drive(job: "Job", parts: "Parts", executor: "TaskQueue", exchange: "ObjectS
         try:
             drive(job, parts, executor, exchange=exchange, listener=display.show)
         except KeyboardInterrupt:
-            raise Interrupted(f"Whole frames are kept in {parts.folder}; go on with the same command.") from None
+            raise Interrupted(f"Complete frames are in {parts.folder}; continue with the same command.") from None

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from structgstream.cli.plain_text import say
+from structgstream.cli.progress import print_lines
 
 if TYPE_CHECKING:
     from structgstream.parallel.driver import State, Status
@@ -90,7 +90,7 @@ class ParallelDisplay:
         line = f"{status.stage}: {done} of {len(status.groups)} groups done" if status.groups else status.stage
         line += f", failed: {', '.join(status.failed)}" if status.failed else ""
         if line != self._told:
-            say(self._console, line)
+            print_lines(self._console, line)
             self._console.file.flush()
             self._told = line
 

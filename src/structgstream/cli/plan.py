@@ -21,8 +21,7 @@ from structgstream.cli.options import (
     resolve_config,
     write_json_output,
 )
-from structgstream.cli.plain_text import say
-from structgstream.cli.progress import human_bytes
+from structgstream.cli.progress import human_bytes, print_lines
 from structgstream.cli.tables import compact_table, literal_cells
 
 if TYPE_CHECKING:
@@ -127,7 +126,7 @@ def _report(options: Plan, work: "Work", source: "FrameSource", found: "Measured
     estimates = [(count, estimate(costs, work, count * options.workers)) for count in options.machines]
     alone, serial, size = sequential_seconds(costs, work), serial_seconds(costs, work), stream_bytes(costs, work)
     seconds = work.frames / source.fps
-    say(
+    print_lines(
         console,
         f"{source.name}: {work.frames} frames ({seconds:.1f} s of film) in {len(work.groups)} groups of {work.group}.",
         f"Measured on one worker: frame 0 {costs.header_seconds:.1f} s, tracking {costs.track_seconds:.2f} s a frame, "
@@ -136,15 +135,15 @@ def _report(options: Plan, work: "Work", source: "FrameSource", found: "Measured
         f"One frame after the other: {_time(alone)}. Stream: {human_bytes(size)}, {size * 8e-6 / seconds:.2f} Mbit/s.",
     )
     _table(console, estimates)
-    say(console, _serial(costs.header_seconds, serial, alone, work.frames))
+    print_lines(console, _serial(costs.header_seconds, serial, alone, work.frames))
     wanted = None
     if options.finish_hours is not None:
         wanted = workers_for(costs, work, options.finish_hours * 3600)
         least = _time(estimate(costs, work, len(work.groups) + 1).seconds)
         ends = f"{wanted.workers} workers ({_time(wanted.seconds)})" if wanted else f"not possible; least {least}"
-        say(console, f"Within {options.finish_hours:g} h: {ends}.")
+        print_lines(console, f"Within {options.finish_hours:g} h: {ends}.")
     rate = 1 / costs.frame_seconds
-    say(console, _live(rate, source.fps), ASSUMED)
+    print_lines(console, _live(rate, source.fps), ASSUMED)
     if options.json is not None:
         facts: dict[str, Any] = {"work": asdict(work), "measured": asdict(found), "bytes": size, "live_fps": rate}
         facts |= {"sequential_seconds": alone, "serial_seconds": serial}

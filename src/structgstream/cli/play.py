@@ -12,7 +12,7 @@ from rich.console import Console
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import Flag, parse_options
 from structgstream.cli.options import StreamFile as StreamPath
-from structgstream.cli.plain_text import say
+from structgstream.cli.progress import print_lines
 from structgstream.errors import MissingExtraError
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def main(arguments: list[str]) -> None:
             lines.append("The file has no end yet: frames appear as they are written.")
         if options.browser and not open_browser(address):
             lines.append("There is no screen to open a browser on: open the address yourself.")
-        say(Console(), *lines)
+        print_lines(Console(), *lines)
 
     run(server(application(stream, truth=truth)), port=options.port, on_start=announce)
 
@@ -79,7 +79,7 @@ def main(arguments: list[str]) -> None:
 def _wait_for(stream: "StreamFile") -> None:
     if not stream.has_header():
         text = f"Waiting for {stream.path}, which comes when frame 0 is done (Ctrl-C ends)."
-        say(Console(stderr=True), text)
+        print_lines(Console(stderr=True), text)
     while not stream.has_header():
         time.sleep(POLL_SECONDS)
 
@@ -91,8 +91,8 @@ def _truth(stream: Path, scene: Path) -> "Truth":
         CaptureError: it is not the capture that the stream was made from.
     """
     from structgstream.codec.reader import open_stream
-    from structgstream.evaluation.capture import capture_of
     from structgstream.evaluation.facts import check_same_rig
+    from structgstream.evaluation.recording import capture_of
     from structgstream.serve.play import Truth
 
     with open_stream(stream, by_index=True) as reader:

@@ -10,10 +10,9 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError, usage_errors
-from structgstream.cli.interruption import interruptible
 from structgstream.cli.options import Flag, Folder, check_ending, parse_options
-from structgstream.cli.plain_text import say
-from structgstream.cli.step_display import step_display
+from structgstream.cli.progress import StepDisplay, print_lines
+from structgstream.cli.signals import interruptible
 
 if TYPE_CHECKING:
     from structgstream.pose_check.findings import Finding
@@ -113,23 +112,23 @@ def _prepare(options: Prepare, console: Console) -> "Sequence[Finding]":
     with usage_errors():
         chosen = _chosen(options)
     try:
-        with interruptible(), step_display(console) as display:
+        with interruptible(), StepDisplay(console) as display:
             made = prepare_capture(options.videos, options.output, options=chosen, listener=display)
     except KeyboardInterrupt:
         raise Interrupted("Steps that are done are kept; continue with the same command.") from None
-    say(console, f"Capture: {made.path}")
-    say(console, f"Report: {made.report}")
+    print_lines(console, f"Capture: {made.path}")
+    print_lines(console, f"Report: {made.report}")
     return made.findings
 
 
 def _check(options: Prepare, console: Console) -> "Sequence[Finding]":
-    from structgstream.data.folder_files import REPORT
+    from structgstream.data.camera_files import REPORT
     from structgstream.preparation.prepare import check_folder
 
     folder = options.videos / REPORT if options.report is None else options.report
-    with interruptible(), step_display(console) as display:
+    with interruptible(), StepDisplay(console) as display:
         checked = check_folder(options.videos, report=folder, listener=display)
-    say(console, f"Report: {folder / 'index.html'}")
+    print_lines(console, f"Report: {folder / 'index.html'}")
     return checked.report.findings
 
 
@@ -167,7 +166,7 @@ def _conclude(findings: "Sequence[Finding]", console: Console) -> None:
     errors = [finding for finding in findings if finding.severity == "error"]
     for finding in findings:
         if finding is not (errors[0] if errors else None):
-            say(console, f"{finding.severity}: {finding.sentence}")
+            print_lines(console, f"{finding.severity}: {finding.sentence}")
     if errors:
         raise CaptureError(errors[0].sentence)
-    say(console, "The check found nothing that would spoil a stream.")
+    print_lines(console, "The check found nothing that would spoil a stream.")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the user sees while frames are fitted: bars on a terminal, a line for each frame elsewhere."""
+"""What commands print: sentences, and progress of runs and of preparation (bars on a terminal, lines elsewhere)."""
 
 import math
 import time
@@ -10,14 +10,32 @@ from typing import TYPE_CHECKING, Protocol
 
 from rich.console import Console, Group
 from rich.live import Live
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.text import Text
-
-from structgstream.cli.plain_text import say
 
 if TYPE_CHECKING:
     from structgstream.session.frame_report import FrameReport
     from structgstream.training.result import Step
+
+
+def printable(text: str) -> str:
+    """A text with control characters as escapes, such as ``\\x1b``."""
+    return "".join(one if one.isprintable() or one in "\n\t" else ascii(one)[1:-1] for one in text)
+
+
+def print_lines(console: Console, *lines: str) -> None:
+    """Prints lines without rich's markup, colours and line breaks, so that paths can be copied and parsed."""
+    for line in lines:
+        console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
+
 
 MAX_NAMES = 5
 QUIET_SECONDS = 15.0  # without a terminal, interval of progress lines within a frame
@@ -133,7 +151,7 @@ class Lines:
         self._print(summary(report, self._frames, quality=quality))
 
     def _print(self, text: str) -> None:
-        say(self._console, text)
+        print_lines(self._console, text)
         self._console.file.flush()
         self._spoken = time.monotonic()
 
@@ -179,3 +197,59 @@ class Bars:
         self._progress.update(self._all, completed=report.index + 1, note=note)
         self._progress.reset(self._one, total=None, description=following, note="")
         self._last.plain = summary(report, self._frames, quality=quality)
+
+
+MIN_SHOWN_SECONDS = 0.05
+
+
+class StepDisplay(AbstractContextManager["StepDisplay"]):
+    """A listener of steps; bars are shown on a terminal only.
+
+    Args:
+        console: where to write.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._bar = Progress(
+            TextColumn("{task.description:<12}"),
+            BarColumn(bar_width=32),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[what]}", style="dim"),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task: TaskID | None = None
+        self._step, self._skipped, self._began = "", False, 0.0
+
+    def __enter__(self) -> "StepDisplay":
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    def begin(self, step: str, *, skipped: bool) -> None:
+        """Shows the running step."""
+        self._step, self._skipped, self._began = step, skipped, time.monotonic()
+        if self._task is not None:
+            self._bar.remove_task(self._task)
+        self._task = None if skipped else self._bar.add_task(step, total=None, what="")
+
+    def progress(self, done: int, total: int, what: str) -> None:
+        """Moves its bar."""
+        if self._task is not None:
+            self._bar.update(self._task, completed=done, total=total, what=what)
+
+    def end(self, step: str, summary: str) -> None:
+        """Prints the line of a step."""
+        seconds = time.monotonic() - self._began
+        took = "  as before" if self._skipped else f"  {seconds:.1f} s" if seconds > MIN_SHOWN_SECONDS else ""
+        print_lines(self._console, f"{step:<12} {summary}{took}")
+        if self._task is not None:
+            self._bar.remove_task(self._task)
+        self._task = None

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError, usage_errors
-from structgstream.cli.live_run import ending_of, run_metrics, stopping, watched
-from structgstream.cli.plain_text import say
+from structgstream.cli.live_run import monitored, run_metrics, stop_of, stop_on_interrupt
+from structgstream.cli.progress import print_lines
 from structgstream.cli.reconstruct import OpenedScene, Reconstruct, open_scene
-from structgstream.cli.termination import Terminated, Termination
+from structgstream.cli.signals import Terminated, Termination
 
 if TYPE_CHECKING:
     from structgstream.qualities.ladder import Quality
@@ -58,7 +58,7 @@ def reconstruct(options: Reconstruct, config: "StreamConfig", *, preset: str) ->
     )
     storages = {name: storage(opened.captured) for name, storage in folders.items()}
     _run(options, config, qualities, opened=opened, storages=storages)
-    say(console, f"Wrote {options.output}: {', '.join(names)}")
+    print_lines(console, f"Wrote {options.output}: {', '.join(names)}")
 
 
 def _run(
@@ -89,9 +89,9 @@ def _run(
     done, pressed = run.done, _Asked()
     try:
         with (
-            Termination(on_ask=ending_of(source)) as ending,
-            watched(source, metrics, done=done) as progress,
-            nullcontext() if total is None else stopping(pressed),  # Live cameras are stopped by themselves.
+            Termination(on_ask=stop_of(source)) as ending,
+            monitored(source, metrics, done=done) as progress,
+            nullcontext() if total is None else stop_on_interrupt(pressed),  # Live cameras are stopped by themselves.
             closing(run.reports) as reports,
         ):
             for one in reports:

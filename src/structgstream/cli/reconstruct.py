@@ -15,7 +15,7 @@ from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError, usage_errors
 from structgstream.cli.config_help import config_lines
-from structgstream.cli.live_run import LiveChoice, ending_of, open_live, run_metrics, watched
+from structgstream.cli.live_run import LiveChoice, monitored, open_live, run_metrics, stop_of
 from structgstream.cli.options import (
     CaptureOptions,
     Device,
@@ -26,10 +26,9 @@ from structgstream.cli.options import (
     parse_known_options,
     resolve_config,
 )
-from structgstream.cli.plain_text import say
-from structgstream.cli.progress import human_bytes
+from structgstream.cli.progress import human_bytes, print_lines
 from structgstream.cli.segment_options import SegmentOptions
-from structgstream.cli.termination import Terminated, Termination
+from structgstream.cli.signals import Terminated, Termination
 
 if TYPE_CHECKING:
     from structgstream.cli.segment_options import Captured, SegmentsStorage
@@ -122,9 +121,9 @@ def main(arguments: list[str]) -> None:
     may_exist = options.resume or options.overwrite
     options.segments.chosen(options.output)
     opened = open_scene(options, config, preset=preset, console=console)
-    with options.segments.storage(options.output, may_exist=may_exist, tell=partial(say, console)) as storage:
+    with options.segments.storage(options.output, may_exist=may_exist, tell=partial(print_lines, console)) as storage:
         _reconstruct(options, config, opened, storage=storage, console=console)
-    say(console, f"Wrote {options.output}")
+    print_lines(console, f"Wrote {options.output}")
 
 
 def _reconstruct(
@@ -147,7 +146,7 @@ def _reconstruct(
     )
     if peaks:
         stages = ", ".join(f"{stage} {human_bytes(size)}" for stage, size in peaks.items())
-        say(console, f"Peak memory by stage: {stages}.")
+        print_lines(console, f"Peak memory by stage: {stages}.")
 
 
 @dataclass(frozen=True)
@@ -174,7 +173,7 @@ def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, con
         UsageError: options that contradict each other.
         StructGStreamError: it cannot be read, or the back-end is not available.
     """
-    from structgstream.evaluation.capture import part_metadata
+    from structgstream.evaluation.recording import part_metadata
     from structgstream.kernels.backend import select_backend
     from structgstream.session.presets import departures
     from structgstream.training.online.select import unrecognized_faults
@@ -194,7 +193,7 @@ def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, con
         source = open_selected_capture(options.scene, options.capture)
         length, captured = f"{len(source)} frames", None
     backend = select_backend(options.device)
-    say(
+    print_lines(
         console,
         f"{source.name}: {len(source.rig.training)} training cameras, held out: "
         f"{', '.join(source.rig.testing) or 'none'}; {length}; preset {preset}, back-end {backend.name}.",
@@ -259,8 +258,8 @@ def run_reconstruction(
     peaks: dict[str, int] = {}
     try:
         with (
-            Termination(on_ask=ending_of(source)) as ending,
-            watched(source, metrics, done=done) as progress,
+            Termination(on_ask=stop_of(source)) as ending,
+            monitored(source, metrics, done=done) as progress,
             closing(run.reports) as reports,
         ):
             for report in reports:

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import Device, Flag, StreamFile, check_ending, parse_options
-from structgstream.cli.plain_text import say
+from structgstream.cli.progress import print_lines
 
 if TYPE_CHECKING:
     import numpy as np
@@ -97,7 +97,7 @@ def main(arguments: list[str]) -> None:
         pictures = camera_pictures(reader, backend, camera=choose_camera(reader, options.camera), frame=options.frame)
     single = output.suffix.lower() == ".png"
     write_pictures(output, islice(pictures, 1) if single else pictures, fps=reader.header.fps)
-    say(Console(), f"Wrote {output}")
+    print_lines(Console(), f"Wrote {output}")
 
 
 def write_pictures(output: Path, pictures: "Iterable[NDArray[np.uint8]]", *, fps: float) -> None:
@@ -107,7 +107,7 @@ def write_pictures(output: Path, pictures: "Iterable[NDArray[np.uint8]]", *, fps
         StorageError: something cannot be written.
     """
     from structgstream.data.video_writer import VideoWriter
-    from structgstream.evaluation.png import write_png
+    from structgstream.evaluation.pictures import write_png
 
     with Console(stderr=True).status("rendering") as status:
         if output.suffix.lower() == ".mp4":
@@ -161,9 +161,9 @@ def compared_pictures(
     reader: "StreamReader", scene: Path, *, backend: "Backend", options: Render
 ) -> "Iterator[NDArray[np.uint8]]":
     """Truth, rendering and difference of a camera, frame by frame."""
-    from structgstream.evaluation.capture import capture_of
     from structgstream.evaluation.evaluate import compared_frames
     from structgstream.evaluation.pictures import side_by_side
+    from structgstream.evaluation.recording import capture_of
 
     camera = choose_camera(reader, options.camera)
     _check_frame(reader, options.frame)

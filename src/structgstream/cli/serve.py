@@ -10,7 +10,7 @@ from rich.console import Console
 
 from structgstream.cli.app import UsageError, usage_errors
 from structgstream.cli.options import Flag, Folder, parse_options
-from structgstream.cli.plain_text import say
+from structgstream.cli.progress import print_lines
 from structgstream.errors import MissingExtraError
 
 MAX_CONNECTIONS = 100_000
@@ -90,7 +90,7 @@ def main(arguments: list[str]) -> None:
             lines.append(f"Viewers need a token: structgstream token NAME --secret-file {options.secret_file}")
         elif options.public:
             lines.append("Everyone who reaches this machine sees all of them.")
-        say(Console(), *lines)
+        print_lines(Console(), *lines)
 
     prepared = server(application(settings), proxies=proxies, connections=options.connections)
     run(prepared, address=address, port=options.port, on_start=announce)

@@ -8,8 +8,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from structgstream.cli.plain_text import printable
-from structgstream.cli.progress import human_bytes
+from structgstream.cli.progress import human_bytes, printable
 
 if TYPE_CHECKING:
     from structgstream.evaluation.report import Report, Scores

@@ -12,9 +12,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from structgstream.cli.app import Interrupted, UsageError
 from structgstream.cli.options import Device, Flag, Folder, StreamFile, check_ending, parse_options
-from structgstream.cli.plain_text import say
-from structgstream.cli.progress import human_bytes
-from structgstream.cli.termination import Terminated, Termination
+from structgstream.cli.progress import human_bytes, print_lines
+from structgstream.cli.signals import Terminated, Termination
 
 if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
@@ -69,8 +68,7 @@ def main(arguments: list[str]) -> None:
     from structgstream.atomic_files import partial_path
     from structgstream.cli.app import usage_errors
     from structgstream.groups.base import GroupBase
-    from structgstream.groups.boundaries import check_length
-    from structgstream.groups.group_list import groups_path
+    from structgstream.groups.boundaries import check_length, groups_path
     from structgstream.groups.pictures import open_for
     from structgstream.groups.segment_file import open_segment
     from structgstream.groups.track_pass import TrackOptions
@@ -130,7 +128,7 @@ def _say(path: Path, frames: int, spent: float | None) -> None:
 
     groups = open_track(path).groups or []
     size = human_bytes(path.stat().st_size)
-    say(
+    print_lines(
         Console(),
         f"Wrote {path}: {frames} frames, {size}; {len(groups)} groups in {path}.groups: "
         + " ".join(f"{first}:{end}" for first, end in groups[:8])

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.data.calibration import Calibration, PosedCamera, intrinsics
 from structgstream.data.calibration_files.reading import readable
 from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential
-from structgstream.data.posed import Calibration, PosedCamera, intrinsics
 from structgstream.data.text_files import Unreadable, number, pixels, read_text, whole
 from structgstream.data.timeline import natural
 from structgstream.errors import CalibrationError

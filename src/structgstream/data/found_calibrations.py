@@ -6,30 +6,18 @@ Tools keep calibration and videos apart: Pose2Sim has ``calibration/Calib.toml``
 """
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from structgstream.data.calibration_files import (
-    anipose,
-    cmu_panoptic,
-    easymocap,
-    kalibr,
-    multical,
-    opencv_cameras,
-    projections,
-    qualisys,
-    transforms,
-    zju_mocap,
-)
-from structgstream.data.camera_files import NO_CAMERAS, folders_of, pictures_in, roots_of, videos_in
+from structgstream.data import transforms
+from structgstream.data.calibration import Calibration, PosedCamera
+from structgstream.data.calibration_files import tools
+from structgstream.data.calibration_files.opencv_cameras import OPENCV_CAMERAS
+from structgstream.data.camera_files import NO_CAMERAS, files_of, folders_of, pictures_in, roots_of, videos_in
 from structgstream.data.colmap import find_model, read_model
-from structgstream.data.folder_files import files_of
 from structgstream.data.images import PICTURE_SUFFIXES
-from structgstream.data.posed import Calibration, PosedCamera
 from structgstream.errors import CalibrationError
 
 log = logging.getLogger(__name__)
@@ -39,32 +27,23 @@ SAME_ROTATION, SAME_SHARE, SAME_PIXELS = 1e-3, 0.01, 1.0
 """How far two files of one calibration differ: entries of rotations, shares of the rig's extent, pixels of K."""
 
 
-class Converter(NamedTuple):
-    """``find`` gives the sets of files in a folder that are a tool's calibrations, ``parse`` the cameras of one.
-
-    ``turned_by_exif`` is of :class:`~structgstream.data.posed.Calibration`.
-    """
-
-    find: Callable[[Path], Iterator[tuple[Path, ...]]]
-    parse: Callable[[tuple[Path, ...]], Calibration]
-    turned_by_exif: bool | None = None
-
-    def read(self, files: tuple[Path, ...]) -> Calibration:
-        """The cameras of a set of files."""
-        return replace(self.parse(files), turned_by_exif=self.turned_by_exif)
-
-
-OF_OPENCV = (anipose, easymocap, multical, opencv_cameras)
-"""Tools that read pictures with OpenCV, which turns them as their EXIF orientation says."""
-CONVERTERS = tuple(
-    Converter(tool.find, tool.read, True if tool in OF_OPENCV else None)
-    for tool in (anipose, easymocap, multical, kalibr, cmu_panoptic, qualisys, zju_mocap, projections, opencv_cameras)
+FORMATS = (
+    tools.ANIPOSE,
+    tools.EASYMOCAP,
+    tools.MULTICAL,
+    tools.KALIBR,
+    tools.CMU_PANOPTIC,
+    tools.QUALISYS,
+    tools.ZJU_MOCAP,
+    tools.PROJECTIONS,
+    OPENCV_CAMERAS,
 )
+"""The other tools' files. What reads pictures with OpenCV turns them as their EXIF orientation states."""
 
 
 def recognizes_calibrated(path: Path) -> bool:
     """Whether the folder has a calibration file of another tool that is known here, or one that is refused."""
-    return any(True for converter in CONVERTERS for _ in converter.find(path)) or bool(_pickles(path))
+    return any(True for own in FORMATS for _ in own.find(path)) or bool(_pickles(path))
 
 
 def read_calibrated(path: Path, file: Path | None = None) -> Calibration | None:
@@ -77,8 +56,8 @@ def read_calibrated(path: Path, file: Path | None = None) -> Calibration | None:
     Raises:
         CalibrationError: a broken file, one that only running it could read, or several that differ.
     """
-    found = [(converter, files) for converter in CONVERTERS for files in converter.find(path)]
-    read = [converter.read(files) for converter, files in found if file is None or file in files]
+    found = [(own, files) for own in FORMATS for files in own.find(path)]
+    read = [own.read(files) for own, files in found if file is None or file in files]
     if different := [other for other in read[1:] if not _agree(read[0], other)]:
         raise CalibrationError(
             f"{path} has several calibrations that differ, {read[0].where.name} and "

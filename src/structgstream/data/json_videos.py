@@ -10,6 +10,7 @@ The shared-intrinsics one: ``{"w", "h", "fl_x", "fl_y", "cx", "cy", "cams": [4x4
 Both in OpenCV axes.
 """
 
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_names
 from structgstream.data.calibration_files.reading import positive, readable
 from structgstream.data.camera_files import roots_of, videos_in
+from structgstream.data.source import FrameSource
 from structgstream.data.text_files import mapping, pixels, read_json, whole
 from structgstream.data.timeline import natural
 from structgstream.data.video import VideoSource, synchronised
@@ -85,3 +87,20 @@ def _shared_intrinsics_rig(content: dict[str, Any], file: Path) -> CameraRig:
             viewmat = np.linalg.inv(np.array(pose, dtype=np.float64).reshape(4, 4))
         cameras[name] = calibrated_camera(name, viewmat=viewmat, K=K, width=width, height=height, where=file)
     return calibrated_rig(cameras, ("cam00",), where=file)
+
+
+def bundled_clip_path() -> Path:
+    """The folder of the bundled clip.
+
+    Raises:
+        CaptureError: the installation lacks the clip.
+    """
+    folder = Path(str(files("structgstream.data") / "clip"))
+    if not recognizes_json_videos(folder):
+        raise CaptureError("The bundled clip is missing from the installation; reinstall structgstream.")
+    return folder
+
+
+def bundled_clip() -> FrameSource:
+    """The bundled clip, as a capture."""
+    return open_json_videos(bundled_clip_path())

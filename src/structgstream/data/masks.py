@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
 from structgstream.data.calibration import listed
-from structgstream.data.folder_files import by_stem, is_hidden
+from structgstream.data.camera_files import by_stem, is_hidden
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, opencv, reduced_mask
 from structgstream.data.source import FrameSource
 from structgstream.data.timeline import natural

@@ -12,6 +12,14 @@ from structgstream.cameras import CameraRig
 from structgstream.data.calibration import with_near
 from structgstream.data.camera_files import ROOTS, pictures_in, roots_of, unread_files, videos_in
 from structgstream.data.colmap import find_model
+from structgstream.data.dataset_layouts import (
+    open_immersive,
+    open_n3dv,
+    open_panoptic,
+    recognizes_immersive,
+    recognizes_n3dv,
+    recognizes_panoptic,
+)
 from structgstream.data.found_calibrations import (
     calibration_below,
     has_calibration,
@@ -20,15 +28,12 @@ from structgstream.data.found_calibrations import (
     recognizes_calibrated,
 )
 from structgstream.data.held_out import best_surrounded
-from structgstream.data.immersive import open_immersive, recognizes_immersive
 from structgstream.data.json_videos import open_json_videos, recognizes_json_videos
 from structgstream.data.masks import FOLDER, with_masks
-from structgstream.data.n3dv import open_n3dv, recognizes_n3dv
-from structgstream.data.panoptic import open_panoptic, recognizes_panoptic
 from structgstream.data.posed_capture import NoFrames, open_posed
 from structgstream.data.prepared import open_prepared, recognizes_prepared
 from structgstream.data.source import FrameSource
-from structgstream.data.transforms_capture import open_transforms, recognizes_transforms
+from structgstream.data.transforms import open_transforms, recognizes_transforms
 from structgstream.data.wrappers import WithoutPoints, WithRig, resized, section
 from structgstream.errors import CaptureError, ConfigError, StructGStreamError
 

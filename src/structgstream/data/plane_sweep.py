@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A small plane sweep: depth maps of the training cameras from zero-mean normalised cross-correlation.
+"""Plane sweep: depth maps of the training cameras from zero-mean normalised cross-correlation.
 
-Each neighbour's picture is warped by the homographies of planes, spaced evenly in inverse depth (Collins,
-CVPR 1996); the best half of the neighbours scores a plane, which tolerates occlusion (Kang, Szeliski and
-Chai, CVPR 2001). Correlation, because cameras of one rig may differ in exposure by half.
+Each neighbour's picture is warped by the homographies of planes (Hartley and Zisserman, Multiple View Geometry, chapter
+13), spaced evenly in inverse depth (Collins, CVPR 1996); the best half of the neighbours scores a plane, which
+tolerates occlusion (Kang, Szeliski and Chai, CVPR 2001). Correlation, because cameras of one rig may differ in exposure
+by half.
 """
 
 import math
@@ -19,8 +20,28 @@ from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv, reduced_mask
 from structgstream.data.matching import back_project, inside, project
-from structgstream.data.plane_homographies import plane_homographies
 from structgstream.kernels.backend import processor_backend
+
+
+def plane_homographies(reference: Camera, cameras: Sequence[Camera], planes: Floats) -> Floats:
+    """From pixel indices of ``reference`` to those of each of ``N`` cameras, through each plane: ``[P, N, 3, 3]``.
+
+    Args:
+        reference: the camera whose pixels are mapped.
+        cameras: the others.
+        planes: ``[P, 3]``; a plane is ``plane . x = 1`` in the axes of ``reference``.
+    """
+    # The first pixel has the index 0, its centre is at 0.5.
+    centred = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+    to_ray = np.linalg.inv(reference.K.numpy()) @ centred
+    found = []
+    for camera in cameras:
+        relative = camera.viewmat.numpy() @ np.linalg.inv(reference.viewmat.numpy())
+        to_pixel = np.linalg.inv(centred) @ camera.K.numpy()
+        induced = relative[:3, :3] + relative[:3, 3:] * planes[:, None]
+        found.append(to_pixel @ induced @ to_ray)
+    return np.stack(found, axis=1)
+
 
 FloatImage = NDArray[np.float32]
 

@@ -23,14 +23,27 @@ from typing import TypeVar
 import numpy as np
 
 from structgstream.cameras import Camera, CameraRig
-from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_names, listed
-from structgstream.data.camera_files import REDUCED, other_roots, pictures_in, roots_of, unread_files, videos_in
-from structgstream.data.exif import read_exif
-from structgstream.data.folder_files import by_stem, files_of
+from structgstream.data.calibration import (
+    Calibration,
+    PosedCamera,
+    calibrated_camera,
+    calibrated_rig,
+    check_names,
+    listed,
+)
+from structgstream.data.camera_files import (
+    REDUCED,
+    by_stem,
+    files_of,
+    other_roots,
+    pictures_in,
+    roots_of,
+    unread_files,
+    videos_in,
+)
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, common_pictures
 from structgstream.data.lenses import LensCamera
-from structgstream.data.picture_size import check_one_series, picture_size
-from structgstream.data.posed import Calibration, PosedCamera
+from structgstream.data.picture_headers import check_one_series, picture_size, read_exif
 from structgstream.data.rectilinear import rectilinear
 from structgstream.data.source import FrameSource
 from structgstream.data.text_files import path_parts

@@ -20,10 +20,10 @@ from structgstream.atomic_files import atomic_write
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import calibrated_camera, calibrated_rig
 from structgstream.data.calibration_files.reading import positive, read_array, readable
-from structgstream.data.folder_files import by_stem, files_of
+from structgstream.data.camera_files import by_stem, files_of
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
-from structgstream.data.picture_size import picture_size
+from structgstream.data.picture_headers import picture_size
 from structgstream.data.source import FrameSource
 from structgstream.data.text_files import Unreadable, mapping, number, pixels, read_json
 from structgstream.data.timeline import Clock, common_slots, natural, picture_slots

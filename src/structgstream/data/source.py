@@ -45,18 +45,8 @@ class FrameSource(FrameStream, Protocol):
 
 
 @runtime_checkable
-class ArrivingFrames(Protocol):
-    """What a stream adds whose frames arrive while it is read; it has no length."""
-
-    @property
-    def newest_only(self) -> bool:
-        """Whether a frame is the newest when it is asked for, so that one that is asked for early is old when used."""
-        ...
-
-
-@runtime_checkable
 class TimedPictures(Protocol):
-    """What a recording adds that knows when its pictures were taken."""
+    """A recording that knows when its pictures were taken."""
 
     @property
     def apart_seconds(self) -> Mapping[str, NDArray[np.float64]]:
@@ -66,30 +56,25 @@ class TimedPictures(Protocol):
 
 
 @runtime_checkable
-class KeepsFrames(Protocol):
-    """What a stream adds that can hand out only those of its older frames again which it was told to keep."""
+class RetainsFrames(Protocol):
+    """A live stream that stores earlier frames, so that a resumed run can read them again."""
 
-    def keep(self, *first: int, last: int) -> None:
-        """Keep the frames ``first``, and at any time the ``last`` frames handed out; others may go."""
+    def retain(self, *first: int, last: int) -> None:
+        """Retains the frames ``first``, and at any time the ``last`` frames delivered; others may be removed."""
         ...
 
 
-def keep_frames(source: FrameStream, *first: int, last: int) -> None:
-    """Ask for what a resumed run reads again, which recordings have anyway."""
-    if isinstance(source, KeepsFrames):
-        source.keep(*first, last=last)
+def retain_frames(source: FrameStream, *first: int, last: int) -> None:
+    """Retains the frames that a resumed run reads again; recordings have all of them."""
+    if isinstance(source, RetainsFrames):
+        source.retain(*first, last=last)
 
 
 def is_recording(source: FrameStream) -> TypeGuard[FrameSource]:
-    """Whether the number of frames is known."""
+    """Whether the number of frames is known. Other streams drop stale frames, and must not be prefetched."""
     return isinstance(source, Sized)
 
 
 def frame_count(source: FrameStream) -> int | None:
-    """Number of frames; None where it is unknown before the end."""
+    """Number of frames; None if it is unknown before the end."""
     return len(source) if is_recording(source) else None
-
-
-def may_read_ahead(source: FrameStream) -> bool:
-    """Whether the next frame may be read while one is fitted, which changes no frame of a recording."""
-    return not (isinstance(source, ArrivingFrames) and source.newest_only)

@@ -44,7 +44,7 @@ BROKEN = (
 def read_text(file: Path) -> str:
     """The text of a file in UTF-8, UTF-16 or UTF-32, with or without a byte order mark; lines end with ``\\n``.
 
-    Letters with marks are composed, as :func:`~structgstream.data.folder_files.name_of` has them.
+    Letters with marks are composed, as :func:`~structgstream.data.camera_files.name_of` has them.
 
     Raises:
         Unreadable: it is in another encoding.

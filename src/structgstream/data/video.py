@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
-from structgstream.data.instants import Placed, measured_rate, origin_of, place, tell_time_error
-from structgstream.data.timeline import Clock, common_slots
+from structgstream.data.timeline import Clock, Placed, common_slots, measured_rate, origin_of, place, tell_time_error
 from structgstream.data.video_index import STREAM_FORMATS, VideoTrack
 from structgstream.data.video_pictures import Mask, Picture, pictures_at
 from structgstream.errors import CalibrationError, CaptureError

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Wrappers of captures: resized, shortened, or with other cameras held out."""
+"""Wrappers of captures: resized, shortened, decoded ahead, or with other cameras held out."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
 from structgstream.data.images import ImageSource, opencv, reduced_mask
-from structgstream.data.source import FrameSource, FrameStream, TimedPictures
+from structgstream.data.source import FrameSource, FrameStream, TimedPictures, is_recording
 from structgstream.data.video import VideoSource
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MultiViewFrame
+from structgstream.lookahead import Lookahead
 
 Source = TypeVar("Source", bound=FrameStream)
 
@@ -256,3 +257,36 @@ def check_step(step: int) -> None:
     """
     if step < 1:
         raise ConfigError(f"The step between frames (--every) must be at least 1, got {step}; 1 uses each frame.")
+
+
+@dataclass(frozen=True)
+class Prefetch(SourceWrapper):
+    """The same frames, decoded ahead in a background thread; results are unchanged.
+
+    Args:
+        source: the capture.
+        depth: number of frames decoded ahead, at least 1; each costs its pictures' bytes.
+    """
+
+    depth: int = 2
+
+    def __post_init__(self) -> None:
+        if self.depth < 1:
+            raise ConfigError(f"Prefetch needs a depth of at least 1, got {self.depth}.")
+
+    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
+        """The frames from stream index ``start``.
+
+        An error of the source is raised in place of the frame that it concerns. Closing the iterator, or an
+        exception in its consumer, ends the thread within the decoding of one frame.
+        """
+        with Lookahead(self.source.frames(start), depth=self.depth) as frames:
+            yield from frames
+
+    def frames_behind(self) -> Iterator[MultiViewFrame]:
+        return self.source.frames_behind() if isinstance(self.source, SourceWrapper) else iter(())
+
+
+def read_ahead(source: FrameStream) -> FrameStream:
+    """A recording decoded ahead; a live source, which has threads and queues of its own, as it is."""
+    return Prefetch(source) if is_recording(source) else source

@@ -26,9 +26,8 @@ from structgstream.evaluation.facts import (
     stream_facts,
     training_facts,
 )
-from structgstream.evaluation.flow import Flow
 from structgstream.evaluation.ghosts import Ghosts, GhostSearch
-from structgstream.evaluation.masks import blackened, both
+from structgstream.evaluation.metrics import blackened, both
 from structgstream.evaluation.optional_metrics import (
     OF_WHOLE_PICTURES,
     ComparedFrame,
@@ -41,6 +40,7 @@ from structgstream.evaluation.recording import Drawable, Recording, to_device
 from structgstream.evaluation.report import FrameScores, Report, Scores, drawing_facts, mean_scores, psnr_trend
 from structgstream.evaluation.scoring import Mask, Picture, counting, score
 from structgstream.evaluation.sizes import StoredSize, half_scores, halved, stored_size
+from structgstream.evaluation.temporal import Flow
 from structgstream.evaluation.worst import worst_facts
 from structgstream.kernels.backend import Backend
 from structgstream.memory import PeakMeter

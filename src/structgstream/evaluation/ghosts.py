@@ -30,8 +30,7 @@ from numpy.typing import NDArray
 
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import every_nth_frame, section
-from structgstream.evaluation.masks import blackened, differing, dilate
-from structgstream.evaluation.metrics import decibels, mean_of_squares, squared_errors
+from structgstream.evaluation.metrics import blackened, decibels, differing, dilate, mean_of_squares, squared_errors
 from structgstream.evaluation.sizes import block_mask, block_means
 
 Picture = NDArray[np.uint8]

@@ -16,11 +16,9 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera
 from structgstream.errors import MissingExtraError
 from structgstream.evaluation.flip import FlipFeatures, features_of, flip_of, opencv
-from structgstream.evaluation.flow import Flow, FlowField, dis_flow
 from structgstream.evaluation.lpips import ALEX, TRUNKS, VGG, Features, Lpips, how_to_get, load_lpips, weights_file
-from structgstream.evaluation.masks import both, changed_pixels
-from structgstream.evaluation.metrics import SMALLEST_OF_SCALES, ms_ssim
-from structgstream.evaluation.temporal import difference_of_change, flicker, warping_error
+from structgstream.evaluation.metrics import SMALLEST_OF_SCALES, both, changed_pixels, ms_ssim
+from structgstream.evaluation.temporal import Flow, FlowField, difference_of_change, dis_flow, flicker, warping_error
 from structgstream.flow import sampled
 
 Picture = NDArray[np.uint8]

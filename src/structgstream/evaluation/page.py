@@ -7,7 +7,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from structgstream.atomic_files import atomic_write
-from structgstream.evaluation.png import write_png
+from structgstream.evaluation.pictures import write_png
 from structgstream.evaluation.worst import Crop
 
 PAGE, FOLDER = "index.html", "worst"

@@ -11,7 +11,7 @@ from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
 from structgstream.codec.segments.store import Store
 from structgstream.errors import StorageError
-from structgstream.evaluation.png import png_bytes
+from structgstream.evaluation.pictures import png_bytes
 from structgstream.kernels.backend import processor_backend
 from structgstream.scene.render import render, to_8bit_image
 

@@ -6,8 +6,15 @@ from numpy.typing import NDArray
 
 from structgstream.errors import CaptureError
 from structgstream.evaluation.affine import ChannelFit, psnr_affine, psnr_camera_color
-from structgstream.evaluation.masks import both, changed_pixels
-from structgstream.evaluation.metrics import decibels, masked_ssim, mean_of_squares, squared_errors, ssim
+from structgstream.evaluation.metrics import (
+    both,
+    changed_pixels,
+    decibels,
+    masked_ssim,
+    mean_of_squares,
+    squared_errors,
+    ssim,
+)
 from structgstream.evaluation.report import Scores
 from structgstream.kernels.backend import Backend
 

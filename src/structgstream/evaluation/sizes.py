@@ -12,8 +12,7 @@ from structgstream.cameras import Camera
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import select_cameras
 from structgstream.errors import CaptureError
-from structgstream.evaluation.masks import blackened
-from structgstream.evaluation.metrics import decibels, masked_ssim, mean_of_squares, squared_errors, ssim
+from structgstream.evaluation.metrics import blackened, decibels, masked_ssim, mean_of_squares, squared_errors, ssim
 from structgstream.evaluation.pictures import spread_indices
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend

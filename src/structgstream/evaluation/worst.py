@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.evaluation.masks import changed_pixels
-from structgstream.evaluation.metrics import squared_errors
+from structgstream.evaluation.metrics import changed_pixels, squared_errors
 from structgstream.evaluation.pictures import side_by_side
 from structgstream.evaluation.report import FrameScores, Scores
 

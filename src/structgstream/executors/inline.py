@@ -13,7 +13,7 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import IO
 
-from structgstream.executors.process import CommandProcess, opened_log, tail_of, waited_for
+from structgstream.executors.local import CommandProcess, opened_log, tail_of, waited_for
 from structgstream.executors.task import PYTHON, Task, TaskResult
 
 WAIT_SECONDS = 3600.0

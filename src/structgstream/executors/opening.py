@@ -7,7 +7,7 @@ from typing import Literal
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.inline import InlineEngine
 from structgstream.executors.local import LocalEngine
-from structgstream.executors.worker_slots import allocate_slots
+from structgstream.executors.task import allocate_slots
 
 ExecutorName = Literal["inline", "local", "ray"]
 

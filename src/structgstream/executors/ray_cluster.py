@@ -16,8 +16,7 @@ from typing import Any
 
 from structgstream.errors import ConfigError, MissingExtraError
 from structgstream.executors.ray_worker import CommandKilled, run_task
-from structgstream.executors.task import Task, TaskResult
-from structgstream.executors.worker_slots import thread_environment
+from structgstream.executors.task import Task, TaskResult, thread_environment
 
 OLDEST = (2, 52)
 OBJECT_STORE_BYTES = 80 * 2**20

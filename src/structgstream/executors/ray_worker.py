@@ -3,7 +3,7 @@
 
 from collections.abc import Mapping
 
-from structgstream.executors.process import CommandProcess, waited_for
+from structgstream.executors.local import CommandProcess, waited_for
 from structgstream.executors.task import Task, TaskResult
 
 POLL_SECONDS = 1.0

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bakes frames of a stream and writes them one by one."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
+from structgstream.cameras import Camera
 from structgstream.codec.reader import StreamReader
 from structgstream.errors import StreamError
 from structgstream.exporters.bake import BakingConfig, bake, with_low_pass
@@ -108,20 +110,20 @@ def selected(gaussians: BakedGaussians, options: FrameOptions) -> BakedGaussians
 
 def baking_loss(scene: Scene, baked: BakedGaussians, reader: StreamReader, backend: Backend) -> BakingLoss:
     """Compares pictures of ``baked``, before ``with_low_pass``, with those of ``scene`` at the stream's cameras."""
-    rig = reader.header.rig
-    training = pictures_psnr(scene, baked, reader, backend, rig.training)
-    return BakingLoss(training, pictures_psnr(scene, baked, reader, backend, rig.testing) if rig.testing else None)
+    header = reader.header
+    training, held_out = ([header.camera(n) for n in names] for names in (header.rig.training, header.rig.testing))
+    return BakingLoss(
+        pictures_psnr(scene, baked, training, backend),
+        pictures_psnr(scene, baked, held_out, backend) if held_out else None,
+    )
 
 
-def pictures_psnr(
-    scene: Drawable, other: Drawable, reader: StreamReader, backend: Backend, names: Sequence[str]
-) -> float:
-    """PSNR, dB, of all pixels that cameras of the stream see of two models in the units of its scenes."""
+def pictures_psnr(one: Drawable, other: Drawable, cameras: Sequence[Camera], backend: Backend) -> float:
+    """PSNR, dB, of all pixels that ``cameras`` see of two models, in the units of both."""
     errors, pixels = 0.0, 0
     with torch.no_grad():
-        for name in names:
-            camera = reader.header.camera(name)
-            one, two = (render(model, camera, backend).image.clamp(0.0, 1.0) for model in (scene, other))
-            errors += float((one - two).double().square().sum())
-            pixels += one.numel()
-    return float(-10.0 * torch.tensor(max(errors / pixels, 1e-12)).log10())
+        for camera in cameras:
+            pictures = [render(model, camera, backend).image.clamp(0.0, 1.0) for model in (one, other)]
+            errors += float((pictures[0] - pictures[1]).double().square().sum())
+            pixels += pictures[0].numel()
+    return -10.0 * math.log10(max(errors / pixels, 1e-12))

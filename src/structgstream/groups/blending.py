@@ -10,8 +10,7 @@ from structgstream.codec.container.records import RecordType, packed, read_recor
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet
-from structgstream.groups.border import draw_border, moving_at_border
-from structgstream.groups.mixture import visible_mixtures
+from structgstream.groups.border import draw_border, moving_at_border, visible_mixtures
 from structgstream.groups.seam_blend import SeamBlend
 from structgstream.groups.segment_file import Segment
 from structgstream.kernels.backend import Backend

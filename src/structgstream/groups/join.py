@@ -14,7 +14,7 @@ from structgstream.codec.reader import open_stream
 from structgstream.errors import ConfigError, StreamError, TaskError
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.local import LocalEngine
-from structgstream.executors.worker_slots import allocate_slots
+from structgstream.executors.task import allocate_slots
 from structgstream.groups.blending import Border, GroupBlender
 from structgstream.groups.blending_run import BlendedRun, header_of, run_task, runs_of
 from structgstream.groups.segment_file import Segment, open_segment

@@ -11,7 +11,7 @@ from structgstream.codec.packets import StreamHeader
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import WithRig, section
 from structgstream.errors import CaptureError
-from structgstream.evaluation.capture import capture_of
+from structgstream.evaluation.recording import capture_of
 
 
 def open_for(header: StreamHeader, folder: Path, *, frames: int | None) -> FrameSource:

@@ -14,12 +14,11 @@ import numpy as np
 import torch
 
 from structgstream.atomic_files import partial_path
-from structgstream.data.prefetch import read_ahead
 from structgstream.data.source import FrameSource
+from structgstream.data.wrappers import read_ahead
 from structgstream.errors import ConfigError, StreamError
 from structgstream.groups.base import GroupBase
-from structgstream.groups.boundaries import equal_groups, quiet_groups
-from structgstream.groups.group_list import Groups, groups_path, write_groups
+from structgstream.groups.boundaries import Groups, equal_groups, groups_path, quiet_groups, write_groups
 from structgstream.groups.growing_file import name_finished
 from structgstream.groups.pictures import fingerprint
 from structgstream.groups.segment_file import Segment

@@ -18,8 +18,8 @@ from typing import Any
 
 from structgstream.errors import ConfigError
 from structgstream.evaluation.run_log import read_log
-from structgstream.groups.group_list import read_groups
-from structgstream.parallel.parts import Note, Parts, group_name
+from structgstream.groups.boundaries import read_groups
+from structgstream.parallel.parts import CompletedTask, Parts, group_name
 from structgstream.parallel.unit import HEADER, JOIN, TRACK
 
 
@@ -83,8 +83,8 @@ class Work:
     @property
     def groups(self) -> list[int]:
         """The length of each group."""
-        whole, rest = divmod(self.frames, self.group)
-        return [self.group] * whole + ([rest] if rest else [])
+        full, rest = divmod(self.frames, self.group)
+        return [self.group] * full + ([rest] if rest else [])
 
 
 @dataclass(frozen=True)
@@ -200,22 +200,22 @@ def measured_in(folder: Path) -> Measured:
         ConfigError: there is no finished run, or none with a group that begins after frame 0.
     """
     parts = Parts(folder)
-    groups = [(parts.notes.get(group_name(a, b)), a, b) for a, b in read_groups(parts.track) or ()]
-    if not {HEADER, TRACK, JOIN} <= parts.notes.keys() or any(note is None for note, _, _ in groups):
+    groups = [(parts.completed.get(group_name(a, b)), a, b) for a, b in read_groups(parts.track) or ()]
+    if not {HEADER, TRACK, JOIN} <= parts.completed.keys() or any(task is None for task, _, _ in groups):
         raise ConfigError(
             f"{folder} has no finished parallel run; give the OUT.parts of one, or none, so that two groups are fitted."
         )
-    whole = [(note, _frames(parts, a, b)) for note, a, b in groups if note is not None and note.attempts == 1 and a]
-    whole = [(note, log) for note, log in whole if len(log) == note.frames]
-    later = [entry for _, log in whole for entry in log[1:]]
+    measured = [(task, _frames(parts, a, b)) for task, a, b in groups if task is not None and task.attempts == 1 and a]
+    measured = [(task, log) for task, log in measured if len(log) == task.frames]
+    later = [entry for _, log in measured for entry in log[1:]]
     if not later:
         raise ConfigError(f"{folder} has no group of two frames that was fitted without a break; fit more groups.")
-    process = fmean(max(note.seconds - sum(entry["total_seconds"] for entry in log), 0.0) for note, log in whole)
-    first_seconds = fmean(log[0]["total_seconds"] for _, log in whole)
+    process = fmean(max(task.seconds - sum(entry["total_seconds"] for entry in log), 0.0) for task, log in measured)
+    first_seconds = fmean(log[0]["total_seconds"] for _, log in measured)
     frame_seconds = fmean(entry["total_seconds"] for entry in later)
-    track, join, header = (parts.notes[name] for name in (TRACK, JOIN, HEADER))
+    track, join, header = (parts.completed[name] for name in (TRACK, JOIN, HEADER))
     keys = [entry["bytes"] for entry in later if entry["kind"] == "key"]
-    first_bytes = fmean(log[0]["bytes"] for _, log in whole)
+    first_bytes = fmean(log[0]["bytes"] for _, log in measured)
     costs = Costs(
         header_seconds=header.seconds,
         track_start_seconds=_start(track, process),
@@ -229,14 +229,14 @@ def measured_in(folder: Path) -> Measured:
         first_bytes=first_bytes,
         key_bytes=fmean(keys) if keys else first_bytes,
         frame_bytes=fmean([entry["bytes"] for entry in later if entry["kind"] != "key"] or [first_bytes]),
-        worker_bytes=max(note.peak_bytes for note in parts.notes.values()),
+        worker_bytes=max(task.peak_bytes for task in parts.completed.values()),
     )
-    return Measured(costs, track.frames, len(whole), sum(note.seconds for note in parts.notes.values()))
+    return Measured(costs, track.frames, len(measured), sum(task.seconds for task in parts.completed.values()))
 
 
-def _start(note: Note, process: float) -> float:
+def _start(task: CompletedTask, process: float) -> float:
     """How much of a task is the start of its process."""
-    return min(process, note.seconds)
+    return min(process, task.seconds)
 
 
 def _frames(parts: Parts, first: int, end: int) -> list[dict[str, Any]]:

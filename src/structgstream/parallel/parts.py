@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder in which the parts of a stream come together: header, track, segments, and notes of what is whole.
+"""The folder of the parts of a stream: header, track, segments, and records of completed tasks.
 
-A part is whole when it has the hash that was noted when its task ended well, and the task is the same as then. Nothing
-else is believed: what was cut or has rotted since, or is of other options, is made again by its command, which takes
-from it what it can.
+A part is complete if it has the hash that was recorded when its task succeeded, and the task has the same arguments.
+All others (truncated, damaged, of other options) are made again by their commands, which reuse what they can.
 """
 
 import hashlib
@@ -23,32 +22,32 @@ from structgstream.file_locks import lock_file, open_lockable
 from structgstream.owned_folders import Owner, check_owned, own_folder, remove_own
 
 PLAN = "plan.json"
-NOTES = "done.jsonl"
+COMPLETED = "done.jsonl"
 PURPOSE = "parts of a parallel run"
-OURS = re.compile(
+PART_NAMES = re.compile(
     r"(plan\.json|done\.jsonl|header\.(sgs|log\.jsonl|metrics\.json)|track\.sgt(\.groups)?|start-\d{6,}\.sgt"
     r"|segments/group-\d{6,}-\d{6,}\.(sgs|log\.jsonl|metrics\.json)|logs/(header|track|join|group-\d{6,}-\d{6,})\.txt"
     r")(\.partial)?"
 )
-"""Names that parts have, here and in a store; nothing else is removed."""
-_RUN = "run"  # of the plan: what tells scratch files of one beginning from those of another
+"""Names of parts, here and in a store; nothing else is removed."""
+_RUN = "run"  # key of the plan: a random name, which distinguishes scratch files of one run from those of another
 _LOCK = ".driver"
 _PIECE_BYTES = 2**20
 
 
 @dataclass(frozen=True)
-class Note:
-    """That a task has ended well, and what it has left.
+class CompletedTask:
+    """Record of a completed task and its part.
 
     Args:
-        name: of the task.
-        key: hash of what it was asked for.
+        name: name of the task.
+        key: hash of its arguments.
         sha256: of the part.
-        bytes: of the part.
-        seconds: that it took, of the last attempt.
-        attempts: how often it was begun.
-        peak_bytes: largest resident memory; 0 where that is not known.
-        frames: that it has fitted, or tracked.
+        bytes: size of the part.
+        seconds: duration of the last attempt.
+        attempts: number of attempts.
+        peak_bytes: largest resident memory; 0 if unknown.
+        frames: number of fitted, or tracked, frames.
     """
 
     name: str
@@ -62,11 +61,11 @@ class Note:
 
 
 class Parts:
-    """The folder of parts, and what is noted of them."""
+    """The folder of parts, with the records of completed tasks by name."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.notes = read_notes(folder)
+        self.completed = read_completed(folder)
 
     @property
     def header(self) -> Path:
@@ -75,7 +74,7 @@ class Parts:
 
     @property
     def track(self) -> Path:
-        """What the tracking pass writes."""
+        """The file of the tracking pass."""
         return self.folder / "track.sgt"
 
     def segment(self, first: int, end: int) -> Path:
@@ -83,7 +82,7 @@ class Parts:
         return self.folder / "segments" / f"{group_name(first, end)}.sgs"
 
     def log(self, name: str) -> Path:
-        """What the task prints."""
+        """The output of a task."""
         return self.folder / "logs" / f"{name}.txt"
 
     def check(self) -> Owner | None:
@@ -95,14 +94,14 @@ class Parts:
         return check_owned(self.folder, PURPOSE)
 
     @contextmanager
-    def held(self, *, owner: Owner | None = None) -> Iterator[None]:
-        """Makes and marks the folder, and keeps other drivers from it within the block.
+    def locked(self, *, owner: Owner | None = None) -> Iterator[None]:
+        """Creates and marks the folder, and locks it for other drivers within the block.
 
         Args:
-            owner: of a folder that is made; None for a new one.
+            owner: of a folder that is created; None for a new one.
 
         Raises:
-            StorageError: another process drives here, or the folder is not one of parts, or cannot be made.
+            StorageError: another process uses it, or the folder is not one of parts, or cannot be made.
         """
         try:
             own_folder(self.folder, PURPOSE, owner=owner)
@@ -118,23 +117,23 @@ class Parts:
             yield
 
     def clear(self) -> None:
-        """Removes all parts and notes, and nothing else.
+        """Removes all parts and records, and nothing else.
 
         Raises:
             StorageError: they cannot be removed.
         """
-        # Killed before its end, what is left is still parts of the old plan, and none of them is believed.
-        remove_own(self.folder, PURPOSE, OURS, order={NOTES: 0, PLAN: 2})
+        # The records go first and the plan last: parts that remain if this is killed are incomplete ones of the plan.
+        remove_own(self.folder, PURPOSE, PART_NAMES, order={COMPLETED: 0, PLAN: 2})
         (self.folder / "segments").mkdir(exist_ok=True)
-        self.notes.clear()
+        self.completed.clear()
 
     @property
     def run(self) -> str:
-        """A name that is another one after every beginning anew."""
+        """A random name, another one after :meth:`clear`."""
         return str((_json_of(self.folder / PLAN) or {}).get(_RUN, ""))
 
-    def keep_to(self, plan: Mapping[str, Any]) -> None:
-        """Notes what the parts are of, or checks it.
+    def use_plan(self, plan: Mapping[str, Any]) -> None:
+        """Records the plan of the parts, or compares it with the recorded one.
 
         Raises:
             ConfigError: the folder has parts of another plan.
@@ -151,47 +150,49 @@ class Parts:
         first = min(key for key in {*found, *wanted} if found.get(key) != wanted.get(key))
         raise ConfigError(
             f"{self.folder} has parts of another run ({first}: {found.get(first)!r} there, {wanted.get(first)!r} "
-            "asked for); choose another output, or give --overwrite to begin anew."
+            "asked for); choose another output, or give --overwrite to start again."
         )
 
-    def is_whole(self, name: str, key: str, part: Path) -> bool:
-        """Whether the part is there as it was when its task ended."""
-        note = self.notes.get(name)
-        if note is None or note.key != key:
+    def is_complete(self, name: str, key: str, part: Path) -> bool:
+        """Whether the part is as it was when its task succeeded."""
+        record = self.completed.get(name)
+        if record is None or record.key != key:
             return False
         try:
-            return part.stat().st_size == note.bytes and sha256_of(part) == note.sha256
+            return part.stat().st_size == record.bytes and sha256_of(part) == record.sha256
         except OSError:
             return False
 
-    def note(self, ending: TaskResult, key: str, part: Path, *, frames: int) -> Note:
-        """Notes that a task has ended well; one that has only found its part whole again is noted already.
+    def record(self, result: TaskResult, key: str, part: Path, *, frames: int) -> CompletedTask:
+        """Records that a task succeeded; the earlier record stays if the part is the same.
 
         Raises:
-            StorageError: its part is not there, or the note cannot be written.
+            StorageError: its part is missing, or the record cannot be written.
         """
         try:
-            note = Note(
-                ending.name,
+            record = CompletedTask(
+                result.name,
                 key,
                 sha256_of(part),
                 part.stat().st_size,
-                round(ending.seconds, 3),
-                ending.attempts,
-                ending.peak_bytes,
+                round(result.seconds, 3),
+                result.attempts,
+                result.peak_bytes,
                 frames,
             )
         except OSError as error:
             raise StorageError(
-                f"The task {ending.name} has ended well, but {part} cannot be read here ({error.strerror}); do all "
+                f"The task {result.name} succeeded, but {part} cannot be read here ({error.strerror}); do all "
                 "machines see this folder at the same place?"
             ) from error
-        earlier = self.notes.get(note.name)
-        if earlier is not None and (earlier.key, earlier.sha256) == (note.key, note.sha256):
+        earlier = self.completed.get(record.name)
+        if earlier is not None and (earlier.key, earlier.sha256) == (record.key, record.sha256):
             return earlier
-        self.notes[note.name] = note
-        atomic_write(self.folder / NOTES, [f"{json.dumps(asdict(each))}\n".encode() for each in self.notes.values()])
-        return note
+        self.completed[record.name] = record
+        atomic_write(
+            self.folder / COMPLETED, [f"{json.dumps(asdict(each))}\n".encode() for each in self.completed.values()]
+        )
+        return record
 
 
 def group_name(first: int, end: int) -> str:
@@ -199,24 +200,24 @@ def group_name(first: int, end: int) -> str:
     return f"group-{first:06d}-{end:06d}"
 
 
-def read_notes(folder: Path) -> dict[str, Note]:
-    """The last note of each task; what is no note is passed over."""
+def read_completed(folder: Path) -> dict[str, CompletedTask]:
+    """The last record of each task; invalid lines are skipped."""
     try:
-        lines = (folder / NOTES).read_text().splitlines()
+        lines = (folder / COMPLETED).read_text().splitlines()
     except OSError:
         return {}
-    notes = {}
+    completed = {}
     for line in lines:
         try:
-            note = Note(**json.loads(line))
+            record = CompletedTask(**json.loads(line))
         except (ValueError, TypeError):
             continue
-        notes[note.name] = note
-    return notes
+        completed[record.name] = record
+    return completed
 
 
 def key_of(*facts: object) -> str:
-    """A hash of what a task is asked for."""
+    """A hash of a task's arguments."""
     return hashlib.sha256(json.dumps(facts, default=str).encode()).hexdigest()[:16]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commands that a parallel run consists of, as tasks: header, tracking pass, a group each, joining."""
+"""The commands of a parallel run as tasks: header, tracking pass, a group each, join."""
 
 import tempfile
 from collections.abc import Collection
@@ -9,9 +9,8 @@ from typing import Protocol
 
 from structgstream.atomic_files import partial_path
 from structgstream.errors import StreamError
-from structgstream.executors.task import PYTHON, Task
-from structgstream.executors.worker_slots import thread_environment
-from structgstream.groups.group_list import Groups
+from structgstream.executors.task import PYTHON, Task, thread_environment
+from structgstream.groups.boundaries import Groups
 from structgstream.parallel.parts import Parts, group_name
 
 HEADER, TRACK, JOIN = "header", "track", "join"
@@ -19,19 +18,19 @@ PROGRAM = (PYTHON, "-m", "structgstream")
 
 
 class ReadsTrack(Protocol):
-    """Tells the frames at which a group may begin by now, of a track that is finished or grows."""
+    """Gives the frames at which a group may start, of a track that is finished or growing."""
 
     def __call__(self, track: Path, /) -> Collection[int]: ...
 
 
 class CutsTrack(Protocol):
-    """Makes of a track one with the start of a single group, which is all that it reads."""
+    """Extracts from a track the start of a single group."""
 
     def __call__(self, track: Path, first: int, /) -> bytes: ...
 
 
 def starts_in(track: Path) -> Collection[int]:
-    """The starts of a file of ``structgstream track``; none while it has no head yet."""
+    """The starts in a file of ``structgstream track``; none before its head is written."""
     from structgstream.groups.track_file import open_track
 
     try:
@@ -41,7 +40,7 @@ def starts_in(track: Path) -> Collection[int]:
 
 
 def cut_track(track: Path, first: int) -> bytes:
-    """A track with the one start that a group needs, as it is while its pass runs.
+    """An unfinished track with the one start that a group needs.
 
     Raises:
         StreamError: there is none, or it is damaged.
@@ -60,19 +59,19 @@ def cut_track(track: Path, first: int) -> bytes:
 
 @dataclass(frozen=True)
 class Unit:
-    """What is asked of the commands.
+    """Options of the commands.
 
     Args:
-        capture: its folder.
-        frames: of the stream; None for all.
-        header: further words for ``reconstruct`` when it fits frame 0: preset, scale, held-out cameras.
-        track: further words for ``track``: length of groups.
-        track_threads: of the tracking pass, which all groups wait for; None for those of its place.
-        device: further words for all of them: which back-end computes.
-        join: further words for ``join``: how many processes hand over.
-        program: what the commands are given to.
+        capture: folder of the capture.
+        frames: number of frames; None for all.
+        header: further arguments of ``reconstruct`` for frame 0: preset, scale, held-out cameras.
+        track: further arguments of ``track``: length of groups.
+        track_threads: threads of the tracking pass, which all groups wait for; None for those of its worker slot.
+        device: further arguments of all commands: the back-end.
+        join: further arguments of ``join``: number of processes.
+        program: runs the commands.
         starts: reads a track.
-        cut: takes from a track what one group needs.
+        cut: extracts from a track what one group needs.
     """
 
     capture: str
@@ -87,27 +86,27 @@ class Unit:
     cut: CutsTrack = field(default=cut_track, compare=False)
 
     def header_task(self, parts: Parts) -> Task:
-        """Frame 0, which all groups share."""
-        words = (*self.program, "reconstruct", self.capture, "-o", str(parts.header), "--frames", "1", "--resume")
-        return Task(HEADER, (*words, *self.header, *self.device), str(parts.header), parts.log(HEADER))
+        """Fits frame 0, which all groups share."""
+        argv = (*self.program, "reconstruct", self.capture, "-o", str(parts.header), "--frames", "1", "--resume")
+        return Task(HEADER, (*argv, *self.header, *self.device), str(parts.header), parts.log(HEADER))
 
     def track_task(self, parts: Parts) -> Task:
-        """The serial pass."""
-        words = (*self.program, "track", self.capture, "--init", str(parts.header), "-o", str(parts.track))
+        """The tracking pass."""
+        argv = (*self.program, "track", self.capture, "--init", str(parts.header), "-o", str(parts.track))
         count = () if self.frames is None else ("--frames", str(self.frames))
-        command = (*words, *count, *self.track, *self.device)
+        command = (*argv, *count, *self.track, *self.device)
         variables = {} if self.track_threads is None else thread_environment(self.track_threads)
         return Task(TRACK, command, str(parts.track), parts.log(TRACK), variables)
 
     def group_task(self, parts: Parts, first: int, end: int) -> Task:
-        """A segment."""
+        """Fits a group to a segment."""
         name, segment = group_name(first, end), str(parts.segment(first, end))
-        words = (*self.program, "fit-group", self.capture, "--init", str(parts.header), "--track", str(parts.track))
-        command = (*words, "--frames", f"{first}:{end}", "-o", segment, *self.device)
+        argv = (*self.program, "fit-group", self.capture, "--init", str(parts.header), "--track", str(parts.track))
+        command = (*argv, "--frames", f"{first}:{end}", "-o", segment, *self.device)
         return Task(name, command, segment, parts.log(name))
 
     def join_task(self, parts: Parts, groups: Groups, output: Path) -> Task:
-        """The stream, of all segments."""
+        """Joins all segments to the stream."""
         segments = [str(parts.segment(first, end)) for first, end in groups]
         command = (*self.program, "join", *segments, "-o", str(output), "--overwrite", *self.device, *self.join)
         return Task(JOIN, command, str(output), parts.log(JOIN))

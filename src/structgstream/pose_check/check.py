@@ -5,11 +5,12 @@ Inverted or flipped pose matrices are valid rigid motions, so only the pictures 
 without the poses, and are inliers of some epipolar geometry, are tested against the epipolar geometry of the poses
 (Hartley and Zisserman, Multiple View Geometry, chapter 11).
 
-Note [Wrong matches] ~~~~~~~~~~~~~~~~~~~~ Of repeated texture, or between cameras far apart, wrong matches fit an
-epipolar geometry of their own, and a pair of right poses is contradicted by up to two thirds of its matches
-(`examples/throw`, cameras 29 degrees apart). So a pair only raises a suspicion: points that the other cameras agree on
-decide (`verdicts.judge`). Pairs of neighbours, which seldom match wrongly, are looked at first, and no others where all
-of them agree.
+Note [Wrong matches]
+~~~~~~~~~~~~~~~~~~~~
+Of repeated texture, or between cameras far apart, wrong matches fit an epipolar geometry of their own, and a pair of
+right poses is contradicted by up to two thirds of its matches (`examples/throw`, cameras 29 degrees apart). So a pair
+only raises a suspicion: points that the other cameras agree on decide (`verdicts.judge`). Pairs of neighbours, which
+seldom match wrongly, are looked at first, and no others where all of them agree.
 """
 
 import logging
@@ -102,7 +103,7 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig) -> PoseCheck:
         _log.warning(
             "The pictures of %s of %d match those of no other camera, so their poses and names are not confirmed; look "
             "at structgstream prepare --check.",
-            listed(check.unmatched, most=12), len(cameras),
+            listed(check.unmatched, limit=12), len(cameras),
         )  # fmt: skip
     off = tuple(cameras) if verdict.suspects.everything else verdict.suspects.off
     return PoseCheck(check.matches, check.share_violating, off, check.unmatched, tuple(findings))

@@ -157,8 +157,8 @@ def explained(tracks: Tracks, camera: Camera, name: str) -> int:
     """Number of points that lie near their keypoints in a camera's picture if that is ``camera``."""
     own = tracks.of(name)
     seen, depths = project(camera, tracks.points[tracks.point[own]])
-    apart = np.linalg.norm(seen - tracks.pixels[own], axis=1)
-    return int(((depths > 0) & (apart < 2 * AGREE_PIXELS * pixel_scale(camera.width))).sum())
+    distances = np.linalg.norm(seen - tracks.pixels[own], axis=1)
+    return int(((depths > 0) & (distances < 2 * AGREE_PIXELS * pixel_scale(camera.width))).sum())
 
 
 def _view(camera: Camera) -> _View:

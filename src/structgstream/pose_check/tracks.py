@@ -235,9 +235,9 @@ def _agreeing(table: _Table, cameras: list[Camera], limit: float) -> _Table:
             np.tile(table.pixels[own], (len(pairs), 1)),
             (np.arange(len(own)) == pairs[:, :1]).ravel() | (np.arange(len(own)) == pairs[:, 1:]).ravel(),
         )
-        apart = _residuals(_closest(each, cameras), each, cameras).reshape(len(pairs), len(own))
-        within = apart < limit
-        best = np.lexsort((np.where(within, apart, limit).sum(1), -within.sum(1)))[0]
+        errors = _residuals(_closest(each, cameras), each, cameras).reshape(len(pairs), len(own))
+        within = errors < limit
+        best = np.lexsort((np.where(within, errors, limit).sum(1), -within.sum(1)))[0]
         rivals = within[(within & ~within[best]).any(1)].sum(1).max(initial=0)
         if within[best].sum() > max(rivals, MIN_VIEWS - 1, len(own) / 2):
             used[own] = within[best]

@@ -5,8 +5,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict
 from pathlib import Path
 
-from structgstream.data.calibration import listed
-from structgstream.data.posed import Calibration
+from structgstream.data.calibration import Calibration, listed
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.frames import MIN_CAMERAS
 from structgstream.preparation.calibration.solved import SolvedCalibration, with_distance

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from structgstream.atomic_files import atomic_file
 from structgstream.cameras import CameraRig
 from structgstream.data.calibration import NEAR_IN_RIG_RADII
-from structgstream.data.folder_files import REPORT
+from structgstream.data.camera_files import REPORT
 from structgstream.data.held_out import best_surrounded
 from structgstream.data.masks import FOLDER as MASKS
 from structgstream.data.open import open_capture

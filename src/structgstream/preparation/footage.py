@@ -21,10 +21,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.audio import read_audio
-from structgstream.data.camera_files import NO_CAMERAS, UNREAD, filmed_folder, other_roots
-from structgstream.data.folder_files import check_link, files_of, is_hidden, name_of
+from structgstream.data.camera_files import (
+    NO_CAMERAS,
+    UNREAD,
+    check_link,
+    files_of,
+    filmed_folder,
+    is_hidden,
+    name_of,
+    other_roots,
+)
 from structgstream.data.images import PICTURE_SUFFIXES, read_picture, significant_bits
-from structgstream.data.picture_size import check_one_series, picture_size
+from structgstream.data.picture_headers import check_one_series, picture_size
 from structgstream.data.posed_capture import filmed_roots
 from structgstream.data.prepared import pictures_of
 from structgstream.data.timeline import natural, picture_slots
@@ -195,8 +203,8 @@ def find_footage(where: Path, *, picture_fps: float | None = None) -> Footage:
         _check_left(root, files)
         ordered = {name: files[name] for name in sorted(files, key=natural)}
         return _footage(where, ordered, picture_fps or PICTURE_FPS)
-    held = ", ".join(sorted(entry.name for entry in where.iterdir())[:6])
-    found = f"holds no videos and no pictures, but {held}" if held else "is empty"
+    contents = ", ".join(sorted(entry.name for entry in where.iterdir())[:6])
+    found = f"holds no videos and no pictures, but {contents}" if contents else "is empty"
     raise NoFootage(f"{where} {found}; expected {LAYOUTS}.")
 
 

@@ -5,13 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from structgstream.data.calibration import listed
+from structgstream.data.calibration import Calibration, PosedCamera, listed
+from structgstream.data.dataset_layouts import MODELS_FILE, read_models
 from structgstream.data.found_calibrations import calibration_below, read_calibration
-from structgstream.data.immersive import MODELS, read_models
 from structgstream.data.json_videos import FILE as CAMERAS
 from structgstream.data.json_videos import read_cameras
 from structgstream.data.lenses import Pinhole
-from structgstream.data.posed import Calibration, PosedCamera
 from structgstream.data.posed_capture import filmed_by, orientations
 from structgstream.data.prepared import FILE as PREPARED
 from structgstream.data.prepared import read_prepared
@@ -35,8 +34,8 @@ def find_calibration(where: Path) -> Calibration | None:
         return _of_prepared(folder)
     if meant(CAMERAS):
         return _of_cameras(folder / CAMERAS)
-    if meant(MODELS):
-        return read_models(folder / MODELS)
+    if meant(MODELS_FILE):
+        return read_models(folder / MODELS_FILE)
     if (found := read_calibration(folder, file)) is not None or file is not None:
         return found
     below = calibration_below(folder)

@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from structgstream.data.folder_files import REPORT
+from structgstream.data.calibration import Calibration
+from structgstream.data.camera_files import REPORT
 from structgstream.data.open import open_capture
-from structgstream.data.posed import Calibration
 from structgstream.data.prepared import read_prepared, recognizes_prepared
 from structgstream.pose_check.findings import Finding
 from structgstream.preparation.camera_steps import CameraSteps, check_used, chosen_method

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from structgstream.data.calibration import listed
-from structgstream.data.exif import read_exif
 from structgstream.data.lenses import LensCamera
+from structgstream.data.picture_headers import read_exif
 from structgstream.data.prepared import LENSES, camera_of, lens_model
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.calibration.board_solving import solve_board
@@ -81,7 +81,6 @@ def refined(
     found = refine(
         matched_pictures(footage, clocks, options),
         solved.cameras,
-        free="lens" if options.lens else "focal",
         lens=options.lens,
         metres=solved.metres,
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records several qualities of one stream frame by frame, reading the cameras once.
+"""Records several qualities of one stream frame by frame, reading the cameras once, with a joint report of each frame.
 
 Note [In step]
 ~~~~~~~~~~~~~~
@@ -9,6 +9,7 @@ they differ by at most one frame when the process is killed. After resuming, a q
 any other continues.
 """
 
+import math
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
@@ -17,14 +18,13 @@ from typing import Any
 
 from structgstream.codec.packets import PacketSink
 from structgstream.data.denoising import DenoisingConfig, denoised
-from structgstream.data.prefetch import read_ahead
 from structgstream.data.shared_frames import SharedFrames
 from structgstream.data.source import FrameStream
+from structgstream.data.wrappers import read_ahead
 from structgstream.errors import StorageError
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry, read_log
 from structgstream.kernels.backend import Backend
 from structgstream.qualities.bit_rates import BitRates
-from structgstream.qualities.joint_frame import joint_entry, joint_report
 from structgstream.qualities.ladder import Quality, configured
 from structgstream.qualities.shared_work import SharedWork, shared_pipeline
 from structgstream.recorder import Storage, log_reports
@@ -35,6 +35,41 @@ from structgstream.session.loop import Session
 from structgstream.session.pipeline import Pipeline, StoredStream
 from structgstream.session.presets import StreamConfig
 from structgstream.training.result import StepListener
+
+FIGURES = ("kind", "bytes", "train_psnr", "total_seconds", "cpu_seconds", "anchors", "free", "begins")
+"""Keys that a line of the joint log contains for each quality, copied from that quality's own log."""
+
+
+def joint_report(reports: Mapping[str, FrameReport]) -> FrameReport:
+    """The sums of bytes and seconds; all other values are those of the finest quality, the last."""
+    each = [*reports.values()]
+    stages = dict.fromkeys(name for report in each for name in report.seconds)
+    return replace(
+        each[-1],
+        bytes=sum(report.bytes for report in each),
+        field_bytes={},
+        train_psnr=math.nan,
+        seconds={name: sum(report.seconds.get(name, 0.0) for report in each) for name in stages},
+        cpu_seconds=sum(report.cpu_seconds for report in each),
+    )
+
+
+def joint_entry(report: FrameReport, entries: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """One line of the run's log.
+
+    Args:
+        report: joint report of all qualities that were fitted now.
+        entries: the frame's line in the log of each quality, by name, including qualities that had the frame already.
+    """
+    each = {name: {key: entry[key] for key in FIGURES if key in entry} for name, entry in entries.items()}
+    return {
+        "index": report.index,
+        "pts_seconds": report.pts_seconds,
+        "bytes": sum(entry.get("bytes", 0) for entry in each.values()),
+        "total_seconds": report.seconds["total"],
+        **({"absent": list(report.absent)} if report.absent else {}),
+        "qualities": each,
+    }
 
 
 @dataclass(frozen=True)

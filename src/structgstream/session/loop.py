@@ -18,7 +18,7 @@ from structgstream.codec.encoder import Encoded
 from structgstream.codec.header import check_picture_sizes
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
 from structgstream.data.denoising import denoised
-from structgstream.data.source import FrameStream, frame_count, keep_frames, may_read_ahead
+from structgstream.data.source import FrameStream, frame_count, is_recording, retain_frames
 from structgstream.errors import StorageError
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
@@ -124,7 +124,7 @@ class Session(Generic[State, Memory]):
 
     def _frames(self, past: Past[State, Memory] | None, start: int) -> Iterator[FrameReport]:
         method = self._pipeline.method
-        with Lookahead(self._observe_frames(start), depth=int(may_read_ahead(self._source))) as observed:
+        with Lookahead(self._observe_frames(start), depth=int(is_recording(self._source))) as observed:
             for meter, task in metered(self._tasks(observed), self._backend.device):
                 fit = method.first(task) if past is None else method.next(past, task)
                 meter.end("fit", peak="fit")
@@ -241,7 +241,7 @@ class Session(Generic[State, Memory]):
 
     def _keep(self, index: int) -> None:
         """Ask for the pictures that a run reads again which is resumed after this frame."""
-        keep_frames(self._source, self._first, last=max(self._plan.remembered, index + 1 - self._shown[0][0]))
+        retain_frames(self._source, self._first, last=max(self._plan.remembered, index + 1 - self._shown[0][0]))
 
     @property
     def _seconds_shown(self) -> tuple[float, float] | None:

@@ -2,27 +2,37 @@
 """Every converter against OpenCV's projection of one made rig: axes, units, order of coefficients, pixel centres."""
 
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from structgstream.data.posed import Calibration
+from structgstream.data import transforms
+from structgstream.data.calibration import Calibration
+from structgstream.data.calibration_files import tools
+from structgstream.data.calibration_files.opencv_cameras import OPENCV_CAMERAS
 from tests.support.calibrations import POINTS, WRITERS, pixels, truths
 from tests.support.captures import HEIGHT, WIDTH
 
-MODULES = {"openpose": "opencv_cameras"}
+FORMATS = {
+    "anipose": tools.ANIPOSE,
+    "easymocap": tools.EASYMOCAP,
+    "multical": tools.MULTICAL,
+    "kalibr": tools.KALIBR,
+    "cmu_panoptic": tools.CMU_PANOPTIC,
+    "qualisys": tools.QUALISYS,
+    "zju_mocap": tools.ZJU_MOCAP,
+    "opencv_cameras": OPENCV_CAMERAS,
+    "openpose": OPENCV_CAMERAS,
+}
 RELATIVE = ("multical", "kalibr")  # their world is the first camera
 WITHOUT_SIZE = ("zju_mocap", "openpose")
 
 
 def converted(tool: str, folder: Path) -> Calibration:
-    module = import_module(f"structgstream.data.calibration_files.{MODULES.get(tool, tool)}")
-    found = module.find(folder)
-    files = found if isinstance(found, tuple) else next(found)
-    assert files
-    return module.read(files)
+    if tool == "transforms":
+        return transforms.read(transforms.find(folder))
+    return FORMATS[tool].read(next(iter(FORMATS[tool].find(folder))))
 
 
 @pytest.mark.parametrize("tool", WRITERS)
@@ -50,9 +60,8 @@ def test_fisheyes(tool: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("tool", WRITERS)
 def test_a_folder_without_such_a_file(tool: str, tmp_path: Path) -> None:
-    module = import_module(f"structgstream.data.calibration_files.{MODULES.get(tool, tool)}")
     (tmp_path / "notes.toml").write_text("[tool]\nx = 1\n")
     (tmp_path / "other.json").write_text("{}")
     (tmp_path / "config.yaml").write_text("a: 1\n")
     (tmp_path / "layout.xml").write_text("<html/>")
-    assert not [*module.find(tmp_path)]
+    assert not [*(transforms if tool == "transforms" else FORMATS[tool]).find(tmp_path)]

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from structgstream.data.calibration_files.reading import calibration_of, readable
+from structgstream.data.calibration import PosedCamera, intrinsics, rigid
+from structgstream.data.calibration_files.reading import CalibrationFormat
 from structgstream.data.lenses import from_integer_centers
-from structgstream.data.posed import Calibration, PosedCamera, intrinsics, rigid
 from structgstream.data.text_files import number, read_text
 from structgstream.data.text_files import pixels as picture_pixels
 from structgstream.errors import CalibrationError
@@ -24,21 +24,20 @@ ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture
-def converter() -> dict[str, Any]:
+def rig_csv() -> CalibrationFormat:
     section = (ROOT / "CONTRIBUTING.md").read_text().split("### A capture format")[1].split("\n##")[0]
     (code,) = re.findall(r" *```python\n(.*?)```", section, re.DOTALL)
     known: dict[str, Any] = {
-        "csv": csv, "Iterator": Iterator, "Path": Path, "readable": readable, "calibration_of": calibration_of,
-        "EXPECTED": "a row a camera", "Calibration": Calibration, "PosedCamera": PosedCamera, "intrinsics": intrinsics,
-        "rigid": rigid, "from_integer_centers": from_integer_centers, "read_text": read_text, "number": number,
-        "pixels": picture_pixels,
+        "csv": csv, "Any": Any, "Iterator": Iterator, "Path": Path, "CalibrationFormat": CalibrationFormat,
+        "PosedCamera": PosedCamera, "intrinsics": intrinsics, "rigid": rigid, "read_text": read_text, "number": number,
+        "from_integer_centers": from_integer_centers, "pixels": picture_pixels,
     }  # fmt: skip
     exec(compile(textwrap.dedent(code), "CONTRIBUTING.md", "exec"), known)
-    return known
+    return known["RIG_CSV"]
 
 
-def test_the_example_reads_what_it_says(converter: dict[str, Any], tmp_path: Path) -> None:
-    assert [*converter["find"](tmp_path)] == []
+def test_the_example_reads_what_it_says(rig_csv: CalibrationFormat, tmp_path: Path) -> None:
+    assert [*rig_csv.find(tmp_path)] == []
     cameras = truths(dist=(0, 0, 0, 0))
     rows = ["name,width,height,fx,fy,cx,cy,rx,ry,rz,tx,ty,tz"]
     for camera in cameras:
@@ -46,15 +45,15 @@ def test_the_example_reads_what_it_says(converter: dict[str, Any], tmp_path: Pat
         numbers = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *camera.rvec, *camera.T]
         rows.append(f"{camera.name},{WIDTH},{HEIGHT},{','.join(repr(float(number)) for number in numbers)}")
     (tmp_path / "rig.csv").write_text("\n".join(rows))
-    (files,) = converter["find"](tmp_path)
-    found = converter["read"](files)
+    (files,) = rig_csv.find(tmp_path)
+    found = rig_csv.read(files)
     for truth, camera in zip(cameras, found.cameras, strict=True):
         np.testing.assert_allclose(pixels(camera, POINTS), truth.pixels(POINTS), atol=1e-7)
     (tmp_path / "rig.csv").write_text("\n".join(rows).replace("rvec", "r").replace("fx", "focal"))
     with pytest.raises(
-        CalibrationError, match=r"'cam00' of .*rig\.csv cannot be read \(no 'fx'\); expected a row a cam"
+        CalibrationError, match=r"'cam00' of .*rig\.csv cannot be read \(no 'fx'\); expected a row per cam"
     ):
-        converter["read"](files)
+        rig_csv.read(files)
 
 
 def test_the_files_it_names_exist_or_are_its_own() -> None:

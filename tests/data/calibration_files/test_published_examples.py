@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from structgstream.data.calibration_files import kalibr, multical, opencv_cameras, qualisys, zju_mocap
+from structgstream.data.calibration import rigid
+from structgstream.data.calibration_files import tools
+from structgstream.data.calibration_files.opencv_cameras import OPENCV_CAMERAS
 from structgstream.data.lenses import RadialTangential
-from structgstream.data.posed import rigid
 from structgstream.errors import CalibrationError
 from tests.support.calibrations import truths, write_kalibr, write_multical, write_opencv, write_qualisys, write_zju
 
@@ -36,7 +37,7 @@ cam1:
   - [0.0, 0.0, 0.0, 1.0]
   resolution: [752, 480]
 """)
-    first, second = kalibr.read(next(kalibr.find(tmp_path))).cameras
+    first, second = tools.KALIBR.read(next(tools.KALIBR.find(tmp_path))).cameras
     assert (first.name, first.size, first.K[0, 2]) == ("cam0", (752, 480), 363.18)
     assert first.lens == RadialTangential(-0.27695497, 0.06712482, 0.00087538, 0.00011556)
     assert second.center[0] == pytest.approx(0.11, abs=1e-3)
@@ -44,16 +45,16 @@ cam1:
     for old, new in (("pinhole", "omni"), ("radtan", "fov")):
         (tmp_path / "camchain.yaml").write_text(text.replace(old, new))
         with pytest.raises(CalibrationError, match=rf"'cam0' of .*camchain\.yaml is of the model .*{new}"):
-            kalibr.read(next(kalibr.find(tmp_path)))
+            tools.KALIBR.read(next(tools.KALIBR.find(tmp_path)))
     (tmp_path / "camchain.yaml").write_text("cam0: [\n")
     with pytest.raises(CalibrationError, match=r"camchain\.yaml cannot be read"):
-        kalibr.read(next(kalibr.find(tmp_path)))
+        tools.KALIBR.read(next(tools.KALIBR.find(tmp_path)))
 
 
 def test_a_long_chain_keeps_its_order(tmp_path: Path) -> None:
     """cam10 comes after cam9."""
     cameras = truths(names=[f"cam{number}" for number in range(12)], dist=(0, 0, 0, 0))
-    found = kalibr.read((write_kalibr(tmp_path, cameras),)).cameras
+    found = tools.KALIBR.read((write_kalibr(tmp_path, cameras),)).cameras
     assert [camera.name for camera in found] == [camera.name for camera in cameras]
     expected = cameras[0].R @ (cameras[11].center - cameras[0].center)
     np.testing.assert_allclose(found[11].center, expected, atol=1e-9)
@@ -67,7 +68,7 @@ def test_multicals_format_page(tmp_path: Path) -> None:
     first = {"R": np.eye(3).tolist(), "T": [0.0, 0.0, 0.0]}
     content = {"cameras": {"cam1": camera, "cam2": camera}, "camera_poses": {"cam1": first, "cam2_to_cam1": pose}}
     (tmp_path / "calibration.json").write_text(json.dumps(content))
-    one, two = multical.read(next(multical.find(tmp_path))).cameras
+    one, two = tools.MULTICAL.read(next(tools.MULTICAL.find(tmp_path))).cameras
     assert one.size == (2000, 1500)
     assert one.K[:2, 2].tolist() == pytest.approx([986.18, 763.5])
     np.testing.assert_allclose(two.center, [0.05, 0, 0])
@@ -80,17 +81,17 @@ def test_multical_without_a_master_and_in_a_chain(tmp_path: Path) -> None:
     content = json.loads(file.read_text())
     absolute = {camera.name: {"R": camera.R.tolist(), "T": camera.T.tolist()} for camera in cameras}
     file.write_text(json.dumps({**content, "camera_poses": absolute}))
-    for truth, camera in zip(cameras, multical.read((file,)).cameras, strict=True):
+    for truth, camera in zip(cameras, tools.MULTICAL.read((file,)).cameras, strict=True):
         np.testing.assert_allclose(camera.viewmat, rigid(truth.R, truth.T))
     step = rigid(cameras[2].R, cameras[2].T) @ np.linalg.inv(rigid(cameras[1].R, cameras[1].T))
     chain = {"cam02_to_cam01": {"R": step[:3, :3].tolist(), "T": step[:3, 3].tolist()}}
     chain |= {name: absolute[name] for name in ("cam01", "cam00")}
     file.write_text(json.dumps({**content, "camera_poses": chain}))
-    found = {camera.name: camera for camera in multical.read((file,)).cameras}
+    found = {camera.name: camera for camera in tools.MULTICAL.read((file,)).cameras}
     np.testing.assert_allclose(found["cam02"].viewmat, rigid(cameras[2].R, cameras[2].T), atol=1e-12)
     file.write_text(json.dumps({**content, "camera_poses": {"a_to_b": absolute["cam00"]}}))
     with pytest.raises(CalibrationError, match="a_to_b refer to no camera that has one"):
-        multical.read((file,))
+        tools.MULTICAL.read((file,))
 
 
 def test_qualisys_sensor_units(tmp_path: Path) -> None:
@@ -104,33 +105,33 @@ def test_qualisys_sensor_units(tmp_path: Path) -> None:
  tangentalDistortion1="0.000615" tangentalDistortion2="-0.000391"/>
 </camera></cameras></calibration>"""
     (tmp_path / "take.qca.txt").write_text(text)
-    (camera,) = qualisys.read(next(qualisys.find(tmp_path))).cameras
+    (camera,) = tools.QUALISYS.read(next(tools.QUALISYS.find(tmp_path))).cameras
     assert (camera.name, camera.size) == ("26580", (1920, 1088))
     assert camera.K[0, 0] == pytest.approx(1685.51, abs=0.01)
     assert camera.lens == RadialTangential(-0.04545, 0.139604, 0.000615, -0.000391)
     np.testing.assert_allclose(camera.center, [4.2633, 2.2838, 1.7943])
     (tmp_path / "take.qca.txt").write_text(text.replace('viewrotation="0"', 'viewrotation="90"'))
     with pytest.raises(CalibrationError, match=r"'26580' of .*turned by 90 degrees.*set the view rotation to 0"):
-        qualisys.read(next(qualisys.find(tmp_path)))
+        tools.QUALISYS.read(next(tools.QUALISYS.find(tmp_path)))
     (tmp_path / "take.qca.txt").write_text(text.replace("<intrinsic ", "<optics "))
     with pytest.raises(CalibrationError, match="'26580' of .*no 'intrinsic'"):
-        qualisys.read(next(qualisys.find(tmp_path)))
+        tools.QUALISYS.read(next(tools.QUALISYS.find(tmp_path)))
     (tmp_path / "take.qca.txt").write_text(text[:80])
     with pytest.raises(CalibrationError, match=r"take\.qca\.txt cannot be read"):
-        qualisys.read(next(qualisys.find(tmp_path)))
+        tools.QUALISYS.read(next(tools.QUALISYS.find(tmp_path)))
 
 
 def test_marker_cameras_of_qualisys_are_no_cameras(tmp_path: Path) -> None:
-    found = qualisys.read((write_qualisys(tmp_path, truths()),))
+    found = tools.QUALISYS.read((write_qualisys(tmp_path, truths()),))
     assert [camera.name for camera in found.cameras] == ["cam00", "cam01", "cam02"]
 
 
 def test_zju_names_cameras_by_folder(tmp_path: Path) -> None:
-    found = zju_mocap.read((write_zju(tmp_path, truths(names=("Camera_B1", "Camera_B2", "Camera_B3"))),))
+    found = tools.ZJU_MOCAP.read((write_zju(tmp_path, truths(names=("Camera_B1", "Camera_B2", "Camera_B3"))),))
     assert [camera.name for camera in found.cameras] == [f"Camera_B{number}/000000.jpg" for number in (1, 2, 3)]
     np.save(tmp_path / "annots.npy", np.array({"cams": {}}, dtype=object))
     with pytest.raises(CalibrationError, match=r"annots\.npy cannot be read \(no 'ims'\); expected a dictionary"):
-        zju_mocap.read(next(zju_mocap.find(tmp_path)))
+        tools.ZJU_MOCAP.read(next(tools.ZJU_MOCAP.find(tmp_path)))
 
 
 def test_opencv_files_without_a_pose(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -138,10 +139,10 @@ def test_opencv_files_without_a_pose(tmp_path: Path, caplog: pytest.LogCaptureFi
     write_opencv(tmp_path, truths())
     file = tmp_path / "cam01.yml"
     file.write_text(file.read_text().replace("R: !!", "unknown: !!"))
-    found = opencv_cameras.read(next(opencv_cameras.find(tmp_path)))
+    found = OPENCV_CAMERAS.read(next(OPENCV_CAMERAS.find(tmp_path)))
     assert [camera.name for camera in found.cameras] == ["cam00", "cam02"]
     assert found.unposed == ("cam01",)
     assert "has no pose of camera 'cam01'; left out" in caplog.text
     file.write_text("%YAML:1.0\n---\nK: !!opencv-matrix\n  rows: [\n")
     with pytest.raises(CalibrationError, match=r"Camera 'cam01' of .* cannot be read \(it is not YAML at line \d\)"):
-        opencv_cameras.read(next(opencv_cameras.find(tmp_path)))
+        OPENCV_CAMERAS.read(next(OPENCV_CAMERAS.find(tmp_path)))

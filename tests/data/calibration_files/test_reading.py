@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from structgstream.data.calibration import PosedCamera
 from structgstream.data.calibration_files import reading
 from structgstream.data.calibration_files.reading import calibration_of, json_files_with, readable
-from structgstream.data.posed import PosedCamera
 from structgstream.data.text_files import Unreadable, reason
 from structgstream.errors import CalibrationError
 

@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 
 from structgstream.data.live.camera import MAX_UNSTAMPED, CameraFeed
-from structgstream.data.live.faults import FaultLog
-from structgstream.data.live.matching import LivePicture
+from structgstream.data.live.clock import ClockMapper
 from structgstream.data.live.rig_file import LiveCamera, TimeBase
-from structgstream.data.live.stamps import StampReader
+from structgstream.data.live.status import FaultLog
+from structgstream.data.live.synchronizer import LivePicture
 from tests.support.sender_modules import moving_pictures, sent_stream
 
 WAIT = 20.0
@@ -41,7 +41,7 @@ class Received:
     def deliver(self, camera: str, picture: LivePicture) -> None:
         self.pictures.append(picture)
 
-    def lost(self, camera: str) -> None:
+    def mark_absent(self, camera: str) -> None:
         self.losses += 1
 
     def others_changed_at(self, camera: str) -> float:
@@ -76,7 +76,7 @@ def camera_feed(
         camera,
         size=(128, 96),
         receiver=received,
-        stamps=StampReader(base),
+        clock=ClockMapper(base),
         faults=faults,
         base=base,
         now=lambda: next(ticks) * PERIOD / 2,
@@ -107,7 +107,7 @@ def read(
         if not waiting:
             feed.stop()
 
-    feed, faults = camera_feed(received, base=base, opens=opens, wait=wait)
+    feed, faults = camera_feed(received, base=base, open_camera=opens, wait=wait)
     feed.start()
     feed.join(WAIT)
     received.waits = waits
@@ -249,7 +249,7 @@ def test_pictures_without_stamps(base: TimeBase, caplog: pytest.LogCaptureFixtur
     feed, faults = camera_feed(Received(), base=base)
     frames = [SimpleNamespace(pts=None, time_base=None)] * 60
     with caplog.at_level(logging.WARNING):
-        placed = [feed._placed(frame, n * PERIOD, None) for n, frame in enumerate(frames)]  # type: ignore[arg-type]
+        placed = [feed._common_time(frame, n * PERIOD, None) for n, frame in enumerate(frames)]  # type: ignore[arg-type]
     assert placed[:MAX_UNSTAMPED] == [None] * MAX_UNSTAMPED
     assert faults.counts["a"] == {"no stamp": 60}
     if base is TimeBase.ARRIVAL:
@@ -259,7 +259,7 @@ def test_pictures_without_stamps(base: TimeBase, caplog: pytest.LogCaptureFixtur
         assert placed == [None] * 60
         assert 'take clock = "arrival"' in caplog.text
     stamped = SimpleNamespace(pts=90, time_base=1)
-    assert feed._placed(stamped, 61 * PERIOD, None) is not None  # type: ignore[arg-type]
+    assert feed._common_time(stamped, 61 * PERIOD, None) is not None  # type: ignore[arg-type]
 
 
 def sent_by_rtp(port: int, form: str, ended: threading.Event) -> None:

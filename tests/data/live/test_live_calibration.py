@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from structgstream.data.clip import bundled_clip, bundled_clip_path
+from structgstream.data.json_videos import bundled_clip, bundled_clip_path
 from structgstream.data.lenses import LensCamera, RadialTangential
 from structgstream.data.live.calibration import (
-    Arriving,
-    as_calibrated,
-    chosen_cameras,
+    LivePictures,
     filmed_rig,
     filmed_sizes,
     read_calibration,
+    select_cameras,
+    with_calibration,
 )
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
 from structgstream.data.undistortion import Undistortion
@@ -53,8 +53,8 @@ def test_pictures_are_undistorted_as_those_of_the_capture(tmp_path: Path) -> Non
         for name, size in filmed_sizes(capture).items()
     }
     frames = [MultiViewFrame(0, 3.25, images, captured_unix_seconds=5.0)]
-    arriving = Arriving("live", filmed, 25.0, iter(frames))
-    source = as_calibrated(arriving, capture, tmp_path, held_out=None, scale=1.0, near=0.3)
+    arriving = LivePictures("live", filmed, 25.0, iter(frames))
+    source = with_calibration(arriving, capture, tmp_path, held_out=None, scale=1.0, near=0.3)
     (frame,) = source.frames()
     second = [*images][1]
     expected = Undistortion(capture.cameras[second].filmed, capture.cameras[second].pinhole)(images[second])
@@ -62,8 +62,8 @@ def test_pictures_are_undistorted_as_those_of_the_capture(tmp_path: Path) -> Non
     assert (expected != images[second]).any()
     assert (frame.pts_seconds, frame.captured_unix_seconds) == (3.25, 5.0)
     assert source.rig[second].near == 0.3
-    half = as_calibrated(
-        replace(arriving, arrived=iter(frames)), capture, tmp_path, held_out=(second,), scale=0.5, near=None
+    half = with_calibration(
+        replace(arriving, arriving=iter(frames)), capture, tmp_path, held_out=(second,), scale=0.5, near=None
     )
     assert half.rig.testing == (second,)
     (small,) = half.frames()
@@ -76,7 +76,7 @@ def test_a_capture_of_another_layout_gives_its_rig() -> None:
     clip = bundled_clip()
     assert capture.held_out == clip.rig.held_out
     assert capture.near == pytest.approx(clip.rig["cam03"].near)
-    chosen = chosen_cameras(capture, ["cam02", "cam01", "cam05"])
+    chosen = select_cameras(capture, ["cam02", "cam01", "cam05"])
     assert [*chosen.cameras] == ["cam01", "cam02", "cam05"]
     assert chosen.held_out == frozenset()
     rig = filmed_rig(capture, bundled_clip_path())

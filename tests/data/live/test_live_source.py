@@ -16,15 +16,15 @@ import pytest
 
 from structgstream.data.denoising import DenoisingConfig
 from structgstream.data.lenses import LensCamera, Pinhole
-from structgstream.data.live import recording
+from structgstream.data.live import recorder as recording
 from structgstream.data.live import source as source_module
 from structgstream.data.live.calibration import read_calibration
-from structgstream.data.live.faults import FaultLog
-from structgstream.data.live.matching import LivePicture, PictureSet
-from structgstream.data.live.source import LiveOptions, LiveSource, Policy
+from structgstream.data.live.source import LiveOptions, LiveSource
+from structgstream.data.live.status import FaultLog
+from structgstream.data.live.synchronizer import LivePicture, PictureSet
 from structgstream.data.open import open_capture
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
-from structgstream.data.source import frame_count, may_read_ahead
+from structgstream.data.source import frame_count, is_recording
 from structgstream.data.video_pictures import srgb
 from structgstream.errors import CaptureError, ConfigError, StorageError
 from tests.support.rigs import arc_rig
@@ -110,7 +110,7 @@ def test_sets_of_one_instant_come_over_the_network(tmp_path: Path, transport: st
     with sending(transport) as urls:
         source = LiveSource(rig_file(tmp_path, urls, clock="unix"), tmp_path / "x.sgs", LiveOptions(frames=5))
         assert frame_count(source) is None
-        assert not may_read_ahead(source)
+        assert not is_recording(source)
         frames = list(source.frames())
     assert [frame.index for frame in frames] == [0, 1, 2, 3, 4]
     assert frames[0].pts_seconds == 0.0
@@ -140,7 +140,7 @@ def test_network_cameras_are_asked_by_rtsp_and_asked_again(tmp_path: Path) -> No
     assert all("jump" not in counts for counts in source.faults.counts.values())
 
 
-def test_latest_skips_what_was_filmed_while_nobody_asked(tmp_path: Path) -> None:
+def test_a_slow_trainer_skips_what_was_filmed_while_nobody_asked(tmp_path: Path) -> None:
     with sending("udp") as urls:
         source = LiveSource(rig_file(tmp_path, urls, clock="unix"), tmp_path / "x.sgs", LiveOptions(frames=3))
         frames = source.frames()
@@ -184,8 +184,7 @@ def test_sets_of_fewer_than_two_training_cameras_are_no_frames(tmp_path: Path) -
 
 
 def test_every_set_of_files_comes_and_then_the_stream_ends(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    source = LiveSource(files(tmp_path), tmp_path / "x.sgs", LiveOptions(policy="every"))
-    assert may_read_ahead(source)
+    source = LiveSource(files(tmp_path), tmp_path / "x.sgs", LiveOptions())
     with caplog.at_level(logging.WARNING):
         frames = list(source.frames())
     numbers = [round(frame.pts_seconds * FPS) for frame in frames]
@@ -195,7 +194,6 @@ def test_every_set_of_files_comes_and_then_the_stream_ends(tmp_path: Path, caplo
     skipped = source.status().skipped_sets
     assert len(frames) == 30 - skipped, "every set, or it is counted"
     assert "have come to their end" in caplog.text
-    assert not (tmp_path / "x.queue").exists()
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no video at all"], ids=["missing", "empty", "no video"])
@@ -208,7 +206,7 @@ def test_a_file_that_cannot_be_read_is_absent_and_the_stream_ends(
     if content is not None:
         (tmp_path / "a.ts").write_bytes(content)
     with caplog.at_level(logging.WARNING):
-        frames = list(LiveSource(path, tmp_path / "x.sgs", LiveOptions(policy="every")).frames())
+        frames = list(LiveSource(path, tmp_path / "x.sgs", LiveOptions()).frames())
     assert len(frames) >= 20
     assert all([*frame.images] == ["b", "c"] for frame in frames)
     (told,) = [text for text in caplog.messages if "camera 'a'" in text]
@@ -229,37 +227,31 @@ def test_a_file_that_ends_first_is_not_waited_for(tmp_path: Path, caplog: pytest
     path = files(tmp_path)
     (tmp_path / "b.ts").write_bytes(sent_stream(frames=12))
     with caplog.at_level(logging.WARNING):
-        frames = list(LiveSource(path, tmp_path / "x.sgs", LiveOptions(policy="every", held_out=())).frames())
+        frames = list(LiveSource(path, tmp_path / "x.sgs", LiveOptions(held_out=())).frames())
     assert round(frames[-1].pts_seconds * FPS) == 29
     assert [*frames[-1].images] == ["a", "c"]
     assert f"camera 'b' has come to the end of its file {tmp_path / 'b.ts'}; it is absent from now on" in caplog.text
     assert "again" not in caplog.text
 
 
-@pytest.mark.parametrize("policy", ["every", "latest"])
-def test_frame_0_is_averaged_and_no_set_that_waits_is_lost(tmp_path: Path, policy: Policy) -> None:
-    """The film moves everywhere but at its rims; with ``every`` the averaged sets are frames of their own, too."""
+def test_frame_0_is_averaged(tmp_path: Path) -> None:
+    """The film moves everywhere but at its rims."""
     denoising = varied(DenoisingConfig(frames=3), THRESHOLD=0.1, REACH_PIXELS=0)
     path = files(tmp_path)
-    source = LiveSource(path, tmp_path / "x.sgs", LiveOptions(policy=policy, denoising=denoising))
+    source = LiveSource(path, tmp_path / "x.sgs", LiveOptions(denoising=denoising))
     frames = list(source.frames())
     assert frames[0].mean_of > 1.2
     assert all(frame.mean_of == 1.0 for frame in frames[1:])
     assert [frame.index for frame in frames] == list(range(len(frames)))
-    if policy == "every":
-        assert len(frames) == 30 - source.status().skipped_sets
-        raw = list(LiveSource(path, tmp_path / "y.sgs", LiveOptions(policy=policy)).frames())
-        assert frames[0].images["b"].shape == raw[0].images["b"].shape
-        assert (frames[0].images["b"] != raw[0].images["b"]).any()
     (again,) = islice(LiveSource(path, tmp_path / "x.sgs", LiveOptions(resume=True)).frames(0), 1)
-    assert (again.images["b"] == frames[0].images["b"]).all(), "what was fitted is kept"
+    assert (again.images["b"] == frames[0].images["b"]).all(), "the averaged pictures are stored"
 
 
 def test_a_resumed_stream_gets_the_pictures_that_no_camera_sends_again(tmp_path: Path) -> None:
     path, stream = files(tmp_path), tmp_path / "x.sgs"
-    source = LiveSource(path, stream, LiveOptions(policy="every"))
+    source = LiveSource(path, stream, LiveOptions())
     first = list(islice(source.frames(), 6))
-    again = LiveSource(path, stream, LiveOptions(policy="every", resume=True, frames=8))
+    again = LiveSource(path, stream, LiveOptions(resume=True, frames=8))
     (zero,) = islice(again.frames(0), 1)
     assert (zero.images["b"] == first[0].images["b"]).all()
     frames = list(again.frames(4))
@@ -278,12 +270,12 @@ def test_a_stream_is_stopped_between_two_frames(tmp_path: Path) -> None:
     next(frames)
     source.stop()
     assert list(frames) == []
-    assert [thread for thread in threading.enumerate() if thread.name.startswith(("camera", "sets"))] == []
+    assert [thread for thread in threading.enumerate() if thread.name.startswith(("camera", "synchronizer"))] == []
 
 
 def test_what_is_recorded_is_a_capture_of_the_same_instants(tmp_path: Path) -> None:
     path, folder = files(tmp_path, b="garbage:0.5:0.2"), tmp_path / "take"
-    options = LiveOptions(policy="every", record=folder)
+    options = LiveOptions(record=folder)
     live = list(LiveSource(path, tmp_path / "x.sgs", options).frames())
     again = open_capture(folder)
     recorded = list(again.frames())
@@ -304,7 +296,7 @@ def test_what_is_recorded_is_a_capture_of_the_same_instants(tmp_path: Path) -> N
 
 def test_pictures_of_other_proportions_are_not_recorded(tmp_path: Path) -> None:
     path, folder = files(tmp_path, frames=48, c="shape:0.4:0.4"), tmp_path / "take"
-    list(LiveSource(path, tmp_path / "x.sgs", LiveOptions(policy="every", record=folder)).frames())
+    list(LiveSource(path, tmp_path / "x.sgs", LiveOptions(record=folder)).frames())
     recorded = list(open_capture(folder).frames())
     assert {frame.index for frame in recorded if "c" not in frame.images} >= set(range(12, 24))
     for frame in recorded:
@@ -313,7 +305,7 @@ def test_pictures_of_other_proportions_are_not_recorded(tmp_path: Path) -> None:
 
 def test_a_recording_that_is_cut_can_be_read_up_to_there(tmp_path: Path) -> None:
     folder = tmp_path / "take"
-    list(LiveSource(files(tmp_path), tmp_path / "x.sgs", LiveOptions(policy="every", record=folder)).frames())
+    list(LiveSource(files(tmp_path), tmp_path / "x.sgs", LiveOptions(record=folder)).frames())
     for name in NAMES:
         file = folder / f"{name}.ts"
         file.write_bytes(file.read_bytes()[: file.stat().st_size * 2 // 3 // 188 * 188])
@@ -326,7 +318,7 @@ def test_a_long_recording_goes_on_in_parts_at_key_frames(tmp_path: Path, monkeyp
     """A part ends within the first group of 12 frames, so the next begins with the second."""
     monkeypatch.setattr(recording, "PART_SECONDS", recording.LEAD_SECONDS + 0.3)
     folder = tmp_path / "take"
-    list(LiveSource(files(tmp_path), tmp_path / "x.sgs", LiveOptions(policy="every", record=folder)).frames())
+    list(LiveSource(files(tmp_path), tmp_path / "x.sgs", LiveOptions(record=folder)).frames())
     first, second = (list(open_capture(part).frames()) for part in (folder, folder / "part-001"))
     assert [shown(frame.images["b"]) for frame in first] == list(range(12))
     assert [shown(frame.images["b"]) for frame in second] == [n % 12 for n in range(18)]
@@ -351,12 +343,12 @@ def record(recorder: recording.CameraRecorder, stream: bytes) -> None:
     with av.open(io.BytesIO(stream), "r") as container:
         for packet in container.demux(video=0):
             if packet.size:
-                recorder.keep(packet, shift_seconds=0.0)
+                recorder.record(packet, shift_seconds=0.0)
 
 
 def test_a_camera_that_comes_back_with_another_codec_goes_on_in_the_next_part(tmp_path: Path) -> None:
     folder = tmp_path / "take"
-    kept = recording.Recording(folder, read_calibration(calibrated(tmp_path / "c")), fps=FPS, unit_name="rig")
+    kept = recording.Recording(folder, read_calibration(calibrated(tmp_path / "c")), fps=FPS)
     recorders = {name: kept.camera(name, FaultLog("rig", now=lambda: 0.0)) for name in NAMES}
     for first in range(0, 48, 12):
         for name in ("b", "a", "c"):
@@ -375,7 +367,7 @@ def test_a_recording_names_the_cameras_that_sent_something(tmp_path: Path) -> No
     """Its capture would be refused otherwise, for a file that was never there."""
     path, folder = files(tmp_path), tmp_path / "take"
     (tmp_path / "a.ts").unlink()
-    list(LiveSource(path, tmp_path / "x.sgs", LiveOptions(policy="every", record=folder)).frames())
+    list(LiveSource(path, tmp_path / "x.sgs", LiveOptions(record=folder)).frames())
     again = open_capture(folder)
     assert [*again.rig] == ["b", "c"]
     assert len(again) == 30
@@ -387,8 +379,8 @@ def test_a_recording_that_cannot_be_written_does_not_end_the_stream(
     def full(self: object, number: int, file: str, line: str) -> None:
         raise StorageError("no room")
 
-    monkeypatch.setattr(recording.Recording, "note", full)
-    options = LiveOptions(policy="every", record=tmp_path / "take", frames=4)
+    monkeypatch.setattr(recording.Recording, "add_line", full)
+    options = LiveOptions(record=tmp_path / "take", frames=4)
     with caplog.at_level(logging.WARNING):
         frames = list(LiveSource(files(tmp_path), tmp_path / "x.sgs", options).frames())
     assert len(frames) == 4
@@ -418,8 +410,8 @@ def test_a_camera_whose_colours_cannot_be_converted_is_absent(
     monkeypatch.setattr(source_module, "srgb", converted)
     sizes = {"a": (128, 96), "b": (64, 48), "c": (128, 96)}
     monkeypatch.setattr(source_module, "filmed_sizes", lambda calibration: sizes)
-    source = LiveSource(files(tmp_path), tmp_path / "x.sgs", LiveOptions(policy="every", frames=0))
-    convert = source._converted()
+    source = LiveSource(files(tmp_path), tmp_path / "x.sgs", LiveOptions(frames=0))
+    convert = source._converter()
     pictures = {name: LivePicture(0.5, 0.0, decoded()) for name in NAMES}
     assert [*convert(PictureSet(0.5, pictures, 0.0)).images] == ["a", "c"]
     assert "camera 'b' sends pictures whose colours cannot be converted (no such format)" in caplog.text
@@ -428,7 +420,7 @@ def test_a_camera_whose_colours_cannot_be_converted_is_absent(
 
 def test_a_second_recording_goes_on_in_the_next_part(tmp_path: Path) -> None:
     path, folder = files(tmp_path), tmp_path / "take"
-    options = LiveOptions(policy="every", record=folder, frames=6)
+    options = LiveOptions(record=folder, frames=6)
     list(LiveSource(path, tmp_path / "x.sgs", options).frames())
     before = (folder / "a.ts").read_bytes()
     list(LiveSource(path, tmp_path / "y.sgs", options).frames())
@@ -438,8 +430,6 @@ def test_a_second_recording_goes_on_in_the_next_part(tmp_path: Path) -> None:
 
 def test_options_that_make_no_sense_are_refused(tmp_path: Path) -> None:
     path = files(tmp_path)
-    with pytest.raises(ConfigError, match="needs room"):
-        LiveSource(path, tmp_path / "x.sgs", LiveOptions(queue_gigabytes=0))
     with pytest.raises(ConfigError, match="scale"):
         LiveSource(path, tmp_path / "x.sgs", LiveOptions(scale=2.0))
     path.write_text(path.read_text().replace("[cameras.c]", "[cameras.d]"))

@@ -1,43 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What live cameras do at a moment, as values."""
+import logging
 
-from types import SimpleNamespace
-from typing import Any
+import pytest
 
-from structgstream.data.live.outlets import QueueStatus
-from structgstream.data.live.status import CameraStatus, LiveStatus, SetAges
-
-AGES = SetAges(0.25, 0.5, 0.75)
-FAULTS = {"a": {"stuck": 2}}
-ARRIVALS: Any = SimpleNamespace(
-    present=["a"],
-    lengths={"a": 3, "b": 0},
-    feeds={"a": SimpleNamespace(decoded=10), "b": SimpleNamespace(decoded=4)},
-    sets=7,
-    small=1,
-)
+from structgstream.data.live.status import Fault, FaultLog
 
 
-def status(arrivals: Any, queue: QueueStatus | None) -> LiveStatus:
-    return LiveStatus.of(arrivals, queue, faults=FAULTS, cameras=("a", "b"), handed_per_second=2.5, ages=AGES)
-
-
-def test_before_cameras_are_opened_only_their_faults_are_known() -> None:
-    expected = LiveStatus({"a": CameraStatus(faults={"stuck": 2}), "b": CameraStatus()})
-    assert status(None, None) == status(ARRIVALS, None) == status(None, QueueStatus(1, 2, 3)) == expected
-    assert (expected.sets, expected.delay_seconds) == (0, None)
-
-
-def test_every_number_stands_under_its_name() -> None:
-    assert status(ARRIVALS, QueueStatus(waiting=5, waiting_bytes=900, skipped=6)) == LiveStatus(
-        cameras={"a": CameraStatus(True, 10, 3, {"stuck": 2}), "b": CameraStatus(False, 4, 0, {})},
-        sets=7,
-        small_sets=1,
-        skipped_sets=6,
-        waiting_sets=5,
-        waiting_bytes=900,
-        handed_per_second=2.5,
-        arrived_seconds=0.25,
-        matched_seconds=0.5,
-        delay_seconds=0.75,
-    )
+def test_each_kind_of_each_camera_is_logged_once_a_minute_and_always_counted(caplog: pytest.LogCaptureFixture) -> None:
+    now = [0.0]
+    faults = FaultLog("studio", now=lambda: now[0], interval_seconds=60.0)
+    with caplog.at_level(logging.WARNING):
+        for _ in range(100):
+            faults.report("a", Fault.GARBAGE, "sends garbage")
+        faults.report("b", Fault.GARBAGE, "sends garbage")
+        faults.report("a", Fault.STUCK, "stands still")
+        now[0] = 61.0
+        faults.report("a", Fault.GARBAGE, "sends garbage")
+        faults.count("a", Fault.OVERFLOW, 3)
+    assert [record.getMessage() for record in caplog.records] == [
+        "studio: camera 'a' sends garbage",
+        "studio: camera 'b' sends garbage",
+        "studio: camera 'a' stands still",
+        "studio: camera 'a' sends garbage",
+    ]
+    assert faults.counts == {"a": {"garbage": 101, "stuck": 1, "overflow": 3}, "b": {"garbage": 1}}

@@ -88,7 +88,7 @@ def test_a_board_that_does_not_fit_says_what_would(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("made", "told"),
+    ("made", "message"),
     [
         (lambda: Board(2, 5), "2 x 5 squares"),
         (lambda: Board(5, 5), "looks alike when turned"),
@@ -97,8 +97,8 @@ def test_a_board_that_does_not_fit_says_what_would(tmp_path: Path) -> None:
         (lambda: Board(20, 14, 0.1, 0.75, "DICT_4X4_50").opencv_board(), "needs 140 markers, DICT_4X4_50 has 50"),
     ],
 )
-def test_impossible_boards_are_refused(made: Callable[[], object], told: str) -> None:
-    with pytest.raises(ConfigError, match=told):
+def test_impossible_boards_are_refused(made: Callable[[], object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         made()
 
 

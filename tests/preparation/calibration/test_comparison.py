@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from structgstream.data.alignment import Alignment
+from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import Fisheye, LensCamera, RadialTangential
-from structgstream.data.posed import rotation_matrix
 from structgstream.errors import CalibrationError
 from tests.support.calibration_errors import calibration_errors, lens_difference
 from tests.support.filmed import ring

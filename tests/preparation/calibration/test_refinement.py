@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 
+from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import LensCamera, RadialTangential
-from structgstream.data.posed import rotation_matrix
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.refinement import refine
 from tests.support.calibration_errors import calibration_errors
@@ -68,19 +68,11 @@ def test_tracks_that_judged_are_adjusted_to_as_well(monkeypatch: pytest.MonkeyPa
 def test_a_lens_that_was_not_known_is_found() -> None:
     rig, pictures = filmed_room()
     given = {name: replace(one, lens=RadialTangential(k1=-0.06)) for name, one in rig.items()}
-    found = refine(pictures, given, free="lens", lens="radial")
+    found = refine(pictures, given, lens="radial")
     assert found.changed
     before, after = calibration_errors(given, rig), calibration_errors(found.solved.cameras, rig)
     for name in rig:
         assert after[name].lens_pixels < 0.5 * before[name].lens_pixels
-
-
-def test_intrinsics_that_are_not_free_stay() -> None:
-    rig, pictures = filmed_room()
-    found = refine(pictures, perturbed(rig, degrees=0.2, percent=0.0), free="poses")
-    for name, one in found.solved.cameras.items():
-        np.testing.assert_allclose(one.camera.K, rig[name].camera.K)
-        assert one.lens == rig[name].lens
 
 
 def test_what_refining_makes_worse_is_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,4 +101,4 @@ def test_a_camera_that_is_far_off_is_named() -> None:
 def test_a_lens_that_cannot_be_refined_is_refused() -> None:
     rig, pictures = filmed_room()
     with pytest.raises(ConfigError, match="model brown cannot be refined; take opencv"):
-        refine(pictures, rig, free="lens", lens="brown")
+        refine(pictures, rig, lens="brown")

@@ -110,29 +110,29 @@ def flipped(cameras: Cameras) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "told"), [(inverted, "camera to world in place of world to camera"), (flipped, "OpenGL axes")]
+    ("change", "message"), [(inverted, "camera to world in place of world to camera"), (flipped, "OpenGL axes")]
 )
-def test_a_convention_of_all_poses_is_told(change: Callable[[Cameras], None], told: str) -> None:
+def test_a_convention_of_all_poses_is_told(change: Callable[[Cameras], None], message: str) -> None:
     (sentence,) = errors(checked(change))
-    assert told in sentence
+    assert message in sentence
     assert "all cameras" in sentence
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         (lambda camera: replace(camera, viewmat=torch.linalg.inv(camera.viewmat)), "inverted"),
         (lambda camera: moved(camera, 1000.0), "millimetres among metres"),
         (lambda camera: scaled(camera, 0.5), "intrinsics of a picture of 80x60 pixels, its pictures have 160x120"),
     ],
 )
-def test_a_mistake_of_one_camera_is_told(change: Callable[[Camera], Camera], told: str) -> None:
+def test_a_mistake_of_one_camera_is_told(change: Callable[[Camera], Camera], message: str) -> None:
     def mistake(cameras: Cameras) -> None:
         cameras["cam03"] = change(cameras["cam03"])
 
     found = checked(mistake).report.errors
     assert [finding.cameras for finding in found] == [("cam03",)]
-    assert told in found[0].sentence
+    assert message in found[0].sentence
 
 
 def test_a_near_plane_behind_the_scene_is_told() -> None:
@@ -243,10 +243,11 @@ def test_cameras_without_a_frame_in_common_are_all_looked_at() -> None:
     report = check_capture(MemoryCapture(rig, frames_without({"cam00": {0, 1}, "cam01": {2, 3}}, 4))).report
     assert not report.errors
     assert all(camera.points > 20 for camera in report.cameras.values())
-    told = [finding.sentence for finding in report.findings]
-    assert any("Camera 'cam01' ends with frame" in sentence for sentence in told)
+    message = [finding.sentence for finding in report.findings]
+    assert any("Camera 'cam01' ends with frame" in sentence for sentence in message)
     assert any(
-        "Camera 'cam00' has no picture of frame 0" in sentence and "no frame has more" in sentence for sentence in told
+        "Camera 'cam00' has no picture of frame 0" in sentence and "no frame has more" in sentence
+        for sentence in message
     )
 
 

@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from structgstream.data.calibration_files.easymocap import EXTRINSICS, INTRINSICS
+from structgstream.data.calibration import PosedCamera, rigid
 from structgstream.data.calibration_files.opencv_storage import may_be_storage, read_storage
-from structgstream.data.calibration_files.projections import decomposed
-from structgstream.data.calibration_files.reading import LARGEST_BYTES, NoPose, calibration_of
+from structgstream.data.calibration_files.reading import LARGEST_BYTES, CalibrationFormat, NoPose, common_folder
+from structgstream.data.calibration_files.tools import EXTRINSICS, INTRINSICS, decompose_projection
 from structgstream.data.lenses import fisheye_lens, from_integer_centers, opencv_lens
-from structgstream.data.posed import Calibration, PosedCamera, rigid
 from structgstream.data.text_files import Unreadable, number, pixels, read_text, reason
 from structgstream.errors import CalibrationError
 
@@ -55,7 +54,7 @@ SHAPES = {
 SUFFIXES = (".xml", ".yml", ".yaml", ".json")
 
 
-def find(folder: Path) -> Iterator[tuple[Path, ...]]:
+def _find(folder: Path) -> Iterator[tuple[Path, ...]]:
     """The files of a folder that hold cameras, together; else those of its folders, one in each."""
     if found := _files(folder):
         yield found
@@ -87,15 +86,10 @@ def _files(folder: Path) -> tuple[Path, ...]:
     return tuple(holding + broken if holding else broken)
 
 
-def read(files: tuple[Path, ...]) -> Calibration:
-    """A camera for each file, or for each map of the one file.
-
-    Raises:
-        CalibrationError: one is broken, or has no pose.
-    """
+def _entries(files: tuple[Path, ...]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """A camera for each file, or for each map of the one file."""
     shared = len({file.parent for file in files}) == 1
     where = files[0].parent if shared else files[0].parent.parent
-    entries: list[tuple[str, Any]] = []
     for file in files:
         name = file.stem if shared else file.parent.name
         try:
@@ -104,8 +98,7 @@ def read(files: tuple[Path, ...]) -> Calibration:
             raise CalibrationError(
                 f"Camera {name!r} of {where} cannot be read ({reason(error)}); expected {EXPECTED}."
             ) from None
-        entries += [(own or name, content) for own, content in tables.items()] or [(name, {})]
-    return calibration_of(entries, _camera, file=files[0] if len(files) == 1 else where, expected=EXPECTED)
+        yield from ((own or name, content) for own, content in tables.items() or {name: {}}.items())
 
 
 def _tables(file: Path) -> dict[str, dict[str, Any]]:
@@ -128,7 +121,7 @@ def _with_intrinsics(content: dict[str, Any]) -> dict[str, Any]:
     projection = _value(content, "projection")
     if projection is None or _value(content, "K") is not None:
         return content
-    K, viewmat = decomposed(projection)
+    K, viewmat = decompose_projection(projection)
     return {**content, "K": K, "R": viewmat[:3, :3], "T": viewmat[:3, 3]}
 
 
@@ -192,3 +185,6 @@ def _shape(value: Any) -> tuple[int, ...]:
         return np.shape(value)
     except ValueError:  # rows of unequal length
         return ()
+
+
+OPENCV_CAMERAS = CalibrationFormat(_find, _entries, _camera, EXPECTED, turned_by_exif=True, where=common_folder)

@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Broken files become one sentence that names file, camera and remedy."""
+"""How calibration files are read: a format, and errors that name file, camera and remedy."""
 
 import logging
+import operator
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.calibration import listed
-from structgstream.data.posed import Calibration, PosedCamera
+from structgstream.data.calibration import Calibration, PosedCamera, listed
 from structgstream.data.text_files import BROKEN, Unreadable, number, read_text, reason
 from structgstream.errors import CalibrationError
 
@@ -31,17 +33,56 @@ def json_files_with(folder: Path, key: str) -> Iterator[tuple[Path]]:
             continue  # no file of these
 
 
+@dataclass(frozen=True)
+class CalibrationFormat:
+    """The calibration files of a tool.
+
+    Args:
+        find: gives the sets of files in a folder that are a calibration of the tool each.
+        entries: gives the cameras of such a set by name, with what the files state of them.
+        camera: makes the camera of an entry.
+        expected: what the files contain, for messages.
+        turned_by_exif: see :class:`~structgstream.data.calibration.Calibration`.
+        where: gives the file or folder that messages name.
+    """
+
+    find: Callable[[Path], Iterator[tuple[Path, ...]]]
+    entries: Callable[[tuple[Path, ...]], Iterable[tuple[str, Any]]]
+    camera: Callable[[str, Any], PosedCamera]
+    expected: str
+    turned_by_exif: bool | None = None
+    where: Callable[[tuple[Path, ...]], Path] = operator.itemgetter(0)
+
+    def read(self, files: tuple[Path, ...]) -> Calibration:
+        """The cameras of a set of files.
+
+        Raises:
+            CalibrationError: a file is missing or broken, or a camera has a model that is not known here.
+            MissingExtraError: a package that parses the files is not installed.
+        """
+        where = self.where(files)
+        with readable(where, self.expected):
+            entries = list(self.entries(files))
+        calibration = calibration_of(entries, self.camera, file=where, expected=self.expected)
+        return replace(calibration, turned_by_exif=self.turned_by_exif)
+
+
+def common_folder(files: tuple[Path, ...]) -> Path:
+    """The one file, or the folder of several."""
+    return files[0] if len(files) == 1 else Path(os.path.commonpath(files))
+
+
 class NoPose(Unreadable):
-    """A camera of which a file says no pose, since it was not calibrated with the others."""
+    """A file has no pose of a camera, since it was not calibrated with the others."""
 
 
 @contextmanager
 def readable(what: Path | str, expected: str) -> Iterator[None]:
-    """What the body raises for a broken file, as a sentence that says what it should hold.
+    """Converts what the body raises for a broken file to a sentence that states what was expected.
 
     Args:
-        what: the file, or what of it is read, for the message.
-        expected: what it should hold.
+        what: the file or its part, for the message.
+        expected: what it should contain.
 
     Raises:
         CalibrationError: it is broken.

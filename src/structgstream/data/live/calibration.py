@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The calibration of live cameras: that of a capture, whose pictures are not needed."""
+"""The calibration of live cameras: that of a capture, applied to pictures that arrive."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,28 +20,28 @@ from structgstream.frames import MultiViewFrame
 
 
 @dataclass(frozen=True)
-class Arriving:
-    """Pictures as cameras sent them, in a capture's shape, so that wrappers of captures apply to them.
+class LivePictures:
+    """Pictures as cameras sent them, as a capture, so that the wrappers of captures apply to them.
 
     Args:
         name: of the stream.
-        rig: the cameras, of the pictures as they are filmed.
+        rig: the cameras of the stored pictures.
         fps: frames a second.
-        arrived: frames, each handed on as soon as it is there.
+        arriving: frames in the order of their arrival.
     """
 
     name: str
     rig: CameraRig
     fps: float
-    arrived: Iterator[MultiViewFrame]
+    arriving: Iterator[MultiViewFrame]
     points: NDArray | None = None
 
     def __len__(self) -> int:
-        """None are known before they arrive."""
+        """0: the number is unknown."""
         return 0
 
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
-        return self.arrived
+        return self.arriving
 
 
 def read_calibration(folder: Path) -> PreparedCapture:
@@ -62,8 +62,8 @@ def read_calibration(folder: Path) -> PreparedCapture:
     return PreparedCapture(cameras, source.fps, near, "arbitrary", rig.held_out)
 
 
-def chosen_cameras(capture: PreparedCapture, names: Sequence[str]) -> PreparedCapture:
-    """The calibration of these cameras, in the calibration's order."""
+def select_cameras(capture: PreparedCapture, names: Sequence[str]) -> PreparedCapture:
+    """The calibration restricted to these cameras, in its order."""
     return PreparedCapture(
         {name: camera for name, camera in capture.cameras.items() if name in names},
         capture.fps,
@@ -74,17 +74,17 @@ def chosen_cameras(capture: PreparedCapture, names: Sequence[str]) -> PreparedCa
 
 
 def filmed_rig(capture: PreparedCapture, folder: Path) -> CameraRig:
-    """The rig of the pictures as they are filmed."""
+    """The rig of the pictures before undistortion."""
     return _rig({name: camera.filmed.camera for name, camera in capture.cameras.items()}, capture, folder)
 
 
 def filmed_sizes(capture: PreparedCapture) -> dict[str, tuple[int, int]]:
-    """Width and height of each camera's pictures as they are filmed."""
+    """Width and height of each camera's pictures before undistortion, pixels."""
     return {name: (own.filmed.camera.width, own.filmed.camera.height) for name, own in capture.cameras.items()}
 
 
-def as_calibrated(
-    arriving: FrameSource,
+def with_calibration(
+    pictures: FrameSource,
     capture: PreparedCapture,
     folder: Path,
     *,
@@ -92,10 +92,10 @@ def as_calibrated(
     scale: float,
     near: float | None,
 ) -> FrameSource:
-    """Arriving pictures with lenses and masks applied as those of a prepared capture are.
+    """Live pictures undistorted and masked as those of a prepared capture are.
 
     Args:
-        arriving: pictures of :func:`filmed_rig`.
+        pictures: those of :func:`filmed_rig`.
         capture: the calibration.
         folder: where it was read.
         held_out: see ``open_capture``.
@@ -108,8 +108,8 @@ def as_calibrated(
     """
     pinholes = _rig({name: camera.pinhole for name, camera in capture.cameras.items()}, capture, folder)
     filmed = {name: camera.filmed for name, camera in capture.cameras.items()}
-    undistorted = UndistortedSource(arriving, pinholes, filmed)
-    source = arriving if all(undistorted.is_unchanged(name) for name in pinholes) else undistorted
+    undistorted = UndistortedSource(pictures, pinholes, filmed)
+    source = pictures if all(undistorted.is_unchanged(name) for name in pinholes) else undistorted
     return selected(with_masks(source, folder / FOLDER), held_out=held_out, scale=scale, near=near)
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One camera of a live run: a thread that opens, decodes and opens again.
+"""One camera of a live run: a thread that opens it, decodes its pictures and reconnects.
 
-A picture that cannot be trusted is not delivered: after a damage none until the next key frame, none whose proportions
-are not the calibration's, none of a picture that stands still while others change.
+Pictures are withheld after a decoding error until the next key frame, if their proportions are not those of the
+calibration, and if they are frozen while those of other cameras change.
 """
 
 import logging
@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 
-from structgstream.data.live.faults import Fault, FaultLog
-from structgstream.data.live.matching import LivePicture
+from structgstream.data.live.clock import ClockMapper
 from structgstream.data.live.rig_file import LiveCamera, TimeBase
-from structgstream.data.live.stamps import StampReader
+from structgstream.data.live.status import Fault, FaultLog
+from structgstream.data.live.synchronizer import LivePicture
 from structgstream.data.video_index import load_av, video_stream
 from structgstream.remote_folders import without_secrets
 
@@ -36,30 +36,30 @@ PROBE_OPTIONS = {"analyzeduration": "2000000", "probesize": "2000000", "fpsprobe
 
 
 class Receiver(Protocol):
-    """Gets a camera's pictures, called from its thread."""
+    """Receives a camera's pictures; called from the camera's thread."""
 
     def deliver(self, camera: str, picture: LivePicture) -> None:
         """A picture."""
         ...
 
-    def lost(self, camera: str) -> None:
-        """The camera has gone, or sends nothing that can be used."""
+    def mark_absent(self, camera: str) -> None:
+        """The camera is disconnected, or sends nothing usable."""
         ...
 
     def others_changed_at(self, camera: str) -> float:
-        """When a picture of any other camera last differed from the one before, monotonic seconds."""
+        """When the picture of another camera last changed, monotonic seconds."""
         ...
 
 
-class PacketKeeper(Protocol):
-    """Keeps a camera's packets as they came."""
+class PacketRecorder(Protocol):
+    """Records a camera's packets unchanged."""
 
-    def keep(self, packet: "Packet", *, shift_seconds: float) -> None:
-        """A packet whose picture lies at its stamp plus ``shift_seconds`` on the common clock."""
+    def record(self, packet: "Packet", *, shift_seconds: float) -> None:
+        """Records a packet, whose time on the common clock is its stamp plus ``shift_seconds``."""
         ...
 
 
-Opens = Callable[[LiveCamera, float], AbstractContextManager[Any]]
+OpenCamera = Callable[[LiveCamera, float], AbstractContextManager[Any]]
 
 
 class CameraFeed:
@@ -69,17 +69,17 @@ class CameraFeed:
         name: of the camera.
         camera: how it is read.
         size: width and height of the calibration's pictures.
-        receiver: gets its pictures.
-        stamps: places them.
-        faults: is told what is wrong.
-        base: what says when a picture was taken.
+        receiver: receives its pictures.
+        clock: maps time stamps to the common clock.
+        faults: counts and logs faults.
+        base: which clock states when a picture was taken.
         now: monotonic seconds; ``unix_offset`` added, Unix time.
         unix_offset: see ``now``.
-        silent_seconds: without packets for so long, it is opened again.
-        stuck_seconds: the same picture for so long is not used if others change.
-        keeper: keeps its packets, or None.
-        opens: opens a camera with a timeout in seconds.
-        wait: waits before the camera is opened again; None for seconds, or until :meth:`stop`.
+        silent_seconds: without packets for this time, the camera is opened again.
+        stuck_seconds: a picture that does not change for this time is not used if others change.
+        recorder: records its packets, or None.
+        open_camera: opens a camera with a timeout in seconds; None for PyAV.
+        wait: waits some seconds before reconnecting; None for a wait that :meth:`stop` ends.
     """
 
     def __init__(
@@ -89,34 +89,34 @@ class CameraFeed:
         *,
         size: tuple[int, int],
         receiver: Receiver,
-        stamps: StampReader,
+        clock: ClockMapper,
         faults: FaultLog,
         base: TimeBase,
         now: Callable[[], float],
         unix_offset: float,
         silent_seconds: float,
         stuck_seconds: float,
-        keeper: PacketKeeper | None = None,
-        opens: Opens | None = None,
+        recorder: PacketRecorder | None = None,
+        open_camera: OpenCamera | None = None,
         wait: Callable[[float], object] | None = None,
     ) -> None:
         self.name, self._camera, self._size = name, camera, size
-        self._receiver, self._stamps, self._faults, self._base = receiver, stamps, faults, base
+        self._receiver, self._clock, self._faults, self._base = receiver, clock, faults, base
         self._now, self._unix_offset = now, unix_offset
         self._silent, self._stuck = silent_seconds, stuck_seconds
-        self._keeper = keeper
-        self._opens = open_camera if opens is None else opens
+        self._recorder = recorder
+        self._open_camera = open_with_pyav if open_camera is None else open_camera
         self._stop = threading.Event()
         self._wait = self._stop.wait if wait is None else wait
         # A daemon, so that a camera that hangs in the system cannot keep the program from ending.
         self._thread = threading.Thread(target=self._run, name=f"camera {name}", daemon=True)
         self._checksum: int | None = None
-        self._damaged, self._shown = True, False
+        self._damaged, self._decodes = True, False
         self._before: Packet | None = None
         self._gone_since: float | None = None
         self._paced: float | None = None
-        self._without_stamp = 0
-        self._proper = True
+        self._unstamped = 0
+        self._usable = True
         self.ended = False
         self.decoded = 0
         self.changed_at = -float("inf")
@@ -137,21 +137,21 @@ class CameraFeed:
         wait = FIRST_WAIT_SECONDS
         while not self._stop.is_set():
             before = self.decoded
-            reason = self._connection()
+            reason = self._read_connection()
             if self._stop.is_set():
                 return
             if self._camera.is_file:
-                self._end(reason)
+                self._report_end(reason)
                 return
-            self._gone(reason)
+            self._report_gone(reason)
             wait = FIRST_WAIT_SECONDS if self.decoded > before else min(2 * wait, MAX_WAIT_SECONDS)
             self._wait(wait)
 
-    def _connection(self) -> str:
-        """Reads until the camera ends or fails; why it did."""
+    def _read_connection(self) -> str:
+        """Reads until the connection ends; why it did."""
         av = load_av()
         try:
-            with self._opens(self._camera, self._silent) as container:
+            with self._open_camera(self._camera, self._silent) as container:
                 self._read(container)
         except av.error.ExitError:
             return f"nothing came for {self._silent:g} s"
@@ -159,8 +159,8 @@ class CameraFeed:
             return str(getattr(error, "strerror", None) or error)
         except Exception as error:  # Whatever it is: a thread that ends would be a camera that never comes back.
             log.exception("camera %r cannot be read", self.name)
-            said = without_secrets(str(error), self._camera.url, *self._camera.options.values())
-            return f"{type(error).__name__}: {said}"
+            message = without_secrets(str(error), self._camera.url, *self._camera.options.values())
+            return f"{type(error).__name__}: {message}"
         return ENDED
 
     def _read(self, container: Any) -> None:
@@ -170,127 +170,127 @@ class CameraFeed:
         if stream.codec_context is None:
             raise ValueError("its coding is unknown to the installed PyAV")
         stream.codec_context.thread_count = 1  # the cameras are the parallelism
-        self._stamps.reconnect()
+        self._clock.reconnect()
         ticks = MPEGTS_STAMPS if container.format.name == "mpegts" else None
-        self._damaged, self._shown = True, False  # until the first key frame, before which it is none that counts
+        self._damaged, self._decodes = True, False  # until the first key frame, before which damage is no fault
         self._before = None
         for packet in container.demux(stream):
             if self._stop.is_set():
                 return
-            if self._repeats(packet):
+            if self._is_duplicate(packet):
                 continue
             shift = None
             for frame in self._frames(packet):
                 wrap = None if ticks is None or frame.time_base is None else float(ticks * frame.time_base)
                 shift = self._picture(frame, wrap)
-            usable = self._proper and not self._damaged and not packet.is_corrupt
-            if self._keeper is not None and packet.size and usable:
-                self._keeper.keep(packet, shift_seconds=self._stamps.shift if shift is None else shift)
+            usable = self._usable and not self._damaged and not packet.is_corrupt
+            if self._recorder is not None and packet.size and usable:
+                self._recorder.record(packet, shift_seconds=self._clock.shift if shift is None else shift)
 
-    def _repeats(self, packet: "Packet") -> bool:
-        """Whether the packet is the one before once more: decoded twice, its differences would be added twice."""
+    def _is_duplicate(self, packet: "Packet") -> bool:
+        """Whether the packet repeats the last one: decoded twice, its differences would be added twice."""
         before, self._before = self._before, packet
         if before is None or packet.pts is None or (packet.pts, packet.size) != (before.pts, before.size):
             return False
         if not packet.size or bytes(packet) != bytes(before):
             return False
-        self._repeated()
+        self._report_duplicate()
         return True
 
-    def _repeated(self) -> None:
+    def _report_duplicate(self) -> None:
         text = "sends two pictures with one time stamp; the first is taken"
-        self._faults.tell(self.name, Fault.DUPLICATE, text)
+        self._faults.report(self.name, Fault.DUPLICATE, text)
 
     def _frames(self, packet: "Packet") -> "Iterable[VideoFrame]":
-        """The pictures of a packet; none from a damage on until the next key frame."""
+        """The pictures of a packet; none after a decoding error until the next key frame."""
         if packet.is_corrupt:
-            self._damage("a packet is missing or broken")
+            self._report_damage("a packet is missing or broken")
             return
         try:
             frames = packet.decode()
         except load_av().error.FFmpegError as error:
-            self._damage(error.strerror)
+            self._report_damage(error.strerror)
             return
         for frame in frames:
             if frame.is_corrupt:
-                self._damage("a frame is broken")
+                self._report_damage("a frame is broken")
             elif not self._damaged or frame.key_frame:
-                self._damaged, self._shown = False, True
+                self._damaged, self._decodes = False, True
                 yield frame
 
-    def _damage(self, reason: str) -> None:
+    def _report_damage(self, reason: str) -> None:
         self._damaged = True
-        if not self._shown:
+        if not self._decodes:
             return
-        self._receiver.lost(self.name)
+        self._receiver.mark_absent(self.name)
         text = f"sends what cannot be decoded ({reason}); it is absent until its next key frame"
-        self._faults.tell(self.name, Fault.GARBAGE, text)
+        self._faults.report(self.name, Fault.GARBAGE, text)
 
     def _picture(self, frame: "VideoFrame", wrap_seconds: float | None) -> float:
         """Delivers a decoded frame unless something is wrong with it; the shift from its stamp to the common clock."""
-        self._keep_pace(frame)
+        self._pace(frame)
         arrived = self._now()
         self.decoded += 1
-        self._back(arrived)
-        seconds = self._placed(frame, arrived, wrap_seconds)
-        self._proper = self._fits(frame)
-        if seconds is not None and self._proper and not self._stands_still(frame, arrived):
+        self._report_back(arrived)
+        seconds = self._common_time(frame, arrived, wrap_seconds)
+        self._usable = self._has_calibrated_shape(frame)
+        if seconds is not None and self._usable and not self._is_frozen(frame, arrived):
             self._receiver.deliver(self.name, LivePicture(seconds, arrived, frame))
-        return self._stamps.shift
+        return self._clock.shift
 
-    def _keep_pace(self, frame: "VideoFrame") -> None:
-        """A file that is complete is read at the speed at which it was filmed."""
+    def _pace(self, frame: "VideoFrame") -> None:
+        """Reads a complete file at its frame rate."""
         if not self._camera.is_file or frame.time is None:
             return
         if self._paced is None:
             self._paced = self._now() - frame.time
         self._stop.wait(max(self._paced + frame.time - self._now(), 0.0))
 
-    def _placed(self, frame: "VideoFrame", arrived: float, wrap_seconds: float | None) -> float | None:
+    def _common_time(self, frame: "VideoFrame", arrived: float, wrap_seconds: float | None) -> float | None:
         """When the picture was taken, on the common clock; None if it must not be used."""
         unix = arrived + self._unix_offset
         if frame.pts is None or frame.time_base is None:
-            stamp, wrap_seconds = self._unstamped(unix), None
+            stamp, wrap_seconds = self._substitute_stamp(unix), None
         else:
-            stamp, self._without_stamp = float(frame.pts * frame.time_base), 0
+            stamp, self._unstamped = float(frame.pts * frame.time_base), 0
         if stamp is None:
             return None
-        placed = self._stamps.place(stamp, arrived=unix, wrap_seconds=wrap_seconds)
-        if placed.fault is Fault.JUMP:
-            text = f"has set its clock by {placed.jump_seconds:+.3f} s; its pictures go on in step with their arrival"
-            self._faults.tell(self.name, Fault.JUMP, text)
-        elif placed.fault is Fault.DUPLICATE:
-            self._repeated()
-        elif placed.fault is Fault.REORDERED:
-            self._faults.tell(self.name, placed.fault, "sends pictures whose time stamps go back; they are left out")
-        return placed.seconds
+        time = self._clock.map(stamp, arrived=unix, wrap_seconds=wrap_seconds)
+        if time.fault is Fault.JUMP:
+            text = f"has set its clock by {time.reset_seconds:+.3f} s; its pictures go on in step with their arrival"
+            self._faults.report(self.name, Fault.JUMP, text)
+        elif time.fault is Fault.DUPLICATE:
+            self._report_duplicate()
+        elif time.fault is Fault.REORDERED:
+            self._faults.report(self.name, time.fault, "sends pictures whose time stamps go back; they are left out")
+        return time.seconds
 
-    def _unstamped(self, unix: float) -> float | None:
-        """What stands for the stamp of a picture without one; None if it must not be used."""
+    def _substitute_stamp(self, unix: float) -> float | None:
+        """The stamp to use for a picture without one; None if the picture must not be used."""
         self._faults.count(self.name, Fault.NO_STAMP)
-        self._without_stamp += 1
+        self._unstamped += 1
         if self._base is not TimeBase.ARRIVAL:
             text = 'sends pictures without time stamps; take clock = "arrival" for this rig if all are'
-            self._faults.say(self.name, Fault.NO_STAMP.value, text)
+            self._faults.warn(self.name, Fault.NO_STAMP.value, text)
             return None
         # The first ones of a connection may have none, and others that follow do.
-        return unix if self._without_stamp > MAX_UNSTAMPED else None
+        return unix if self._unstamped > MAX_UNSTAMPED else None
 
-    def _fits(self, frame: "VideoFrame") -> bool:
-        """Whether the picture has the proportions that were calibrated; a uniform reduction has."""
+    def _has_calibrated_shape(self, frame: "VideoFrame") -> bool:
+        """Whether the picture has the proportions of the calibration, at any size."""
         width, height = self._size
         if (frame.width, frame.height) == (width, height):
             return True
         alike = abs(frame.width * height - width * frame.height) <= max(width, height)
         what = "it is resampled" if alike else "it is absent until that is mended, because what is cut off is unknown"
         text = f"sends {frame.width}x{frame.height} pixels, its calibration is for {width}x{height}; {what}"
-        self._faults.tell(self.name, Fault.OTHER_SIZE, text)
+        self._faults.report(self.name, Fault.OTHER_SIZE, text)
         if not alike:
-            self._receiver.lost(self.name)
+            self._receiver.mark_absent(self.name)
         return alike
 
-    def _stands_still(self, frame: "VideoFrame", arrived: float) -> bool:
-        """Whether the picture has been the same for long while those of other cameras changed."""
+    def _is_frozen(self, frame: "VideoFrame", arrived: float) -> bool:
+        """Whether the picture has not changed for a long time while those of other cameras did."""
         checksum = picture_checksum(frame)
         if checksum != self._checksum:
             self._checksum, self.changed_at = checksum, arrived
@@ -298,13 +298,13 @@ class CameraFeed:
         if self._receiver.others_changed_at(self.name) - self.changed_at < self._stuck:
             return False
         text = f"has sent the same picture for {arrived - self.changed_at:.1f} s; it is absent until that changes"
-        self._faults.tell(self.name, Fault.STUCK, text)
-        self._receiver.lost(self.name)
+        self._faults.report(self.name, Fault.STUCK, text)
+        self._receiver.mark_absent(self.name)
         return True
 
-    def _end(self, reason: str) -> None:
-        """Nothing more comes of a file: it was read, or cannot be."""
-        self._receiver.lost(self.name)
+    def _report_end(self, reason: str) -> None:
+        """A file was read to its end, or cannot be read."""
+        self._receiver.mark_absent(self.name)
         if self.decoded:
             how = "" if reason is ENDED else f" ({reason})"
             text = f"has come to the end of its file {self._camera.shown_url}{how}; it is absent from now on"
@@ -313,23 +313,23 @@ class CameraFeed:
                 f"is absent, because its file {self._camera.shown_url} cannot be read ({reason}); correct its url in "
                 "the rig file, or give follow = true if the file is still to be written"
             )
-        self._faults.tell(self.name, Fault.GONE, text)
+        self._faults.report(self.name, Fault.GONE, text)
         self.ended = True
 
-    def _gone(self, reason: str) -> None:
+    def _report_gone(self, reason: str) -> None:
         if self._gone_since is None:
             self._gone_since = self._now()
-        self._receiver.lost(self.name)
+        self._receiver.mark_absent(self.name)
         text = f"at {self._camera.shown_url} is gone ({reason}); it is absent, and is opened again until it is back"
-        self._faults.tell(self.name, Fault.GONE, text)
+        self._faults.report(self.name, Fault.GONE, text)
 
-    def _back(self, arrived: float) -> None:
+    def _report_back(self, arrived: float) -> None:
         if self._gone_since is not None:
-            self._faults.say(self.name, "back", f"is back after {arrived - self._gone_since:.1f} s")
+            self._faults.warn(self.name, "back", f"is back after {arrived - self._gone_since:.1f} s")
             self._gone_since = None
 
 
-def open_camera(camera: LiveCamera, timeout_seconds: float) -> AbstractContextManager[Any]:
+def open_with_pyav(camera: LiveCamera, timeout_seconds: float) -> AbstractContextManager[Any]:
     """The opened camera.
 
     Raises:
@@ -347,8 +347,8 @@ def open_camera(camera: LiveCamera, timeout_seconds: float) -> AbstractContextMa
 
 
 def picture_checksum(frame: "VideoFrame") -> int:
-    """A number that pictures which are the same have in common: of some rows of the first plane."""
+    """Checksum of some rows of a picture's first plane."""
     plane = frame.planes[0]
-    bytes_of = np.asarray(memoryview(cast(bytes, plane)), np.uint8)
-    rows = bytes_of.reshape(-1, plane.line_size)[: plane.height : SAMPLED_ROWS, : plane.width]
+    values = np.asarray(memoryview(cast(bytes, plane)), np.uint8)
+    rows = values.reshape(-1, plane.line_size)[: plane.height : SAMPLED_ROWS, : plane.width]
     return zlib.crc32(rows.tobytes())

@@ -13,17 +13,17 @@ from structgstream.data.text_files import Unreadable, read_toml, reason
 from structgstream.errors import CaptureError
 from structgstream.remote_folders import shown_address, without_secrets
 
-Made = TypeVar("Made")
+Parsed = TypeVar("Parsed")
 FILE_URL = re.compile(r"^file:(//(?=/))?", re.IGNORECASE)
 SCHEME = re.compile(r"^[a-z][a-z0-9+.-]+:", re.IGNORECASE)
 
 
 class TimeBase(StrEnum):
-    """What says when a picture was taken."""
+    """Which clock states when a picture was taken."""
 
-    ARRIVAL = "arrival"  # when it came here, smoothed by the stamps' spacing
-    STREAM = "stream"  # its stamp: the cameras share a clock
-    UNIX = "unix"  # its stamp, which is Unix time, as far as the container's bits go
+    ARRIVAL = "arrival"  # that of this machine at arrival, smoothed by time stamps
+    STREAM = "stream"  # the time stamps: the cameras share a clock
+    UNIX = "unix"  # the time stamps, which are Unix time modulo the container's range
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class LiveCamera:
     Args:
         url: whatever PyAV opens: ``rtsp://``, ``udp://``, ``http://``, ``rtp://``, an ``.sdp`` file, a device, a file.
         offset_seconds: added to the times of its pictures.
-        format: the container or device driver, where the URL does not tell (``mpegts``, ``v4l2``); None to be probed.
+        format: the container or device driver, where the URL does not state it (``mpegts``, ``v4l2``); None to probe.
         options: of FFmpeg's protocol and demuxer, by name.
-        follow: whether a file is still being written, so that its end is waited at.
+        follow: whether a file is still being written, so that reading waits at its end.
     """
 
     url: str
@@ -51,7 +51,7 @@ class LiveCamera:
 
     @property
     def is_file(self) -> bool:
-        """Whether it is a file, which ends for good, and not a stream or a device, which may come back."""
+        """Whether it is a complete file, and not a stream or a device, which may return."""
         if self.follow or self.is_session:
             return False
         path = Path(name := FILE_URL.sub("", self.url))
@@ -73,15 +73,15 @@ class LiveRig:
         name: of the stream.
         calibration: folder of the capture that has the cameras' calibration.
         cameras: by name, in the order of the file.
-        fps: frames a second at most, and of the header; None for the calibration's.
-        clock: what says when a picture was taken.
-        tolerance_seconds: how far a picture of a set may lie from its instant; None for half a frame.
+        fps: maximum number of frames per second, stated in the header; None for that of the calibration.
+        clock: which clock states when a picture was taken.
+        tolerance_seconds: maximum distance of a picture of a set from its instant; None for half a frame period.
         deadline_seconds: how long a set waits for pictures of cameras that are present.
-        queue_frames: pictures of a camera that wait to be matched; the oldest are dropped.
-        stuck_seconds: a camera is absent when its picture has been the same for so long while others changed.
-        silent_seconds: a camera without packets for so long is opened again.
+        queue_frames: maximum number of pictures of a camera that wait to be matched; the oldest are dropped.
+        stuck_seconds: a camera is absent when its picture has not changed for this time while others did.
+        silent_seconds: a camera without packets for this time is opened again.
         start_seconds: how long frame 0 waits for all cameras.
-        end_seconds: the stream ends when no camera has sent for so long; None for never.
+        end_seconds: the stream ends when no camera has sent for this time; None for never.
         without: cameras of the calibration that are not used.
     """
 
@@ -113,9 +113,9 @@ def read_rig(path: Path) -> LiveRig:
     entries = content.pop("cameras", None)
     if not isinstance(entries, dict) or not entries:
         raise CaptureError(f"The rig file {path} has no cameras; give each a table [cameras.NAME] with its url.")
-    cameras = {name: _made(LiveCamera, entry, where=f"camera {name!r} of {path}") for name, entry in entries.items()}
+    cameras = {name: _parse(LiveCamera, entry, where=f"camera {name!r} of {path}") for name, entry in entries.items()}
     settings = {"name": path.stem, **content, "cameras": cameras}
-    rig = _made(LiveRig, settings, where=f"the rig file {path}")
+    rig = _parse(LiveRig, settings, where=f"the rig file {path}")
     return _resolved(rig, path)
 
 
@@ -158,8 +158,8 @@ def _in_folder(camera: LiveCamera, folder: Path) -> LiveCamera:
     return replace(camera, url=str(folder / camera.url))
 
 
-def _made(kind: type[Made], entry: Any, *, where: str) -> Made:
-    """A dataclass from a table, each of whose values is checked."""
+def _parse(kind: type[Parsed], entry: Any, *, where: str) -> Parsed:
+    """A dataclass from a table whose values are checked."""
     if not isinstance(entry, dict):
         raise CaptureError(f"The entry of {where} must be a table, got {without_secrets(repr(entry))}.")
     known = {item.name: item for item in fields(kind)}  # type: ignore[arg-type]

@@ -1,22 +1,88 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What live cameras and queues do at a moment, as plain values."""
+"""Faults and state of live cameras.
 
-from collections.abc import Mapping
+Faults are always counted, and logged when they begin and then at most once a minute.
+"""
+
+import logging
+import threading
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
 
-from structgstream.data.live.arrivals import Arrivals
-from structgstream.data.live.outlets import QueueStatus
+log = logging.getLogger(__name__)
+
+REPORT_INTERVAL_SECONDS = 60.0
+
+
+class Fault(StrEnum):
+    """Faults of a camera."""
+
+    GONE = "gone"  # it cannot be opened, has ended, or sends nothing
+    GARBAGE = "garbage"  # what it sent cannot be decoded; absent until the next key frame
+    OTHER_SIZE = "other size"  # its picture does not have the size of the calibration
+    STUCK = "stuck"  # the same picture while others change
+    JUMP = "jump"  # its clock was reset
+    DUPLICATE = "duplicate"  # the time stamp of an earlier picture
+    REORDERED = "reordered"  # a time stamp before the last one
+    NO_STAMP = "no stamp"
+    OVERFLOW = "overflow"  # the queue was full: its oldest picture was dropped
+    UNMATCHED = "unmatched"  # a picture that belonged to no set: late, between instants, or out of step
+
+
+class FaultLog:
+    """Counts faults by camera, and logs each kind at most once in ``interval_seconds``. Thread-safe.
+
+    Args:
+        name: of the rig, for messages.
+        now: monotonic seconds.
+        interval_seconds: after which a kind of fault of a camera is logged again.
+    """
+
+    def __init__(
+        self, name: str, *, now: Callable[[], float], interval_seconds: float = REPORT_INTERVAL_SECONDS
+    ) -> None:
+        self._name, self._now, self._interval = name, now, interval_seconds
+        self._counts: defaultdict[str, Counter[str]] = defaultdict(Counter)
+        self._reported: dict[tuple[str, str], float] = {}
+        self._lock = threading.Lock()
+
+    def count(self, camera: str, fault: Fault, times: int = 1) -> None:
+        """Counts without logging."""
+        with self._lock:
+            self._counts[camera][fault.value] += times
+
+    def report(self, camera: str, fault: Fault, text: str) -> None:
+        """Counts, and logs unless this fault of this camera was logged a short time ago."""
+        self.count(camera, fault)
+        self.warn(camera, fault.value, text)
+
+    def warn(self, camera: str, kind: str, text: str) -> None:
+        """Logs without counting, as rarely as :meth:`report`."""
+        with self._lock:
+            now, last = self._now(), self._reported.get((camera, kind))
+            if last is not None and now - last < self._interval:
+                return
+            self._reported[camera, kind] = now
+        log.warning("%s: camera %r %s", self._name, camera, text)
+
+    @property
+    def counts(self) -> dict[str, dict[str, int]]:
+        """Number of occurrences by camera and fault."""
+        with self._lock:
+            return {camera: dict(found) for camera, found in self._counts.items()}
 
 
 @dataclass(frozen=True)
 class CameraStatus:
-    """A camera.
+    """State of a camera.
 
     Args:
-        present: whether it sent a usable picture a moment ago.
-        decoded: pictures that were decoded.
-        queued: pictures that wait to be matched.
-        faults: kind to number.
+        present: whether it sent a usable picture within the deadline.
+        decoded: number of decoded pictures.
+        queued: number of pictures that wait to be matched.
+        faults: number of occurrences by kind.
     """
 
     present: bool = False
@@ -26,75 +92,23 @@ class CameraStatus:
 
 
 @dataclass(frozen=True)
-class SetAges:
-    """How old the pictures of a frame were, in seconds from when they were filmed; None where that is not known.
-
-    Args:
-        arrived_seconds: when the last of them came.
-        matched_seconds: when their set was ready.
-        handed_seconds: when the frame was handed to the trainer.
-    """
-
-    arrived_seconds: float | None
-    matched_seconds: float | None
-    handed_seconds: float
-
-
-@dataclass(frozen=True)
 class LiveStatus:
-    """All of them.
+    """State of a live run. Ages are of the frame delivered last, seconds from capture; None if unknown.
 
     Args:
         cameras: by name.
-        sets: of pictures that were matched.
+        sets: number of matched sets of pictures.
         small_sets: of them, with too few training cameras for a frame.
-        skipped_sets: of them, no frame was made because there was a newer one, or no room.
-        waiting_sets: of them, wait for the trainer.
-        waiting_bytes: of the files they wait in.
-        handed_per_second: frames handed to the trainer.
-        arrived_seconds: from filming until the last picture came, of the frame handed out last; None before the first.
-        matched_seconds: of that frame, from filming until its set was ready.
-        delay_seconds: of that frame, from filming to handing out.
+        skipped_sets: of them, replaced by a newer one before the trainer asked.
+        arrived_seconds: age when the last picture arrived.
+        matched_seconds: age when the set was complete.
+        delay_seconds: age when the frame was delivered.
     """
 
     cameras: Mapping[str, CameraStatus]
     sets: int = 0
     small_sets: int = 0
     skipped_sets: int = 0
-    waiting_sets: int = 0
-    waiting_bytes: int = 0
-    handed_per_second: float = 0.0
     arrived_seconds: float | None = None
     matched_seconds: float | None = None
     delay_seconds: float | None = None
-
-    @classmethod
-    def of(
-        cls,
-        arrivals: Arrivals | None,
-        queue: QueueStatus | None,
-        *,
-        faults: Mapping[str, Mapping[str, int]],
-        cameras: tuple[str, ...],
-        handed_per_second: float,
-        ages: SetAges | None,
-    ) -> "LiveStatus":
-        """The status of a source, whose cameras may not have been opened yet."""
-        if arrivals is None or queue is None:
-            return cls({name: CameraStatus(faults=faults.get(name, {})) for name in cameras})
-        present, lengths = arrivals.present, arrivals.lengths
-        return cls(
-            {
-                name: CameraStatus(name in present, feed.decoded, lengths[name], faults.get(name, {}))
-                for name, feed in arrivals.feeds.items()
-            },
-            arrivals.sets,
-            arrivals.small,
-            queue.skipped,
-            queue.waiting,
-            queue.waiting_bytes,
-            handed_per_second,
-            None if ages is None else ages.arrived_seconds,
-            None if ages is None else ages.matched_seconds,
-            None if ages is None else ages.handed_seconds,
-        )

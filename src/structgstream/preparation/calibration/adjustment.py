@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
 from structgstream.data.lenses import Fisheye, LensCamera
-from structgstream.preparation.calibration.bundle import BodyObservations, Bundle, Scene, linearized, solved
+from structgstream.preparation.calibration.bundle import BodyObservations, Bundle, Parameters, linearized, solved
 from structgstream.preparation.calibration.lens_prior import usual_prior
 from structgstream.preparation.calibration.lens_terms import row_of, with_row
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
@@ -56,14 +56,14 @@ def adjust_together(
         free: the terms of ``lens_terms.py`` that are estimated.
         fixed: by lens, whether it stays.
     """
-    bundle, scene = _problem(found, np.asarray(lens, np.intp), tuple(free), fixed)
-    bundle, scene = estimated(bundle, scene)
-    adjusted = _result(found, bundle, scene)
+    bundle, parameters = _problem(found, np.asarray(lens, np.intp), tuple(free), fixed)
+    bundle, parameters = estimated(bundle, parameters)
+    adjusted = _result(found, bundle, parameters)
     inliers = cleaned(adjusted, limits)
     _log_adjustment(adjusted, inliers, bundle)
-    again, scene = _problem(inliers, bundle.lens, bundle.free, fixed)
+    again, parameters = _problem(inliers, bundle.lens, bundle.free, fixed)
     again = replace(again, prior=bundle.prior, noise=bundle.noise)
-    return cleaned(_result(inliers, again, solved(again, scene)), limits)
+    return cleaned(_result(inliers, again, solved(again, parameters)), limits)
 
 
 def cleaned(found: SolvedCalibration, limits: Limits) -> SolvedCalibration:
@@ -85,12 +85,12 @@ def chosen(found: SolvedCalibration, good: NDArray[np.bool_]) -> SolvedCalibrati
 
 def _problem(
     found: SolvedCalibration, lens: NDArray[np.intp], free: tuple[int, ...], fixed: NDArray[np.bool_]
-) -> tuple[Bundle, Scene]:
+) -> tuple[Bundle, Parameters]:
     cameras, seen = list(found.cameras.values()), found.observations
     observations = BodyObservations(seen.camera, seen.point, np.zeros((len(seen), 3)), seen.pixels)
-    turns = np.broadcast_to(np.eye(3), (len(found.points), 3, 3))
+    rotations = np.broadcast_to(np.eye(3), (len(found.points), 3, 3))
     return posed_problem(
-        cameras, observations, (turns, found.points), lens=lens, free=free, fixed=fixed, rotating=False
+        cameras, observations, (rotations, found.points), lens=lens, free=free, fixed=fixed, rotating=False
     )
 
 
@@ -103,11 +103,11 @@ def posed_problem(
     free: tuple[int, ...],
     fixed: NDArray[np.bool_],
     rotating: bool,
-) -> tuple[Bundle, Scene]:
+) -> tuple[Bundle, Parameters]:
     """The problem of cameras that see bodies, with the usual prior of their lenses.
 
     Args:
-        bodies: rotations ``[B, 3, 3]`` and places ``[B, 3]``.
+        bodies: rotations ``[B, 3, 3]`` and positions ``[B, 3]``.
     """
     first = [int(np.flatnonzero(lens == number)[0]) for number in range(len(fixed))]
     rows = np.stack([row_of(cameras[index]) for index in first])
@@ -119,42 +119,44 @@ def posed_problem(
     prior = usual_prior(alike, free, fisheye=bool(fisheye[first][~fixed].any()))
     views = np.stack([filmed.camera.viewmat.numpy() for filmed in cameras])
     bundle = Bundle(observations, lens, sizes, fisheye, free, fixed, rotating, prior)
-    return bundle, Scene(views[:, :3, :3], views[:, :3, 3], rows, *bodies)
+    return bundle, Parameters(views[:, :3, :3], views[:, :3, 3], rows, *bodies)
 
 
-def estimated(bundle: Bundle, scene: Scene) -> tuple[Bundle, Scene]:
+def estimated(bundle: Bundle, parameters: Parameters) -> tuple[Bundle, Parameters]:
     """Adjusted, with the noise and the differences of lenses that fit best."""
     poses = bundle.columns[0]
-    bundle = _with_noise(bundle, scene)
+    bundle = _with_noise(bundle, parameters)
     for _ in range(ROUNDS if bundle.free else 1):
-        scene = solved(bundle, scene, max_steps=STEPS)
-        covariance = linearized(bundle, scene).covariance()
-        prior = bundle.prior.updated(scene.rows, covariance, start=poses, free=bundle.free)
+        parameters = solved(bundle, parameters, max_steps=STEPS)
+        covariance = linearized(bundle, parameters).covariance()
+        prior = bundle.prior.updated(parameters.rows, covariance, start=poses, free=bundle.free)
         change = np.abs(prior.differences / bundle.prior.differences - 1).max(initial=0.0)
-        bundle = _with_noise(replace(bundle, prior=prior), scene)
+        bundle = _with_noise(replace(bundle, prior=prior), parameters)
         if change < SAME:
             break
-    return bundle, solved(bundle, scene)
+    return bundle, solved(bundle, parameters)
 
 
-def _with_noise(bundle: Bundle, scene: Scene) -> Bundle:
-    residuals = np.linalg.norm(bundle.residuals(scene), axis=1)
+def _with_noise(bundle: Bundle, parameters: Parameters) -> Bundle:
+    residuals = np.linalg.norm(bundle.residuals(parameters), axis=1)
     poses, lenses, size = bundle.columns
-    left = max(0.1, 1 - (poses + lenses + size * len(scene.places)) / (2 * len(residuals)))
+    left = max(0.1, 1 - (poses + lenses + size * len(parameters.body_positions)) / (2 * len(residuals)))
     return replace(bundle, noise=max(float(np.median(residuals)) / NORMAL_MEDIAN / np.sqrt(left), 1e-3))
 
 
-def _result(found: SolvedCalibration, bundle: Bundle, scene: Scene) -> SolvedCalibration:
-    return replace(found, cameras=cameras_in(scene, found.cameras, bundle.lens), points=scene.places)
+def _result(found: SolvedCalibration, bundle: Bundle, parameters: Parameters) -> SolvedCalibration:
+    return replace(found, cameras=cameras_in(parameters, found.cameras, bundle.lens), points=parameters.body_positions)
 
 
-def cameras_in(scene: Scene, cameras: Mapping[str, LensCamera], lens: NDArray[np.intp]) -> dict[str, LensCamera]:
-    """``cameras`` with the poses and lenses of a scene."""
+def cameras_in(
+    parameters: Parameters, cameras: Mapping[str, LensCamera], lens: NDArray[np.intp]
+) -> dict[str, LensCamera]:
+    """``cameras`` with the poses and lenses of the parameters."""
     adjusted = {}
     for index, (name, filmed) in enumerate(cameras.items()):
         viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = scene.rotations[index], scene.translations[index]
-        adjusted[name] = with_row(filmed, scene.rows[lens[index]], viewmat)
+        viewmat[:3, :3], viewmat[:3, 3] = parameters.rotations[index], parameters.translations[index]
+        adjusted[name] = with_row(filmed, parameters.rows[lens[index]], viewmat)
     return adjusted
 
 
@@ -167,11 +169,11 @@ def _angles(found: SolvedCalibration, good: NDArray[np.bool_]) -> Floats:
     order = np.argsort(seen.point[good], kind="stable")
     rays, points = rays[order], seen.point[good][order]
     widest = np.zeros(len(found.points))
-    for apart in range(1, int(np.bincount(points).max(initial=0))):
-        same = points[apart:] == points[:-apart]
-        sine = np.linalg.norm(np.cross(rays[apart:], rays[:-apart]), axis=1)
-        angle = np.arctan2(sine, (rays[apart:] * rays[:-apart]).sum(1))
-        np.maximum.at(widest, points[apart:][same], angle[same])
+    for step in range(1, int(np.bincount(points).max(initial=0))):
+        same = points[step:] == points[:-step]
+        sine = np.linalg.norm(np.cross(rays[step:], rays[:-step]), axis=1)
+        angle = np.arctan2(sine, (rays[step:] * rays[:-step]).sum(1))
+        np.maximum.at(widest, points[step:][same], angle[same])
     return widest
 
 

@@ -86,11 +86,11 @@ class Board:
                 f"{self.dictionary!r} is no dictionary of OpenCV's; expected such as {', '.join(dictionaries()[:3])}."
             )
         markers = aruco.getPredefinedDictionary(number)
-        needed, held = self.columns * self.rows // 2, len(markers.bytesList)
-        if needed > held:
+        needed, available = self.columns * self.rows // 2, len(markers.bytesList)
+        if needed > available:
             raise ConfigError(
                 f"A board of {self.columns} x {self.rows} squares needs {needed} markers, {self.dictionary} has "
-                f"{held}; take a larger dictionary or fewer squares."
+                f"{available}; take a larger dictionary or fewer squares."
             )
         side = self.square_metres
         return aruco.CharucoBoard((self.columns, self.rows), side, side * self.marker_share, markers)
@@ -135,8 +135,8 @@ def board_sightings(
     without_corners = 0
     tasks = [(name, instant) for name, shots in pictures.items() for instant in range(len(shots))]
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        sights = pool.map(lambda task: _sighted(pictures[task[0]][task[1]], board), tasks)
-        for (name, instant), (corners, pixels, ids) in zip(tasks, sights, strict=True):
+        detections = pool.map(lambda task: _sighted(pictures[task[0]][task[1]], board), tasks)
+        for (name, instant), (corners, pixels, ids) in zip(tasks, detections, strict=True):
             markers[name] |= ids
             if len(corners) >= MIN_CORNERS and not _collinear(corners, board):
                 found[name].append(Sighting(instant, corners, pixels))
@@ -152,7 +152,7 @@ def board_sightings(
     few = [name for name in pictures if len(found[name]) < MIN_SIGHTINGS]
     if few:
         raise CalibrationError(_too_few(board, {name: (len(found[name]), len(pictures[name])) for name in few}, found))
-    return {name: tuple(sights) for name, sights in found.items()}
+    return {name: tuple(own_sightings) for name, own_sightings in found.items()}
 
 
 def _too_few(board: Board, seen: Mapping[str, tuple[int, int]], found: Mapping[str, Sequence[Sighting]]) -> str:
@@ -234,12 +234,12 @@ def _check_layout(board: Board, found: Mapping[str, Sequence[Sighting]]) -> None
     cv2 = opencv()
     wrong = total = 0
     flat = board.corners[:, :2]
-    for sights in found.values():
-        for sight in sights:
-            if len(sight.corners) < 8:
+    for own_sightings in found.values():
+        for sighting in own_sightings:
+            if len(sighting.corners) < 8:
                 continue
             total += 1
-            H, mask = cv2.findHomography(flat[sight.corners], sight.pixels, cv2.RANSAC, 8.0)
+            H, mask = cv2.findHomography(flat[sighting.corners], sighting.pixels, cv2.RANSAC, 8.0)
             wrong += H is None or mask is None or float(np.mean(mask)) < WRONG_LAYOUT
     if total and wrong > total / 2:
         raise CalibrationError(

@@ -20,7 +20,7 @@ from structgstream.data.lenses import LensCamera
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.adjustment import cameras_in, estimated, posed_problem
 from structgstream.preparation.calibration.board import Board, Sighting, board_sightings
-from structgstream.preparation.calibration.bundle import BodyObservations, Scene
+from structgstream.preparation.calibration.bundle import BodyObservations, Parameters
 from structgstream.preparation.calibration.colmap import (
     LensModel,
     colmap_camera,
@@ -61,44 +61,44 @@ def board_model(
             rig.add_sensor(camera.sensor_id, colmap_pose(sensors[name]))
     model.add_rig(rig)
     black = np.zeros(3, np.uint8)
-    places = board.corners
-    corners = {index: model.add_point3D(places[index], pycolmap.Track(), black) for index in _repeated(sightings)}
+    known = board.corners
+    corners = {index: model.add_point3D(known[index], pycolmap.Track(), black) for index in _repeated(sightings)}
     images: list[tuple[int, str, Sighting]] = []
     for instant, pose in rig_poses.items():
         frame = pycolmap.Frame(frame_id=instant + 1, rig_id=1)
-        for name, sights in sightings.items():
-            for sight in (sight for sight in sights if sight.instant == instant):
-                images.append((len(images) + 1, name, sight))
+        for name, own_sightings in sightings.items():
+            for sighting in (sighting for sighting in own_sightings if sighting.instant == instant):
+                images.append((len(images) + 1, name, sighting))
                 frame.add_data_id(pycolmap.data_t(cameras[name].sensor_id, len(images)))
         frame.rig_from_world = colmap_pose(pose)
         model.add_frame(frame)
-    for number, name, sight in images:
+    for number, name, sighting in images:
         image = pycolmap.Image(
-            name=f"{name}/{sight.instant}",
+            name=f"{name}/{sighting.instant}",
             camera_id=cameras[name].camera_id,
             image_id=number,
-            frame_id=sight.instant + 1,
+            frame_id=sighting.instant + 1,
         )
-        seen = [(pixel, corners[corner]) for pixel, corner in _of_points(sight, corners)]
+        seen = [(pixel, corners[corner]) for pixel, corner in _of_points(sighting, corners)]
         image.points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel, point) for pixel, point in seen])
         model.add_image(image)
     for instant in rig_poses:
         model.register_frame(instant + 1)
-    for number, _, sight in images:
-        for index, (_, corner) in enumerate(_of_points(sight, corners)):
+    for number, _, sighting in images:
+        for index, (_, corner) in enumerate(_of_points(sighting, corners)):
             model.point3D(corners[corner]).track.add_element(number, index)
     return model
 
 
 def _repeated(sightings: Sightings) -> list[int]:
     """The corners that have two observations or more: COLMAP adjusts no others."""
-    seen = [sight.corners for sights in sightings.values() for sight in sights]
+    seen = [sighting.corners for own_sightings in sightings.values() for sighting in own_sightings]
     corners, counts = np.unique(np.concatenate(seen), return_counts=True)
     return [int(corner) for corner in corners[counts > 1]]
 
 
-def _of_points(sight: Sighting, points: Mapping[int, int]) -> list[tuple[Floats, int]]:
-    pairs = zip(sight.pixels, sight.corners.tolist(), strict=True)
+def _of_points(sighting: Sighting, points: Mapping[int, int]) -> list[tuple[Floats, int]]:
+    pairs = zip(sighting.pixels, sighting.corners.tolist(), strict=True)
     return [(pixel, corner) for pixel, corner in pairs if corner in points]
 
 
@@ -196,10 +196,14 @@ class _View:
     poses: Mapping[int, Floats]
 
 
-def _own_view(name: str, sights: Sequence[Sighting], board: Board, starts: Sequence[Any], *, fixed: bool) -> _View:
+def _own_view(
+    name: str, own_sightings: Sequence[Sighting], board: Board, starts: Sequence[Any], *, fixed: bool
+) -> _View:
     """Intrinsics from the best start, and a pose for each sighting that agrees with them."""
-    chosen = sorted(sights, key=lambda sight: (-len(sight.corners), sight.instant))[: 2 * MAX_SIGHTINGS_ALONE]
-    chosen = sorted(chosen, key=lambda sight: sight.instant)
+    chosen = sorted(own_sightings, key=lambda sighting: (-len(sighting.corners), sighting.instant))[
+        : 2 * MAX_SIGHTINGS_ALONE
+    ]
+    chosen = sorted(chosen, key=lambda sighting: sighting.instant)
     picks = np.linspace(0, len(chosen) - 1, min(len(chosen), MAX_SIGHTINGS_ALONE)).round().astype(int)
     sample = [chosen[index] for index in picks]
     best: tuple[float, Any] | None = None
@@ -208,7 +212,7 @@ def _own_view(name: str, sights: Sequence[Sighting], board: Board, starts: Seque
         if len(poses) < max(3, len(sample) // 2):
             continue
         if not fixed:
-            seen = {name: [sight for sight in sample if sight.instant in poses]}
+            seen = {name: [sighting for sighting in sample if sighting.instant in poses]}
             model = board_model(board, seen, {name: camera}, {name: np.eye(4)}, poses)
             adjust(model, freedom=Freedom(), constant_points=True)
             camera = model.camera(camera.camera_id)
@@ -217,41 +221,45 @@ def _own_view(name: str, sights: Sequence[Sighting], board: Board, starts: Seque
         if best is None or error < best[0]:
             best = error, camera
     if best is not None:
-        poses = _poses(best[1], sights, board, share=0.005)
+        poses = _poses(best[1], own_sightings, board, share=0.005)
         if len(poses) >= 3:
             return _View(best[1], poses)
     raise CalibrationError(
-        f"The lens of camera {name!r} cannot be estimated from its {len(sights)} sightings of the board "
+        f"The lens of camera {name!r} cannot be estimated from its {len(own_sightings)} sightings of the board "
         f"({board.text}): show the board whole, flat, and tilted in several directions, or choose the lens model that "
         "the camera has (fisheye for very wide ones)."
     )
 
 
-def _poses(camera: Any, sights: Sequence[Sighting], board: Board, *, share: float = POSE_PIXELS) -> dict[int, Floats]:
+def _poses(
+    camera: Any, own_sightings: Sequence[Sighting], board: Board, *, share: float = POSE_PIXELS
+) -> dict[int, Floats]:
     """Board-to-camera matrices by instant, of the sightings of which most corners agree."""
     pycolmap = pycolmap_module()
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = max(2.0, share * max(camera.width, camera.height))
     options.ransac.random_seed = 0
     found = {}
-    for sight in sights:
-        result = pycolmap.estimate_and_refine_absolute_pose(sight.pixels, board.corners[sight.corners], camera, options)
-        if result is not None and result["num_inliers"] >= 0.7 * len(sight.corners):
-            found[sight.instant] = matrix(result["cam_from_world"])
+    for sighting in own_sightings:
+        result = pycolmap.estimate_and_refine_absolute_pose(
+            sighting.pixels, board.corners[sighting.corners], camera, options
+        )
+        if result is not None and result["num_inliers"] >= 0.7 * len(sighting.corners):
+            found[sighting.instant] = matrix(result["cam_from_world"])
     return found
 
 
-def _misfit(camera: Any, sights: Sequence[Sighting], board: Board) -> float:
+def _misfit(camera: Any, own_sightings: Sequence[Sighting], board: Board) -> float:
     """Median over the sightings of the median reprojection error, pixels; infinite for one without a pose."""
     errors = []
-    poses = _poses(camera, sights, board)
-    for sight in sights:
-        if sight.instant not in poses:
+    poses = _poses(camera, own_sightings, board)
+    for sighting in own_sightings:
+        if sighting.instant not in poses:
             errors.append(np.inf)
             continue
-        pose = poses[sight.instant]
-        local = board.corners[sight.corners] @ pose[:3, :3].T + pose[:3, 3]
-        errors.append(float(np.median(np.linalg.norm(camera.img_from_cam(local) - sight.pixels, axis=1))))
+        pose = poses[sighting.instant]
+        local = board.corners[sighting.corners] @ pose[:3, :3].T + pose[:3, 3]
+        errors.append(float(np.median(np.linalg.norm(camera.img_from_cam(local) - sighting.pixels, axis=1))))
     return float(np.median(errors))
 
 
@@ -284,15 +292,15 @@ def _middle(moves: Sequence[Floats]) -> Floats:
     size = float(np.median([np.linalg.norm(move[:3, 3]) for move in moves])) or 1.0
     stack = np.stack(moves)
     stack[:, :3, 3] /= size
-    apart = np.linalg.norm(stack[:, None] - stack[None], axis=(2, 3)).sum(1)
-    return moves[int(np.argmin(apart))]
+    distances = np.linalg.norm(stack[:, None] - stack[None], axis=(2, 3)).sum(1)
+    return moves[int(np.argmin(distances))]
 
 
 def _rig_poses(views: Mapping[str, _View], sensors: Mapping[str, Floats], sightings: Sightings) -> dict[int, Floats]:
     """Board-to-rig matrices by instant, from the camera that sees most corners."""
     best: dict[int, tuple[int, Floats]] = {}
     for name, view in views.items():
-        counts = {sight.instant: len(sight.corners) for sight in sightings[name]}
+        counts = {sighting.instant: len(sighting.corners) for sighting in sightings[name]}
         for instant, pose in view.poses.items():
             if counts[instant] > best.get(instant, (0, None))[0]:
                 best[instant] = counts[instant], np.linalg.inv(sensors[name]) @ pose
@@ -311,10 +319,10 @@ def _solved(
     corners = board.corners
     points = [corners @ pose[:3, :3].T + pose[:3, 3] for pose in poses.values()]
     rows = [
-        (number[sight.instant] * len(corners) + corner, index, sight.instant, *pixel)
+        (number[sighting.instant] * len(corners) + corner, index, sighting.instant, *pixel)
         for index, name in enumerate(filmed)
-        for sight in sightings[name]
-        for corner, pixel in zip(sight.corners, sight.pixels, strict=True)
+        for sighting in sightings[name]
+        for corner, pixel in zip(sighting.corners, sighting.pixels, strict=True)
     ]
     table = np.array(rows, np.float64).reshape(-1, 5)
     which, owner, instant = (table[:, column].astype(np.intp) for column in range(3))
@@ -329,12 +337,14 @@ def _without_outliers(sightings: Sightings, solved: SolvedCalibration) -> Sighti
     limit = max(OUTLIER_PIXELS, 6 * float(np.nanmedian(errors)))
     good = iter((errors <= limit).tolist())
     inliers: dict[str, list[Sighting]] = {}
-    for name, sights in sightings.items():
+    for name, own_sightings in sightings.items():
         inliers[name] = []
-        for sight in sights:
-            inside = np.array([next(good) for _ in sight.corners], bool)
+        for sighting in own_sightings:
+            inside = np.array([next(good) for _ in sighting.corners], bool)
             if inside.sum() >= 4:
-                inliers[name].append(replace(sight, corners=sight.corners[inside], pixels=sight.pixels[inside]))
+                inliers[name].append(
+                    replace(sighting, corners=sighting.corners[inside], pixels=sighting.pixels[inside])
+                )
     return inliers
 
 
@@ -354,45 +364,47 @@ def adjust_board(
         known: cameras whose intrinsics and lens stay.
     """
     number = {instant: index for index, instant in enumerate(poses)}
-    seen = [(index, sight) for index, name in enumerate(cameras) for sight in sightings[name]]
-    counts = [len(sight.corners) for _, sight in seen]
-    sights = BodyObservations(
+    seen = [(index, sighting) for index, name in enumerate(cameras) for sighting in sightings[name]]
+    counts = [len(sighting.corners) for _, sighting in seen]
+    observations = BodyObservations(
         np.repeat([index for index, _ in seen], counts).astype(np.intp),
-        np.repeat([number[sight.instant] for _, sight in seen], counts).astype(np.intp),
-        np.concatenate([board.corners[sight.corners] for _, sight in seen]),
-        np.concatenate([sight.pixels for _, sight in seen]),
+        np.repeat([number[sighting.instant] for _, sighting in seen], counts).astype(np.intp),
+        np.concatenate([board.corners[sighting.corners] for _, sighting in seen]),
+        np.concatenate([sighting.pixels for _, sighting in seen]),
     )
     stack = np.stack(list(poses.values()))
-    bundle, scene = posed_problem(
+    bundle, parameters = posed_problem(
         list(cameras.values()),
-        sights,
+        observations,
         (stack[:, :3, :3], stack[:, :3, 3]),
         lens=np.arange(len(cameras)),
         free=(FOCAL, ASPECT, ACROSS, DOWN, *DISTORTION[lens]),
         fixed=np.array([name in known for name in cameras]),
         rotating=True,
     )
-    bundle, scene = estimated(bundle, scene)
-    scene = _from_first(scene)
-    return cameras_in(scene, cameras, bundle.lens), dict(zip(poses, _matrices(scene.turns, scene.places), strict=True))
-
-
-def _from_first(scene: Scene) -> Scene:
-    """In the axes of the first camera."""
-    turn, move = scene.rotations[0], scene.translations[0]
-    rotations = scene.rotations @ turn.T
-    translations = scene.translations - rotations @ move
-    rotations[0], translations[0] = np.eye(3), 0.0  # exactly
-    return replace(
-        scene,
-        rotations=rotations,
-        translations=translations,
-        turns=turn @ scene.turns,
-        places=scene.places @ turn.T + move,
+    bundle, parameters = estimated(bundle, parameters)
+    parameters = _from_first(parameters)
+    return cameras_in(parameters, cameras, bundle.lens), dict(
+        zip(poses, _matrices(parameters.body_rotations, parameters.body_positions), strict=True)
     )
 
 
-def _matrices(turns: Floats, places: Floats) -> Floats:
-    found = np.tile(np.eye(4), (len(turns), 1, 1))
-    found[:, :3, :3], found[:, :3, 3] = turns, places
+def _from_first(parameters: Parameters) -> Parameters:
+    """In the axes of the first camera."""
+    turn, move = parameters.rotations[0], parameters.translations[0]
+    rotations = parameters.rotations @ turn.T
+    translations = parameters.translations - rotations @ move
+    rotations[0], translations[0] = np.eye(3), 0.0  # exactly
+    return replace(
+        parameters,
+        rotations=rotations,
+        translations=translations,
+        body_rotations=turn @ parameters.body_rotations,
+        body_positions=parameters.body_positions @ turn.T + move,
+    )
+
+
+def _matrices(body_rotations: Floats, body_positions: Floats) -> Floats:
+    found = np.tile(np.eye(4), (len(body_rotations), 1, 1))
+    found[:, :3, :3], found[:, :3, 3] = body_rotations, body_positions
     return found

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
-from structgstream.data.posed import rotation_matrix
+from structgstream.data.calibration import rotation_matrix
 from structgstream.preparation.calibration.lens_prior import LensPrior
 from structgstream.preparation.calibration.lens_terms import derivatives, projected
 
@@ -33,33 +33,33 @@ class BodyObservations:
     Args:
         camera: ``[M]``.
         body: ``[M]``.
-        place: ``[M, 3]``, where on the body; zeros for points.
+        offset: ``[M, 3]``, from the body's origin in its axes; zeros for points.
         pixels: ``[M, 2]``.
     """
 
     camera: Indices
     body: Indices
-    place: Floats
+    offset: Floats
     pixels: Floats
 
 
 @dataclass(frozen=True)
-class Scene:
-    """Everything that is adjusted.
+class Parameters:
+    """Everything that is adjusted: poses and lenses of cameras, poses of bodies.
 
     Args:
         rotations: ``[C, 3, 3]``, world to camera.
         translations: ``[C, 3]``.
         rows: ``[L, TERMS]`` of the lenses.
-        turns: ``[B, 3, 3]`` of the bodies, body to world; identities for points.
-        places: ``[B, 3]`` of the bodies.
+        body_rotations: ``[B, 3, 3]`` of the bodies, body to world; identities for points.
+        body_positions: ``[B, 3]`` of the bodies.
     """
 
     rotations: Floats
     translations: Floats
     rows: Floats
-    turns: Floats
-    places: Floats
+    body_rotations: Floats
+    body_positions: Floats
 
 
 @dataclass(frozen=True)
@@ -93,45 +93,48 @@ class Bundle:
         """Number of parameters of poses, of lenses, and of a body."""
         return 6 * len(self.lens), len(self.fixed) * len(self.free), 6 if self.rotating else 3
 
-    def residuals(self, scene: Scene) -> Floats:
+    def residuals(self, parameters: Parameters) -> Floats:
         """Projected minus observed ``[M, 2]``, pixels; infinite behind a camera."""
-        own, local = self.observations.camera, self._local(scene)
+        own, local = self.observations.camera, self._local(parameters)
         ahead = local[:, 2] > 0
         safe = np.where(ahead[:, None], local, [0.0, 0.0, 1.0])
-        found = projected(safe, scene.rows[self.lens[own]], self.sizes[own], self.fisheye[own])
+        found = projected(safe, parameters.rows[self.lens[own]], self.sizes[own], self.fisheye[own])
         return np.where(ahead[:, None], found - self.observations.pixels, np.inf)
 
-    def cost(self, scene: Scene) -> float:
+    def cost(self, parameters: Parameters) -> float:
         """Huber's loss of the misses, and what the prior adds."""
-        off = np.linalg.norm(self.residuals(scene), axis=1) / self.noise
+        off = np.linalg.norm(self.residuals(parameters), axis=1) / self.noise
         if not np.isfinite(off).all():
             return float("inf")
         loss = np.where(off <= HUBER, off**2 / 2, HUBER * off - HUBER**2 / 2)
-        return float(loss.sum()) + self.prior.cost(scene.rows)
+        return float(loss.sum()) + self.prior.cost(parameters.rows)
 
-    def _local(self, scene: Scene) -> Floats:
+    def _local(self, parameters: Parameters) -> Floats:
         seen = self.observations
-        world = np.einsum("mab,mb->ma", scene.turns[seen.body], seen.place) + scene.places[seen.body]
-        return np.einsum("mab,mb->ma", scene.rotations[seen.camera], world) + scene.translations[seen.camera]
+        world = (
+            np.einsum("mab,mb->ma", parameters.body_rotations[seen.body], seen.offset)
+            + parameters.body_positions[seen.body]
+        )
+        return np.einsum("mab,mb->ma", parameters.rotations[seen.camera], world) + parameters.translations[seen.camera]
 
 
-def solved(bundle: Bundle, scene: Scene, *, max_steps: int = MAX_STEPS) -> Scene:
-    """The scene of least cost near ``scene``, or after ``max_steps`` steps."""
-    damping, cost = 1e-4, bundle.cost(scene)
+def solved(bundle: Bundle, parameters: Parameters, *, max_steps: int = MAX_STEPS) -> Parameters:
+    """The parameters of least cost near ``parameters``, or after ``max_steps`` steps."""
+    damping, cost = 1e-4, bundle.cost(parameters)
     for _ in range(max_steps):
-        system = linearized(bundle, scene)
+        system = linearized(bundle, parameters)
         for _ in range(10):
-            tried = system.stepped(bundle, scene, damping)
+            tried = system.stepped(bundle, parameters, damping)
             new = bundle.cost(tried)
             if new <= cost:
                 break
             damping *= 10
         else:
-            return scene
-        gained, scene, cost, damping = cost - new, tried, new, max(damping / 10, 1e-9)
+            return parameters
+        gained, parameters, cost, damping = cost - new, tried, new, max(damping / 10, 1e-9)
         if gained < SMALL * cost:
             break
-    return scene
+    return parameters
 
 
 @dataclass(frozen=True)
@@ -158,12 +161,12 @@ class System:
         left = self.A + np.diag((damping + RIDGE) * own) - (weighed @ self.W.T).toarray()
         return left, self.gradient - weighed @ self.body_gradient.ravel(), inverse
 
-    def stepped(self, bundle: Bundle, scene: Scene, damping: float) -> Scene:
-        """The scene after one damped step."""
+    def stepped(self, bundle: Bundle, parameters: Parameters, damping: float) -> Parameters:
+        """The parameters after one damped step."""
         left, right, inverse = self.reduced(damping)
         step: Floats = np.asarray(-np.linalg.solve(left, right), np.float64)
         rest = self.body_gradient + (self.W.T @ step).reshape(self.body_gradient.shape)
-        return _moved(bundle, scene, step, -np.einsum("bij,bj->bi", inverse, rest))
+        return _moved(bundle, parameters, step, -np.einsum("bij,bj->bi", inverse, rest))
 
     def covariance(self) -> Floats:
         """Of poses and lenses, in that order."""
@@ -172,11 +175,11 @@ class System:
         return np.linalg.inv(left / np.outer(scale, scale)) / np.outer(scale, scale)
 
 
-def linearized(bundle: Bundle, scene: Scene) -> System:
-    """The normal equations at ``scene``."""
+def linearized(bundle: Bundle, parameters: Parameters) -> System:
+    """The normal equations at ``parameters``."""
     poses, lenses, size = bundle.columns
-    by_camera, by_body, columns = _derivatives(bundle, scene)
-    residuals = bundle.residuals(scene)
+    by_camera, by_body, columns = _derivatives(bundle, parameters)
+    residuals = bundle.residuals(parameters)
     off = np.linalg.norm(residuals, axis=1) / bundle.noise
     weight = np.where(off <= HUBER, 1.0, HUBER / np.maximum(off, HUBER)) / bundle.noise**2
     total = poses + lenses
@@ -188,10 +191,10 @@ def linearized(bundle: Bundle, scene: Scene) -> System:
             where = columns[own[0]]
             A[np.ix_(where, where)] += np.einsum("m,mai,maj->ij", w, J, J, optimize=True)
             gradient[where] += np.einsum("m,mai,ma->i", w, J, residuals[own])
-    bundle.prior.add(A, gradient, scene.rows, start=poses, free=bundle.free)
+    bundle.prior.add(A, gradient, parameters.rows, start=poses, free=bundle.free)
     stuck = np.diag(A) == 0  # what is fixed, or observed by no camera
     A[stuck, stuck] = 1.0
-    count = len(scene.places)
+    count = len(parameters.body_positions)
     V, body_gradient = np.zeros((count, size, size)), np.zeros((count, size))
     np.add.at(V, bundle.observations.body, np.einsum("m,mai,maj->mij", weight, by_body, by_body))
     np.add.at(body_gradient, bundle.observations.body, np.einsum("m,mai,ma->mi", weight, by_body, residuals))
@@ -200,17 +203,17 @@ def linearized(bundle: Bundle, scene: Scene) -> System:
     )
 
 
-def _derivatives(bundle: Bundle, scene: Scene) -> tuple[Floats, Floats, Indices]:
+def _derivatives(bundle: Bundle, parameters: Parameters) -> tuple[Floats, Floats, Indices]:
     """Of the misses by their camera's parameters ``[M, 2, 6 + F]`` and by their body's, and the former's unknowns."""
     seen, (poses, _, _) = bundle.observations, bundle.columns
     own, lens = seen.camera, bundle.lens[seen.camera]
-    on_body = np.einsum("mab,mb->ma", scene.turns[seen.body], seen.place)
-    turned = np.einsum("mab,mb->ma", scene.rotations[own], on_body + scene.places[seen.body])
-    local = turned + scene.translations[own]
-    by_point, by_row = derivatives(local, scene.rows[lens], bundle.sizes[own], bundle.fisheye[own], bundle.free)
+    on_body = np.einsum("mab,mb->ma", parameters.body_rotations[seen.body], seen.offset)
+    turned = np.einsum("mab,mb->ma", parameters.rotations[own], on_body + parameters.body_positions[seen.body])
+    local = turned + parameters.translations[own]
+    by_point, by_row = derivatives(local, parameters.rows[lens], bundle.sizes[own], bundle.fisheye[own], bundle.free)
     by_row[bundle.fixed[lens]] = 0.0
     by_camera = np.concatenate([by_point @ _crosses(-turned), by_point, by_row], 2)
-    by_world = by_point @ scene.rotations[own]
+    by_world = by_point @ parameters.rotations[own]
     by_body = np.concatenate([by_world @ _crosses(-on_body), by_world], 2) if bundle.rotating else by_world
     free = len(bundle.free)
     columns = np.concatenate([6 * own[:, None] + np.arange(6), poses + free * lens[:, None] + np.arange(free)], 1)
@@ -229,21 +232,21 @@ def _crossed(
     return csr_array((blocks.ravel(), (rows.ravel(), np.broadcast_to(bodies, blocks.shape).ravel())), shape=shape)
 
 
-def _moved(bundle: Bundle, scene: Scene, step: Floats, body_step: Floats) -> Scene:
+def _moved(bundle: Bundle, parameters: Parameters, step: Floats, body_step: Floats) -> Parameters:
     poses, lenses, _ = bundle.columns
     by_pose = step[:poses].reshape(-1, 6)
-    rows = scene.rows.copy()
+    rows = parameters.rows.copy()
     rows[:, bundle.free] += step[poses : poses + lenses].reshape(len(rows), -1)
-    turns = scene.turns
+    body_rotations = parameters.body_rotations
     if bundle.rotating:
-        turns = np.stack([rotation_matrix(w) for w in body_step[:, :3]]) @ turns
+        body_rotations = np.stack([rotation_matrix(w) for w in body_step[:, :3]]) @ body_rotations
     return replace(
-        scene,
-        rotations=np.stack([rotation_matrix(w) for w in by_pose[:, :3]]) @ scene.rotations,
-        translations=scene.translations + by_pose[:, 3:],
+        parameters,
+        rotations=np.stack([rotation_matrix(w) for w in by_pose[:, :3]]) @ parameters.rotations,
+        translations=parameters.translations + by_pose[:, 3:],
         rows=rows,
-        turns=turns,
-        places=scene.places + body_step[:, -3:],
+        body_rotations=body_rotations,
+        body_positions=parameters.body_positions + body_step[:, -3:],
     )
 
 

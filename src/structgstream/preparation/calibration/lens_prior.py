@@ -91,10 +91,10 @@ class LensPrior:
             where = start + lenses * len(free) + free.index(term)
             pull = self._pull(group, column)
             own = covariance[np.ix_(where, where)]
-            apart = np.eye(len(lenses)) - pull
-            spread = np.einsum("ij,jk,ik->i", apart, own, apart)
+            centering = np.eye(len(lenses)) - pull
+            spread = np.einsum("ij,jk,ik->i", centering, own, centering)
             unsure = self.differences[group, column] ** 2 * pull  # of the mean, were the lenses known
-            squared = (apart @ rows[lenses, term]) ** 2 + np.maximum(spread, 0) + unsure
+            squared = (centering @ rows[lenses, term]) ** 2 + np.maximum(spread, 0) + unsure
             usual = self.usual[column]
             found = (WORTH * usual**2 + squared.sum()) / (WORTH + len(lenses))
             differences[group, column] = max(np.sqrt(found), MIN_DIFFERENCE * usual)

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.arrays import Floats
-from structgstream.data.descriptor_matches import mutual_matches
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Features, Pair, mutually_best
+from structgstream.data.pair_matches import mutual_matches
 from structgstream.preparation.calibration.keypoints import Keypoints
 
 Indices = NDArray[np.intp]

@@ -4,7 +4,6 @@
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from structgstream.data.matching import Pair, connected_groups
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.adjustment import Limits, adjust_together
 from structgstream.preparation.calibration.colmap import MODELS, LensModel, holding
-from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL
+from structgstream.preparation.calibration.lens_terms import ASPECT, DISTORTION, FOCAL
 from structgstream.preparation.calibration.mapping import Freedom, adjust, cameras_of, filtered, observed
 from structgstream.preparation.calibration.matching import epipolar_pixels
 from structgstream.preparation.calibration.solved import SolvedCalibration, normalized, rig_alignment
@@ -27,9 +26,6 @@ from structgstream.preparation.calibration.triangulation import (
 )
 
 _log = logging.getLogger(__name__)
-
-Free = Literal["poses", "focal", "lens", "all"]
-"""What moves in addition to poses: nothing; focal lengths; these and distortion; these and principal points."""
 
 SLACK_DEGREES = 1.5  # of matches to the epipolar planes of the given poses, so how wrong these may be
 ROUNDS = (1.0, 0.4, 0.2)  # shares of the slack
@@ -60,7 +56,6 @@ def refine(
     pictures: Mapping[str, Sequence[NDArray[np.uint8]]],
     cameras: Mapping[str, LensCamera],
     *,
-    free: Free = "focal",
     lens: LensModel | None = None,
     metres: bool = False,
 ) -> Refinement:
@@ -71,8 +66,8 @@ def refine(
     to the given ones as they can.
 
     Args:
-        free: what moves in addition to poses.
-        lens: the model of the refined lenses; by default the given one's.
+        lens: the model of lenses whose distortion is estimated, too; by default the given distortion stays, and only
+            poses and focal lengths move.
         metres: whether the given cameras are in metres.
 
     Raises:
@@ -89,11 +84,11 @@ def refine(
     judging = _held_out(graph)
     learning = without(graph, judging)
     judges = {pair: graph.matches[pair][judging[pair]] for pair in graph.matches}
-    refined, solved = dict(cameras), None
+    refined = dict(cameras)
     models = {name: MODELS[lens] if lens else holding(filmed.lens) for name, filmed in cameras.items()}
-    freedom = Freedom(focal=free != "poses", lens=free in ("lens", "all"), center=free == "all")
-    longest = max(max(filmed.camera.width, filmed.camera.height) for filmed in cameras.values())
-    limits = Limits.for_pictures(longest)
+    freedom = Freedom(lens=lens is not None, center=False)
+    limits = Limits.for_pictures(max(max(filmed.camera.width, filmed.camera.height) for filmed in cameras.values()))
+    model = None
     for share in ROUNDS:
         slack = SLACK_DEGREES * share
         focal = max(float(filmed.camera.K[0, 0]) for filmed in refined.values())
@@ -104,20 +99,16 @@ def refine(
         adjust(model, freedom=freedom)
         found = cameras_of(model)
         refined = {name: found[name] for name in cameras}
-        solved = model
-    assert solved is not None
-    points, observations = observed(solved, graph.keypoints, cameras)
-    result = SolvedCalibration(refined, points, observations)
+    result = SolvedCalibration(refined, *observed(model, graph.keypoints, cameras))
     result = result.aligned(rig_alignment(refined, cameras), metres=metres)
     before, after = (_judged(graph, judges, which) for which in (cameras, result.cameras))
     count = sum(map(len, judges.values()))
     if after < before:
-        terms = _free_terms(free, lens)
-        if terms is not None:
-            everything = _completed(graph, result, terms, limits=limits)
-            everything = everything.aligned(rig_alignment(everything.cameras, cameras), metres=metres)
-            if _judged(graph, judges, everything.cameras) <= after:
-                result = everything
+        terms = (FOCAL, ASPECT, *(DISTORTION[lens] if lens else ()))
+        everything = _completed(graph, result, terms, limits=limits)
+        everything = everything.aligned(rig_alignment(everything.cameras, cameras), metres=metres)
+        if _judged(graph, judges, everything.cameras) <= after:
+            result = everything
         return Refinement(result, before, after, count, True)
     _log.warning(
         "Refining does not help: matches that were held out are %.2f pixels off with the given cameras and %.2f with "
@@ -125,17 +116,6 @@ def refine(
     )  # fmt: skip
     given = triangulated(graph, cameras, limits=limits)
     return Refinement(replace(given, metres=metres), before, after, count, False)
-
-
-def _free_terms(free: Free, lens: LensModel | None) -> tuple[int, ...] | None:
-    """The terms of ``lens_terms.py`` that move; None where it depends on the lens that each camera has."""
-    if free == "poses":
-        return ()
-    if free == "focal":
-        return (FOCAL, ASPECT)
-    if lens is None:
-        return None
-    return (FOCAL, ASPECT, *((ACROSS, DOWN) if free == "all" else ()), *DISTORTION[lens])
 
 
 def _completed(

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera
 from structgstream.data.arrays import Floats
 from structgstream.data.calibration import listed
-from structgstream.data.descriptor_matches import mutual_matches
 from structgstream.data.images import opencv
 from structgstream.data.matching import epipolar_errors, fundamental_matrix, sift_features
-from structgstream.data.pair_matches import KEYPOINT_SIDE
+from structgstream.data.pair_matches import KEYPOINT_SIDE, mutual_matches
 from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.findings import Finding
 from structgstream.pose_check.tracks import AGREE_PIXELS, Evidence, gather, pixel_scale
@@ -72,12 +71,12 @@ def picture_movement(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Moveme
         return None
     start, end = before.pixels[rows], after.pixels[columns]
     still = STILL_PIXELS * pixel_scale(one.shape[1])
-    apart = np.linalg.norm(end - start, axis=1)
-    if (apart < still).mean() > STILL_SHARE:
+    distances = np.linalg.norm(end - start, axis=1)
+    if (distances < still).mean() > STILL_SHARE:
         return STAYED
     homography, mask = opencv().findHomography(start, end, opencv().RANSAC, 2 * still)
     follows = np.zeros(len(rows), bool) if mask is None else mask.ravel().astype(bool)
-    shift = float(np.median(apart[follows])) if follows.any() else 0.0
+    shift = float(np.median(distances[follows])) if follows.any() else 0.0
     if follows.mean() <= MOVED_SHARE or shift <= still:
         return None
     return Movement(shift, np.asarray(homography, np.float64))

@@ -89,11 +89,11 @@ def color_findings(colors: Mapping[str, Color]) -> list[Finding]:
     return findings
 
 
-def _worst(stops: Mapping[str, float], most: int = 6) -> str:
+def _worst(stops: Mapping[str, float], limit: int = 6) -> str:
     """The largest differences, for messages."""
     worst = sorted(stops, key=lambda name: -abs(stops[name]))
-    rest = f" and {len(worst) - most} more" if len(worst) > most else ""
-    return ", ".join(f"{name!r} {stops[name]:+.2f}" for name in worst[:most]) + rest
+    rest = f" and {len(worst) - limit} more" if len(worst) > limit else ""
+    return ", ".join(f"{name!r} {stops[name]:+.2f}" for name in worst[:limit]) + rest
 
 
 def _samples(picture: NDArray[np.uint8], pixels: Floats) -> Floats:

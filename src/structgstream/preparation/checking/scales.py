@@ -107,13 +107,13 @@ def _foreign(points: Floats, depths: Floats, cameras: Mapping[str, Camera]) -> s
     if fits >= FIT and 0.02 < _typical_depth(points, cameras) / typical < 50:
         return None
     extent = float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
-    apart = {
+    differences = {
         factor: abs(np.log(_typical_depth(points * factor, cameras) / typical))
         for factor in FACTORS
         if factor * extent > MIN_EXTENT * typical  # any points, made small enough, lie in the middle of a rig
     }
-    likely = min(apart, key=lambda factor: apart[factor], default=None)
-    if likely is not None and apart[likely] < np.log(5):
+    likely = min(differences, key=lambda factor: differences[factor], default=None)
+    if likely is not None and differences[likely] < np.log(5):
         return (
             f"The points that come with the capture lie at impossible depths: they look {UNITS[likely]}; convert "
             "points and positions of cameras to one unit, or leave the points out."

@@ -64,7 +64,7 @@ class SynchronizationCheck:
     @property
     def between(self) -> dict[str, float]:
         """Of :attr:`apart_seconds` those that count: cameras whose pictures lie between the instants of the others."""
-        return {name: apart for name, apart in self.apart_seconds.items() if abs(apart) > WARNED_SECONDS}
+        return {name: lateness for name, lateness in self.apart_seconds.items() if abs(lateness) > WARNED_SECONDS}
 
     @property
     def late_against_others(self) -> dict[str, float]:
@@ -95,9 +95,9 @@ def check_synchronization(source: FrameSource) -> SynchronizationCheck:
     pairs = [pair for pair in pairs if pair.epipolar]
     takes = {name: (float(own.times[0]), float(own.times[-1])) for name, own in changes.items() if len(own.times)}
     group, coarse, good = agreeing_cameras(takes, pairs, slack_seconds=period / 2) if pairs else ((), None, [])
-    apart = _apart(source)
+    lateness = _stated_lateness(source)
     if coarse is None:
-        return SynchronizationCheck({}, {}, (), tuple(source.rig), period, apart)
+        return SynchronizationCheck({}, {}, (), tuple(source.rig), period, lateness)
     solution = solve_by_motion({name: takes[name] for name in group}, good, slack_seconds=period / 2, drift=False)
     middle = float(np.median(list(solution.offsets.values())))
     # A clock that is uncertain by a good part of a frame is not judged, however far it is from the others.
@@ -106,23 +106,23 @@ def check_synchronization(source: FrameSource) -> SynchronizationCheck:
     errors = {name: solution.sigmas[name] for name in judged}
     off = tuple(name for name in judged if abs(late[name]) > max(OFF_PERIODS * period, OFF_SIGMAS * errors[name]))
     undecided = tuple(name for name in source.rig if name not in judged)
-    return SynchronizationCheck(late, errors, off, undecided, period, apart)
+    return SynchronizationCheck(late, errors, off, undecided, period, lateness)
 
 
 def _changes(source: FrameSource) -> dict[str, Changes]:
     reduced: dict[str, list[NDArray[np.uint8]]] = {name: [] for name in source.rig}
     stamps: dict[str, list[float]] = {name: [] for name in source.rig}
-    apart = apart_seconds(source)
+    lateness = apart_seconds(source)
     for frame in islice(source.frames(), FRAMES):
         for name, picture in frame.images.items():
             reduced[name].append(reduced_grey(picture))
-            later = float(apart[name][frame.index]) if name in apart else 0.0
+            later = float(lateness[name][frame.index]) if name in lateness else 0.0
             stamps[name].append(frame.index / source.fps + later)
     sizes = {name: (source.rig[name].width, source.rig[name].height) for name in source.rig}
     return {name: reduced_changes(reduced[name], np.array(stamps[name]), sizes[name]) for name in source.rig}
 
 
-def _apart(source: FrameSource) -> dict[str, float]:
+def _stated_lateness(source: FrameSource) -> dict[str, float]:
     """The median over the first frames for each camera, relative to the median camera."""
     usual = {
         name: float(np.median(own))
@@ -130,7 +130,7 @@ def _apart(source: FrameSource) -> dict[str, float]:
         if name in source.rig and len(own := all_[:FRAMES][~np.isnan(all_[:FRAMES])])
     }
     middle = float(np.median(list(usual.values()))) if usual else 0.0
-    return {name: apart - middle for name, apart in usual.items()}
+    return {name: lateness - middle for name, lateness in usual.items()}
 
 
 def time_findings(measured: SynchronizationCheck | None) -> list[Finding]:
@@ -164,11 +164,11 @@ def _between(measured: SynchronizationCheck) -> Finding:
     """Cameras whose pictures by their time stamps lie between those of the others."""
     names = measured.between
     worst = max(names, key=lambda name: abs(names[name]))
-    apart = names[worst]
+    lateness = names[worst]
     return Finding(
         "warning",
         f"By their time stamps the pictures of {', '.join(map(repr, names))} lie between those of the others, those of "
-        f"{worst!r} {abs(apart) * 1e3:.1f} ms ({abs(apart) / measured.period_seconds:.2f} frames) too "
-        f"{'late' if apart > 0 else 'early'}: {LESS_THAN_A_FRAME}",
+        f"{worst!r} {abs(lateness) * 1e3:.1f} ms ({abs(lateness) / measured.period_seconds:.2f} frames) too "
+        f"{'late' if lateness > 0 else 'early'}: {LESS_THAN_A_FRAME}",
         tuple(names),
     )

@@ -207,10 +207,10 @@ def _within(points: Floats, counts: np.ndarray, centers: Floats) -> tuple[Floats
     """Without the few points far away, which would make the rig a dot."""
     if not len(points):
         return points, counts
-    apart = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-    reach = max(float(np.percentile(apart, FAR_PERCENTILE)), 1e-9)
+    distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    reach = max(float(np.percentile(distances, FAR_PERCENTILE)), 1e-9)
     reach = min(reach, 6 * max(float(np.linalg.norm(centers - np.median(points, axis=0), axis=1).max()), 1e-9))
-    return points[apart <= reach], counts[apart <= reach]
+    return points[distances <= reach], counts[distances <= reach]
 
 
 def _draw_labels(
@@ -355,10 +355,10 @@ def _picture(axis: "Axes", examined: Examination, name: str) -> None:
 def _spread(pixels: np.ndarray, count: int) -> Sequence[int]:
     """Rows far from each other: each next one is the farthest from those chosen."""
     chosen = [int(np.argmin(((pixels - pixels.mean(0)) ** 2).sum(1)))]
-    apart = np.full(len(pixels), np.inf)
+    distances = np.full(len(pixels), np.inf)
     while len(chosen) < min(count, len(pixels)):
-        apart = np.minimum(apart, ((pixels - pixels[chosen[-1]]) ** 2).sum(1))
-        chosen.append(int(apart.argmax()))
+        distances = np.minimum(distances, ((pixels - pixels[chosen[-1]]) ** 2).sum(1))
+        chosen.append(int(distances.argmax()))
     return chosen
 
 

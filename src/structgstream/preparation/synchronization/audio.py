@@ -244,8 +244,8 @@ def _several(one: Signal, other: Signal, lag: float) -> bool:
         at_one = one.start + one.step * np.arange(len(x)), other.start - lag + other.step * np.arange(len(y))
         both += np.interp(times, at_one[0], x) * np.interp(times, at_one[1], y)
     first = int(both.argmax())
-    apart = np.abs(times - times[first]) > SEVERAL_SECONDS
-    return bool(apart.any()) and float(both[apart].max()) > SEVERAL_SHARE * float(both[first])
+    elsewhere = np.abs(times - times[first]) > SEVERAL_SECONDS
+    return bool(elsewhere.any()) and float(both[elsewhere].max()) > SEVERAL_SHARE * float(both[first])
 
 
 def _matches(lags: Sequence[PairLag], weights: Sequence[float]) -> list[TimeCorrespondence]:
@@ -256,8 +256,8 @@ def _matches(lags: Sequence[PairLag], weights: Sequence[float]) -> list[TimeCorr
         shared = lag.ambiguity_seconds * weight * len(lag.instants) ** 0.5 if lag.fine else 0.0
         sigma = float(np.hypot(lag.sigma_seconds, shared))
         matches += [
-            TimeCorrespondence(lag.first, lag.second, at, at + apart, sigma, lag.confidence)
-            for at, apart in lag.instants
+            TimeCorrespondence(lag.first, lag.second, at, at + seconds, sigma, lag.confidence)
+            for at, seconds in lag.instants
         ]
     return matches
 

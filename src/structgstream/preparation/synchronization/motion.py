@@ -123,7 +123,7 @@ def solve_by_motion(
     group, coarse, good = agreeing_cameras(takes, pairs, slack_seconds=slack_seconds)
     if coarse is None or len(group) < len(takes):
         seconds = min(end - start for start, end in takes.values())
-        raise CaptureError(_apart([name for name in takes if name not in group], group, seconds))
+        raise CaptureError(_unconnected([name for name in takes if name not in group], group, seconds))
     matches = motion_correspondences(good, near=coarse)
     if len(connected_groups(takes, camera_pairs(matches))) > 1:  # too little is left near the clocks of the first round
         matches = motion_correspondences(good)
@@ -179,11 +179,11 @@ def _supported(
     return True
 
 
-def _apart(apart: Sequence[str], group: Sequence[str], seconds: float) -> str:
-    names = ", ".join(repr(name) for name in apart)
-    others = f"the cameras {', '.join(repr(name) for name in group)}" if len(group) > 1 else "any other camera"
+def _unconnected(others: Sequence[str], group: Sequence[str], seconds: float) -> str:
+    names = ", ".join(repr(name) for name in others)
+    rest = f"the cameras {', '.join(repr(name) for name in group)}" if len(group) > 1 else "any other camera"
     return (
-        f"What moves before {names} cannot be recognised in the motion before {others}, so their clocks are not "
+        f"What moves before {names} cannot be recognised in the motion before {rest}, so their clocks are not "
         f"connected; the shortest take has {seconds:.1f} s: film ten seconds of motion that all see (a person who "
         "walks and claps), give the calibration, or synchronise by audio or timestamps.csv."
     )
@@ -234,8 +234,8 @@ def _near(pair: PairSignals, near: Solution, edges: NDArray[np.float64] | None) 
         return [match]
     own = edges - near.offsets[pair.first]
     line = fitted_line(one, other, expected_seconds=expected, edges=own, rates=False)
-    apart = 0.0 if line is None else line.lag_seconds - lag.seconds
-    return [replace(match, changes=(*lag_changes(*cut, lag.seconds, own).tolist(), apart))]
+    difference = 0.0 if line is None else line.lag_seconds - lag.seconds
+    return [replace(match, changes=(*lag_changes(*cut, lag.seconds, own).tolist(), difference))]
 
 
 def _along(pair: PairSignals, near: Solution, edges: NDArray[np.float64]) -> list[TimeCorrespondence]:

@@ -9,8 +9,7 @@ import numpy as np
 
 from structgstream.data.arrays import Floats
 from structgstream.data.calibration import listed
-from structgstream.data.instants import counted_rate
-from structgstream.data.timeline import Clock, period_seconds
+from structgstream.data.timeline import Clock, counted_rate, period_seconds
 from structgstream.errors import CaptureError
 
 WARNED_SECONDS = 5e-3

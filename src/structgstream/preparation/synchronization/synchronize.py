@@ -174,9 +174,9 @@ def _by_audio(streams: Streams, stamps: Mapping[str, NDArray[np.float64]], reaso
     takes = {name: (0.0, len(sound.samples) / sound.rate) for name, sound in sounds.items()}
     groups = connected_by(list(takes), lags)
     if len(groups) > 1:
-        apart = ", ".join(repr(name) for group in groups[1:] for name in group)
+        others = ", ".join(repr(name) for group in groups[1:] for name in group)
         raise UnusableSoundError(
-            f"The sound of {apart} has nothing in common with that of {groups[0][0]!r}: no lag stands out, or the "
+            f"The sound of {others} has nothing in common with that of {groups[0][0]!r}: no lag stands out, or the "
             "videos are shorter than the time between their starts",
             "film a clap that all hear, or synchronise by motion or timestamps.csv",
         )

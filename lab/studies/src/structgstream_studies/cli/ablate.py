@@ -8,7 +8,7 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.options import Folder, parse_known_options, resolve_config
-from structgstream.cli.plain_text import say
+from structgstream.cli.progress import print_lines
 from structgstream_studies.cli.experiment import ExperimentOptions, capture_part, print_sheet, run_sweep
 
 if TYPE_CHECKING:
@@ -79,4 +79,4 @@ def main(arguments: list[str]) -> None:
     for table in options.table:
         for sheet in write_ablation(options.output, table, runs, backend=select_backend(options.device)):
             print_sheet(sheet, console)
-    say(console, f"Tables and pictures: {options.output}")
+    print_lines(console, f"Tables and pictures: {options.output}")

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import Folder, parse_options
-from structgstream.cli.plain_text import say
+from structgstream.cli.progress import print_lines
 from structgstream_studies.cli.experiment import ExperimentOptions, capture_part, print_sheet, run_sweep
 
 
@@ -58,4 +58,4 @@ def main(arguments: list[str]) -> None:
     run_sweep(with_dependencies(runs), options)
     console = Console()
     print_sheet(write_methods(options.output, runs, backend=select_backend(options.device)), console)
-    say(console, f"Table and pictures: {options.output}")
+    print_lines(console, f"Table and pictures: {options.output}")

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from structgstream.cli.app import Interrupted, UsageError
 from structgstream.cli.options import CaptureOptions, Device, Folder
-from structgstream.cli.plain_text import say
+from structgstream.cli.progress import print_lines
 from structgstream.cli.tables import compact_table, literal_cells
 from structgstream.executors.opening import ExecutorName, ExecutorOptions
 from structgstream_studies.errors import ExperimentError
@@ -135,7 +135,7 @@ class Display:
             self._live.update(Text("\n".join([counts + failed, *lines])))
             return
         for name in sorted(progress.running.keys() - self._known):
-            say(self._console, f"{counts}{failed}; begins {name}")
+            print_lines(self._console, f"{counts}{failed}; begins {name}")
         self._known |= progress.running.keys()
 
 

@@ -199,8 +199,8 @@ def _reconstruct(
     capture: CapturePart, config: StreamConfig, stream: Path, backend: "Backend", *, first: FirstFrameRun | None
 ) -> None:
     """Reconstructs into ``stream``, going on after the frames that it holds."""
-    from structgstream.evaluation.capture import part_metadata
     from structgstream.evaluation.environment import environment
+    from structgstream.evaluation.recording import part_metadata
     from structgstream.recorder import record
     from structgstream.session.struct_gstream import stream_pipeline
 

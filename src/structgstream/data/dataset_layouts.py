@@ -1,0 +1,291 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Layouts of published data sets that have a calibration file of their own.
+
+PanopticSports of Dynamic 3D Gaussians (Luiten et al., 3DV 2024): ``train_meta.json`` and ``test_meta.json`` have ``w``,
+``h`` and, per frame and camera, ``k``, ``w2c`` (OpenCV world to camera), ``fn`` (file below ``ims/``) and ``cam_id``.
+The cameras of ``test_meta.json`` are held out.
+
+Google Immersive (Broxton et al., SIGGRAPH 2020): ``models.json`` and a video per camera. Each entry has ``name``,
+``width``, ``height``, ``focal_length``, ``principal_point``, ``radial_distortion`` (OpenCV's fisheye; the first two are
+used, as published loaders do), ``orientation`` (a rotation vector, world to camera) and ``position`` (of the camera in
+the world). The first camera is held out. Published results undistort to pinholes of the same size and principal point
+with half the focal length, and take half of that size (``--scale 0.5``, 1280x960); so does this reader, in one step.
+Pixels outside of the lens's picture are black.
+
+Neural 3D Video (Li et al., CVPR 2022) and Meet Room (Li et al., NeurIPS 2022): ``poses_bounds.npy`` and one
+``camXX.mp4`` (Meet Room: ``cam_X.mp4``) per camera, or, decoded for 4DGaussians, ``camXX/images/FRAME.png``. Each row
+is an LLFF pose: a 3x5 matrix ``[R | t | (height, width, focal)]``, camera to world with the axes down, right, backward,
+then two depth bounds. Rows belong to the existing videos in sorted order; the first camera, ``cam00`` or ``cam_0``, is
+held out, as in published results. Published loaders add a COLMAP model, in ``sparse``, ``colmap/sparse`` or
+``colmap_0/sparse``: its points are used, transformed to the poses of the file.
+
+Note [Order of rows]
+~~~~~~~~~~~~~~~~~~~~
+Meet Room's rows follow the numbers of ``cam_2`` and ``cam_10``; LLFF sorts names as text, ``cam_10`` first. Where the
+two differ the pictures decide: the order in which more pairs of neighbours agree with the poses.
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from structgstream.cameras import Camera, CameraRig
+from structgstream.data.alignment import aligned_points
+from structgstream.data.calibration import (
+    Calibration,
+    PosedCamera,
+    calibrated_camera,
+    calibrated_rig,
+    intrinsics,
+    rigid,
+    rotation_matrix,
+)
+from structgstream.data.calibration_files.reading import calibration_of, read_array, readable
+from structgstream.data.camera_files import pictures_in, roots_of, videos_in
+from structgstream.data.colmap import find_model, read_model
+from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, common_pictures
+from structgstream.data.lenses import LensCamera, fisheye_lens, from_integer_centers
+from structgstream.data.pair_matches import PairMatcher, confirmed_share
+from structgstream.data.posed_capture import of_pictures, of_videos, open_posed
+from structgstream.data.source import FrameSource
+from structgstream.data.text_files import NamedFiles, mapping, number, path_parts, pixels, read_json
+from structgstream.data.timeline import natural
+from structgstream.data.wrappers import resized
+from structgstream.errors import CalibrationError, CaptureError
+
+PANOPTIC_FPS = 30000 / 1001
+TRAIN, TEST = "train_meta.json", "test_meta.json"
+
+
+def recognizes_panoptic(path: Path) -> bool:
+    """Whether the folder has this layout."""
+    return (path / TRAIN).is_file()
+
+
+def open_panoptic(path: Path) -> ImageSource:
+    """The capture at ``path``.
+
+    Raises:
+        CaptureError: a file is not what the layout asks for, or a camera has no pictures.
+        CalibrationError: broken numbers, or a camera that moves.
+    """
+    cameras: dict[str, Camera] = {}
+    files: dict[str, dict[str, Path]] = {}
+    held_out: list[str] = []
+    for meta in (path / TRAIN, path / TEST):
+        if not meta.is_file():
+            continue
+        found, pictures = _read_meta(meta)
+        if both := sorted(found.keys() & cameras.keys(), key=natural):
+            raise CaptureError(f"Camera {both[0]!r} is in both {TRAIN} and {TEST} of {path}; keep it in one.")
+        cameras |= found
+        files |= pictures
+        if meta.name == TEST:
+            held_out += found
+    names = sorted(cameras, key=natural)
+    rig = calibrated_rig({name: cameras[name] for name in names}, held_out, where=path)
+    common = common_pictures({name: files[name] for name in names}, where=path, training=rig.training)
+    return ImageSource(path.name, rig, PANOPTIC_FPS, common.files, instants=common.instants)
+
+
+def _read_meta(meta: Path) -> tuple[dict[str, Camera], dict[str, dict[str, Path]]]:
+    """Cameras of one file, and those pictures of each that exist, by the name of the instant."""
+    with readable(meta, "w, h, k, w2c, fn and cam_id, the last four as lists over frames and cameras"):
+        content = mapping(read_json(meta))
+        width, height = pixels((content["w"], content["h"]))
+        pictures = NamedFiles(meta.parent / "ims", PICTURE_SUFFIXES)
+        rows = [
+            (str(name), K, viewmat, _picture(pictures, str(file)), file)
+            for frame in zip(content["cam_id"], content["k"], content["w2c"], content["fn"], strict=True)
+            for name, K, viewmat, file in zip(*frame, strict=True)
+        ]
+    first: dict[str, tuple[Any, Any]] = {}
+    files: dict[str, dict[str, Path]] = {name: {} for name, *_ in rows}
+    for name, K, viewmat, picture, file in rows:
+        known = first.setdefault(name, (K, viewmat))
+        if known != (K, viewmat) and not _same(known, (K, viewmat)):
+            raise CalibrationError(
+                f"Camera {name!r} of {meta} moves: its k or w2c changes at {file}; expected cameras that stand still."
+            )
+        if picture is not None:
+            files[name][picture.stem] = picture
+    cameras = {
+        name: calibrated_camera(name, viewmat=viewmat, K=K, width=width, height=height, where=meta)
+        for name, (K, viewmat) in first.items()
+    }
+    return cameras, files
+
+
+def _picture(pictures: NamedFiles, text: str) -> Path | None:
+    """The picture of a path below ``ims``, which may name that and what is above it."""
+    return pictures.find(text) or pictures.find("/".join(path_parts(text)[-2:]))
+
+
+def _same(a: tuple[Any, Any], b: tuple[Any, Any]) -> bool:
+    """Whether two pairs of matrices agree up to rounding; NaN agrees with NaN, which the camera refuses."""
+    try:
+        return all(
+            np.allclose(np.array(x, float), np.array(y, float), rtol=1e-6, atol=1e-9, equal_nan=True)
+            for x, y in zip(a, b)
+        )
+    except (TypeError, ValueError):
+        return False
+
+
+MODELS_FILE = "models.json"
+IMMERSIVE_HELD_OUT = "camera_0001"
+FOCAL_SHARE = 0.5
+IMMERSIVE_EXPECTED = (
+    "a list of cameras with name, width, height, focal_length, principal_point, radial_distortion, orientation "
+    "and position"
+)
+
+
+def recognizes_immersive(path: Path) -> bool:
+    """Whether the folder has this layout."""
+    return (path / MODELS_FILE).is_file()
+
+
+def open_immersive(path: Path) -> FrameSource:
+    """The capture at ``path``, undistorted; a video without calibration, which some takes have, is left out.
+
+    Raises:
+        CaptureError: a video cannot be read.
+        CalibrationError: a broken file, or videos of other proportions than it says.
+    """
+    return open_posed(path, read_models(path / MODELS_FILE), target=_as_published, complete=False)
+
+
+def _as_published(filmed: LensCamera) -> Camera:
+    shares = torch.tensor([[FOCAL_SHARE, 1, 1], [1, FOCAL_SHARE, 1], [1, 1, 1]], dtype=torch.float64)
+    return replace(filmed.camera, K=filmed.camera.K * shares)
+
+
+def read_models(file: Path) -> Calibration:
+    """The cameras of ``models.json``.
+
+    Raises:
+        CalibrationError: the file cannot be read.
+    """
+    with readable(file, IMMERSIVE_EXPECTED):
+        entries = [(str(entry["name"]), entry) for entry in read_json(file)]
+    return replace(
+        calibration_of(entries, _immersive_camera, file=file, expected=IMMERSIVE_EXPECTED),
+        held_out=(IMMERSIVE_HELD_OUT,),
+    )
+
+
+def _immersive_camera(name: str, entry: dict[str, Any]) -> PosedCamera:
+    focal, (cx, cy) = number(entry["focal_length"]), entry["principal_point"]
+    rotation = rotation_matrix(np.array(entry["orientation"], dtype=np.float64).reshape(3))
+    viewmat = rigid(rotation, -rotation @ np.array(entry["position"], dtype=np.float64))
+    return PosedCamera(
+        name=name,
+        viewmat=viewmat,
+        K=from_integer_centers(intrinsics(focal, focal * number(entry.get("pixel_aspect_ratio", 1)), cx, cy)),
+        size=pixels((entry["width"], entry["height"])),
+        lens=fisheye_lens(entry["radial_distortion"][:2]),
+    )
+
+
+log = logging.getLogger(__name__)
+
+POSES = "poses_bounds.npy"
+N3DV_HELD_OUT = ("cam00", "cam_0")
+COLMAP_FOLDERS = ("", "colmap", "colmap_0")
+SIDE = 640  # pixels, of pictures that are matched to tell the order of rows
+LARGEST = 1e100  # of a number of a pose
+MIN_CONFIRMED = 0.5  # of the pairs of neighbours
+
+
+def recognizes_n3dv(path: Path) -> bool:
+    """Whether the folder has this layout."""
+    return (path / POSES).is_file()
+
+
+def open_n3dv(path: Path) -> FrameSource:
+    """The capture at ``path``. Videos smaller than the poses say are taken as uniformly reduced.
+
+    Raises:
+        CaptureError: a video or picture cannot be read.
+        CalibrationError: broken poses, not one pose per video, or a video of other proportions than its pose.
+    """
+    poses = _read_llff_poses(path / POSES)
+    videos = next(filter(None, map(videos_in, roots_of(path))), {})
+    pictures = {} if videos else next(filter(None, map(pictures_in, roots_of(path))), {})
+    names = sorted(videos or pictures, key=natural)
+    if len(names) != len(poses):
+        raise CalibrationError(
+            f"{path / POSES} has {len(poses)} poses, {path} has {len(names)} {'videos' if videos else 'cameras'}; "
+            "expected one pose per camera, in sorted order."
+        )
+
+    def opened(names: Sequence[str]) -> FrameSource:
+        posed = {name: _n3dv_camera(name, pose, path / POSES) for name, pose in zip(names, poses, strict=True)}
+        posed = {name: posed[name] for name in sorted(posed, key=natural)}
+        held_out = [name for name in N3DV_HELD_OUT if name in posed]
+        calibration = Calibration(path / POSES, tuple(posed.values()), held_out=held_out)
+        if videos:
+            return of_videos(path, videos, root=path, calibration=calibration)[0]
+        return of_pictures(path, pictures, posed, root=path, calibration=calibration)[0]
+
+    source = opened(names)
+    if names != sorted(names) and _as_text(source, opened(sorted(names)).rig):
+        log.info(
+            "%s: its rows are in the order of the names as text (cam1, cam10, cam2), as the pictures say", path / POSES
+        )
+        source = opened(sorted(names))
+    return replace(source, points=_points(path, source.rig))  # type: ignore[type-var]
+
+
+def _as_text(by_number: FrameSource, as_text: CameraRig) -> bool:
+    """Whether the pictures of frame 0 agree with the second rig rather than the first; see Note [Order of rows]."""
+    training = {name: by_number.rig[name] for name in by_number.rig.training}
+    width = max(camera.width for camera in training.values())
+    small = resized(by_number, min(1.0, SIDE / width))
+    frame = next(iter(small.frames()))
+    names = list(frame.showing(small.rig.training))
+    matcher = PairMatcher({name: frame.images[name] for name in names})
+    shares = []
+    for rig in (by_number.rig, as_text):
+        cameras = {name: rig[name].resized(small.rig[name].width, small.rig[name].height) for name in names}
+        shares.append(confirmed_share(cameras, matcher))
+    if max(shares) < MIN_CONFIRMED or shares[0] == shares[1]:
+        log.warning(
+            "%s: the pictures do not say whether the rows of %s follow the names by number or as text; by "
+            "number is taken. Names with leading zeros (cam01) are clear.",
+            by_number.name, POSES,
+        )  # fmt: skip
+        return False
+    return shares[1] > shares[0]
+
+
+def _points(path: Path, rig: CameraRig) -> NDArray[np.float64] | None:
+    """Those of the COLMAP model beside the poses, if there is one that agrees with them."""
+    found = next((model for name in COLMAP_FOLDERS if (model := find_model(path / name)) is not None), None)
+    return None if found is None else aligned_points(read_model(found), rig)
+
+
+def _read_llff_poses(file: Path) -> NDArray[np.float64]:
+    """``[V, 3, 5]`` matrices of the file."""
+    with readable(file, "3x5 poses and two bounds of each camera"):
+        rows = read_array(file)
+    if rows.ndim != 2 or rows.shape[1] != 17:
+        raise CalibrationError(f"{file} has shape {rows.shape}; expected (cameras, 17): 3x5 poses and two bounds.")
+    return rows[:, :15].reshape(-1, 3, 5)
+
+
+def _n3dv_camera(name: str, pose: NDArray[np.float64], where: Path) -> PosedCamera:
+    if not (np.abs(pose) < LARGEST).all():
+        raise CalibrationError(f"Camera {name!r} of {where} has a number that is not finite (NaN or infinity).")
+    down, right, backward, center, (height, width, focal) = pose.T
+    rotation = np.stack([right, down, -backward])  # rows of world to camera: x right, y down, z forward
+    with readable(where, "3x5 poses with height, width and focal length"):
+        size = pixels((width, height))
+    return PosedCamera(name, rigid(rotation, -rotation @ center), intrinsics(focal, focal, width / 2, height / 2), size)

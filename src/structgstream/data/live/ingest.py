@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ingest of all cameras of a live run: a thread per camera, and one that synchronises their pictures into sets."""
+
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from structgstream.data.live.camera import CameraFeed, OpenCamera
+from structgstream.data.live.clock import ClockMapper, ClockResets
+from structgstream.data.live.recorder import Recording
+from structgstream.data.live.rig_file import LiveRig
+from structgstream.data.live.status import Fault, FaultLog
+from structgstream.data.live.synchronizer import FrameSynchronizer, LivePicture, PictureSet, SetTimes
+from structgstream.frames import MultiViewFrame
+
+TICK_SECONDS = 0.02
+MAX_MISSED_SETS = 30  # before a camera is reported as out of step
+JOIN_SECONDS = 1.0
+
+
+class FrameBuffer:
+    """Holds the newest set of pictures until it is taken; a newer one replaces it. Thread-safe.
+
+    Args:
+        convert: makes the frame of a set: sRGB pictures, and the presentation time on the common clock.
+    """
+
+    def __init__(self, convert: Callable[[PictureSet], MultiViewFrame]) -> None:
+        self._convert = convert
+        self._newest: PictureSet | None = None
+        self._changed = threading.Condition()
+        self.skipped = 0
+        """Number of sets that were replaced by a newer one."""
+        self.times: SetTimes | None = None
+        """Times of the set that was taken last; None before the first."""
+
+    def put(self, pictures: PictureSet) -> None:
+        """Stores a set."""
+        with self._changed:
+            self.skipped += self._newest is not None
+            self._newest = pictures
+            self._changed.notify()
+
+    def take(self, timeout_seconds: float) -> MultiViewFrame | None:
+        """The next frame; None if there was none in time."""
+        with self._changed:
+            if self._newest is None:
+                self._changed.wait(timeout_seconds)
+            pictures, self._newest = self._newest, None
+        if pictures is None:
+            return None
+        self.times = pictures.times
+        return self._convert(pictures)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no set waits."""
+        return self._newest is None
+
+
+class Ingest:
+    """Cameras' pictures on their way to a buffer, as complete sets.
+
+    Args:
+        rig: the content of the rig file.
+        sizes: width and height of each camera's pictures as they were calibrated, pixels.
+        fps: maximum number of sets per second.
+        faults: counts and logs faults.
+        buffer: receives the sets.
+        recording: records packets, or None.
+        now: monotonic seconds.
+        unix_offset: Unix time minus ``now``, seconds.
+        open_camera: opens a camera with a timeout; None for PyAV.
+    """
+
+    def __init__(
+        self,
+        rig: LiveRig,
+        *,
+        sizes: Mapping[str, tuple[int, int]],
+        fps: float,
+        faults: FaultLog,
+        buffer: FrameBuffer,
+        recording: Recording | None,
+        now: Callable[[], float],
+        unix_offset: float,
+        open_camera: OpenCamera | None = None,
+    ) -> None:
+        self._rig, self._faults, self.buffer, self._now = rig, faults, buffer, now
+        self._synchronizer = FrameSynchronizer(
+            sizes,
+            fps=fps,
+            tolerance_seconds=rig.tolerance_seconds or 0.5 / fps,
+            deadline_seconds=rig.deadline_seconds,
+            queue_frames=rig.queue_frames,
+            count=faults.count,
+            started=now(),
+        )
+        self._changed = threading.Condition()
+        self._stop = threading.Event()
+        self._last_arrival = now()
+        self._failure: BaseException | None = None
+        self.sets = self.small_sets = 0
+        resets = ClockResets()
+        common: dict[str, Any] = {
+            "receiver": self, "faults": faults, "base": rig.clock, "now": now, "unix_offset": unix_offset,
+            "silent_seconds": rig.silent_seconds, "stuck_seconds": rig.stuck_seconds, "open_camera": open_camera,
+        }  # fmt: skip
+        self.feeds = {
+            name: CameraFeed(
+                name,
+                camera,
+                size=sizes[name],
+                clock=ClockMapper(rig.clock, offset_seconds=camera.offset_seconds, resets=resets),
+                recorder=None if recording is None else recording.camera(name, faults),
+                **common,
+            )
+            for name, camera in rig.cameras.items()
+        }
+        self._thread = threading.Thread(target=self._synchronize, name="synchronizer", daemon=True)
+
+    def start(self) -> None:
+        """Opens all cameras."""
+        self._thread.start()
+        for feed in self.feeds.values():
+            feed.start()
+
+    def stop(self) -> None:
+        """Ends all threads; waits at most a second for each."""
+        self._stop.set()
+        for feed in self.feeds.values():
+            feed.stop()
+        for thread in (self._thread, *self.feeds.values()):
+            thread.join(JOIN_SECONDS)
+
+    def deliver(self, camera: str, picture: LivePicture) -> None:
+        """See ``camera.Receiver``."""
+        with self._changed:
+            self._synchronizer.add(camera, picture)
+            self._last_arrival = picture.arrived
+            self._changed.notify()
+
+    def mark_absent(self, camera: str) -> None:
+        """See ``camera.Receiver``."""
+        with self._changed:
+            self._synchronizer.mark_absent(camera)
+            self._changed.notify()
+
+    def others_changed_at(self, camera: str) -> float:
+        """See ``camera.Receiver``."""
+        return max((feed.changed_at for name, feed in self.feeds.items() if name != camera), default=-float("inf"))
+
+    def count_small_set(self) -> None:
+        """A set had pictures of too few training cameras."""
+        self.small_sets += 1
+
+    @property
+    def queue_lengths(self) -> dict[str, int]:
+        """Number of pictures that wait to be matched, by camera."""
+        with self._changed:
+            return self._synchronizer.queue_lengths
+
+    @property
+    def present(self) -> list[str]:
+        """Cameras that sent a usable picture within the deadline."""
+        with self._changed:
+            return self._synchronizer.present(self._now())
+
+    @property
+    def open_cameras(self) -> list[str]:
+        """Cameras that may still send: all but files that have ended or cannot be read."""
+        return [name for name, feed in self.feeds.items() if not feed.ended]
+
+    @property
+    def end_reason(self) -> str | None:
+        """Why no more pictures will arrive; None while they may.
+
+        Raises:
+            BaseException: what ended the synchroniser's thread.
+        """
+        if self._failure is not None:
+            raise self._failure
+        if not self.buffer.is_empty:
+            return None
+        if not self.open_cameras and not any(self.queue_lengths.values()):
+            return "all files of cameras have come to their end, or cannot be read"
+        limit, silent = self._rig.end_seconds, self._now() - self._last_arrival
+        if limit is not None and silent > limit:
+            return f"no camera has sent a picture for {silent:.0f} s, so the stream ends (end_seconds in the rig file)"
+        return None
+
+    def describe_absent(self) -> str:
+        """How many cameras are present, and which are absent, for a message."""
+        present = self.present
+        absent = [name for name in self.feeds if name not in present]
+        return f"{len(present)} of {len(self.feeds)} cameras send; absent: {', '.join(absent) or 'none'}"
+
+    def _synchronize(self) -> None:
+        try:
+            while not self._stop.is_set():
+                with self._changed:
+                    pictures = self._synchronizer.next_set(self._now())
+                    if pictures is None:
+                        self._changed.wait(TICK_SECONDS)
+                        continue
+                    out_of_step = self._synchronizer.out_of_step(MAX_MISSED_SETS)
+                self.sets += 1
+                self.buffer.put(pictures)
+                self._warn_out_of_step(out_of_step)
+        except BaseException as error:  # raised in the trainer's thread
+            self._failure = error
+
+    def _warn_out_of_step(self, cameras: Mapping[str, float]) -> None:
+        for name, seconds in cameras.items():
+            if seconds < 0:
+                why = (
+                    f"are {-seconds:.3f} s behind those of the others: either they come late, which a longer "
+                    "deadline_seconds or a less busy machine mends, or its clock is"
+                )
+            else:
+                why = f"are {seconds:.3f} s ahead of those of the others: its clock is"
+            text = (
+                f"is absent, because its pictures {why}, which offset_seconds = {-seconds:+.3f} in the rig file mends"
+            )
+            self._faults.warn(name, Fault.UNMATCHED.value, text)

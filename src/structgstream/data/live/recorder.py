@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Records the cameras' packets, so that a live run can be repeated from files.
+
+Each camera has a file: MPEG-TS for codecs that it supports, Matroska for others; both can be read up to where a crash
+truncated them. Time stamps are those of the common clock, less its value at the start, so that a camera that
+reconnected or whose clock was reset stays synchronised; pictures are not encoded again. ``capture.json`` makes the
+folder a prepared capture of the cameras that sent something. Damaged packets, and pictures of another size, are not
+recorded.
+
+A file has one codec, and time stamps of MPEG-TS wrap after 26 hours. After :data:`PART_SECONDS`, and when a camera
+returns with another codec, size or parameters, every camera continues, at its next key frame, in the folder
+``part-001``, then ``part-002``, each a capture, too.
+"""
+
+import json
+import logging
+import threading
+from bisect import bisect_right
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+from structgstream.data.live.calibration import select_cameras
+from structgstream.data.live.status import FaultLog
+from structgstream.data.prepared import FILE, PreparedCapture, write_prepared
+from structgstream.data.timeline import Clock
+from structgstream.data.video_index import load_av
+from structgstream.errors import StorageError
+from structgstream.frames import MultiViewFrame
+
+if TYPE_CHECKING:
+    from av.packet import Packet
+
+log = logging.getLogger(__name__)
+
+PART_SECONDS = 12 * 3600.0
+LEAD_SECONDS = 10.0  # for cameras whose first pictures were taken before those of the first packet
+MPEGTS_CODECS = frozenset({"h264", "hevc", "mpeg2video"})
+TICKS = 90_000
+STAMPS, FRAMES = "timestamps.csv", "frames.jsonl"
+
+
+class Recording:
+    """The folder of a recording.
+
+    Args:
+        folder: created; a recording in it is continued in its next part.
+        calibration: of the cameras.
+        fps: of the common timeline.
+
+    Raises:
+        StorageError: the folder cannot be written.
+    """
+
+    def __init__(self, folder: Path, calibration: PreparedCapture, *, fps: float) -> None:
+        self._folder, self._calibration, self._fps = folder, calibration, fps
+        self._starts: list[float] = []  # of the parts, on the common clock
+        self._lock = threading.Lock()
+        self._first = 0
+        while (_part(folder, self._first) / FILE).exists():
+            self._first += 1
+        self._files: dict[int, dict[str, str]] = {}
+        self._cameras: list[CameraRecorder] = []
+        self._texts: dict[Path, IO[str]] = {}
+        self.folder(0, {})
+
+    def camera(self, name: str, faults: FaultLog) -> "CameraRecorder":
+        """The recorder of a camera."""
+        self._cameras.append(CameraRecorder(self, name, faults))
+        return self._cameras[-1]
+
+    def part_at(self, common_seconds: float) -> int:
+        """The number of the part of an instant of the common clock."""
+        with self._lock:
+            return self._part_at(common_seconds)
+
+    def time_in_part(self, number: int, common_seconds: float) -> float:
+        """Seconds from the start of a part to an instant of the common clock."""
+        with self._lock:
+            return common_seconds - self._starts[number]
+
+    def next_part(self, part: int, common_seconds: float) -> int | None:
+        """The part in which a new file may start at an instant, after one in ``part``; None if none may yet."""
+        with self._lock:
+            number = self._part_at(common_seconds)
+            if number == part == len(self._starts) - 1:
+                self._starts.append(common_seconds)
+                return number + 1
+            return number if number > part and common_seconds >= self._starts[number] else None
+
+    def _part_at(self, common_seconds: float) -> int:
+        if not self._starts:
+            self._starts = [common_seconds - LEAD_SECONDS]
+        while common_seconds - self._starts[-1] >= PART_SECONDS:
+            self._starts.append(self._starts[-1] + PART_SECONDS)
+        return max(bisect_right(self._starts, common_seconds) - 1, 0)
+
+    def folder(self, number: int, files: Mapping[str, str]) -> Path:
+        """The folder of a part, whose ``capture.json`` then names these files of cameras, and those before."""
+        with self._lock:
+            folder = _part(self._folder, self._first + number)
+            if number not in self._files:
+                self._files[number] = {}
+                try:
+                    folder.mkdir(parents=True, exist_ok=True)
+                except OSError as error:
+                    raise StorageError(f"The folder {folder} cannot be made ({error.strerror}).") from None
+            known = self._files[number]
+            known.update(files)
+            cameras = {
+                name: replace(camera, files=known.get(name, f"{name}.ts"), clock=Clock())
+                for name, camera in self._calibration.cameras.items()
+            }
+            capture = replace(self._calibration, cameras=cameras, fps=self._fps, points=None)
+            write_prepared(folder, select_cameras(capture, [*known]) if known else capture)
+            return folder
+
+    def add_frame(self, frame: MultiViewFrame, *, common_seconds: float) -> None:
+        """Records which instant became which frame of the stream."""
+        number = self.part_at(common_seconds)
+        entry = {
+            "index": frame.index,
+            "pts_seconds": round(frame.pts_seconds, 6),
+            "recorded_seconds": round(self.time_in_part(number, common_seconds), 6),
+            "captured_unix_seconds": frame.captured_unix_seconds,
+            "cameras": [*frame.images],
+        }
+        self.add_line(number, FRAMES, json.dumps(entry) + "\n")
+
+    def add_line(self, number: int, file: str, line: str) -> None:
+        """Appends a line to a text file of a part.
+
+        Raises:
+            StorageError: it cannot be written.
+        """
+        if number not in self._files:
+            self.folder(number, {})
+        path = _part(self._folder, self._first + number) / file
+        try:
+            with self._lock:
+                text = self._texts.get(path)
+                if text is None:
+                    text = self._texts[path] = path.open("a", buffering=1)
+                    if file == STAMPS:
+                        text.write("camera,recorded_seconds,common_seconds,key\n")
+                text.write(line)
+        except OSError as error:
+            raise StorageError(f"{path} cannot be written ({error.strerror}).") from None
+
+    def close(self) -> None:
+        """Closes all files; what cannot be written any more is left out."""
+        for camera in self._cameras:
+            camera.close()
+        for text in self._texts.values():
+            with suppress(OSError):
+                text.close()
+
+
+class CameraRecorder:
+    """Records the packets of one camera; called from its thread. A failure is logged and ends its recording."""
+
+    def __init__(self, recording: Recording, name: str, faults: FaultLog) -> None:
+        self._recording, self._name, self._faults = recording, name, faults
+        self._output: Any = None
+        self._stream: Any = None
+        self._codec: tuple[object, ...] | None = None
+        self._part = -1
+        self._last = -1
+        self._failed = False
+        self._lock = threading.Lock()
+
+    def record(self, packet: "Packet", *, shift_seconds: float) -> None:
+        """See ``camera.PacketRecorder``."""
+        if self._failed or packet.pts is None or packet.time_base is None:
+            return
+        try:
+            with self._lock:
+                self._record(packet, shift_seconds)
+        except (load_av().error.FFmpegError, OSError, ValueError, StorageError) as error:
+            self._failed = True
+            self._report(error)
+
+    def _report(self, error: Exception) -> None:
+        reason = getattr(error, "strerror", None) or error
+        self._faults.warn(self._name, "recording", f"is no longer recorded ({reason}); the stream goes on")
+
+    def close(self) -> None:
+        """Closes the file."""
+        with self._lock:
+            try:
+                self._close()
+            except (load_av().error.FFmpegError, OSError, ValueError) as error:
+                self._report(error)
+            self._failed = True
+
+    def _record(self, packet: "Packet", shift_seconds: float) -> None:
+        assert packet.pts is not None
+        pts = float(packet.pts * packet.time_base)
+        common = pts + shift_seconds
+        number = self._recording.part_at(common)
+        same = self._output is not None and _codec(packet.stream) == self._codec
+        starts = packet.is_keyframe and (number > self._part or not same)
+        if starts and (new := self._recording.next_part(self._part, common)) is not None:
+            self._open(packet, new)
+            number, same = new, True
+        if not same or number < self._part:
+            return
+        stamp = self._recording.time_in_part(self._part, common)
+        behind = 0.0 if packet.dts is None else pts - float(packet.dts * packet.time_base)
+        self._write(packet, round(stamp * TICKS), round(behind * TICKS))
+        line = f"{self._name},{stamp:.6f},{common:.6f},{int(packet.is_keyframe)}\n"
+        self._recording.add_line(self._part, STAMPS, line)
+
+    def _write(self, packet: "Packet", pts: int, behind: int) -> None:
+        """Writes a copy of the packet with other time stamps; those of decoding must increase."""
+        copy = load_av().Packet(bytes(packet))
+        copy.stream = self._stream
+        copy.time_base = Fraction(1, TICKS)
+        copy.dts = max(pts - behind, self._last + 1)
+        copy.pts = max(pts, copy.dts)
+        copy.is_keyframe = packet.is_keyframe
+        self._last = copy.dts
+        self._output.mux(copy)
+
+    def _open(self, packet: "Packet", number: int) -> None:
+        self._close()
+        codec = packet.stream.codec_context.name
+        suffix, kind = ("ts", "mpegts") if codec in MPEGTS_CODECS else ("mkv", "matroska")
+        name = f"{self._name}.{suffix}"
+        folder = self._recording.folder(number, {self._name: name})
+        self._output = load_av().open(str(folder / name), "w", format=kind, options={"flush_packets": "1"})
+        self._stream = self._output.add_stream_from_template(packet.stream)
+        self._codec, self._part, self._last = _codec(packet.stream), number, -1
+
+    def _close(self) -> None:
+        if self._output is not None:
+            output, self._output = self._output, None
+            output.close()
+
+
+def _codec(stream: Any) -> tuple[object, ...]:
+    """Codec, size and parameters, of which a file has one."""
+    context = stream.codec_context
+    return context.name, context.width, context.height, bytes(context.extradata or b"")
+
+
+def _part(folder: Path, number: int) -> Path:
+    return folder if number == 0 else folder / f"part-{number:03d}"

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``transforms.json`` of Blender, instant-ngp, nerfstudio and others, as a calibration and as a capture.
+
+Poses are camera to world in OpenGL axes. Intrinsics are at the top or in each frame: ``fl_x``, ``fl_y``, ``cx``,
+``cy``, ``w``, ``h``, or Blender's ``camera_angle_x``; ``k1`` ... ``p2``; ``camera_model``. The top-left pixel's centre
+is (0.5, 0.5), as here. ``transforms_test.json`` is held out.
+
+Pictures of one pose are of one camera. If each has a ``time``, the instants are the times; otherwise pictures and
+videos are found by the cameras' names, as with other calibrations, so that a file of one instant serves for all.
+"""
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from structgstream.data.calibration import Calibration, PosedCamera, intrinsics
+from structgstream.data.calibration_files.reading import calibration_of, positive, readable
+from structgstream.data.images import PICTURE_SUFFIXES
+from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential
+from structgstream.data.picture_headers import picture_size
+from structgstream.data.posed_capture import of_pictures, open_posed
+from structgstream.data.source import FrameSource
+from structgstream.data.text_files import NamedFiles, Unreadable, mapping, number, path_parts, pixels, read_json
+from structgstream.data.undistortion import undistort
+from structgstream.errors import CalibrationError
+
+WHOLE, TRAIN = "transforms.json", "transforms_train.json"
+TEST, VALIDATION = "transforms_test.json", "transforms_val.json"
+EXPECTED = "frames with file_path and transform_matrix, and fl_x, cx, cy, w and h or camera_angle_x"
+log = logging.getLogger(__name__)
+
+PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
+OPENCVS = ("OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
+FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A picture of a file of transforms: its camera, where it lies, when it was taken and whether it is held out."""
+
+    camera: PosedCamera
+    file: Path
+    time: float | None
+    held_out: bool
+
+
+def find(folder: Path) -> tuple[Path, ...]:
+    """The file, or Blender's two."""
+    if (folder / WHOLE).is_file():
+        return (folder / WHOLE,)
+    return tuple(folder / name for name in (TRAIN, TEST) if (folder / TRAIN).is_file() and (folder / name).is_file())
+
+
+def read(files: tuple[Path, ...]) -> Calibration:
+    """A camera for each picture of the files.
+
+    Raises:
+        CalibrationError: they are broken.
+    """
+    shots = read_shots(files)
+    held_out = [shot.camera.name for shot in shots if shot.held_out]
+    return Calibration(files[0], tuple(shot.camera for shot in shots), held_out=held_out)
+
+
+def read_shots(files: tuple[Path, ...]) -> list[Shot]:
+    """Every picture of the files, in their order.
+
+    Raises:
+        CalibrationError: they are broken, or a lens is not known here.
+    """
+    shots = []
+    if (files[0].parent / VALIDATION).is_file():
+        log.warning("%s: the pictures of %s are left out", files[0].parent, VALIDATION)
+    for file in files:
+        with readable(file, EXPECTED):
+            content = mapping(read_json(file))
+            frames = [{**content, **mapping(frame)} for frame in content["frames"]]
+            entries = [(str(frame["file_path"]), frame) for frame in frames]
+        pictures = NamedFiles(file.parent, PICTURE_SUFFIXES)
+        found: list[tuple[Path, float | None]] = []
+
+        def camera(
+            name: str,
+            frame: dict[str, Any],
+            pictures: NamedFiles = pictures,
+            found: list[tuple[Path, float | None]] = found,
+            file: Path = file,
+        ) -> PosedCamera:
+            picture = pictures.find(name) or file.parent.joinpath(*path_parts(name))
+            found.append((picture, None if frame.get("time") is None else number(frame["time"])))
+            return _camera(name, frame, picture, file)
+
+        cameras = calibration_of(entries, camera, file=file, expected=EXPECTED).cameras
+        shots += [
+            Shot(posed, picture, time, file.name == TEST) for posed, (picture, time) in zip(cameras, found, strict=True)
+        ]
+    return shots
+
+
+def stated_fps(file: Path) -> float | None:
+    """The frames a second that a file states, or None.
+
+    Raises:
+        CalibrationError: a rate that is not positive.
+    """
+    with readable(file, "fps as a number of frames a second"):
+        content = mapping(read_json(file))
+        return None if content.get("fps") is None else positive(content, "fps")
+
+
+def _camera(name: str, frame: dict[str, Any], picture: Path, where: Path) -> PosedCamera:
+    if frame.get("w") is not None and frame.get("h") is not None:
+        width, height = pixels((frame["w"], frame["h"]))
+    elif picture.is_file():
+        width, height = picture_size(picture)
+    else:
+        raise KeyError("w and h")
+    if frame.get("fl_x") is not None:
+        fx = number(frame["fl_x"])
+    elif not 0 < (angle := number(frame["camera_angle_x"])) < math.pi:
+        raise Unreadable(f"camera_angle_x of {angle:g} radians")
+    else:
+        fx = width / 2 / math.tan(angle / 2)
+    stated = {key: frame[key] for key in ("fl_y", "cx", "cy") if frame.get(key) is not None}
+    K = intrinsics(fx, stated.get("fl_y", fx), stated.get("cx", width / 2), stated.get("cy", height / 2))
+    pose = np.array(frame["transform_matrix"], dtype=np.float64)
+    pose = np.vstack([pose, [0, 0, 0, 1]]) if pose.shape == (3, 4) else pose.reshape(4, 4)
+    viewmat = np.linalg.inv(pose @ np.diag([1.0, -1.0, -1.0, 1.0])).astype(np.float64)
+    inside = picture.relative_to(where.parent).as_posix()
+    return PosedCamera(inside, viewmat, K, (width, height), _lens(name, frame, where))
+
+
+def _lens(name: str, frame: dict[str, Any], where: Path) -> Lens:
+    """The lens of a picture, whose model may be one of COLMAP's names.
+
+    Raises:
+        CalibrationError: it is not known here.
+    """
+    model = "OPENCV_FISHEYE" if frame.get("is_fisheye") else str(frame.get("camera_model") or "OPENCV").upper()
+    k1, k2, k3, k4, p1, p2 = (number(frame.get(key) or 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    if model in FISHEYES:
+        return Fisheye(k1, k2, k3, k4)
+    if model in PINHOLES or (model in OPENCVS and not any((k1, k2, k3, k4, p1, p2))):
+        return Pinhole()
+    if model not in OPENCVS or (k4 and model != "FULL_OPENCV"):
+        raise CalibrationError(
+            f"The camera of {name!r} of {where} is of the model {model}{' with k4' if k4 else ''}, which is not known "
+            f"here; expected {', '.join((*PINHOLES, *OPENCVS, *FISHEYES))} (k1, k2, k3, p1, p2)."
+        )
+    k5, k6 = (number(frame.get(key) or 0.0) for key in ("k5", "k6"))
+    return RadialTangential(k1, k2, p1, p2, k3, k4, k5, k6)
+
+
+SAME = 6  # digits in which poses of one camera agree
+
+Cameras = Mapping[str, Sequence[Shot]]
+
+
+def recognizes_transforms(path: Path) -> bool:
+    """Whether the folder has this layout."""
+    return bool(find(path))
+
+
+def open_transforms(path: Path) -> FrameSource:
+    """The capture at ``path``; what ``transforms_test.json`` lists is held out.
+
+    Raises:
+        CaptureError: a picture is missing or cannot be read.
+        CalibrationError: a broken file, or a camera that moves.
+    """
+    files = find(path)
+    shots = read_shots(files)
+    if files[0].name == WHOLE and any(shot.time is None for shot in shots):
+        return open_posed(path, read(files), fps=stated_fps(files[0]))
+    cameras = _by_pose(shots, files[0])
+    pictures = {name: _instants(own) for name, own in cameras.items()}
+    poses = {name: own[0].camera for name, own in cameras.items()}
+    held_out = [name for name, own in cameras.items() if own[0].held_out]
+    calibration = Calibration(files[0], tuple(poses.values()), held_out=held_out)
+    source, filmed = of_pictures(path, pictures, poses, root=path, calibration=calibration, fps=stated_fps(files[0]))
+    return undistort(source, filmed)
+
+
+def _by_pose(shots: Sequence[Shot], where: Path) -> Cameras:
+    """The pictures of each camera, by a name that its files share."""
+    groups: dict[tuple[float, ...], list[Shot]] = {}
+    for shot in shots:
+        camera = shot.camera
+        key = (*camera.viewmat.round(SAME).ravel().tolist(), *camera.K.round(3).ravel().tolist(), shot.held_out)
+        groups.setdefault(key, []).append(shot)
+    if len({shot.time for shot in shots}) > 1 and all(len(own) == 1 for own in groups.values()):
+        raise CalibrationError(
+            f"Every picture of {where} has a pose and a time of its own: one camera that moves; expected several that "
+            "stand still."
+        )
+    listed = list(groups.values())
+    for part in ("parent", "stem"):
+        names = [{_part(shot.file, part) for shot in own} for own in listed]
+        if all(len(name) == 1 for name in names) and len(set.union(*names)) == len(listed):
+            return dict(zip(sorted(set.union(*names)), _sorted(listed, part), strict=True))
+    return {f"cam{number:02d}": own for number, own in enumerate(listed)}
+
+
+def _part(file: Path, part: str) -> str:
+    return file.parent.name if part == "parent" else file.stem
+
+
+def _sorted(groups: Sequence[list[Shot]], part: str) -> list[list[Shot]]:
+    return sorted(groups, key=lambda own: _part(own[0].file, part))
+
+
+def _instants(shots: Sequence[Shot]) -> dict[str, Path]:
+    """The pictures of a camera by time, or by the part of their names that differs."""
+    if all(shot.time is not None for shot in shots):
+        return {f"{shot.time:.6f}": shot.file for shot in shots}
+    if len(shots) == 1:
+        return {"0": shots[0].file}
+    part = "stem" if len({shot.file.stem for shot in shots}) == len(shots) else "parent"
+    return {_part(shot.file, part): shot.file for shot in shots}

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbered ``.ply`` files of other trainers: what is read, and what is said about files that cannot be."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData, PlyElement
+
+from structgstream.errors import CaptureError
+from structgstream.exporters.ply import ply_bytes
+from structgstream.exporters.ply_reader import find_sequence, read_ply
+from tests.support.plain import some
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_another_library_s_file(degree: int, tmp_path: Path) -> None:
+    """Properties in another order and of other types, one more of them, and a second element."""
+    wanted = some(20, degree=degree)
+    (tmp_path / "ours.ply").write_bytes(ply_bytes(wanted))
+    ours = PlyData.read(str(tmp_path / "ours.ply"))["vertex"].data
+    names = [name for name in reversed(ours.dtype.names) if not name.startswith("n")]
+    rows = np.empty(20, [("label", "u1"), *((name, "f8" if name == "x" else "f4") for name in names)])
+    for name in names:
+        rows[name] = ours[name]
+    other = PlyElement.describe(np.zeros(2, [("x", "f4")]), "other")
+    PlyData([PlyElement.describe(rows, "vertex"), other], byte_order="<").write(str(tmp_path / "theirs.ply"))
+    found = read_ply(tmp_path / "theirs.ply")
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        torch.testing.assert_close(getattr(found, name), getattr(wanted, name), rtol=1e-5, atol=1e-6)
+
+
+def test_files_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    for number in (0, 5, 10, 100, 15, *range(20, 100, 5)):
+        (tmp_path / f"point_cloud_{number}.ply").touch()
+    assert [file.stem for file in find_sequence(tmp_path)] == [f"point_cloud_{n}" for n in range(0, 101, 5)]
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        ((), "is no folder with numbered .ply files"),
+        (("a_0", "a_1", "a_3", "a_5"), "2 of 6 frames are missing .* the first is number 2"),
+        (("a_0", "b_1"), "more than one sequence, aN.ply and bN.ply|more than one sequence, a_N.ply and b_N.ply"),
+        (("a_1", "a_01"), "have the same number"),
+        (("a_0", "mean"), r"mean\.ply has no number"),
+    ],
+)
+def test_sequences_that_are_none(names: tuple[str, ...], words: str, tmp_path: Path) -> None:
+    for name in names:
+        (tmp_path / f"{name}.ply").touch()
+    with pytest.raises(CaptureError, match=words):
+        find_sequence(tmp_path)
+
+
+GOOD = ply_bytes(some(5, degree=1))
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"", "is not a .ply file"),
+        (GOOD.replace(b"binary_little_endian", b"ascii"), "not binary little endian"),
+        (GOOD.replace(b"element vertex 5", b"element chunk 5"), "it is a compressed .ply of SuperSplat"),
+        (GOOD.replace(b"float rot_2\n", b"float turn\n"), "lacks the property rot_2"),
+        (GOOD.replace(b"property float opacity\n", b""), "lacks the property opacity"),
+        (GOOD.replace(b"f_rest_8\n", b"f_more_8\n"), "has 8 properties f_rest|lacks the property f_rest"),
+        (GOOD.replace(b"float x\n", b"quad x\n"), "of unknown types"),
+        (GOOD[:-100], "ends after 4 of 5 Gaussians"),
+        (ply_bytes(replace(some(5), means=torch.full((5, 3), torch.inf))), "5 of 5 Gaussians of .* finite"),
+    ],
+)
+def test_files_that_cannot_be_read(data: bytes, words: str, tmp_path: Path) -> None:
+    (tmp_path / "frame_0.ply").write_bytes(data)
+    with pytest.raises(CaptureError, match=words):
+        read_ply(tmp_path / "frame_0.ply")
