@@ -14,7 +14,6 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError, usage_errors
-from structgstream.cli.config_help import config_lines
 from structgstream.cli.live_run import LiveChoice, monitored, open_live, run_metrics, stop_of
 from structgstream.cli.options import (
     CaptureOptions,
@@ -22,6 +21,7 @@ from structgstream.cli.options import (
     Flag,
     Folder,
     check_ending,
+    config_lines,
     open_selected_capture,
     parse_known_options,
     resolve_config,

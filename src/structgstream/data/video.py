@@ -108,7 +108,7 @@ def synchronised(
 ) -> VideoSource:
     """One source from one video per camera, synchronised by time stamp on a common timeline.
 
-    Each instant takes the nearest frame of each camera within half a period (``instants``), so rates may differ or
+    Each instant takes the nearest frame of each camera within half a period (``timeline``), so rates may differ or
     vary; a camera without one is absent. Of different rates the lowest is taken.
 
     Args:
@@ -157,7 +157,7 @@ def synchronised(
 
 
 def measured_fps(tracks: Mapping[str, VideoTrack], clocks: Mapping[str, Clock] | None = None) -> float | None:
-    """Frames a second of the common timeline by time stamp (``instants.measured_rate``); None for one frame.
+    """Frames a second of the common timeline by time stamp (``timeline.measured_rate``); None for one frame.
 
     Raises:
         CaptureError: the frames of a video all have one time.
