@@ -26,27 +26,20 @@ Tiles tiles_of(const Splat& s) {
     return {tile(s.box[0]), tile(s.box[1]), tile(s.box[2] - 1), tile(s.box[3] - 1)};
 }
 
-// The drawn splats front to back. Positive floats have the order of their bits; the index breaks ties.
-std::vector<uint64_t> by_depth(const std::vector<Splat>& splats) {
-    constexpr int kDigit = 11, kBuckets = 1 << kDigit, kPasses = 3;
-    std::vector<uint64_t> keys, other;
-    keys.reserve(splats.size());
+constexpr int kDigit = 11, kBuckets = 1 << kDigit, kPasses = 3;
+
+// Sorts keys by their upper halves, which are bits of positive floats and so have their order; the lower ones break ties.
+void sort_by_depth(std::vector<uint64_t>& keys) {
     size_t counts[kPasses][kBuckets + 1] = {};
-    for (size_t i = 0; i < splats.size(); ++i) {
-        if (splats[i].box[0] >= splats[i].box[2]) continue;
-        uint32_t bits;
-        std::memcpy(&bits, &splats[i].depth, sizeof bits);
-        keys.push_back(static_cast<uint64_t>(bits) << 32 | i);
-        for (int pass = 0; pass < kPasses; ++pass) ++counts[pass][(bits >> kDigit * pass & (kBuckets - 1)) + 1];
-    }
-    other.resize(keys.size());
+    for (uint64_t key : keys)
+        for (int pass = 0; pass < kPasses; ++pass) ++counts[pass][(key >> (32 + kDigit * pass) & (kBuckets - 1)) + 1];
+    std::vector<uint64_t> other(keys.size());
     for (int pass = 0; pass < kPasses; ++pass) {
         size_t* next = counts[pass];
         for (int b = 0; b < kBuckets; ++b) next[b + 1] += next[b];
         for (uint64_t key : keys) other[next[key >> (32 + kDigit * pass) & (kBuckets - 1)]++] = key;
         keys.swap(other);
     }
-    return keys;
 }
 
 }  // namespace
@@ -54,12 +47,21 @@ std::vector<uint64_t> by_depth(const std::vector<Splat>& splats) {
 void bin(Raster& raster) {
     const int tiles = raster.tiles_x * raster.tiles_y;
     raster.starts.assign(tiles + 1, 0);
-    raster.slots.assign(raster.splats.size() + 1, 0);
+    raster.slots.resize(raster.splats.size() + 1);
+    raster.slots[0] = 0;
+    // Small entries of what is drawn instead of whole splats, because the following steps are bound by memory.
+    std::vector<Entry> entries;
+    std::vector<uint64_t> keys;
+    entries.reserve(raster.splats.size()), keys.reserve(raster.splats.size());
     int64_t total = 0;
     for (size_t i = 0; i < raster.splats.size(); ++i) {
         const Splat& s = raster.splats[i];
         if (s.box[0] < s.box[2]) {
             const Tiles t = tiles_of(s);
+            uint32_t depth;
+            std::memcpy(&depth, &s.depth, sizeof depth);
+            keys.push_back(static_cast<uint64_t>(depth) << 32 | entries.size());
+            entries.push_back({static_cast<int32_t>(i), static_cast<int32_t>(total), t});
             for (int y = t.y0; y <= t.y1; ++y)
                 for (int x = t.x0; x <= t.x1; ++x) {
                     const int tile = y * raster.tiles_x + x;
@@ -70,17 +72,12 @@ void bin(Raster& raster) {
         raster.slots[i + 1] = static_cast<int32_t>(total);
     }
     for (int t = 0; t < tiles; ++t) raster.starts[t + 1] += raster.starts[t];
-    // Small entries in depth order instead of whole splats, because the following steps are bound by memory.
-    const std::vector<uint64_t> keys = by_depth(raster.splats);
-    std::vector<Entry> order(keys.size());
-    for (size_t i = 0; i < keys.size(); ++i) {
-        const int32_t splat = static_cast<int32_t>(keys[i] & 0xffffffffu);
-        order[i] = {splat, raster.slots[splat], tiles_of(raster.splats[splat])};
-    }
+    sort_by_depth(keys);
     raster.pairs.resize(raster.starts[tiles]);
     raster.pair_slots.resize(raster.starts[tiles]);
     std::vector<int32_t> next(raster.starts.begin(), raster.starts.end() - 1);
-    for (const Entry& e : order) {
+    for (uint64_t key : keys) {
+        const Entry& e = entries[key & 0xffffffffu];
         int32_t slot = e.slot;
         for (int y = e.tiles.y0; y <= e.tiles.y1; ++y)
             for (int x = e.tiles.x0; x <= e.tiles.x1; ++x) {

@@ -7,6 +7,7 @@
 #include <new>
 
 #include "bin.h"
+#include "draw.h"
 #include "lift.h"
 #include "planes.h"
 #include "splat.h"
@@ -36,6 +37,8 @@
     void lift_flow(const FlowLift&, int);                                                                             \
     void plane_scores(const PlaneSweep&);                                                                             \
     double change_bits(const float*, const float*, int64_t, float, float*);                                           \
+    void fold_appearance(const float*, const float*, const float*, int64_t, int, int, float*);                        \
+    void fold_appearance_backward(const float*, const float*, int64_t, int, int, float*);                             \
     }
 
 SGS_DECLARE(baseline)
@@ -82,29 +85,10 @@ int best_isa() {
 
 std::atomic<int> isa{-1};
 
-void project_dispatched(const GaussianInputs& in, Raster& raster, float* radii, int threads) {
-    SGS_DISPATCH(project(in, raster, radii, threads))
-}
-
-void rasterize_dispatched(const Raster& raster, const float* background, float* image, float* alpha, int threads) {
-    SGS_DISPATCH(rasterize(raster, background, image, alpha, threads))
-}
-
-void rasterize_backward_dispatched(
-    const Raster& raster, const float* background, const float* image, const float* alpha, const float* grad_image,
-    const float* grad_alpha, float* moments, int threads) {
-    SGS_DISPATCH(rasterize_backward(raster, background, image, alpha, grad_image, grad_alpha, moments, threads))
-}
-
 void weigh_dispatched(
     const Raster& raster, const float* maps, int channels, float* sums, const float* background, float* image,
     int threads) {
     SGS_DISPATCH(weigh(raster, maps, channels, sums, background, image, threads))
-}
-
-void project_backward_dispatched(
-    const GaussianInputs& in, const Raster& raster, const float* moments, const GaussianGradients& out, int threads) {
-    SGS_DISPATCH(project_backward(in, raster, moments, out, threads))
 }
 
 void l1_ssim_dispatched(const Pictures& pictures, const Part* parts, int count, float* gradient, int threads) {
@@ -120,17 +104,6 @@ void lift_flow_dispatched(const FlowLift& lift, int threads) { SGS_DISPATCH(lift
 
 void plane_scores_dispatched(const PlaneSweep& sweep) { SGS_DISPATCH(plane_scores(sweep)) }
 
-Pinhole pinhole(const float* viewmat, const float* K, int width, int height, float near_plane) {
-    Pinhole c;
-    std::copy_n(viewmat, 12, c.view);
-    c.fx = K[0], c.fy = K[4], c.cx = K[2], c.cy = K[5];
-    const float margin_x = 0.3f * 0.5f * width / c.fx, margin_y = 0.3f * 0.5f * height / c.fy;
-    c.left = c.cx / c.fx + margin_x, c.right = (width - c.cx) / c.fx + margin_x;
-    c.up = c.cy / c.fy + margin_y, c.down = (height - c.cy) / c.fy + margin_y;
-    c.near = near_plane, c.width = width, c.height = height;
-    return c;
-}
-
 // A byte for each tile: whether any of its `channels` maps is not zero.
 std::vector<uint8_t> tiles_with_values(const Raster& raster, const float* maps, int channels) {
     std::vector<uint8_t> found(static_cast<size_t>(raster.tiles_x) * raster.tiles_y, 0);
@@ -145,6 +118,56 @@ std::vector<uint8_t> tiles_with_values(const Raster& raster, const float* maps, 
 }
 
 }  // namespace
+
+namespace structgstream {
+
+void look(
+    Raster& raster, const float* viewmat, const float* K, int width, int height, float near_plane,
+    const uint8_t* drawn_tiles) {
+    Pinhole& c = raster.camera;
+    std::copy_n(viewmat, 12, c.view);
+    c.fx = K[0], c.fy = K[4], c.cx = K[2], c.cy = K[5];
+    const float margin_x = 0.3f * 0.5f * width / c.fx, margin_y = 0.3f * 0.5f * height / c.fy;
+    c.left = c.cx / c.fx + margin_x, c.right = (width - c.cx) / c.fx + margin_x;
+    c.up = c.cy / c.fy + margin_y, c.down = (height - c.cy) / c.fy + margin_y;
+    c.near = near_plane, c.width = width, c.height = height;
+    raster.tiles_x = (width + kTile - 1) / kTile;
+    raster.tiles_y = (height + kTile - 1) / kTile;
+    raster.drawn_tiles.clear();
+    if (drawn_tiles) raster.drawn_tiles.assign(drawn_tiles, drawn_tiles + raster.tiles_x * raster.tiles_y);
+}
+
+void project(const GaussianInputs& in, Raster& raster, float* radii, int threads) {
+    SGS_DISPATCH(project(in, raster, radii, threads))
+}
+
+void rasterize(const Raster& raster, const float* background, float* image, float* alpha, int threads) {
+    SGS_DISPATCH(rasterize(raster, background, image, alpha, threads))
+}
+
+void rasterize_backward(
+    const Raster& raster, const float* background, const float* image, const float* alpha, const float* grad_image,
+    const float* grad_alpha, float* moments, int threads) {
+    SGS_DISPATCH(rasterize_backward(raster, background, image, alpha, grad_image, grad_alpha, moments, threads))
+}
+
+void project_backward(
+    const GaussianInputs& in, const Raster& raster, const float* moments, const GaussianGradients& out, int threads) {
+    SGS_DISPATCH(project_backward(in, raster, moments, out, threads))
+}
+
+void fold_appearance(
+    const float* features, const float* appearance, const float* basis, int64_t count, int size, int rank,
+    float* folded) {
+    SGS_DISPATCH(fold_appearance(features, appearance, basis, count, size, rank, folded))
+}
+
+void fold_appearance_backward(
+    const float* to_folded, const float* basis, int64_t count, int size, int rank, float* gradient) {
+    SGS_DISPATCH(fold_appearance_backward(to_folded, basis, count, size, rank, gradient))
+}
+
+}  // namespace structgstream
 
 extern "C" {
 
@@ -170,19 +193,31 @@ void* sgs_raster_forward(
     int64_t trained, float* image, float* alpha, float* radii, int threads) {
     try {
         auto raster = std::make_unique<Raster>();
-        raster->camera = pinhole(viewmat, K, width, height, near_plane);
-        raster->tiles_x = (width + kTile - 1) / kTile;
-        raster->tiles_y = (height + kTile - 1) / kTile;
-        if (drawn_tiles) raster->drawn_tiles.assign(drawn_tiles, drawn_tiles + raster->tiles_x * raster->tiles_y);
+        look(*raster, viewmat, K, width, height, near_plane, drawn_tiles);
         raster->trained = trained;
         raster->splats.resize(count);
-        project_dispatched(
-            {means, quats, scales, opacities, colors, screen_offsets, intervals, count}, *raster, radii, threads);
+        project({means, quats, scales, opacities, colors, screen_offsets, intervals, count}, *raster, radii, threads);
         bin(*raster);
-        rasterize_dispatched(*raster, background, image, alpha, threads);
+        rasterize(*raster, background, image, alpha, threads);
         return raster.release();
     } catch (const std::bad_alloc&) {
         return nullptr;
+    }
+}
+
+int sgs_raster_radii(
+    int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
+    const float* viewmat, const float* K, int width, int height, float near_plane, const float* intervals, float* radii,
+    int threads) {
+    try {
+        Raster raster;
+        look(raster, viewmat, K, width, height, near_plane, nullptr);
+        raster.splats.resize(count);
+        // Colours are not used; any memory of the right size is sufficient.
+        project({means, quats, scales, opacities, means, nullptr, intervals, count}, raster, radii, threads);
+        return 0;
+    } catch (const std::bad_alloc&) {
+        return 1;
     }
 }
 
@@ -193,15 +228,13 @@ int sgs_raster_weights(
     int threads) {
     try {
         Raster raster;
-        raster.camera = pinhole(viewmat, K, width, height, near_plane);
-        raster.tiles_x = (width + kTile - 1) / kTile;
-        raster.tiles_y = (height + kTile - 1) / kTile;
+        look(raster, viewmat, K, width, height, near_plane, nullptr);
         if (!image) raster.drawn_tiles = tiles_with_values(raster, maps, channels);
         raster.trained = 0;
         raster.splats.resize(count);
         std::vector<float> radii(count);
         // Without a picture colours are not used; any memory of the right size is sufficient.
-        project_dispatched(
+        project(
             {means, quats, scales, opacities, image ? colors : means, nullptr, intervals, count}, raster, radii.data(),
             threads);
         bin(raster);
@@ -254,8 +287,8 @@ int sgs_raster_backward(
     const size_t numbers = static_cast<size_t>(raster.slots[raster.trained]) * kMomentCount;
     const std::unique_ptr<float[]> moments(new (std::nothrow) float[numbers]);
     if (!moments) return 1;
-    rasterize_backward_dispatched(raster, background, image, alpha, grad_image, grad_alpha, moments.get(), threads);
-    project_backward_dispatched(
+    rasterize_backward(raster, background, image, alpha, grad_image, grad_alpha, moments.get(), threads);
+    project_backward(
         {means, quats, scales, opacities, colors, nullptr, nullptr, count}, raster, moments.get(),
         {grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_screen_offsets}, threads);
     return 0;

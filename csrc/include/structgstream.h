@@ -13,7 +13,7 @@ extern "C" {
 
 /* Version of the library's interface. It is incremented with every change of the declarations in this file or in
  * cpu/anchors.h. kernels/native.py requires the same number, so that a library of another version is refused. */
-#define SGS_ABI_VERSION 8
+#define SGS_ABI_VERSION 10
 int sgs_abi_version(void);
 
 /* Instruction sets: 0 baseline (SSE2, NEON or plain C++), 1 AVX2 with FMA, 2 AVX-512. */
@@ -32,6 +32,11 @@ void* sgs_raster_forward(
     const float* colors, const float* viewmat, const float* K, int width, int height, float near_plane,
     const float* background, const float* screen_offsets, const float* intervals, const uint8_t* drawn_tiles,
     int64_t trained, float* image, float* alpha, float* radii, int threads);
+/* Out: radii [N] alone. Returns 0, or 1 if memory is not sufficient. */
+int sgs_raster_radii(
+    int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
+    const float* viewmat, const float* K, int width, int height, float near_plane, const float* intervals, float* radii,
+    int threads);
 /* weights [N,C]: for each Gaussian the sum over the pixels of its blending weight times each of maps [H,W,C], C =
  * channels >= 1. Needs C numbers of memory for each pair of a Gaussian and a tile. image [H,W,3]: the picture of colors
  * [N,3] over background [3] or null, drawn in the same pass; or null together with colors. Returns 0, or 1 if memory is
@@ -155,6 +160,60 @@ double sgs_change_bits(const float* values, const float* before, int64_t count, 
 void sgs_adam_step(
     float* param, const float* grad, float* first, float* second, int64_t count, double lr, int64_t step, double beta1,
     double beta2, double eps, int threads);
+
+/* Iterations of a later frame in which only anchors and free Gaussians are trained (training/online/iterations.py).
+ *
+ * A tensor of `count` numbers. values, the moments of Adam, and the sums (null: no mean) are updated in place; all but values
+ * are null if it is not trained. step: quantization step, 0 for none. before [before_count]: values from which changes of the
+ * first numbers are priced, or null. */
+struct sgs_leaf {
+    float *values, *first, *second, *sums;
+    const float* before;
+    int64_t count, before_count;
+    float step;
+};
+/* anchors' positions, offset scales, base scales, offsets, features, appearance; free Gaussians' means, scales, quaternions,
+ * opacities, colors: logarithms and logits where the scene has them */
+#define SGS_LEAVES 11
+/* A picture [H,W,3] to fit. tiles, changed: bytes of the tiles of a full and of a resting visit. mask: a byte for each pixel that
+ * counts, or null. background [3] or null. image [H,W,3] is drawn into. Last the static Gaussians; intervals may be null. */
+struct sgs_fit_view {
+    const float *viewmat, *K, *center;
+    const uint8_t *picture, *tiles, *changed, *mask;
+    const float *gains, *biases, *background;
+    float* image;
+    const float *means, *quats, *scales, *opacities, *colors, *intervals;
+    int64_t static_count;
+    float near_plane;
+    int32_t width, height;
+};
+/* M = anchors, F = free. basis [R,D] or null. anchor_intervals [M] and free_intervals [F] or null. neighbours, shares [M,N] and
+ * start [M,3] of the smoothness (N: 0 for none). Iteration i, from 0, visits view order[i], without its tiles at rest if
+ * rests[i], and steps by rates [i, SGS_LEAVES]; sums are from mean_from on, squared errors from errors_from.
+ * Out: terms [i, 5]: L1, 1 - SSIM, volume, smoothness, total; squared_errors [i]. */
+struct sgs_fit_frame {
+    struct sgs_leaf leaves[SGS_LEAVES];
+    struct sgs_head heads[3];
+    const float *basis, *anchor_intervals, *free_intervals;
+    const struct sgs_fit_view* views;
+    const int64_t* neighbours;
+    const float *shares, *start;
+    const int32_t* order;
+    const uint8_t* rests;
+    const double* rates;
+    float* terms;
+    double* squared_errors;
+    int64_t anchors, free, neighbour_count;
+    int32_t view_count, offsets_per_anchor, feature_size, hidden_size, distance_input, rank, mean_volume, mean_from,
+        errors_from;
+    float l1, ssim, volume, smoothness, rate, pixel, slack;
+    double beta1, beta2, eps;
+};
+/* The frame is copied, what it points to must live as long. new and run return null and 1 if memory is not sufficient. run does
+ * iterations from ... to - 1. */
+void* sgs_fit_new(const struct sgs_fit_frame* frame);
+int sgs_fit_run(void* fit, int from, int to, int threads);
+void sgs_fit_free(void* fit);
 
 /* Interleaved rANS (docs/entropy.md). symbols [count], contexts [count] rows of frequencies [context_count, alphabet];
  * lanes is 1, 4 or 32; states [lanes]; words has room for `count` (encode). Return 0; 1 if memory is not sufficient;

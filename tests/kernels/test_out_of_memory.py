@@ -43,6 +43,12 @@ CALLS: dict[str, tuple[object, str, int | None, Callable[[], object]]] = {
         None,
         lambda: cpu_raster.rasterize(SPLATS, VIEW),
     ),
+    "radii": (
+        cpu_raster,
+        "sgs_raster_radii",
+        1,
+        lambda: cpu_raster.projected_radii(SPLATS, VIEW),
+    ),
     "weights": (
         cpu_raster,
         "sgs_raster_weights",

@@ -6,6 +6,8 @@ The scene stays away from where the definition jumps: depths are far apart, and 
 would decide which branch is taken, and the comparison would measure that instead of the kernel.
 """
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -369,6 +371,16 @@ def test_a_picture_with_weights_is_both(isa: int, channels: int, background: Ten
     drawn = cpu_raster.rasterize(splats, camera(torch.float32), background=background)
     assert torch.equal(picture, drawn.image)
     assert torch.equal(weights, cpu_raster.blending_weights(splats, camera(torch.float32), maps))
+
+
+@native
+@pytest.mark.parametrize("intervals", [None, torch.full((300,), 0.02)])
+def test_radii_are_those_of_a_drawing(isa: int, intervals: Tensor | None) -> None:
+    splats = replace(splats_of(*(value.float() for value in gaussians()[:5])), sampling_intervals=intervals)
+    for module in (cpu_raster, reference_raster):
+        radii = module.projected_radii(splats, camera(torch.float32))
+        assert 0 < (radii > 0).sum() < 300
+        assert torch.equal(radii, module.rasterize(splats, camera(torch.float32)).radii)
 
 
 @native

@@ -185,6 +185,7 @@ def pretended_gpu(on_processor: Rasterizer) -> Backend:
     there = partial(rasterize, on_processor)
     return replace(reference_backend(), name="cuda", device=DEVICE).with_functions(
         rasterize=there,
+        projected_radii=partial(reference_raster.radii_by_drawing, there),
         blending_weights=partial(reference_raster.weights_by_gradient, there),
         picture_and_weights=partial(reference_raster.picture_and_weights_by_gradient, there),
     )

@@ -13,7 +13,7 @@ from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.scene import Scene
 from structgstream.training.losses import GradientStatistics, LossWeights, SceneLoss
 from structgstream.training.online.config import PatchingConfig
-from structgstream.training.online.optimize import OnlineHooks, StartingPoint
+from structgstream.training.online.iterations import OnlineHooks, StartingPoint
 from structgstream.training.online.patching import FreeSet
 from structgstream.training.online.split import DynamicSplit
 from structgstream.training.optim import Adam, LastPass

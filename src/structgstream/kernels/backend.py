@@ -33,6 +33,7 @@ from structgstream.errors import BackendError
 from structgstream.kernels import reference_anchors, reference_losses, reference_motion, reference_raster
 from structgstream.kernels.cuda_graph import GraphMemory, Recorder
 from structgstream.kernels.cuda_tiles import PairBudget
+from structgstream.kernels.values import FitFrame
 
 _log = logging.getLogger(__name__)
 
@@ -72,14 +73,18 @@ class Backend:
         device: device of its tensors.
         functions: function of each operation by name, with the signature of the oracle.
         recorder: creates a recorder of iterations (``kernels.cuda_graph``); None if operations are queued one by one.
+        iterations: runs those of a frame in which only anchors and free Gaussians are trained (``kernels.cpu_fit``);
+            None: they are run in torch.
     """
 
     name: str
     device: torch.device
     functions: Mapping[str, Callable[..., Any]]
     recorder: Callable[[], Recorder[Any]] | None = None
+    iterations: Callable[[FitFrame], Callable[[int, int], None]] | None = None
 
     rasterize = Operation(reference_raster.rasterize)  # cuda: gsplat
+    projected_radii = Operation(reference_raster.projected_radii)  # cuda: gsplat, which draws a picture
     blending_weights = Operation(reference_raster.blending_weights)  # cuda: gradients of gsplat's picture
     picture_and_weights = Operation(reference_raster.picture_and_weights)  # cuda: gsplat
     generate_structured = Operation(reference_anchors.generate_structured)  # cuda: own kernels
@@ -125,11 +130,12 @@ def cpu_backend() -> Backend:
     Raises:
         BackendError: the native library was not built or cannot be loaded.
     """
-    from structgstream.kernels import cpu_anchors, cpu_losses, cpu_motion, cpu_raster
+    from structgstream.kernels import cpu_anchors, cpu_fit, cpu_losses, cpu_motion, cpu_raster
     from structgstream.kernels.native import native_library
 
     native_library()
-    return Backend("cpu", torch.device("cpu"), _functions_of(cpu_raster, cpu_anchors, cpu_losses, cpu_motion))
+    functions = _functions_of(cpu_raster, cpu_anchors, cpu_losses, cpu_motion)
+    return Backend("cpu", torch.device("cpu"), functions, iterations=cpu_fit.iterations)
 
 
 def processor_backend() -> Backend:
@@ -160,6 +166,7 @@ def cuda_backend() -> Backend:
         recorder=GraphMemory(torch.device("cuda")).recorder,
     ).with_functions(
         rasterize=rasterize,
+        projected_radii=partial(reference_raster.radii_by_drawing, rasterize),
         blending_weights=partial(reference_raster.weights_by_gradient, rasterize),
         picture_and_weights=partial(reference_raster.picture_and_weights_by_gradient, rasterize),
         adam_step=cuda.adam_step,

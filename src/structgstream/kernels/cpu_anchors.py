@@ -52,15 +52,19 @@ class _AnchorGradients(ctypes.Structure):
     ]
 
 
-def _heads(weights: Sequence[Tensor | None]) -> Any:
-    return (_Head * 3)(*(_Head(*addresses(*weights[4 * head : 4 * head + 4])) for head in range(3)))
+Heads = _Head * 3
+
+
+def native_heads(weights: Sequence[Tensor | None]) -> Any:
+    """Four weights for each of the three heads in the form of csrc/cpu/anchors.h."""
+    return Heads(*(_Head(*addresses(*weights[4 * head : 4 * head + 4])) for head in range(3)))
 
 
 def _anchors(tensors: Sequence[Tensor], visible: Tensor, center: list[float], distance_input: bool) -> _Anchors:
     """``tensors``: the five anchor tensors, then four weights for each of the three heads."""
     return _Anchors(
         *addresses(*tensors[:5], visible),
-        _heads(tensors[5:]),
+        native_heads(tensors[5:]),
         (ctypes.c_float * 3)(*center),
         visible.shape[0],
         tensors[3].shape[1],
@@ -113,7 +117,7 @@ class _Generate(torch.autograd.Function):
             ctypes.byref(_Selection(*addresses(raw, bits, active, starts), active_count, ids.shape[0])),
             ctypes.byref(_Gaussians(*addresses(*drawn, ids, norms))),
             ctypes.byref(_GaussianGradients(*addresses(*given))),
-            ctypes.byref(_AnchorGradients(*addresses(*results[:5]), _heads(results[5:]))),
+            ctypes.byref(_AnchorGradients(*addresses(*results[:5]), native_heads(results[5:]))),
             torch.get_num_threads(),
         )
         return None, None, None, *(result if want else None for result, want in zip(results, wanted, strict=True))

@@ -146,6 +146,22 @@ def rasterize(
     return RasterOutput(image, alpha, radii)
 
 
+def projected_radii(gaussians: Gaussians, viewport: Viewport) -> Tensor:
+    """See ``reference_raster.projected_radii``; float32.
+
+    Raises:
+        OutOfMemoryError: there is no memory for the projected Gaussians.
+    """
+    tensors = [constant(t) for t in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)]
+    view = _View(_in_float32(viewport), None, None, 0, _intervals(gaussians))
+    radii = torch.empty(len(gaussians))
+    if native_library().sgs_raster_radii(
+        len(gaussians), *tensors, *view.arguments(), view.intervals, radii, torch.get_num_threads()
+    ):
+        raise OutOfMemoryError("to project Gaussians")
+    return radii
+
+
 def blending_weights(gaussians: Gaussians, viewport: Viewport, maps: Tensor) -> Tensor:
     """See ``reference_raster.blending_weights``; float32.
 

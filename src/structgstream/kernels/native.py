@@ -16,7 +16,7 @@ from torch import Tensor
 
 from structgstream.errors import BackendError
 
-ABI_VERSION = 8
+ABI_VERSION = 10
 """Equal to the version in csrc/include/structgstream.h, which states when it is incremented."""
 ISA_NAMES = ("baseline", "avx2", "avx512")
 TYPES: Mapping[str, Any] = {
@@ -35,6 +35,7 @@ PROTOTYPES: Mapping[str, tuple[str, str]] = {
     "sgs_best_isa": ("i", ""),
     "sgs_use_isa": ("i", "i"),
     "sgs_raster_forward": ("p", "lpppppppiifpppplpppi"),
+    "sgs_raster_radii": ("i", "lppppppiifppi"),
     "sgs_raster_weights": ("i", "lpppppppiifpppippi"),
     "sgs_raster_backward": ("i", "plppppppppppppppppi"),
     "sgs_raster_free": ("v", "p"),
@@ -57,6 +58,9 @@ PROTOTYPES: Mapping[str, tuple[str, str]] = {
     "sgs_neighbour_difference": ("d", "pppllfp"),
     "sgs_change_bits": ("d", "pplfp"),
     "sgs_adam_step": ("v", "ppppldldddi"),
+    "sgs_fit_new": ("p", "p"),
+    "sgs_fit_run": ("i", "piii"),
+    "sgs_fit_free": ("v", "p"),
     "sgs_rans_encode": ("i", "pplpliippp"),
     "sgs_rans_decode": ("i", "plpiplplip"),
     "sgs_code_activity": ("i", "pppilppp"),

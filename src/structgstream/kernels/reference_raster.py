@@ -136,8 +136,7 @@ def rasterize(
     """
     gaussians, screen_offsets = detach_untrained(gaussians, screen_offsets, trained)
     projected = _project(gaussians, viewport, screen_offsets)
-    radii = gaussians.means.new_zeros(len(gaussians), dtype=torch.float32)
-    radii[projected.rows] = projected.extents.amax(1).float() if len(projected.rows) else radii[:0]
+    radii = _radii(projected, len(gaussians))
     back = gaussians.means.new_zeros(3) if background is None else background
     low = projected.means2d.detach() - projected.extents
     high = projected.means2d.detach() + projected.extents
@@ -157,6 +156,23 @@ def rasterize(
         bands.append(torch.cat(row, dim=1))
         bands_alpha.append(torch.cat(row_alpha, dim=1))
     return restrict_to_tiles(torch.cat(bands), torch.cat(bands_alpha), radii, tiles, onto)
+
+
+def projected_radii(gaussians: Gaussians, viewport: Viewport) -> Tensor:
+    """The extents ``[N]`` of Gaussians on a picture, pixels, as :func:`rasterize` gives them; without graph.
+
+    Args:
+        gaussians: to project; their colours and ids are not read.
+        viewport: the camera.
+    """
+    with torch.no_grad():
+        return _radii(_project(gaussians, viewport, None), len(gaussians))
+
+
+def _radii(projected: _Projected, count: int) -> Tensor:
+    radii = projected.extents.new_zeros(count, dtype=torch.float32)
+    radii[projected.rows] = projected.extents.amax(1).float() if len(projected.rows) else radii[:0]
+    return radii
 
 
 def detach_untrained(
@@ -213,6 +229,12 @@ def picture_and_weights(
         background: ``[3]``, black when None.
     """
     return picture_and_weights_by_gradient(rasterize, gaussians, viewport, maps, background=background)
+
+
+def radii_by_drawing(rasterizer: Rasterizer, gaussians: Gaussians, viewport: Viewport) -> Tensor:
+    """:func:`projected_radii` of any rasteriser."""
+    with torch.no_grad():
+        return rasterizer(gaussians, viewport).radii
 
 
 def weights_by_gradient(rasterizer: Rasterizer, gaussians: Gaussians, viewport: Viewport, maps: Tensor) -> Tensor:

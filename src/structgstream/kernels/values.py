@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arguments and results of operations: selections of tiles, renderings, anchors, flow in several views, sweeps."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from structgstream.cameras import Viewport
 from structgstream.gaussians import Gaussians
 
 TILE_PIXELS = 16
@@ -222,3 +223,138 @@ class Swept:
 
     depths: Tensor
     costs: Tensor
+
+
+FIT_LEAVES = 11
+"""Number of tensors of a frame's fit: positions, offset scales, base scales, offsets, features and appearance of
+anchors; means, scales, quaternions, opacities and colours of free Gaussians."""
+
+
+class FitLeaf(NamedTuple):
+    """A tensor of a frame's fit: ``values``, with the rest for one that is trained.
+
+    Args:
+        values: updated in place.
+        first: Adam's first moments, zero at the first iteration; None: not trained.
+        second: its second moments.
+        sums: get the values of the last iterations; None: no mean.
+        before: values from which changes of the first rows are priced; None for no price.
+        step: the quantization step with which it is drawn; 0 for none.
+    """
+
+    values: Tensor
+    first: Tensor | None = None
+    second: Tensor | None = None
+    sums: Tensor | None = None
+    before: Tensor | None = None
+    step: float = 0.0
+
+
+class FitView(NamedTuple):
+    """A view of a frame's fit.
+
+    Args:
+        viewport: the camera.
+        picture: ``[H, W, 3]`` uint8.
+        mask: ``[H, W]`` bool, the pixels that count; None for all.
+        tiles: those that are drawn.
+        changed: those that are drawn in visits without tiles at rest.
+        gains: ``[3]`` the camera's correction of colours.
+        biases: ``[3]``.
+        background: ``[3]``; None for black.
+        image: ``[H, W, 3]``, drawn into.
+        static: Gaussians that are not trained.
+    """
+
+    viewport: Viewport
+    picture: Tensor
+    mask: Tensor | None
+    tiles: TileSelection
+    changed: TileSelection
+    gains: Tensor
+    biases: Tensor
+    background: Tensor | None
+    image: Tensor
+    static: Gaussians
+
+
+class FitPrices(NamedTuple):
+    """Weights of the loss.
+
+    Args:
+        l1: of the mean absolute difference.
+        ssim: of 1 - SSIM.
+        volume: of the product of a Gaussian's scales.
+        mean_volume: the mean of these products, not their sum.
+        rate: of a bit of changes.
+        smoothness: of the mean difference of displacements from the neighbours.
+        pixel: unit of displacements.
+        slack: see ``reference_losses.neighbour_difference``.
+    """
+
+    l1: float
+    ssim: float
+    volume: float
+    mean_volume: bool
+    rate: float = 0.0
+    smoothness: float = 0.0
+    pixel: float = 1.0
+    slack: float = 0.0
+
+
+class FitPlan(NamedTuple):
+    """The iterations, ``I`` of them, counted from 0.
+
+    Args:
+        order: ``[I]`` int32, the view of each.
+        rests: ``[I]`` bool: only the view's ``changed`` tiles are drawn.
+        rates: ``[I, FIT_LEAVES]`` float64 learning rates.
+        mean_from: the first iteration whose values are summed.
+        errors_from: the first one whose squared error is computed.
+        betas: of Adam.
+        eps: of Adam.
+        terms: ``[I, 5]`` results: L1, 1 - SSIM, volume, smoothness and the weighted sum of all.
+        squared_errors: ``[I]`` float64 results: mean squared error of the view's picture in its ``tiles``.
+    """
+
+    order: Tensor
+    rests: Tensor
+    rates: Tensor
+    mean_from: int
+    errors_from: int
+    betas: tuple[float, float]
+    eps: float
+    terms: Tensor
+    squared_errors: Tensor
+
+
+class FitFrame(NamedTuple):
+    """Iterations of a frame in which only anchors and free Gaussians are trained.
+
+    Args:
+        leaves: ``FIT_LEAVES`` tensors; None for appearance that the scene lacks.
+        mlps: of the scene.
+        basis: ``[R, D]`` of appearance; None without it.
+        distance_input: whether the distance to the camera is an input of the MLPs.
+        anchor_intervals: ``[M]`` sampling intervals; None: the low-pass is that of the picture.
+        free_intervals: ``[F]``, as ``anchor_intervals``.
+        views: the views.
+        start: ``[M, 3]`` positions from which displacements are counted; None without smoothness.
+        neighbours: ``[M, N]`` int64 anchors that each is compared with.
+        shares: ``[M, N]`` their weights.
+        prices: weights of the loss.
+        plan: the iterations.
+    """
+
+    leaves: Sequence[FitLeaf | None]
+    mlps: MLPWeights
+    basis: Tensor | None
+    distance_input: bool
+    anchor_intervals: Tensor | None
+    free_intervals: Tensor | None
+    views: Sequence[FitView]
+    start: Tensor | None
+    neighbours: Tensor | None
+    shares: Tensor | None
+    prices: FitPrices
+    plan: FitPlan

@@ -2,7 +2,7 @@
 """Adam, the optimisation loop of all fits (a view, its loss, one Adam step), and what follows its steps.
 
 Fits differ in their hooks: the loss of a view, and the actions between steps (growing, patching).
-``training/frame0/fit.py``, ``training/online/optimize.py`` and the methods of studies use this loop.
+``training/frame0/fit.py``, ``training/online/iterations.py`` and the methods of studies use this loop.
 """
 
 import math
@@ -78,7 +78,7 @@ class Adam(Generic[Name]):
             if not isinstance(rate, Tensor) and rate <= 0.0:
                 continue
             value = self.values[name]
-            self._begin(name)
+            self.begin(name)
             self.steps[name] += 1
             self.backend.adam_step(
                 value.detach(),
@@ -94,10 +94,11 @@ class Adam(Generic[Name]):
     def count_on_device(self, names: Iterable[Name]) -> None:
         """From now on the numbers of the steps of ``names`` are tensors, so that steps can be recorded."""
         for name in names:
-            self._begin(name)
+            self.begin(name)
             self.steps[name] = torch.full((), float(self.steps[name]), device=self.values[name].device)
 
-    def _begin(self, name: Name) -> None:
+    def begin(self, name: Name) -> None:
+        """Set the moments of a leaf that was never updated to zero."""
         if name not in self.first:
             self.first[name] = torch.zeros_like(self.values[name], requires_grad=False)
             self.second[name] = torch.zeros_like(self.values[name], requires_grad=False)
@@ -306,6 +307,17 @@ class MeanOfSteps:
             else:
                 self.sums[name], self.counts[name] = value.detach().clone(), 1
 
+    def sums_of(self, name: ParameterName, value: Tensor, iteration: int) -> Tensor:
+        """The sums of a leaf after ``iteration``, for who adds to them and then calls :meth:`count`."""
+        if name not in self.sums or self.sums[name].shape != value.shape:
+            self.counts[name] = int(iteration > self.after)
+            self.sums[name] = value.detach() * float(self.counts[name])
+        return self.sums[name]
+
+    def count(self, iterations: int) -> None:
+        """Count ``iterations`` (none if negative) whose leaves were added to all sums."""
+        self.counts = {name: count + max(iterations, 0) for name, count in self.counts.items()}
+
     def apply(self, values: Mapping[ParameterName, Tensor]) -> None:
         """Set the leaves to their means, in place."""
         with torch.no_grad():
@@ -323,17 +335,25 @@ class LastPass:
     """
 
     def __init__(self, after: int = 0, *, terms_after: int | None = None) -> None:
-        self._after, self._terms_after = after, after if terms_after is None else terms_after
+        self.after, self._terms_after = after, after if terms_after is None else terms_after
         self._terms: dict[int, dict[str, Tensor]] = {}
         self._squared_errors: dict[int, Tensor] = {}
 
     def add(self, iteration: int, loss: ViewLoss, view: View, *, comparable: bool = True) -> None:
         """Record a view's result, replacing its earlier one; its loss terms only if they are ``comparable``."""
-        if iteration > self._after:
-            self._squared_errors[view.index] = loss.squared_error(view)
+        error = loss.squared_error(view) if iteration > self.after else None
+        # Copies: the next recorded iteration writes over the tensors of this one.
+        terms = {name: value.detach().clone() for name, value in loss.terms.items()}
+        self.add_results(iteration, view.index, terms, error, comparable=comparable)
+
+    def add_results(
+        self, iteration: int, view_index: int, terms: dict[str, Tensor], error: Tensor | None, *, comparable: bool
+    ) -> None:
+        """As :meth:`add`, of terms and of the squared error, which may be None where it does not count."""
+        if iteration > self.after and error is not None:
+            self._squared_errors[view_index] = error
         if comparable and iteration > self._terms_after:
-            # Copies: the next recorded iteration writes over the tensors of this one.
-            self._terms[view.index] = {name: value.detach().clone() for name, value in loss.terms.items()}
+            self._terms[view_index] = terms
 
     @property
     def psnr(self) -> float:

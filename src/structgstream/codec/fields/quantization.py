@@ -142,6 +142,11 @@ class RateTerm:
             return None
         return cls(weight, {name: values[name].detach().clone() for name in counted}, counted)
 
+    @property
+    def weight_per_bit(self) -> float:
+        """What a bit adds to the loss."""
+        return self.weight / _BITS_PER_KB
+
     def after_pruning(self, keep: Tensor) -> "RateTerm":
         """The term after free Gaussians outside the mask ``keep`` were pruned; ones spawned since have none."""
         rows = trainable("free")
@@ -152,7 +157,7 @@ class RateTerm:
         """Weighted sum of log2(1 + distance in bins), in kilobytes."""
         priced = [_first_rows(values[name], len(self.before[name])) for name in self.steps]
         before = [self.before[name] for name in self.steps]
-        return self.weight / _BITS_PER_KB * backend.change_bits(priced, before, [*self.steps.values()])
+        return self.weight_per_bit * backend.change_bits(priced, before, [*self.steps.values()])
 
 
 def _first_rows(value: Tensor, count: int) -> Tensor:

@@ -10,77 +10,30 @@ Methods).
 """
 
 import math
-from collections.abc import Hashable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor
 
 from structgstream.codec.fields.quantization import RateTerm
 from structgstream.kernels.backend import Backend, nonblocking
 from structgstream.kernels.cuda_tiles import PairBudget, run_with_pair_budget
-from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, ParameterName, fields_of
-from structgstream.training.losses import GradientStatistics, LossWeights, SceneLoss, view_loss, with_term
+from structgstream.training.losses import GradientStatistics
 from structgstream.training.online.config import OnlineConfig, online_rates
+from structgstream.training.online.iterations import OnlineHooks, StartingPoint, minimize_natively
 from structgstream.training.online.measure import slot_count
 from structgstream.training.online.patching import FreeSet
 from structgstream.training.online.smoothness import MotionSmoothness
-from structgstream.training.online.split import DynamicSplit
-from structgstream.training.optim import Adam, Hooks, LastPass, MeanOfSteps, Schedule, minimize
+from structgstream.training.optim import Adam, LastPass, MeanOfSteps, Schedule, minimize
 from structgstream.training.parameters import FREE_ROWS, Parameters, detached, parameters_of_fields, values_of_rows
 from structgstream.training.result import FitResult, StepListener, Stopwatch
-from structgstream.training.views import View, shuffled_views
+from structgstream.training.views import shuffled_views
 
 SHARED_FIELDS: frozenset[FieldName] = frozenset(fields_of("shared", "camera"))
 """Shared fields are trained only in frames in which everything is, because static anchors depend on them."""
-
-
-@dataclass(frozen=True)
-class StartingPoint:
-    """Initial state of a frame's optimisation.
-
-    Args:
-        scene: the whole scene, or the dynamic part of ``split``.
-        views: the pictures.
-        displacements: ``[M + F, 3]`` initial displacements of its primitives (Note [Primitives]).
-        split: of which the scene is the moving part; None for a whole scene.
-        active_tiles: by view index, the tiles that the scene reaches; None for whole pictures of all views.
-        new_free: free Gaussians to add.
-        reference: anchors as in ``scene``, from whose values changes and motion are priced; free Gaussians then have no
-            price. None: since ``scene``.
-    """
-
-    scene: Scene
-    views: list[View]
-    displacements: Tensor
-    split: DynamicSplit | None = None
-    active_tiles: Mapping[int, ActiveTiles] | None = None
-    new_free: FreeGaussians | None = None
-    reference: Scene | None = None
-
-    @property
-    def known(self) -> Scene:
-        """The scene against which changes and displacements are penalised."""
-        return self.scene if self.reference is None else self.reference
-
-    @property
-    def seen(self) -> list[View]:
-        """The views in which the scene is visible."""
-        return (
-            self.views
-            if self.active_tiles is None
-            else [view for view in self.views if view.index in self.active_tiles]
-        )
-
-    def with_own_pictures(self) -> "StartingPoint":
-        """The same with copies of the pictures that iterations draw into."""
-        if self.active_tiles is None:
-            return self
-        copies = {i: replace(active, picture=active.picture.clone()) for i, active in self.active_tiles.items()}
-        return replace(self, active_tiles=copies)
 
 
 @dataclass(frozen=True)
@@ -166,15 +119,12 @@ class FrameOptimizer:
             average=average,
         )
         recorder = None if backend.recorder is None else backend.recorder()
-        done = minimize(
-            adam,
-            shuffled_views(seen, self.generator),
-            Schedule(iterations, lambda iteration: online_rates(config, (iteration - 1) / iterations)),
-            hooks,
-            watch=self.watch,
-            on_step=self.on_step,
-            recorder=recorder,
-        )
+        schedule = Schedule(iterations, lambda iteration: online_rates(config, (iteration - 1) / iterations))
+        samples = shuffled_views(seen, self.generator)
+        if backend.iterations is not None and hooks.native:
+            done = minimize_natively(adam, samples, schedule, hooks, begin=backend.iterations, on_step=self.on_step)
+        else:
+            done = minimize(adam, samples, schedule, hooks, watch=self.watch, on_step=self.on_step, recorder=recorder)
         if average is not None:
             average.apply(parameters.values)
         return FitResult(
@@ -224,118 +174,3 @@ def _displace_parameters(parameters: Parameters, adam: Adam[ParameterName], star
         keep = torch.ones(len(start.scene.free), dtype=torch.bool, device=start.new_free.means.device)
         parameters.births = torch.cat([parameters.births, start.new_free.births])
         adam.replace_rows(values_of_rows(start.new_free, FREE_ROWS), keep=keep)
-
-
-@dataclass
-class OnlineHooks(Hooks[View, SceneLoss]):
-    """What an iteration minimises, and what is done between iterations.
-
-    Args:
-        start: the initial state.
-        parameters: of the scene.
-        losses: weights of the terms.
-        rate_term: the price of changing bins; None for none.
-        smoothness: the price of incoherent motion; None for none.
-        free_set: of the free Gaussians.
-        patch_at: the iteration after which free Gaussians are pruned and spawned.
-        patches: whether they are.
-        last_pass: gets the result of each view; loss terms of visits of all its tiles only.
-        backend: the compute back-end.
-        watch: seconds by stage.
-        rest_every: tiles in which nothing has changed are drawn every this many times that a view is.
-        visits: by view index, how often it was drawn.
-        average: gets the leaves of each iteration; None for none.
-        iterations: of the frame, at most; to know which of them are worth recording. 0: none is.
-        recorded: keys that :meth:`repeats` has given.
-    """
-
-    start: StartingPoint
-    parameters: Parameters
-    losses: LossWeights
-    rate_term: RateTerm | None
-    smoothness: MotionSmoothness | None
-    free_set: FreeSet
-    patch_at: int
-    patches: bool
-    last_pass: LastPass
-    backend: Backend
-    watch: Stopwatch
-    rest_every: int = 1
-    visits: dict[int, int] = field(default_factory=dict)
-    average: MeanOfSteps | None = None
-    iterations: int = 0
-    recorded: set[Hashable] = field(default_factory=set)
-
-    def loss(self, iteration: int, sample: View) -> SceneLoss:
-        active = self._active_tiles_of(sample)
-        loss = view_loss(
-            self.parameters.scene(self.start.scene),
-            sample,
-            backend=self.backend,
-            weights=self.losses,
-            track_screen=self._tracks_screen(iteration),
-            watch=self.watch,
-            active=replace(active, tiles=active.changed) if active is not None and self._rests(sample) else active,
-            background=None if active is None else active.background,
-        )
-        # Tiles that are not drawn now hold their last drawing.
-        return self._with_regularizers(replace(loss, active=active))
-
-    def _with_regularizers(self, loss: SceneLoss) -> SceneLoss:
-        values = self.parameters.values
-        if self.smoothness is not None:
-            difference = self.smoothness.difference(values["anchor_positions"], self.backend)
-            loss = with_term(loss, "smoothness", difference, weight=self.smoothness.weight)
-        if self.rate_term is None:
-            return loss
-        return replace(loss, total=loss.total + self.rate_term.value(values, self.backend))
-
-    def _active_tiles_of(self, sample: View) -> ActiveTiles | None:
-        return None if self.start.active_tiles is None else self.start.active_tiles[sample.index]
-
-    def _alternates(self, sample: View) -> bool:
-        """Whether some visits of the view are without the tiles in which nothing has changed."""
-        active = self._active_tiles_of(sample)
-        return active is not None and active.changed is not None and self.rest_every > 1
-
-    def _rests(self, sample: View) -> bool:
-        """Whether this visit of the view is without the tiles in which nothing has changed."""
-        return self._alternates(sample) and (self.visits.get(sample.index, 0) + 1) % self.rest_every != 0
-
-    def _tracks_screen(self, iteration: int) -> bool:
-        patching = self.free_set.config
-        return patching.spawn != "off" and patching.collect_from < iteration <= self.patch_at
-
-    def repeats(self, iteration: int, sample: View) -> Hashable | None:
-        """Visits of a view that draw the same tiles, until rows of free Gaussians come or go."""
-        active, alternates, rests = self._active_tiles_of(sample), self._alternates(sample), self._rests(sample)
-        key = sample.index, rests, self.free_set.version
-        if key not in self.recorded:
-            # The other visits of a view follow each other; those of all tiles are ``rest_every`` visits apart.
-            visits_left = (self.iterations - iteration) // len(self.start.seen)
-            if self._tracks_screen(iteration) or visits_left < (self.rest_every if alternates and not rests else 1):
-                return None
-            for tiles in () if active is None else (active.tiles, active.changed):
-                if tiles is not None:
-                    tiles.pixels()  # Masks are made at their first use, which must not be part of a recording.
-            self.recorded.add(key)
-        return key
-
-    def after_step(self, iteration: int, sample: View, loss: SceneLoss, screen_gradient: Tensor | None) -> None:
-        rests = self._rests(sample)
-        self.visits[sample.index] = self.visits.get(sample.index, 0) + 1
-        self.last_pass.add(iteration, loss, sample, comparable=not rests)
-        if screen_gradient is not None:
-            self.free_set.statistics.add(loss.rendering, screen_gradient)
-        if iteration == self.patch_at and self.patches:
-            with self.watch.stage("patch"), torch.no_grad():
-                version, survivors = self.free_set.version, self.free_set.patch(sample)
-                if self.rate_term is not None and self.free_set.version != version:
-                    self.rate_term = self.rate_term.after_pruning(survivors)
-        if self.average is not None:
-            self.average.add(iteration, self.parameters.values)
-
-    def counts(self) -> tuple[int, int]:
-        split = self.start.split
-        static = 0 if split is None else len(split.static.free)
-        return len(self.start.scene.anchors), len(self.free_set) + static

@@ -16,7 +16,7 @@ from structgstream.gaussians import concatenate
 from structgstream.kernels.backend import Backend
 from structgstream.kernels.values import TILE_PIXELS, TileSelection, tile_grid
 from structgstream.scene.active_tiles import ActiveTiles
-from structgstream.scene.render import Rendering, draw
+from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.select import DynamicSelection
@@ -115,12 +115,12 @@ def _focus(
     backend: Backend,
 ) -> ActiveTiles | None:
     in_motion = dynamic.gaussians(camera, backend)
-    # Extents of Gaussians are measured on a reduced picture, which costs a sixteenth.
+    # Extents are those on a reduced picture.
     small = camera.scaled(REACH_SCALE)
-    reach = draw(in_motion, small, backend)
-    reach = replace(reach, radii=reach.radii * (camera.width / small.width))
+    radii = backend.projected_radii(in_motion, small.viewport(in_motion.means)) * (camera.width / small.width)
     enlarged = enlargement(camera.width, camera.height)
-    tiles = reached_tiles(reach, visible[in_motion.ids], camera, round(config.MARGIN_PIXELS * enlarged))
+    shown = visible[in_motion.ids] & (radii > 0)
+    tiles = reached_tiles(in_motion.means[shown], radii[shown], camera, round(config.MARGIN_PIXELS * enlarged))
     if not tiles.mask.any():
         return None
     tiles_of_change = changed_tiles(tiles, changed)
@@ -156,18 +156,16 @@ def changed_tiles(tiles: TileSelection, changed: Tensor | None) -> TileSelection
     return replace(tiles, mask=mask) if mask.any() else tiles
 
 
-def reached_tiles(rendering: Rendering, visible: Tensor, camera: Camera, margin_pixels: int) -> TileSelection:
-    """The tiles within ``margin_pixels`` of the drawn Gaussians of the mask ``visible``.
+def reached_tiles(means: Tensor, radii: Tensor, camera: Camera, margin_pixels: int) -> TileSelection:
+    """The tiles within ``margin_pixels`` of Gaussians at ``means`` ``[N, 3]``, ``radii`` ``[N]`` pixels large.
 
     Gaussians are truncated at two standard deviations.
     """
     rows, columns = tile_grid(camera.width, camera.height)
-    drawn = visible & (rendering.radii > 0)
-    means = rendering.gaussians.means[drawn]
     viewmat, K = camera.viewport(means)[:2]
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     centers = (points @ K.T)[:, :2] / points[:, 2:]
-    reach = 0.6 * rendering.radii[drawn, None] + margin_pixels
+    reach = 0.6 * radii[:, None] + margin_pixels
     none, last = centers.new_zeros(2), centers.new_tensor([columns - 1, rows - 1])
     low = ((centers - reach) / TILE_PIXELS).floor()
     high = ((centers + reach) / TILE_PIXELS).floor()

@@ -1,0 +1,319 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The iterations of a frame after the first: their initial state, and two ways to run them.
+
+:class:`OnlineHooks` for ``training.optim.minimize``, in torch, defines the results. Where only a dynamic split is
+trained, without view-space gradients, :func:`minimize_natively` takes the back-end's own iterations
+(``Backend.iterations``, csrc/cpu/fit.cpp), without Python between them.
+"""
+
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import islice, pairwise
+
+import torch
+from torch import Tensor
+
+from structgstream.codec.fields.quantization import RateTerm
+from structgstream.kernels.backend import Backend
+from structgstream.kernels.values import FitFrame, FitLeaf, FitPlan, FitPrices, FitView
+from structgstream.scene.active_tiles import ActiveTiles
+from structgstream.scene.free import FreeGaussians
+from structgstream.scene.scene import Scene
+from structgstream.scene.state import ParameterName
+from structgstream.training.losses import LossWeights, SceneLoss, view_loss, with_term
+from structgstream.training.online.patching import FreeSet
+from structgstream.training.online.smoothness import MotionSmoothness
+from structgstream.training.online.split import DynamicSplit
+from structgstream.training.optim import BETAS, Adam, Hooks, LastPass, MeanOfSteps, Schedule
+from structgstream.training.parameters import ANCHOR_ROWS, FREE_ROWS, Parameters
+from structgstream.training.result import Step, StepListener, Stopwatch
+from structgstream.training.views import View
+
+LEAVES: tuple[ParameterName, ...] = (*ANCHOR_ROWS, *FREE_ROWS)
+"""Tensors of a frame's fit (``values.FIT_LEAVES``)."""
+REPORT_INTERVAL = 10
+"""Iterations between reports of progress, where a back-end runs them."""
+
+
+@dataclass(frozen=True)
+class StartingPoint:
+    """Initial state of a frame's optimisation.
+
+    Args:
+        scene: the whole scene, or the dynamic part of ``split``.
+        views: the pictures.
+        displacements: ``[M + F, 3]`` initial displacements of its primitives (Note [Primitives]).
+        split: of which the scene is the moving part; None for a whole scene.
+        active_tiles: by view index, the tiles that the scene reaches; None for whole pictures of all views.
+        new_free: free Gaussians to add.
+        reference: anchors as in ``scene``, from whose values changes and motion are priced; free Gaussians then have no
+            price. None: since ``scene``.
+    """
+
+    scene: Scene
+    views: list[View]
+    displacements: Tensor
+    split: DynamicSplit | None = None
+    active_tiles: Mapping[int, ActiveTiles] | None = None
+    new_free: FreeGaussians | None = None
+    reference: Scene | None = None
+
+    @property
+    def known(self) -> Scene:
+        """The scene against which changes and displacements are penalised."""
+        return self.scene if self.reference is None else self.reference
+
+    @property
+    def seen(self) -> list[View]:
+        """The views in which the scene is visible."""
+        return (
+            self.views
+            if self.active_tiles is None
+            else [view for view in self.views if view.index in self.active_tiles]
+        )
+
+    def with_own_pictures(self) -> "StartingPoint":
+        """The same with copies of the pictures that iterations draw into."""
+        if self.active_tiles is None:
+            return self
+        copies = {i: replace(active, picture=active.picture.clone()) for i, active in self.active_tiles.items()}
+        return replace(self, active_tiles=copies)
+
+
+@dataclass
+class OnlineHooks(Hooks[View, SceneLoss]):
+    """What an iteration minimises, and what is done between iterations.
+
+    Args:
+        start: the initial state.
+        parameters: of the scene.
+        losses: weights of the terms.
+        rate_term: the price of changing bins; None for none.
+        smoothness: the price of incoherent motion; None for none.
+        free_set: of the free Gaussians.
+        patch_at: the iteration after which free Gaussians are pruned and spawned.
+        patches: whether they are.
+        last_pass: gets the result of each view; loss terms of visits of all its tiles only.
+        backend: the compute back-end.
+        watch: seconds by stage.
+        rest_every: tiles in which nothing has changed are drawn every this many times that a view is.
+        visits: by view index, how often it was drawn.
+        average: gets the leaves of each iteration; None for none.
+        iterations: of the frame, at most; to know which of them are worth recording. 0: none is.
+        recorded: keys that :meth:`repeats` has given.
+    """
+
+    start: StartingPoint
+    parameters: Parameters
+    losses: LossWeights
+    rate_term: RateTerm | None
+    smoothness: MotionSmoothness | None
+    free_set: FreeSet
+    patch_at: int
+    patches: bool
+    last_pass: LastPass
+    backend: Backend
+    watch: Stopwatch
+    rest_every: int = 1
+    visits: dict[int, int] = field(default_factory=dict)
+    average: MeanOfSteps | None = None
+    iterations: int = 0
+    recorded: set[Hashable] = field(default_factory=set)
+
+    def loss(self, iteration: int, sample: View) -> SceneLoss:
+        active = self.active_tiles_of(sample)
+        loss = view_loss(
+            self.parameters.scene(self.start.scene),
+            sample,
+            backend=self.backend,
+            weights=self.losses,
+            track_screen=self._tracks_screen(iteration),
+            watch=self.watch,
+            active=replace(active, tiles=active.changed) if active is not None and self._rests(sample) else active,
+            background=None if active is None else active.background,
+        )
+        # Tiles that are not drawn now hold their last drawing.
+        return self._with_regularizers(replace(loss, active=active))
+
+    def _with_regularizers(self, loss: SceneLoss) -> SceneLoss:
+        values = self.parameters.values
+        if self.smoothness is not None:
+            difference = self.smoothness.difference(values["anchor_positions"], self.backend)
+            loss = with_term(loss, "smoothness", difference, weight=self.smoothness.weight)
+        if self.rate_term is None:
+            return loss
+        return replace(loss, total=loss.total + self.rate_term.value(values, self.backend))
+
+    def active_tiles_of(self, sample: View) -> ActiveTiles | None:
+        """The tiles of the view that the scene reaches; None for whole pictures."""
+        return None if self.start.active_tiles is None else self.start.active_tiles[sample.index]
+
+    def _alternates(self, sample: View) -> bool:
+        """Whether some visits of the view are without the tiles in which nothing has changed."""
+        active = self.active_tiles_of(sample)
+        return active is not None and active.changed is not None and self.rest_every > 1
+
+    def _rests(self, sample: View) -> bool:
+        """Whether this visit of the view is without the tiles in which nothing has changed."""
+        return self._alternates(sample) and (self.visits.get(sample.index, 0) + 1) % self.rest_every != 0
+
+    def _tracks_screen(self, iteration: int) -> bool:
+        patching = self.free_set.config
+        return patching.spawn != "off" and patching.collect_from < iteration <= self.patch_at
+
+    @property
+    def native(self) -> bool:
+        """Whether a back-end that has its own iterations can run these."""
+        return None not in (self.start.active_tiles, self.start.split) and not self._tracks_screen(self.patch_at)
+
+    def repeats(self, iteration: int, sample: View) -> Hashable | None:
+        """Visits of a view that draw the same tiles, until rows of free Gaussians come or go."""
+        active, alternates, rests = self.active_tiles_of(sample), self._alternates(sample), self._rests(sample)
+        key = sample.index, rests, self.free_set.version
+        if key not in self.recorded:
+            # The other visits of a view follow each other; those of all tiles are ``rest_every`` visits apart.
+            visits_left = (self.iterations - iteration) // len(self.start.seen)
+            if self._tracks_screen(iteration) or visits_left < (self.rest_every if alternates and not rests else 1):
+                return None
+            for tiles in () if active is None else (active.tiles, active.changed):
+                if tiles is not None:
+                    tiles.pixels()  # Masks are made at their first use, which must not be part of a recording.
+            self.recorded.add(key)
+        return key
+
+    def after_step(self, iteration: int, sample: View, loss: SceneLoss, screen_gradient: Tensor | None) -> None:
+        self.last_pass.add(iteration, loss, sample, comparable=not self.visit(sample))
+        if screen_gradient is not None:
+            self.free_set.statistics.add(loss.rendering, screen_gradient)
+        if iteration == self.patch_at and self.patches:
+            self.patch(sample)
+        if self.average is not None:
+            self.average.add(iteration, self.parameters.values)
+
+    def visit(self, sample: View) -> bool:
+        """Counts a visit of the view; whether it was without the tiles in which nothing has changed."""
+        rests = self._rests(sample)
+        self.visits[sample.index] = self.visits.get(sample.index, 0) + 1
+        return rests
+
+    def patch(self, sample: View) -> bool:
+        """Prunes and spawns free Gaussians; whether any came or went."""
+        with self.watch.stage("patch"), torch.no_grad():
+            version, survivors = self.free_set.version, self.free_set.patch(sample)
+            if self.rate_term is not None and self.free_set.version != version:
+                self.rate_term = self.rate_term.after_pruning(survivors)
+        return self.free_set.version != version
+
+    def counts(self) -> tuple[int, int]:
+        split = self.start.split
+        static = 0 if split is None else len(split.static.free)
+        return len(self.start.scene.anchors), len(self.free_set) + static
+
+
+def minimize_natively(
+    adam: Adam[ParameterName],
+    samples: Iterator[View],
+    schedule: Schedule[ParameterName],
+    hooks: OnlineHooks,
+    *,
+    begin: Callable[[FitFrame], Callable[[int, int], None]],
+    on_step: StepListener | None,
+) -> int:
+    """As ``training.optim.minimize`` where ``hooks.native``, by the back-end's iterations ``begin``."""
+    views = list(islice(samples, schedule.iterations))
+    plan = _plan(adam, views, schedule, hooks)
+    patch_at = hooks.patch_at if hooks.patches and hooks.patch_at <= len(views) else 0
+    interval = REPORT_INTERVAL if on_step is not None else max(len(views), 1)
+    run = None
+    for first, last in pairwise(sorted({*range(0, len(views), interval), patch_at, len(views)})):
+        with hooks.watch.stage("iterations"):
+            run = run or begin(_frame(adam, plan, hooks, first))
+            run(first, last)
+        if hooks.average is not None:
+            hooks.average.count(last - max(first, plan.mean_from))
+        if last == patch_at and hooks.patch(views[last - 1]):
+            run = None
+        if on_step is not None:
+            on_step(Step(last, len(views), float(plan.terms[last - 1, 4]), *hooks.counts()))
+    terms = {"l1": 0, "ssim": 1, **({"volume": 2} if hooks.losses.volume else {})}
+    terms |= {} if hooks.smoothness is None else {"smoothness": 3}
+    for i, (view, rests) in enumerate(zip(views, plan.rests.tolist(), strict=True)):
+        found = {name: plan.terms[i, column] for name, column in terms.items()}
+        hooks.last_pass.add_results(i + 1, view.index, found, plan.squared_errors[i], comparable=not rests)
+    return len(views)
+
+
+def _plan(
+    adam: Adam[ParameterName], views: list[View], schedule: Schedule[ParameterName], hooks: OnlineHooks
+) -> FitPlan:
+    count, numbers = len(views), {view.index: n for n, view in enumerate(hooks.start.seen)}
+    rates = [[found[name] for name in LEAVES] for found in map(schedule.rates, range(1, count + 1))]
+    return FitPlan(
+        order=torch.tensor([numbers[view.index] for view in views], dtype=torch.int32),
+        rests=torch.tensor([hooks.visit(view) for view in views], dtype=torch.bool),
+        rates=torch.tensor(rates, dtype=torch.float64),
+        mean_from=count if hooks.average is None else hooks.average.after,
+        errors_from=hooks.last_pass.after,
+        betas=BETAS,
+        eps=adam.eps,
+        terms=torch.zeros(count, 5),
+        squared_errors=torch.zeros(count, dtype=torch.float64),
+    )
+
+
+def _frame(adam: Adam[ParameterName], plan: FitPlan, hooks: OnlineHooks, done: int) -> FitFrame:
+    """The frame from iteration ``done``, with the rows that its leaves have now."""
+    scene, rate_term, smoothness, losses = hooks.start.scene, hooks.rate_term, hooks.smoothness, hooks.losses
+    values = hooks.parameters.values
+
+    def leaf(name: ParameterName) -> FitLeaf | None:
+        value = values.get(name)
+        if value is None or not value.requires_grad:
+            return None if value is None else FitLeaf(value)
+        adam.begin(name)
+        sums = None if hooks.average is None else hooks.average.sums_of(name, value.detach(), done)
+        before = None if rate_term is None else rate_term.before.get(name)
+        step = hooks.parameters.steps.get(name, 0.0)
+        return FitLeaf(value.detach(), adam.first[name], adam.second[name], sums, before, step)
+
+    appears = scene.anchors.appearance is not None
+    sampling, free_means = scene.sampling, values["free_means"].detach()
+    return FitFrame(
+        leaves=[leaf(name) for name in LEAVES],
+        mlps=scene.mlps,
+        basis=scene.appearance_basis if appears else None,
+        distance_input=scene.distance_input,
+        anchor_intervals=scene.anchor_intervals,
+        # Free Gaussians, too, move by far less than their depth.
+        free_intervals=None if sampling is None else sampling.intervals(free_means),
+        views=[_view(view, hooks) for view in hooks.start.seen],
+        start=None if smoothness is None else smoothness.start,
+        neighbours=None if smoothness is None else smoothness.neighbours,
+        shares=None if smoothness is None else smoothness.shares,
+        prices=FitPrices(
+            losses.l1,
+            losses.ssim,
+            losses.volume,
+            losses.volume_reduction == "mean",
+            0.0 if rate_term is None else rate_term.weight_per_bit,
+            *(() if smoothness is None else (smoothness.weight, smoothness.pixel, smoothness.slack_pixels)),
+        ),
+        plan=plan,
+    )
+
+
+def _view(view: View, hooks: OnlineHooks) -> FitView:
+    scene, active = hooks.start.scene, hooks.active_tiles_of(view)
+    assert active is not None
+    return FitView(
+        viewport=view.camera.viewport(scene.anchors.positions),
+        picture=view.image,
+        mask=view.mask,
+        tiles=active.tiles,
+        changed=active.tiles if active.changed is None else active.changed,
+        gains=scene.camera_color.gains[view.index],
+        biases=scene.camera_color.biases[view.index],
+        background=active.background,
+        image=active.picture,
+        static=active.static,
+    )
