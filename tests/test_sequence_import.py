@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from structgstream.cli import main
+from structgstream.codec.fields.free_rows import MAX_FREE
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import open_stream
 from structgstream.errors import CaptureError
@@ -28,9 +29,10 @@ def write(folder: Path, parts: Sequence[BakedGaussians]) -> list[Path]:
     return [write_gaussians(folder / f"frame_{t}.ply", part, format="ply") for t, part in enumerate(parts)]
 
 
-def imported(folder: Path, parts: Sequence[BakedGaussians], **options: int) -> ImportedSequence:
+def imported(folder: Path, parts: Sequence[BakedGaussians], *, max_splats: int = MAX_FREE) -> ImportedSequence:
     files = write(folder, parts)
-    return import_sequence(files, folder / "out.sgs", fps=2.0, backend=quickest_backend(), rig=RIG, **options)
+    output, backend = folder / "out.sgs", quickest_backend()
+    return import_sequence(files, output, fps=2.0, backend=backend, rig=RIG, max_splats=max_splats)
 
 
 def check(path: Path, parts: Sequence[BakedGaussians]) -> None:

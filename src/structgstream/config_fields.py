@@ -20,8 +20,6 @@ _KINDS: Mapping[Any, tuple[type, ...]] = {int: (int,), float: (int, float), bool
 
 def holds(found: Any, given: Any) -> bool:
     """Whether ``found`` has all that is ``given``."""
-    if isinstance(found, list) and isinstance(given, dict):
-        given = [*given.values()]
     if isinstance(given, list) and isinstance(found, list):
         return len(found) == len(given) and all(map(holds, found, given))
     if isinstance(given, dict) and isinstance(found, dict):
@@ -106,13 +104,18 @@ def without_fields(values: Mapping[str, Any], paths: Collection[str], path: str 
 
 
 def with_present_names(values: Mapping[str, Any], present_name: Callable[[str], str], path: str = "") -> dict[str, Any]:
-    """``values`` of an earlier version with the present names of fields; ``present_name`` has them by earlier path."""
-    return {
-        present_name(f"{path}{name}"): with_present_names(item, present_name, f"{path}{name}.")
-        if isinstance(item, Mapping)
-        else item
-        for name, item in values.items()
-    }
+    """``values`` of an earlier version with the present names of fields; ``present_name`` has them by earlier path.
+
+    The ends of a schedule, which had names, are a pair.
+    """
+    found: dict[str, Any] = {}
+    for name, item in values.items():
+        if isinstance(item, Mapping) and item.keys() == {"initial", "final"}:
+            item = [item["initial"], item["final"]]
+        elif isinstance(item, Mapping):
+            item = with_present_names(item, present_name, f"{path}{name}.")
+        found[present_name(f"{path}{name}")] = item
+    return found
 
 
 def check_numbers(config: Any, path: str = "") -> None:
@@ -154,6 +157,5 @@ def read_value(kind: Any, value: Any) -> Any:
         (kind,) = (of for of in arguments if of is not type(None))
         return None if value is None else read_value(kind, value)
     if origin is tuple:
-        items = value.values() if isinstance(value, Mapping) else value  # The ends of a schedule had names once.
-        return tuple(read_value(arguments[0], item) for item in items)
+        return tuple(read_value(arguments[0], item) for item in value)
     return origin(value) if origin in (frozenset, dict) else value

@@ -121,6 +121,7 @@ def test_the_list_of_formats(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", "--list"]) == 0
     said = capsys.readouterr().out
     assert all(name in said for name in (*FORMATS, *PAGES))
+    assert "export needs a stream file" in error_of([], capsys, status=2)
 
 
 def test_names_beside_the_stream(stream: Path, tmp_path: Path) -> None:

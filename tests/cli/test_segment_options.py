@@ -48,12 +48,12 @@ def test_seconds_that_do(tmp_path: Path) -> None:
 
 
 def test_a_file_is_checked_and_left_to_others(tmp_path: Path) -> None:
-    with SegmentOptions().storage(tmp_path / "new.sgs", may_exist=False, tell=print) as storage:
+    with SegmentOptions().storage(tmp_path / "new.sgs", may_exist=False, report=print) as storage:
         assert storage is None
     (tmp_path / "old.sgs").touch()
     with (
         pytest.raises(StorageError, match="old.sgs exists"),
-        SegmentOptions().storage(tmp_path / "old.sgs", may_exist=False, tell=print),
+        SegmentOptions().storage(tmp_path / "old.sgs", may_exist=False, report=print),
     ):
         pass
 
@@ -61,7 +61,7 @@ def test_a_file_is_checked_and_left_to_others(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::ResourceWarning")
 def test_the_manifest_says_when_a_live_frame_was_filmed(tmp_path: Path) -> None:
     options = SegmentOptions(sink="segments")
-    with options.storage(tmp_path / "now", may_exist=False, tell=print) as storage:
+    with options.storage(tmp_path / "now", may_exist=False, report=print) as storage:
         assert storage is not None
         sink, resumed = storage(lambda frame: 1.7e9 + frame)(False)
         assert resumed is None
@@ -74,7 +74,7 @@ def test_the_manifest_says_when_a_live_frame_was_filmed(tmp_path: Path) -> None:
 
 def test_window_and_grace_arrive(tmp_path: Path) -> None:
     options = SegmentOptions(sink="segments", window=0.05, keep=0.0)
-    with options.storage(tmp_path / "now", may_exist=False, tell=print) as storage:
+    with options.storage(tmp_path / "now", may_exist=False, report=print) as storage:
         assert storage is not None
         sink, _ = storage(None)(False)
         sink.open(header())
@@ -89,15 +89,15 @@ def test_window_and_grace_arrive(tmp_path: Path) -> None:
 
 def test_a_folder_that_is_there_is_asked_for(tmp_path: Path) -> None:
     options, output = SegmentOptions(sink="segments"), tmp_path / "now"
-    with options.storage(output, may_exist=False, tell=print) as storage:
+    with options.storage(output, may_exist=False, report=print) as storage:
         assert storage is not None
         sink, _ = storage(None)(False)
         sink.open(header())
         sink.write(packets(1)[0])
         sink.close()
-    with pytest.raises(StorageError, match="--resume"), options.storage(output, may_exist=False, tell=print):
+    with pytest.raises(StorageError, match="--resume"), options.storage(output, may_exist=False, report=print):
         pass
-    with options.storage(output, may_exist=True, tell=print) as storage:
+    with options.storage(output, may_exist=True, report=print) as storage:
         assert storage is not None
 
 
@@ -107,7 +107,7 @@ def test_another_programs_manifest_is_never_replaced(tmp_path: Path) -> None:
     (output / MANIFEST).write_text("{}")
     options = SegmentOptions(sink="segments")
     for_another = pytest.raises(StorageError, match="of another program")
-    with for_another, options.storage(output, may_exist=True, tell=print):
+    with for_another, options.storage(output, may_exist=True, report=print):
         pass
     assert (output / MANIFEST).read_text() == "{}"
 

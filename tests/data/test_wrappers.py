@@ -153,7 +153,7 @@ def test_a_thinned_section_begins_at_the_start_and_counts_what_is_used(source: F
         assert part.fps == source.fps / every
     part = section(source, start=1, frames=1, every=2)
     assert isinstance(part, SourceWrapper)
-    assert all_numbers(part.frames_behind()) == [whole[3], whole[5]]  # what a look ahead may see has the same step
+    assert all_numbers(part.frames_after()) == [whole[3], whole[5]]  # what a look ahead may see has the same step
     for start, frames, every in ((0, 4, 2), (6, None, 2), (-1, 1, 2), (0, 0, 3)):
         with pytest.raises(CaptureError, match=f"has 6 frames; .*1 in {every}"):
             section(source, start=start, frames=frames, every=every)

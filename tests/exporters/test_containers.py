@@ -140,10 +140,10 @@ def test_usd_has_a_time_sample_of_each_frame(tmp_path: Path) -> None:
 
 def test_usd_of_one_frame_as_fourdgs_reads_it(tmp_path: Path) -> None:
     """The library reads what an OpenUSD stage has by default, which a text file with samples turned off shows."""
-    from pxr import Usd
+    from pxr import Usd  # pyright: ignore[reportMissingImports]
 
     path = write_all(tmp_path / "one.usda", "usd", [some(40, degree=1)])
-    stage = Usd.Stage.Open(str(path))
+    stage = Usd.Stage.Open(str(path))  # pyright: ignore[reportAttributeAccessIssue]
     for attribute in stage.GetDefaultPrim().GetAttributes():
         if samples := attribute.GetTimeSamples():
             attribute.Set(attribute.Get(samples[0]))

@@ -131,7 +131,6 @@ def test_refined_and_in_metres(tmp_path: Path) -> None:
     assert across == pytest.approx(scale * float((rig["cam01"].center - rig["cam03"].center).norm()), rel=0.02)
 
 
-@pytest.mark.usefixtures("without_points")
 def test_a_wrong_calibration_is_told(tmp_path: Path) -> None:
     """Other mistakes: tests/pose_check."""
     write_room(tmp_path / "videos", cameras=8)
@@ -145,7 +144,6 @@ def test_a_wrong_calibration_is_told(tmp_path: Path) -> None:
     assert "are exchanged" in made.report.read_text()
 
 
-@pytest.mark.usefixtures("without_points")
 def test_dead_cameras_are_told_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_room(tmp_path / "videos", cameras=4, frames=9)
     short = tmp_path / "short"

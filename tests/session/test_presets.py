@@ -89,6 +89,9 @@ def with_former_names(config: StreamConfig) -> dict[str, Any]:
         group = group_at(values, renamed(".".join(parents)))
         if name in group:
             group[former] = group.pop(name)
+    rates = values["initial"]["rates"]
+    # Headers are stored with sorted keys.
+    values["initial"]["rates"] = {name: {"final": last, "initial": first} for name, (first, last) in rates.items()}
     return values
 
 

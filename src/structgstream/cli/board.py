@@ -49,9 +49,9 @@ def main(arguments: list[str]) -> None:
         board = parse_board(f"{options.squares}:{options.square}:{options.dictionary}")
         write_board_pdf(options.output, board, options.paper)
     console = Console()
-    told = (
+    written = (
         f"Wrote {options.output}: {board.text}, on {options.paper}. Print it at 100 %, and check its bar with a ruler."
     )
-    print_lines(console, told)
+    print_lines(console, written)
     use = f"Then: structgstream prepare VIDEOS -o CAPTURE --calibration board --board {board_text(board)}"
     print_lines(console, use)

@@ -71,7 +71,7 @@ def main(arguments: list[str]) -> None:
     print_lines(
         console,
         f"\nWatch it from any angle: open {player} in a browser,\n{player.resolve().as_uri()}\n"
-        f"or, beside what the cameras took: structgstream play {stream} --capture {bundled_clip_path()}",
+        f"or, next to the cameras' pictures: structgstream play {stream} --capture {bundled_clip_path()}",
     )
 
 

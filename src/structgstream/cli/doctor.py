@@ -21,6 +21,8 @@ OPTIONAL = (
     ("starlette", "starlette", "serve", "commands play and serve"),
     ("uvicorn", "uvicorn", "serve", "commands play and serve"),
     ("prometheus_client", "prometheus-client", "serve", "command serve"),
+    ("pxr", "usd-core", "export", "export to .usd"),
+    ("fourdgs", "fourdgs", "export", "export to .4dgs"),
     ("s3fs", "s3fs", "cloud", "publish segments to S3"),
     ("anywidget", "anywidget", "notebook", "player in notebooks"),
     ("gsplat", "gsplat", "cuda", "back-end cuda"),

@@ -111,7 +111,7 @@ def run_evaluation(
 
     frames = len(reader.packets)
     wanted = set(spread_indices(frames, SHEET_COLUMNS)) if frames else set()
-    kept: dict[str, dict] = {}
+    compared_pictures: dict[str, dict] = {}
     worst = WorstPictures()
     console = Console(stderr=True)
     with console.status("evaluating") as status:
@@ -121,7 +121,7 @@ def run_evaluation(
             if folder is not None:
                 worst.see(index, compared)
                 if index in wanted:
-                    kept.setdefault(compared.camera, {})[index] = (compared.truth, compared.picture)
+                    compared_pictures.setdefault(compared.camera, {})[index] = (compared.truth, compared.picture)
 
         report = evaluate(
             reader,
@@ -138,6 +138,6 @@ def run_evaluation(
         title = f"{source.name}, {stream.name}: {quality_text(report)} over {frames} frames"
         write_json(folder / "report.json", as_json(report))
         write_plots(folder / "over_time.png", report, title=title)
-        contact_sheet(folder / "contact_sheet.png", kept, title=title)
+        contact_sheet(folder / "contact_sheet.png", compared_pictures, title=title)
         write_page(folder, worst.crops(), title=title, pictures=("over_time.png", "contact_sheet.png"))
     return report

@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from structgstream.cli.app import usage_errors
-from structgstream.cli.options import EXPORTS, Device, Flag, StreamFile, check_ending, parse_options
+from structgstream.cli.app import UsageError, usage_errors
+from structgstream.cli.options import EXPORTS, Device, Flag, check_ending, parse_options
 from structgstream.cli.progress import human_bytes, print_lines
 from structgstream.exporters.formats import FORMATS, Format, FrameOptions, PageFormat, SpzVersion
 
@@ -37,7 +37,7 @@ class Export:
     Example: structgstream export ball.sgs -o ball.usd
     """
 
-    stream: tyro.conf.Positional[StreamFile]
+    stream: tyro.conf.Positional[Annotated[Path | None, tyro.conf.arg(metavar="STREAM", help_behavior_hint="")]] = None
     """The stream file."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="OUT", help_behavior_hint="")] = None
     """Output file or folder. Default: a file (with --frame) or a folder next to the stream."""
@@ -73,10 +73,13 @@ class Export:
 
 def main(arguments: list[str]) -> None:
     """Exports and prints the path of the result."""
-    if "--list" in arguments:
+    options = parse_options(Export, "export", arguments=arguments)
+    if options.list:
         _list_formats(Console())
         return
-    options = parse_options(Export, "export", arguments=arguments)
+    if options.stream is None:
+        raise UsageError("export needs a stream file, or --list.")
+    stream = options.stream
     check_ending(options.output, *EXPORTS, ".zip", ".html", command="export", folder=True)
     from structgstream.exporters.request import check_page, choose_frames, destination
 
@@ -91,17 +94,17 @@ def main(arguments: list[str]) -> None:
         spz_version=options.spz_version,
     )
     with usage_errors():
-        output, format = destination(options.stream, options.output, format=options.format, frame=frame, frames=frames)
+        output, format = destination(stream, options.output, format=options.format, frame=frame, frames=frames)
         if format == "html" or format == "site":
             check_page(frame=frame, frames=frames, options=chosen)
-            _export_page(options.stream, output, format)
+            _export_page(stream, output, format)
             return
         chosen.check(format)
     from structgstream.codec.reader import open_stream
     from structgstream.exporters.frames import write_frames
     from structgstream.kernels.backend import select_backend
 
-    reader = open_stream(options.stream, by_index=options.frame is not None)
+    reader = open_stream(stream, by_index=options.frame is not None)
     with usage_errors():
         numbers = choose_frames(reader.runs, output, frame=frame, frames=frames)
     backend = select_backend(options.device)

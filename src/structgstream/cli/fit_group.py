@@ -65,7 +65,7 @@ def main(arguments: list[str]) -> None:
     from structgstream.groups.first_frame import GroupStartConfig
     from structgstream.groups.unit import SegmentTask
 
-    logging.basicConfig(format="structgstream: %(message)s")  # what a run says beside its progress
+    logging.basicConfig(format="structgstream: %(message)s")  # warnings between progress lines
     start = GroupStartConfig(iterations=options.iterations, rounds=options.rounds)
     task = SegmentTask(options.scene, options.init, options.track, first, end, start)
     written = _fit(options, task)
@@ -96,6 +96,6 @@ def _fit(options: FitGroup, task: "SegmentTask") -> bool:
                 if ending.asked and done != task.end:
                     raise Terminated
     except KeyboardInterrupt as error:
-        kept = f"{done - task.first} of {task.end - task.first} frames are safe; give the same command to go on."
-        raise (Terminated if isinstance(error, Terminated) else Interrupted)(kept) from None
+        message = f"{done - task.first} of {task.end - task.first} frames are safe; give the same command to go on."
+        raise (Terminated if isinstance(error, Terminated) else Interrupted)(message) from None
     return True

@@ -46,7 +46,7 @@ class Join:
 
 
 def main(arguments: list[str]) -> None:
-    """Writes the file, and prints what was handed over and its size."""
+    """Writes the file, and prints the blended seams and its size."""
     options = parse_options(Join, "join", arguments=arguments)
     output = options.output
     check_ending(output, ".sgs", command="join")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the user sees of a parallel run: a cell for each group on a terminal, a line for each ending elsewhere."""
+"""Display of a parallel run: a cell for each group on a terminal, a line for each result elsewhere."""
 
 import time
 from collections import Counter
@@ -28,11 +28,11 @@ OTHERS = ("running", "ready", "waiting for the track", "failed")
 ROWS = 6
 SHOWN = 8
 FramesOf = Callable[[int, int], int]
-"""How many frames a running group has by now."""
+"""Number of fitted frames of a running group."""
 
 
 def cells(states: Sequence["State"], *, width: int) -> Text:
-    """The groups in order, a sign each; of many, one for several, which shows what is least done among them."""
+    """A sign per group; of many groups, one for several, which shows the least advanced state."""
     share = max(1, -(-len(states) // (width * ROWS)))
     text = Text()
     for start in range(0, len(states), share):
@@ -46,7 +46,7 @@ def cells(states: Sequence["State"], *, width: int) -> Text:
 
 
 def counted(status: "Status") -> str:
-    """The state in words."""
+    """The status as text."""
     if not status.groups:
         return {"header": "frame 0", "track": "tracking begins"}.get(status.stage, status.stage)
     counts = Counter(str(state) for state in status.states)
@@ -57,18 +57,18 @@ def counted(status: "Status") -> str:
 
 
 class ParallelDisplay:
-    """Shows a state when told: a picture of all groups that renews itself, or lines.
+    """Shows the status: all groups, redrawn on a terminal, else lines.
 
     Args:
         console: where to write.
-        frames_of: how far a group is.
+        frames_of: number of fitted frames of a group.
     """
 
     def __init__(self, console: Console, frames_of: FramesOf) -> None:
         self._console, self._frames_of = console, frames_of
         self._begun = time.monotonic()
         self._live = Live(Text(), console=console, refresh_per_second=2)
-        self._told = ""
+        self._printed = ""
 
     def __enter__(self) -> "ParallelDisplay":
         if self._console.is_terminal:
@@ -82,17 +82,17 @@ class ParallelDisplay:
             self._live.stop()
 
     def show(self, status: "Status") -> None:
-        """Renews the picture; elsewhere than on a terminal, prints a line if it says something new."""
+        """Redraws the groups on a terminal; elsewhere prints a line if it has changed."""
         if self._console.is_terminal:
             self._live.update(self._picture(status))
             return
         done = sum(state == "done" for state in status.states)
         line = f"{status.stage}: {done} of {len(status.groups)} groups done" if status.groups else status.stage
         line += f", failed: {', '.join(status.failed)}" if status.failed else ""
-        if line != self._told:
+        if line != self._printed:
             print_lines(self._console, line)
             self._console.file.flush()
-            self._told = line
+            self._printed = line
 
     def _picture(self, status: "Status") -> Text:
         width = max(10, min(self._console.width - 2, 100))

@@ -105,14 +105,14 @@ def _probe(options: Plan, rest: list[str], console: Console) -> Path:
     options.output.mkdir(parents=True, exist_ok=True)
     stream = options.output / "probe.sgs"
     capture = options.capture
-    words = ["parallel", str(options.scene), "-o", str(stream), "--frames", str(PROBE_FRAMES)]
-    words += ["--groups", str(PROBE_GROUP), "--allow-unaligned", "--workers", "1", "--device", options.device]
-    words += [] if options.preset is None else ["--preset", options.preset]
-    words += [] if capture.held_out is None else ["--held-out", *capture.held_out]
-    words += ["--scale", str(capture.scale), "--start", str(capture.start), "--every", str(capture.every)]
-    words += [] if capture.near is None else ["--near", str(capture.near)]
+    probe = ["parallel", str(options.scene), "-o", str(stream), "--frames", str(PROBE_FRAMES)]
+    probe += ["--groups", str(PROBE_GROUP), "--allow-unaligned", "--workers", "1", "--device", options.device]
+    probe += [] if options.preset is None else ["--preset", options.preset]
+    probe += [] if capture.held_out is None else ["--held-out", *capture.held_out]
+    probe += ["--scale", str(capture.scale), "--start", str(capture.start), "--every", str(capture.every)]
+    probe += [] if capture.near is None else ["--near", str(capture.near)]
     console.print(f"Probe: frame 0 and {PROBE_FRAMES - 1} frames, on one worker.", highlight=False)
-    if status := command([*words, *rest]):
+    if status := command([*probe, *rest]):
         raise SystemExit(status)  # It has said why.
     from structgstream.cli.parallel import parts_folder
 

@@ -115,7 +115,7 @@ def _prepare(options: Prepare, console: Console) -> "Sequence[Finding]":
         with interruptible(), StepDisplay(console) as display:
             made = prepare_capture(options.videos, options.output, options=chosen, listener=display)
     except KeyboardInterrupt:
-        raise Interrupted("Steps that are done are kept; continue with the same command.") from None
+        raise Interrupted("Completed steps remain; continue with the same command.") from None
     print_lines(console, f"Capture: {made.path}")
     print_lines(console, f"Report: {made.report}")
     return made.findings

@@ -103,5 +103,5 @@ def _run(
             raise Terminated if ending.asked else KeyboardInterrupt
     except KeyboardInterrupt as error:
         of = "" if total is None else f" of {total}"
-        kept = f"{output} has {done}{of} frames in all qualities; continue with the same command and --resume."
-        raise (Terminated if isinstance(error, Terminated) else Interrupted)(kept) from None
+        message = f"{output} has {done}{of} frames in all qualities; continue with the same command and --resume."
+        raise (Terminated if isinstance(error, Terminated) else Interrupted)(message) from None

@@ -14,7 +14,6 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError, usage_errors
-from structgstream.cli.config_help import config_lines
 from structgstream.cli.live_run import LiveChoice, monitored, open_live, run_metrics, stop_of
 from structgstream.cli.options import (
     CaptureOptions,
@@ -22,6 +21,7 @@ from structgstream.cli.options import (
     Flag,
     Folder,
     check_ending,
+    config_lines,
     open_selected_capture,
     parse_known_options,
     resolve_config,
@@ -121,7 +121,7 @@ def main(arguments: list[str]) -> None:
     may_exist = options.resume or options.overwrite
     options.segments.chosen(options.output)
     opened = open_scene(options, config, preset=preset, console=console)
-    with options.segments.storage(options.output, may_exist=may_exist, tell=partial(print_lines, console)) as storage:
+    with options.segments.storage(options.output, may_exist=may_exist, report=partial(print_lines, console)) as storage:
         _reconstruct(options, config, opened, storage=storage, console=console)
     print_lines(console, f"Wrote {options.output}")
 
@@ -228,7 +228,7 @@ def run_reconstruction(
         backend: the compute back-end.
         metadata: for the header.
         resume: continue after the last whole frame.
-        metrics: what the run does is written beside ``output``, too.
+        metrics: the metrics of the run, written next to ``output``.
 
     Returns:
         the largest peak memory in bytes over all frames, by stage; a GPU's under the stage's name and "on the GPU".
@@ -274,10 +274,10 @@ def run_reconstruction(
                 raise Terminated
     except KeyboardInterrupt as error:
         of = "" if total is None else f" of {total}"
-        kept = f"{output} has {done}{of} frames; continue with the same command and --resume."
+        message = f"{output} has {done}{of} frames; continue with the same command and --resume."
         nothing = "No frame was done, so no stream was written; its log and its metrics were begun."
         ended = Terminated if isinstance(error, Terminated) else Interrupted
-        raise ended(kept if done else nothing) from None
+        raise ended(message if done else nothing) from None
     return peaks
 
 

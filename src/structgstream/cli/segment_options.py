@@ -108,11 +108,11 @@ class SegmentOptions:
 
     @contextmanager
     def storage(
-        self, output: Path, *, may_exist: bool, tell: Callable[[str], object]
+        self, output: Path, *, may_exist: bool, report: Callable[[str], object]
     ) -> Iterator["SegmentsStorage | None"]:
         """Where the stream goes, checked before anything takes time; None for the file ``output``.
 
-        At the end of the block what is to be published is waited for, and ``tell`` gets a sentence if it is not done.
+        The end of the block waits until everything is published; ``report`` gets a sentence if that fails.
 
         Raises:
             StorageError: it exists and may not be replaced, or cannot be written, or what is to be published would
@@ -135,7 +135,7 @@ class SegmentOptions:
 
             remote = CloudStore(self.publish)
             folder = segments_folder(output, may_exist=may_exist)
-            mirror = MirroredStore(folder, remote, options=MirrorOptions(self.keep, tell))
+            mirror = MirroredStore(folder, remote, options=MirrorOptions(self.keep, report))
             try:
                 mirror.claim()
             except AnotherStreamError:
@@ -147,7 +147,7 @@ class SegmentOptions:
                 yield partial(_storage, mirror, options)
             finally:
                 if left := mirror.finish(wait_seconds=FINISH_SECONDS):
-                    tell(
+                    report(
                         f"{left} files of {output} are not yet in {remote.name}; the next run with --resume, or any "
                         "program that copies folders, brings them there."
                     )

@@ -221,5 +221,5 @@ def _scores(scores: "Scores | None") -> list[str]:
 def quality_text(report: "Report") -> str:
     """The mean PSNR as text, with that after frame 0's colour fit."""
     held = report.mean.psnr_camera_color
-    beside = "" if held is None else f" ({held:.2f} after frame 0's colour fit)"
-    return f"{report.mean.psnr:.2f} dB{beside}"
+    corrected = "" if held is None else f" ({held:.2f} after frame 0's colour fit)"
+    return f"{report.mean.psnr:.2f} dB{corrected}"

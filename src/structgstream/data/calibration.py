@@ -28,7 +28,7 @@ class PosedCamera:
         name: the camera's, or a path of which its name is a part (``cam00/000017.png``).
         viewmat: ``[4, 4]`` float64, world to camera, OpenCV axes.
         K: ``[3, 3]`` float64, pixels, the top-left pixel's centre at (0.5, 0.5).
-        size: width and height, pixels, that ``K`` is for; None where the file does not say: that of the pictures.
+        size: width and height, pixels, that ``K`` is for; None if the file does not state it: that of the pictures.
         lens: its distortion.
     """
 
@@ -52,9 +52,9 @@ class Calibration:
         where: the file or folder that they come from, for messages.
         cameras: as :class:`PosedCamera`; several of one camera must agree.
         points: ``[P, 3]`` points of the scene, or None.
-        held_out: names of cameras that are kept from training as published.
-        unposed: names of cameras that it has no pose of.
-        turned_by_exif: whether it is for pictures turned as their EXIF orientation says, as OpenCV reads them; None
+        held_out: names of cameras that are held out in published results.
+        unposed: names of cameras without a pose.
+        turned_by_exif: whether it is for pictures turned by their EXIF orientation, as OpenCV reads them; None
             where that depends on how it was made.
     """
 

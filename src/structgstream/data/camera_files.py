@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the files of each camera lie in a folder, with or without a calibration beside them.
+"""Where the files of each camera lie in a folder, with or without a calibration.
 
 ::
 
@@ -31,7 +31,7 @@ SYSTEM = frozenset({"__MACOSX", "@eaDir", "#recycle", "$RECYCLE.BIN", "System Vo
 
 
 def is_hidden(path: Path) -> bool:
-    """Whether a file is none that was filmed: macOS leaves a ``._NAME`` beside each NAME on file systems of cards."""
+    """Whether a file is hidden or of the system: macOS leaves a ``._NAME`` for each NAME on file systems of cards."""
     return path.name.startswith(".") or path.name in SYSTEM
 
 
@@ -157,7 +157,7 @@ def other_roots(where: Path, *, pictures: bool = False) -> Iterator[Path]:
     """Folders of videos, or of folders of pictures, up to two below ``where`` and of other names: takes.
 
     Raises:
-        CaptureError: there are several, and none says which is meant.
+        CaptureError: there are several.
     """
     below = folders_of(where) + folders_of(where / RECORDINGS)
     below += [inner for folder in folders_of(where, without=NO_TAKES) for inner in folders_of(folder, without=NO_TAKES)]

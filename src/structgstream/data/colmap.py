@@ -75,7 +75,7 @@ def _registered(folder: Path) -> int:
 
 
 def warn_of_other_models(folder: Path) -> None:
-    """Warns of the models beside the one in ``folder``, which are left out."""
+    """Warns of models other than the one in ``folder``, which are left out."""
     others = [other for other in folder.parent.iterdir() if other != folder and is_model(other)]
     if folder.parent.name == "sparse" and others:
         rest = ", ".join(f"{other.name} of {_registered(other)}" for other in sorted(others))

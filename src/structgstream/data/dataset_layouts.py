@@ -157,7 +157,7 @@ def open_immersive(path: Path) -> FrameSource:
 
     Raises:
         CaptureError: a video cannot be read.
-        CalibrationError: a broken file, or videos of other proportions than it says.
+        CalibrationError: a broken file, or videos of other proportions than it states.
     """
     return open_posed(path, read_models(path / MODELS_FILE), target=_as_published, complete=False)
 
@@ -199,7 +199,7 @@ log = logging.getLogger(__name__)
 POSES = "poses_bounds.npy"
 N3DV_HELD_OUT = ("cam00", "cam_0")
 COLMAP_FOLDERS = ("", "colmap", "colmap_0")
-SIDE = 640  # pixels, of pictures that are matched to tell the order of rows
+SIDE = 640  # pixels, of pictures that are matched to find the order of rows
 LARGEST = 1e100  # of a number of a pose
 MIN_CONFIRMED = 0.5  # of the pairs of neighbours
 
@@ -210,7 +210,7 @@ def recognizes_n3dv(path: Path) -> bool:
 
 
 def open_n3dv(path: Path) -> FrameSource:
-    """The capture at ``path``. Videos smaller than the poses say are taken as uniformly reduced.
+    """The capture at ``path``. Videos smaller than the size of the poses are taken as uniformly reduced.
 
     Raises:
         CaptureError: a video or picture cannot be read.
@@ -267,7 +267,7 @@ def _as_text(by_number: FrameSource, as_text: CameraRig) -> bool:
 
 
 def _points(path: Path, rig: CameraRig) -> NDArray[np.float64] | None:
-    """Those of the COLMAP model beside the poses, if there is one that agrees with them."""
+    """The points of the COLMAP model next to the poses, if there is one that agrees with them."""
     found = next((model for name in COLMAP_FOLDERS if (model := find_model(path / name)) is not None), None)
     return None if found is None else aligned_points(read_model(found), rig)
 

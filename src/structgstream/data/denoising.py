@@ -6,8 +6,8 @@ Note [Means of still pixels]
 Every camera has noise of its own in every picture, and a fit of thousands of iterations learns that of frame 0 by
 heart: it is wrong between the cameras, and in all later frames, which inherit frame 0. The mean of n pictures has
 noise of 1 / sqrt(n). A pixel is averaged over consecutive frames as long as its surroundings stay as they are in frame
-0; what moves keeps its one picture, sharp. Only the frames that everything else is built on are averaged: frame 0, and
-the first frame of a group that is fitted apart. For later frames it gained nothing (lab/notes/compact-measured.md).
+0; what moves keeps its one picture, sharp. Only frames on which all others depend are averaged: frame 0, and the first
+frame of a group that is fitted separately. For later frames it gained nothing (lab/notes/compact-measured.md).
 """
 
 from collections.abc import Iterable, Iterator
@@ -72,13 +72,13 @@ class Denoised(SourceWrapper):
         with ExitStack() as stack:
             following = frame.index + 1
             own = self.source.frames(following) if following < len(self.source) else iter(())
-            behind = self.source.frames_behind() if isinstance(self.source, SourceWrapper) else iter(())
-            later = chain(_closed(stack, own), _closed(stack, behind))
+            after = self.source.frames_after() if isinstance(self.source, SourceWrapper) else iter(())
+            later = chain(_closed(stack, own), _closed(stack, after))
             return mean_of_still(frame, _readable(later), names=self.rig.training, config=self.config)
 
 
 def denoised(source: FrameStream, config: DenoisingConfig, *, at: tuple[int, ...] = (0,)) -> FrameStream:
-    """A recording with means in the frames ``at``; live cameras, which average before they hand out, as they are."""
+    """A recording with means in the frames ``at``; live cameras, which average themselves, unchanged."""
     return Denoised(source, config, at) if config.frames > 1 and is_recording(source) else source
 
 
@@ -94,7 +94,7 @@ def mean_of_still(
         config: what is averaged.
 
     Returns:
-        the frame; ``mean_of`` says over how many pictures a pixel was averaged, on average.
+        the frame; ``mean_of`` is the mean number of pictures over which a pixel was averaged.
     """
     sums = {name: _Sum(frame.images[name], frame.masks.get(name), config) for name in names if name in frame.images}
     for other in islice(later, config.frames - 1):
@@ -123,7 +123,7 @@ class _Sum:
             return
         first, other = self._image, image
         for counting in (self._mask, mask):
-            if counting is not None:  # What a mask leaves out says nothing of its surroundings.
+            if counting is not None:  # Masked pixels do not make their surroundings moving.
                 first, other = first * counting[..., None], other * counting[..., None]
         self._still &= _unchanged(first, other, self._config)
         if mask is not None:
@@ -155,7 +155,7 @@ def _box_sums(values: Any) -> Any:
 
 
 def _readable(frames: Iterator[MultiViewFrame]) -> Iterator[MultiViewFrame]:
-    """``frames`` up to one that cannot be read, which is told when it is that one's turn."""
+    """``frames`` up to one that cannot be read, which raises its error when it is reached itself."""
     with suppress(CaptureError):
         yield from frames
 

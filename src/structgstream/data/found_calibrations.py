@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The calibration of a project folder, as COLMAP, transforms.json or a file of another tool, in it or one folder below.
 
-Tools keep calibration and videos apart: Pose2Sim has ``calibration/Calib.toml`` beside ``videos/``, caliscope
+Tools separate calibration and videos: Pose2Sim has ``calibration/Calib.toml`` next to ``videos/``, caliscope
 ``camera_array.toml`` above ``recordings/TAKE/``, 3DGStream the model of COLMAP in the folder of the first frame.
 """
 
@@ -132,8 +132,8 @@ def _is_capture(folder: Path) -> bool:
     stills = [root for root in roots if root == folder or root.name.lower() == "images"]
     if any(len(videos_in(root)) > 1 or len(pictures_in(root)) > 1 for root in roots):
         return True
-    beside = pictures_in(folder.parent)
-    is_frame = folder.name in beside and len(beside) > 1
+    siblings = pictures_in(folder.parent)
+    is_frame = folder.name in siblings and len(siblings) > 1
     return not is_frame and any(files_of(root, PICTURE_SUFFIXES) for root in stills)
 
 

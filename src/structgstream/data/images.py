@@ -366,7 +366,7 @@ def reduced_picture(picture: NDArray[np.uint8], longest_side: int) -> NDArray[np
 
 
 def reduced_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
-    """``mask`` ``[H, W]`` at another ``size``, width and height: a pixel counts if all that it is made of counts."""
+    """``mask`` ``[H, W]`` at another ``size``, width and height: a pixel counts if all that it averages count."""
     if mask.shape[1::-1] == size:
         return mask
     cv2 = opencv()

@@ -56,7 +56,7 @@ def open_json_videos(path: Path) -> VideoSource:
 
 
 def read_cameras(file: Path) -> tuple[CameraRig, float | None, int]:
-    """The rig of a ``cameras.json``, its frames a second (None where it does not say) and the number of frames.
+    """The rig of a ``cameras.json``, its frames a second (None if not stated) and the number of frames.
 
     Raises:
         CalibrationError: the file cannot be read, or has broken numbers.

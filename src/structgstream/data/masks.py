@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Masks beside a capture of any layout: what is black in them does not count.
+"""Masks of a capture of any layout: black pixels do not count.
 
 ::
 

@@ -232,8 +232,8 @@ def guided_matches(
     distances = lines.astype(np.float32) @ _homogeneous(second.pixels).astype(np.float32).T
     row, column = np.nonzero(np.abs(distances) < line_pixels)
     _, depths = triangulate(*cameras, first.pixels[row], second.pixels[column])
-    kept = ((depths > depth_range[0]) & (depths < depth_range[1])).all(1)
-    row, column = row[kept], column[kept]
+    in_range = ((depths > depth_range[0]) & (depths < depth_range[1])).all(1)
+    row, column = row[in_range], column[in_range]
     return mutually_best(first, second, row, column, ratio=ratio, distinct_pixels=distinct_pixels)
 
 
@@ -291,8 +291,8 @@ def distinct_best(
     starts = np.flatnonzero(np.diff(query_sorted, prepend=-1))
     best = order[starts]
     group = np.cumsum(np.diff(query_sorted, prepend=-1) != 0) - 1
-    apart = np.linalg.norm(pixels[candidate[order]] - pixels[candidate[best]][group], axis=1)
-    rival = apart > distinct_pixels
+    distances = np.linalg.norm(pixels[candidate[order]] - pixels[candidate[best]][group], axis=1)
+    rival = distances > distinct_pixels
     rival_cost = np.full(len(starts), np.inf)
     np.minimum.at(rival_cost, group[rival], cost[order][rival])
     return best[cost[best] < ratio * rival_cost]

@@ -36,7 +36,7 @@ KEYPOINT_SIDE = 2000
 within a third of a pixel, here 1/6000 of the side; the smallest error that the checks count is 1/1300 of the width
 (``pose_check.verdicts.FLOOR_PIXELS``)."""
 BLOCK = 2048
-OPPOSITE = -1.0  # the cosine of descriptors that are as far apart as can be
+OPPOSITE = -1.0  # the cosine of descriptors at the largest distance
 MIN_PARALLAX_DEGREES = 0.3  # between the rays of a match, from which a point behind a camera counts
 VIOLATION_SHARE = 0.01  # of the picture's width
 PAIR_SHARE = 0.3  # of a pair's matches that violate the poses: of right poses mostly 0 to 0.14, of wrong ones most
@@ -74,18 +74,18 @@ def mutual_matches(
         # The largest values say which matches are mutual; where they are along the first axis costs ten times as much.
         np.maximum(most, similarity.max(0), out=most)
         nearest[rows], nearest_value[rows], distinct[rows] = _distinct_nearest(similarity, ratio, distance)
-    kept = np.flatnonzero(distinct & (nearest_value == most[nearest]))
-    _, once = np.unique(nearest[kept], return_index=True)  # equal descriptors of the first list are equally near
-    kept = np.sort(kept[once])
-    return np.stack([kept, nearest[kept]], 1)
+    mutual = np.flatnonzero(distinct & (nearest_value == most[nearest]))
+    _, once = np.unique(nearest[mutual], return_index=True)  # equal descriptors of the first list are equally near
+    mutual = np.sort(mutual[once])
+    return np.stack([mutual, nearest[mutual]], 1)
 
 
 def _never_together(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """``[N, M]``, where rows ``[N, B]`` and ``[M, B]`` of bits have none in common."""
-    apart = np.ones((len(first), len(second)), bool)
+    disjoint = np.ones((len(first), len(second)), bool)
     for one, two in zip(first.T, second.T, strict=True):
-        apart &= (one[:, None] & two) == 0
-    return apart
+        disjoint &= (one[:, None] & two) == 0
+    return disjoint
 
 
 def _distinct_nearest(
@@ -97,8 +97,8 @@ def _distinct_nearest(
     top = similarity[lines, nearest]
     similarity[lines, nearest] = OPPOSITE
     next_best = similarity.max(1)
-    apart, further = (np.sqrt(np.maximum(2 - 2 * value, 0)) for value in (top, next_best))
-    return nearest, top, (apart < ratio * further) & (apart < distance)
+    first_distance, second_distance = (np.sqrt(np.maximum(2 - 2 * value, 0)) for value in (top, next_best))
+    return nearest, top, (first_distance < ratio * second_distance) & (first_distance < distance)
 
 
 @dataclass(frozen=True)

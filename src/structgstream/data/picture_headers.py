@@ -94,7 +94,7 @@ class StatedOptics:
     """Focal length and orientation of a picture by its header.
 
     Args:
-        focal_pixels: focal length in pixels of the picture; None where it does not say.
+        focal_pixels: focal length in pixels of the picture; None if not stated.
         orientation: how the stored picture is to be turned (1 to 8; 1 is not at all).
     """
 

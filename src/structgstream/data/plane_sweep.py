@@ -153,9 +153,9 @@ def sweep_depth(
     inverse, peak, lead = searches[0]
     for other_inverse, other_peak, other_lead in searches[1:]:
         # Margins compare the families only where their depths differ.
-        apart = np.abs(other_inverse - inverse) > 2 * step
+        is_other = np.abs(other_inverse - inverse) > 2 * step
         better = other_peak > peak
-        gap = np.where(apart, np.abs(other_peak - peak), np.inf)
+        gap = np.where(is_other, np.abs(other_peak - peak), np.inf)
         lead = np.minimum(np.where(better, other_lead, lead), gap)
         inverse, peak = np.where(better, other_inverse, inverse), np.maximum(other_peak, peak)
     believed = (peak > config.min_score) & (lead > config.min_margin)
@@ -183,10 +183,10 @@ def consistent_pixels(
         total[seen] += estimate
         looking += inside(other.camera, *project(other.camera, points), near=0.0)
     # At the edge of the common volume, where only one other camera sees the point, that one suffices.
-    kept = agreeing >= np.clip(looking, 1, config.views)
+    confirmed = agreeing >= np.clip(looking, 1, config.views)
     mask = np.zeros(depth_map.believed.shape, bool)
-    mask[row[kept], column[kept]] = True
-    return total[kept] / (agreeing[kept, None] + 1), mask
+    mask[row[confirmed], column[confirmed]] = True
+    return total[confirmed] / (agreeing[confirmed, None] + 1), mask
 
 
 def sweep_points(
@@ -333,8 +333,8 @@ def _search(
     peak = np.take_along_axis(scores, best[None], 0)[0]
     before = np.take_along_axis(scores, np.maximum(best - 1, 0)[None], 0)[0]
     after = np.take_along_axis(scores, np.minimum(best + 1, last)[None], 0)[0]
-    for apart in range(-2, 3):  # Clipped indices lie among the five, too.
-        np.put_along_axis(scores, np.clip(best + apart, 0, last)[None], -1, 0)
+    for offset in range(-2, 3):  # Clipped indices lie among the five, too.
+        np.put_along_axis(scores, np.clip(best + offset, 0, last)[None], -1, 0)
     rival = scores.max(0)
     interior = (best > 0) & (best < last) & (before > -1) & (after > -1)
     bend = np.maximum(2 * peak - before - after, 1e-6)

@@ -2,7 +2,7 @@
 """Initial points from the first frame with known poses, for captures without points.
 
 Random initial points lead to overfitting, with floaters visible in held-out views. Matched keypoints are precise but
-sparse; the plane sweep covers floors, walls and people. Both are kept only where further views agree.
+sparse; the plane sweep covers floors, walls and people. Both need the agreement of further views.
 """
 
 import logging
@@ -128,13 +128,13 @@ def initial_points(
         )
         positions, colors = np.concatenate([positions, swept]), np.concatenate([colors, swept_colors])
         sources = np.concatenate([sources, np.ones(len(swept), np.uint8)])
-    kept = np.flatnonzero(_has_neighbors(positions, cell=config.ISOLATION_SHARE * distance))
-    kept = kept[_thin_out(positions[kept], cell=config.CELL_SHARE * distance, count=config.max_points)]
-    if len(kept) < config.MIN_POINTS:
+    selected = np.flatnonzero(_has_neighbors(positions, cell=config.ISOLATION_SHARE * distance))
+    selected = selected[_thin_out(positions[selected], cell=config.CELL_SHARE * distance, count=config.max_points)]
+    if len(selected) < config.MIN_POINTS:
         _log.warning(
             "Only %d initial points could be triangulated from frame %d (too little texture or overlap); "
             "starting from %d random points in the volume that the cameras see: expect a worse result.",
-            len(kept),
+            len(selected),
             frame.index,
             config.RANDOM_POINTS,
         )
@@ -142,8 +142,8 @@ def initial_points(
             cameras, images, masks=masks, distance=distance, rng=np.random.default_rng(seed), config=config
         )
         return InitialPoints(positions, colors, {"random": len(positions)})
-    counts = {"sift": int((sources[kept] == 0).sum()), "sweep": int((sources[kept] == 1).sum())}
-    return InitialPoints(positions[kept], colors[kept], counts)
+    counts = {"sift": int((sources[selected] == 0).sum()), "sweep": int((sources[selected] == 1).sum())}
+    return InitialPoints(positions[selected], colors[selected], counts)
 
 
 def _at_reference(

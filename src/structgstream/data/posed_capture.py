@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Captures of pictures or videos beside a calibration that names them: a COLMAP model, or a file of another tool.
+"""Captures of pictures or videos with a calibration that names them: a COLMAP model, or a file of another tool.
 
 ::
 
@@ -71,7 +71,7 @@ def open_posed(
     complete: bool = True,
     fps: float | None = None,
 ) -> FrameSource:
-    """The capture at ``path`` with these cameras; the calibration's points come along.
+    """The capture at ``path`` with these cameras; with the calibration's points.
 
     Args:
         path: the folder with pictures or videos.
@@ -99,7 +99,9 @@ def open_posed(
             return undistort(*of_videos(path, videos, root=root, calibration=calibration), target=target)
         if folders := pictures_in(root):
             files = _layout(folders, calibration)
-            if root != path or not stills or _poses(calibration, files):  # else depth maps, say, beside images/CAMERA
+            if (
+                root != path or not stills or _poses(calibration, files)
+            ):  # else depth maps, for example, next to images/CAMERA
                 return pictured(root, files, partial=bool(calibration.unposed))
     if stills:
         # Structure from motion often leaves out some photos.

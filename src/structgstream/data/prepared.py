@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prepared captures: ``capture.json`` beside the videos or pictures as they were filmed (docs/captures.md).
+"""Prepared captures: ``capture.json`` next to the original videos or pictures (docs/captures.md).
 
 Nothing is stored undistorted or in step: lenses and clocks are applied as frames are read, so that a capture can be
 calibrated again without touching what was filmed.
@@ -67,7 +67,7 @@ class PreparedCapture:
         fps: frames a second of the common timeline.
         near: near plane, in the capture's units.
         unit: of poses and points; ``arbitrary`` where no length was given.
-        held_out: names of the cameras that are kept from training.
+        held_out: names of the held-out cameras.
         points: file of points ``[P, 3]`` (``.npy``) relative to the capture, or None.
     """
 
@@ -218,11 +218,11 @@ def _of_folders(
                 f"The pictures of camera {name!r} in {files[name]} have {size[0]}x{size[1]} pixels, {path / FILE} is "
                 f"for {own[0]}x{own[1]}; restore them, or prepare the capture again."
             )
-    apart = {}
+    errors = {}
     for name, shift in shifts.items():
         late = capture.cameras[name].clock.offset_seconds - shift / capture.fps
-        apart[name] = np.array([np.nan if file is None else late for file in cut[name]])
-    return ImageSource(path.name, rig, capture.fps, cut, points, apart_seconds=apart)
+        errors[name] = np.array([np.nan if file is None else late for file in cut[name]])
+    return ImageSource(path.name, rig, capture.fps, cut, points, apart_seconds=errors)
 
 
 def _rig(cameras: Mapping[str, Camera], capture: PreparedCapture, path: Path) -> CameraRig:

@@ -25,7 +25,7 @@ from structgstream.frames import MIN_CAMERAS
 log = logging.getLogger(__name__)
 
 MAX_SINGLE = 2
-"""Cameras that lack frames and get a line each; of more one line tells."""
+"""Maximum number of cameras that lack frames with a line each; more are listed in one line."""
 
 
 def period_seconds(stamps: NDArray[np.float64]) -> float:
@@ -133,7 +133,7 @@ def common_slots(
     Args:
         slots: camera name to the slots it has, ascending; a slot is one instant of the common timeline.
         where: the capture, for messages.
-        label: says which instant a slot is, for messages ("at 0.133 s", "000017").
+        label: names the instant of a slot, for messages ("at 0.133 s", "000017").
         training: names of the cameras that are not held out; None for all.
 
     Raises:
@@ -159,8 +159,8 @@ def common_slots(
                 f"Camera {camera!r} of {where} has two frames for {label(repeated)}; expected one frame per "
                 "camera and instant at one common rate. Re-encode it at the rate of the others."
             )
-    _tell_cuts(slots, first, last, where=where, label=label)
-    _tell_absences(inside, first, last, where=where, label=label, training=training)
+    _log_cuts(slots, first, last, where=where, label=label)
+    _log_absences(inside, first, last, where=where, label=label, training=training)
     return range(first, last + 1)
 
 
@@ -171,7 +171,7 @@ def _end(slots: Mapping[str, Sequence[int]], training: Collection[str] | None) -
     return min(ends[(len(ends) - 1) // 2], trained[min(MIN_CAMERAS, len(trained)) - 1])
 
 
-def _tell_cuts(
+def _log_cuts(
     slots: Mapping[str, Sequence[int]], first: int, last: int, *, where: str, label: Callable[[int], str]
 ) -> None:
     starts = min(own[0] for own in slots.values())
@@ -190,7 +190,7 @@ def _tell_cuts(
         )  # fmt: skip
 
 
-def _tell_absences(
+def _log_absences(
     slots: Mapping[str, Sequence[int]],
     first: int,
     last: int,
@@ -233,7 +233,7 @@ def _tell_absences(
 
 STANDARD_RATES = tuple(rate * factor for rate in (24, 25, 30, 50, 60, 120) for factor in (1.0, 1000 / 1001))
 SAME_RATE = 0.02
-"""Rates that differ by less than this share are one: short videos do not tell them apart."""
+"""Rates that differ by less than this share are one: short videos do not distinguish them."""
 STEADY = 0.9
 """Length of the mean of the frames' phases as unit vectors, above which a camera keeps one distance to the instants."""
 DUPLICATE = 0.5
@@ -282,8 +282,8 @@ def origin_of(positions: Sequence[Floats]) -> float:
     phases = np.array([float(own[0]) - origin for own in positions])
     # Phases are circular: 0.45 and -0.45 are neighbours.
     middle = np.angle(np.exp(2j * np.pi * phases).mean()) / (2 * np.pi)
-    apart = phases - middle
-    return origin + float(middle + np.median(apart - np.rint(apart)))
+    deviations = phases - middle
+    return origin + float(middle + np.median(deviations - np.rint(deviations)))
 
 
 def measured_rate(seconds: Sequence[Floats]) -> float | None:
@@ -320,8 +320,8 @@ def counted_rate(seconds: Sequence[Floats]) -> float | None:
     return rate
 
 
-def tell_time_error(placed: Mapping[str, Placed], slots: range, *, fps: float, where: str) -> None:
-    """States the largest distance of a picture to its instant, with a warning above 5 ms."""
+def log_time_error(placed: Mapping[str, Placed], slots: range, *, fps: float, where: str) -> None:
+    """Logs the largest distance of a picture to its instant, as a warning above 5 ms."""
     worst = {}
     for name, own in placed.items():
         inside = (own.slots >= slots.start) & (own.slots < slots.stop)

@@ -71,7 +71,7 @@ def read_shots(files: tuple[Path, ...]) -> list[Shot]:
     """Every picture of the files, in their order.
 
     Raises:
-        CalibrationError: they are broken, or a lens is not known here.
+        CalibrationError: they are broken, or a lens model is unknown.
     """
     shots = []
     if (files[0].parent / VALIDATION).is_file():
@@ -139,7 +139,7 @@ def _lens(name: str, frame: dict[str, Any], where: Path) -> Lens:
     """The lens of a picture, whose model may be one of COLMAP's names.
 
     Raises:
-        CalibrationError: it is not known here.
+        CalibrationError: the lens model is unknown.
     """
     model = "OPENCV_FISHEYE" if frame.get("is_fisheye") else str(frame.get("camera_model") or "OPENCV").upper()
     k1, k2, k3, k4, p1, p2 = (number(frame.get(key) or 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))

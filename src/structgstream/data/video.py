@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
-from structgstream.data.timeline import Clock, Placed, common_slots, measured_rate, origin_of, place, tell_time_error
+from structgstream.data.timeline import Clock, Placed, common_slots, log_time_error, measured_rate, origin_of, place
 from structgstream.data.video_index import STREAM_FORMATS, VideoTrack
 from structgstream.data.video_pictures import Mask, Picture, pictures_at
 from structgstream.errors import CalibrationError, CaptureError
@@ -47,7 +47,7 @@ class VideoSource:
     stamps: Mapping[str, tuple[int | None, ...]]
     points: NDArray[np.float64] | None = None
     apart_seconds: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
-    _told: set[str] = field(default_factory=set, init=False, repr=False, compare=False)
+    _reported: set[str] = field(default_factory=set, init=False, repr=False, compare=False)
 
     def __len__(self) -> int:
         return min(len(stamps) for stamps in self.stamps.values())
@@ -79,10 +79,10 @@ class VideoSource:
     def _pictures(self, name: str, start: int) -> Generator[tuple[Picture, Mask | None] | None]:
         track, camera = self.tracks[name], self.rig[name]
 
-        def tell(lost: int, following: int | None, reason: str) -> None:
-            if name in self._told:
+        def report(lost: int, following: int | None, reason: str) -> None:
+            if name in self._reported:
                 return
-            self._told.add(name)
+            self._reported.add(name)
             until = "the end" if following is None else f"{following * track.tick_seconds:.3f} s"
             log.warning(
                 "%s: the video %s of camera %r cannot be decoded at %.3f s (%s); the camera is absent until %s, and "
@@ -90,7 +90,7 @@ class VideoSource:
                 self.name, track.path, name, lost * track.tick_seconds, reason, until,
             )  # fmt: skip
 
-        return pictures_at(track, self.stamps[name][start:], size=(camera.width, camera.height), on_damage=tell)
+        return pictures_at(track, self.stamps[name][start:], size=(camera.width, camera.height), on_damage=report)
 
 
 def _next(pictures: Iterator[tuple[Picture, Mask | None] | None]) -> tuple[Picture, Mask | None] | None:
@@ -108,7 +108,7 @@ def synchronised(
 ) -> VideoSource:
     """One source from one video per camera, synchronised by time stamp on a common timeline.
 
-    Each instant takes the nearest frame of each camera within half a period (``instants``), so rates may differ or
+    Each instant takes the nearest frame of each camera within half a period (``timeline``), so rates may differ or
     vary; a camera without one is absent. Of different rates the lowest is taken.
 
     Args:
@@ -150,14 +150,14 @@ def synchronised(
         label=lambda slot: f"the instant {(origin + slot) / rate:.3f} s",
         training=rig.training,
     )
-    tell_time_error(placed, common, fps=rate, where=str(where))
+    log_time_error(placed, common, fps=rate, where=str(where))
     stamps = {name: _stamps(tracks[name], own, common) for name, own in placed.items()}
-    apart = {name: _apart(own, common) / rate for name, own in placed.items()}
-    return VideoSource(where.name, rig, rate, tracks, stamps, points, apart)
+    errors = {name: _errors(own, common) / rate for name, own in placed.items()}
+    return VideoSource(where.name, rig, rate, tracks, stamps, points, errors)
 
 
 def measured_fps(tracks: Mapping[str, VideoTrack], clocks: Mapping[str, Clock] | None = None) -> float | None:
-    """Frames a second of the common timeline by time stamp (``instants.measured_rate``); None for one frame.
+    """Frames a second of the common timeline by time stamp (``timeline.measured_rate``); None for one frame.
 
     Raises:
         CaptureError: the frames of a video all have one time.
@@ -199,9 +199,9 @@ def _stamps(track: VideoTrack, placed: Placed, common: range) -> tuple[int | Non
     return tuple(track.stamps[frame_of[slot]] if slot in frame_of else None for slot in common)
 
 
-def _apart(placed: Placed, common: range) -> NDArray[np.float64]:
+def _errors(placed: Placed, common: range) -> NDArray[np.float64]:
     """Time of the frame of each slot of the range minus the slot's instant, in periods; NaN for those without one."""
-    apart = np.full(len(common), np.nan)
+    errors = np.full(len(common), np.nan)
     inside = (placed.slots >= common.start) & (placed.slots < common.stop)
-    apart[placed.slots[inside] - common.start] = placed.errors[inside]
-    return apart
+    errors[placed.slots[inside] - common.start] = placed.errors[inside]
+    return errors

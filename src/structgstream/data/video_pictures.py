@@ -4,7 +4,7 @@
 Note [Damaged videos]
 ~~~~~~~~~~~~~~~~~~~~~
 A frame counts as decodable if all frames from the key frame before it on are. So what is lost does not depend on where
-reading starts, and a resumed stream sees what the first run saw. After a damage reading goes on at the next key frame.
+reading starts, and a resumed stream sees what the first run saw. After damage, reading continues at the next key frame.
 """
 
 from bisect import bisect_left, bisect_right
@@ -50,7 +50,7 @@ def pictures_at(
         track: the video.
         stamps: time stamps of its frames, ascending, in ticks; None where no picture is wanted.
         size: width and height of the pictures.
-        on_damage: told of frames that cannot be decoded, whose pictures are None.
+        on_damage: called for frames that cannot be decoded, whose pictures are None.
     """
     reformatter = load_av().video.reformatter.VideoReformatter()
     with closing(_decoded(track, [stamp for stamp in stamps if stamp is not None], on_damage)) as decoded:
@@ -118,7 +118,7 @@ class _Run:
         return self.track.stamps[min(self.expected, len(self.track.stamps) - 1)]
 
     def frames(self) -> Generator["VideoFrame"]:
-        """The frames in the order in which they are shown, each as the index says."""
+        """The frames in the order in which they are shown, each with the time stamp of the index."""
         av, stamps, begin = load_av(), self.track.stamps, self.begin
         with open_video(self.track.path) as container:
             stream = video_stream(container)
@@ -199,7 +199,7 @@ def srgb(frame: "VideoFrame", reformatter: "VideoReformatter", *, width: int, he
     """Colours by the frame's own matrix and range, stated because the defaults differ between tools.
 
     A file that states no matrix gets BT.709 from 720 lines on and BT.601 below, as broadcasting has it; one
-    that states no range is taken as limited unless its pixel format says otherwise. HLG and PQ are converted
+    that states no range is taken as limited unless its pixel format states otherwise. HLG and PQ are converted
     (``transfer``).
     """
     matrix = MATRICES.get(int(frame.colorspace), BT709 if frame.height >= 720 else BT601)

@@ -21,7 +21,7 @@ Source = TypeVar("Source", bound=FrameStream)
 
 
 class SourceFacts(Generic[Source]):
-    """What a wrapper tells about its ``source`` unchanged."""
+    """Attributes that a wrapper takes from its ``source``."""
 
     source: Source
 
@@ -54,10 +54,10 @@ class SourceWrapper(SourceFacts[FrameSource]):
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
         return self.source.frames(start)
 
-    def frames_behind(self) -> Iterator[MultiViewFrame]:
+    def frames_after(self) -> Iterator[MultiViewFrame]:
         """What follows the last frame of a section, numbered otherwise; nothing if this wrapper changes frames."""
         unchanged = type(self).frames is SourceWrapper.frames
-        return self.source.frames_behind() if unchanged and isinstance(self.source, SourceWrapper) else iter(())
+        return self.source.frames_after() if unchanged and isinstance(self.source, SourceWrapper) else iter(())
 
 
 @dataclass(frozen=True)
@@ -141,12 +141,12 @@ class Section(SourceWrapper):
             index = frame.index - self.first
             yield replace(frame, index=index, pts_seconds=index / self.fps)
 
-    def frames_behind(self) -> Iterator[MultiViewFrame]:
+    def frames_after(self) -> Iterator[MultiViewFrame]:
         end = self.first + self.length
         if end < len(self.source):
             yield from self.source.frames(end)
         if isinstance(self.source, SourceWrapper):
-            yield from self.source.frames_behind()
+            yield from self.source.frames_after()
 
 
 def resized(source: FrameSource, scale: float) -> FrameSource:
@@ -193,11 +193,11 @@ def section(source: FrameSource, *, start: int = 0, frames: int | None = None, e
 def select_cameras(source: FrameSource, names: tuple[str, ...]) -> FrameSource:
     """The capture restricted to these cameras, so that other pictures are not decoded.
 
-    A rig needs two cameras, so with a single name another camera is kept. Sources of an unknown type are returned
+    A rig needs two cameras, so with a single name another camera is included. Sources of an unknown type are returned
     unchanged. Nothing is held out in the result.
     """
-    kept = names if len(names) > 1 else (*names, *[name for name in source.rig if name not in names][:1])
-    rig = CameraRig({name: source.rig[name] for name in source.rig if name in kept})
+    selected = names if len(names) > 1 else (*names, *[name for name in source.rig if name not in names][:1])
+    rig = CameraRig({name: source.rig[name] for name in source.rig if name in selected})
     if isinstance(source, ImageSource | VideoSource):
         return replace(source, rig=rig)
     if isinstance(source, WithRig):
@@ -283,8 +283,8 @@ class Prefetch(SourceWrapper):
         with Lookahead(self.source.frames(start), depth=self.depth) as frames:
             yield from frames
 
-    def frames_behind(self) -> Iterator[MultiViewFrame]:
-        return self.source.frames_behind() if isinstance(self.source, SourceWrapper) else iter(())
+    def frames_after(self) -> Iterator[MultiViewFrame]:
+        return self.source.frames_after() if isinstance(self.source, SourceWrapper) else iter(())
 
 
 def read_ahead(source: FrameStream) -> FrameStream:

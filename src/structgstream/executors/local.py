@@ -110,7 +110,7 @@ def tail_of(file: BinaryIO, begin: int) -> str:
 
 
 class LocalEngine:
-    """Processes in slots: shares of the cores, or GPUs (``worker_slots.allocate_slots``)."""
+    """Processes in slots: shares of the cores, or GPUs (``task.allocate_slots``)."""
 
     name = "local"
     repeats = False

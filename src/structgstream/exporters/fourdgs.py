@@ -13,6 +13,9 @@ from structgstream.errors import MissingExtraError
 from structgstream.exporters.baked_gaussians import BakedGaussians
 from structgstream.scene.harmonics import Y0
 
+# An optional package.
+# pyright: reportMissingImports=false
+
 
 class FourDgsFile:
     """Collects frames and writes them to one file."""

@@ -32,7 +32,7 @@ def destination(
         raise ConfigError("--frame names one frame, --frames the first and the last; give one of them.")
     if output is None:
         format = format or "ply"
-        if format == "html" or (format in FORMATS and FORMATS[format].all_frames and frame is None):
+        if format == "html" or (format != "site" and FORMATS[format].all_frames and frame is None):
             return stream.with_suffix(f".{format}"), format
         name = f"{stream.stem}-{format}" if frame is None else f"{stream.stem}-{frame}.{format}"
         return stream.with_name(name), format
@@ -41,11 +41,10 @@ def destination(
         raise ConfigError(f"a page is a file whose name ends in .html, unlike {output.name}.")
     if format == "site" or output.is_dir() or not ending:
         return output, format or "ply"
-    if ending == "zip":
-        format = format or "ply"
-        if FORMATS[format].all_frames:
+    if ending == "zip" and format != "html":
+        if format is not None and FORMATS[format].all_frames:
             raise ConfigError(f"a .{format} file contains all frames; name it {output.stem}.{format}, without a zip.")
-        return output, format
+        return output, format or "ply"
     known = "html" if ending == "html" else SUFFIXES.get(ending)
     if known is not None:
         if format not in (None, known):

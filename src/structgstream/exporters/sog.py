@@ -129,7 +129,7 @@ def vector_palette(rows: Floats) -> tuple[Floats, NDArray[np.int64]]:
 
 
 def _sums(group: NDArray[np.int64], rows: Floats, count: int) -> NDArray[np.float64]:
-    return np.stack([np.bincount(group, column, count) for column in rows.T], axis=1)
+    return np.stack([np.bincount(group, column, count) for column in rows.T], axis=1).astype(np.float64)
 
 
 def _smallest_three(quats: Floats) -> Bytes:

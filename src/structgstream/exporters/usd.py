@@ -15,6 +15,9 @@ import torch
 from structgstream.errors import MissingExtraError
 from structgstream.exporters.baked_gaussians import BakedGaussians
 
+# pxr has no types.
+# pyright: reportAttributeAccessIssue=false, reportMissingImports=false
+
 PRIM_TYPE = "ParticleField3DGaussianSplat"
 
 

@@ -11,7 +11,7 @@ anchor or most of its neighbours change, because motion hides the step. Differen
 (Note [Bins]), hence exact. Most are 1 or 2, so each value is rounded by a threshold of its own; otherwise all of them
 would vanish in the same frame.
 
-A mixture of the two fits may show what neither fit shows (``mixture``); anchors there are not blended (``withdraw``).
+A mixture of the two fits may show what neither fit shows (``border``); anchors there are not blended (``withdraw``).
 
 Free Gaussians of two groups cannot be paired, so a group starts with its own. The exposure
 (``training/online/exposure.py``), which each group fits independently, changes from that of the frame before in equal

@@ -147,7 +147,7 @@ def _camera(name: str, content: dict[str, Any]) -> PosedCamera:
 
 
 def _own_pose(content: dict[str, Any]) -> bool:
-    """Whether a camera's pose is beside its intrinsics, as other tools' JSON has it not, or in other units."""
+    """Whether a camera's entry has its pose; JSON of other tools has poses elsewhere, or in other units."""
     return "distCoef" not in content and (
         any(_value(content, key) is not None for key in ("pose", "inverse pose"))
         or all(_value(content, key) is not None for key in ("rotation", "translation"))
