@@ -10,4 +10,4 @@ def test_no_property_is_timed_and_ordinary_runs_draw_nothing() -> None:
     for used in (settings(), examples(8)):
         assert used.deadline is None
         assert used.derandomize != THOROUGH
-    assert settings().max_examples == (100 if THOROUGH else 25)
+    assert settings().max_examples == (100 if THOROUGH else 10)
