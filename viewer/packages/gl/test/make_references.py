@@ -18,7 +18,7 @@ from structgstream.cameras import Camera, CameraRig
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.evaluation.camera_path import arc, focus_point, free_near
 from structgstream.evaluation.evaluate import rendered
-from structgstream.evaluation.png import write_png
+from structgstream.evaluation.pictures import write_png
 from structgstream.kernels.backend import Backend, select_backend
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
