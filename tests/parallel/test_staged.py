@@ -22,7 +22,7 @@ from structgstream.parallel.unit import Unit
 @pytest.fixture(autouse=True)
 def quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(object_folder, "FIRST_DELAY_SECONDS", 0.0)
-    monkeypatch.setattr(staged, "LOOK_SECONDS", 0.01)
+    monkeypatch.setattr(staged, "POLL_SECONDS", 0.01)
     monkeypatch.setenv(staged.SCRATCH, str(tmp_path / "scratch"))
 
 

@@ -163,10 +163,11 @@ def resolve_config(
 
     for option in (override.partition("=")[0] for override in overrides if override.startswith("--")):
         path = option.removeprefix("--").replace("-", "_")
-        if (now := renamed(path)) != path:
-            raise UsageError(f"{option} is called --{now.replace('_', '-')} now.")
-        if (value := constant_at(StreamConfig, path)) is not None:
+        now = renamed(path)
+        if (value := constant_at(StreamConfig, now)) is not None:
             raise UsageError(f"{option} is no option any more: it is always {value}.")
+        if now != path:
+            raise UsageError(f"{option} is called --{now.replace('_', '-')} now.")
     name = DEFAULT_PRESET if preset is None else preset
     with usage_errors():
         default = preset_named(name)

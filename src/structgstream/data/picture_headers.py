@@ -3,6 +3,7 @@
 
 import math
 import re
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -64,7 +65,9 @@ def _opened(path: Path) -> Iterator["ImageFile | None"]:
     except ImportError:
         raise MissingExtraError("Pillow", "capture") from None
     try:
-        picture = Image.open(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of damaged metadata; what is needed of them is checked where it is read
+            picture = Image.open(path)
     except (UnidentifiedImageError, SyntaxError, ValueError, Image.DecompressionBombError):
         yield None
         return
