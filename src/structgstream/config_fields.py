@@ -66,7 +66,9 @@ def constant_at(kind: Any, path: str) -> Any:
     name, _, rest = path.partition(".")
     if not isinstance(kind, type) or not is_dataclass(kind):
         return None
-    return constant_at(get_type_hints(kind).get(name), rest) if rest else constants_of(kind).get(name)
+    if rest:
+        return constant_at(get_type_hints(kind).get(name), rest)
+    return None if name in {item.name for item in fields(kind)} else constants_of(kind).get(name)
 
 
 def without_constants(kind: Any, values: Any, path: str = "", *, off: bool = False) -> Any:

@@ -135,7 +135,7 @@ def test_every_second_frame_is_resumed_and_scored_against_the_same_frames(
         (["--preset", "compact", "--mbits", "0"], 2, "--mbits 0 is no rate"),
         (["--preset", "compact", "--mbits", "inf"], 2, "--mbits inf is no rate"),
         (["--preset", "compact", "--mbits", "5M"], 2, "5M"),
-        (["--online.births.overflow", "all"], 2, "--online.births.overflow is called --online.spawn.overflow now."),
+        (["--online.births.missing-threshold", "1"], 2, "is called --online.spawn.missing-threshold now."),
         (["--online.spawn.least-hits", "3"], 2, "--online.spawn.least-hits is no option any more: it is always 4."),
     ],
 )
