@@ -18,6 +18,7 @@ from structgstream.training.frame0.quantization import (
     FINEST,
     SENSITIVITY_FIELDS,
     Sensitivity,
+    _quantize_rows,
     estimate_sensitivity,
     quantize_first_frame,
     regauge,
@@ -122,6 +123,17 @@ def test_the_noise_is_about_what_was_asked_for(levels: float) -> None:
     scene, _ = quantized(levels)
     found = noise_levels(scene)
     assert 0.3 * levels < found < 3.0 * levels
+
+
+def test_rows_that_pictures_depend_on_more_are_finer() -> None:
+    """A row whose noise costs sixteen times as much has a quarter of the step."""
+    sensitivities = torch.ones(40, 3)
+    sensitivities[::2] = 16.0
+    values = torch.rand(40, 3, generator=torch.Generator().manual_seed(0))
+    step, rounded = _quantize_rows(values, sensitivities, 0.01, counted=None)
+    errors = (rounded - values).abs()
+    assert errors[::2].max() * 3 < errors[1::2].max()
+    assert step * 2.0 ** (COARSEST - FINEST) >= 2 * errors.max()
 
 
 def test_everything_that_is_coded_is_a_whole_number_of_steps() -> None:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from dataclasses import replace
 
+import pytest
 import torch
 
 from structgstream.gaussians import Gaussians
@@ -41,8 +42,9 @@ def test_new_anchors_sit_on_cells_that_were_empty() -> None:
     anchors = random_scene(60).anchors
     n = slots(anchors)
     new = grown(anchors, torch.ones(n), torch.full((n,), 100.0))
-    assert len(new) > 0
-    for cell in (16 * VOXEL, 4 * VOXEL, VOXEL):
+    sizes = [16 * VOXEL, 4 * VOXEL, VOXEL]
+    assert sorted(new.cell_sizes.unique().tolist(), reverse=True) == pytest.approx(sizes)
+    for cell in sizes:
         mine = new.positions[(new.cell_sizes - cell).abs() < 1e-6]
         cells = (mine / cell).round()
         assert torch.allclose(cells * cell, mine, atol=1e-5)
