@@ -388,7 +388,10 @@ describe.skipIf(!executable)("the player in a browser", () => {
     };
     await moved(() => page.keyboard.press("Shift+ArrowLeft"));
     await moved(() => page.keyboard.press("+"));
-    await moved(() => page.keyboard.press("w", { delay: 200 }));
+    await moved(() => page.keyboard.down("w")); // a picture may take longer than any press
+    await page.keyboard.up("w");
+    await page.waitForTimeout(100);
+    places.push(await eye());
     await moved(async () => {
       await page.mouse.move(100, 100);
       await page.mouse.down();
