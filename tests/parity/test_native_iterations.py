@@ -90,9 +90,9 @@ def start_of(scene: Scene) -> StartingPoint:
 
 
 def fitted(
-    backend: Backend, *, appears: bool = True, free: int = 9, told: list[Step] | None = None, **changes: Any
+    backend: Backend, *, appears: bool = True, free: int = 9, reported: list[Step] | None = None, **changes: Any
 ) -> FitResult[Scene]:
-    on_step = None if told is None else told.append
+    on_step = None if reported is None else reported.append
     config, generator = replace(CONFIG, **changes), torch.Generator().manual_seed(3)
     optimizer = FrameOptimizer(config, backend, 1, generator, Stopwatch(), STEPS, on_step)
     return optimizer.run(start_of(scene_of(appears=appears, free=free)))
@@ -135,17 +135,17 @@ def test_results_are_those_of_the_loop(oracle: Callable[[], Backend], changes: d
 
 
 def test_results_do_not_depend_on_threads_nor_on_reports() -> None:
-    threads, told = torch.get_num_threads(), list[Step]()
+    threads, reported = torch.get_num_threads(), list[Step]()
     try:
         found = []
         for number in (1, 2, 3):
             torch.set_num_threads(number)
-            found.append(state_of(fitted(cpu_backend(), told=told if number == 3 else None).scene))
+            found.append(state_of(fitted(cpu_backend(), reported=reported if number == 3 else None).scene))
     finally:
         torch.set_num_threads(threads)
     assert all(torch.equal(value, other[name]) for other in found[1:] for name, value in found[0].items())
-    assert [step.iteration for step in told] == [4, 9]
-    assert {step.anchors for step in told} == {40}
+    assert [step.iteration for step in reported] == [4, 9]
+    assert {step.anchors for step in reported} == {40}
 
 
 @pytest.mark.parametrize("begun", [None, 1])

@@ -95,7 +95,7 @@ def test_without_motion_it_cannot_be_told() -> None:
     check = check_synchronization(MadeSource(RIG, {}, still=True))
     assert not check.conclusive
     assert check.undecided == tuple(RIG)
-    assert "cannot be told" in time_findings(check)[0].sentence
+    assert "cannot be determined" in time_findings(check)[0].sentence
 
 
 def test_the_bundled_clip_is_synchronous() -> None:

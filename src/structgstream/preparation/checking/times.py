@@ -143,7 +143,9 @@ def time_findings(measured: SynchronizationCheck | None) -> list[Finding]:
         return []
     findings = [_between(measured)] if measured.between else []
     if not measured.conclusive:
-        unknown = "It cannot be told whether the cameras are synchronous: too little moves that several of them see."
+        unknown = (
+            "It cannot be determined whether the cameras are synchronous: too little moves that several of them see."
+        )
         return [*findings, Finding("note", unknown)]
     for name, late in measured.late_seconds.items():
         if abs(late) < max(WARNED_SECONDS, SIGMAS * measured.uncertainty_seconds[name]):
