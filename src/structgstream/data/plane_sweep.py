@@ -17,9 +17,9 @@ import torch
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
-from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv, reduced_mask
 from structgstream.data.matching import back_project, inside, project
+from structgstream.geometry import Floats
 from structgstream.kernels.backend import processor_backend
 
 

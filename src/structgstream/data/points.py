@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig, enlargement
-from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv, reduced_mask
 from structgstream.data.matching import (
     Features,
@@ -34,6 +33,7 @@ from structgstream.data.matching import (
 )
 from structgstream.data.plane_sweep import DEFAULT_LEVELS, SweepBounds, SweepConfig, sweep_points
 from structgstream.frames import MultiViewFrame
+from structgstream.geometry import Floats
 
 _log = logging.getLogger(__name__)
 

@@ -41,14 +41,19 @@ from structgstream.data.camera_files import (
     unread_files,
     videos_in,
 )
-from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, common_pictures
+from structgstream.data.images import (
+    PICTURE_SUFFIXES,
+    ImageSource,
+    check_one_series,
+    common_pictures,
+    picture_size,
+    read_exif,
+)
 from structgstream.data.lenses import LensCamera
-from structgstream.data.picture_headers import check_one_series, picture_size, read_exif
-from structgstream.data.rectilinear import rectilinear
 from structgstream.data.source import FrameSource
 from structgstream.data.text_files import path_parts
 from structgstream.data.timeline import natural
-from structgstream.data.undistortion import undistort
+from structgstream.data.undistortion import rectilinear, undistort
 from structgstream.data.video import VideoSource, synchronised
 from structgstream.data.video_index import VIDEO_SUFFIXES, scan_videos
 from structgstream.errors import CalibrationError, CaptureError
@@ -76,7 +81,7 @@ def open_posed(
     Args:
         path: the folder with pictures or videos.
         calibration: its cameras.
-        target: chooses the pinhole to undistort a camera to, see :func:`~structgstream.data.rectilinear.rectilinear`.
+        target: chooses the pinhole to undistort a camera to, see :func:`~structgstream.data.undistortion.rectilinear`.
         complete: whether every video must be calibrated; else the others are left out with a warning.
         fps: frames a second of pictures; None for :data:`PICTURE_FPS`. Videos state theirs.
 

@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.errors import CaptureError
 from structgstream.frames import MIN_CAMERAS
+from structgstream.geometry import Floats
 
 log = logging.getLogger(__name__)
 

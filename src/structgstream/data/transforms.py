@@ -20,9 +20,8 @@ import numpy as np
 
 from structgstream.data.calibration import Calibration, PosedCamera, intrinsics
 from structgstream.data.calibration_files.reading import calibration_of, positive, readable
-from structgstream.data.images import PICTURE_SUFFIXES
+from structgstream.data.images import PICTURE_SUFFIXES, picture_size
 from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential
-from structgstream.data.picture_headers import picture_size
 from structgstream.data.posed_capture import of_pictures, open_posed
 from structgstream.data.source import FrameSource
 from structgstream.data.text_files import NamedFiles, Unreadable, mapping, number, path_parts, pixels, read_json

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import listed
-from structgstream.data.pair_matches import PAIR_SHARE, PairError, PairMatcher, neighbor_errors
+from structgstream.data.matching import PAIR_SHARE, PairError, PairMatcher, neighbor_errors
 from structgstream.errors import CalibrationError
 from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.findings import Finding, explain, readings_of

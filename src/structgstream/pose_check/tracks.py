@@ -9,10 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
-from structgstream.data.arrays import Floats
-from structgstream.data.matching import Pair, epipolar_errors, fundamental_matrix, project, rays
-from structgstream.data.pair_matches import PairError, PairMatcher, neighbor_pairs, pair_error
+from structgstream.data.matching import (
+    Pair,
+    PairError,
+    PairMatcher,
+    epipolar_errors,
+    fundamental_matrix,
+    neighbor_pairs,
+    pair_error,
+    project,
+    rays,
+)
 from structgstream.frames import MultiViewFrame
+from structgstream.geometry import Floats
 
 ALL_PAIRS = 32  # cameras; with more, only neighbours by the given poses are matched
 NEIGHBOURS = 8

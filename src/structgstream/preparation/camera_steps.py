@@ -18,20 +18,18 @@ from structgstream.preparation.clocks import (
     unpacked_clocks,
 )
 from structgstream.preparation.footage import Footage, find_footage
-from structgstream.preparation.given_calibration import (
-    calibration_key,
-    find_calibration,
-    given_cameras,
-    require_calibration,
-)
 from structgstream.preparation.options import METHODS, PrepareOptions
 from structgstream.preparation.output_folder import mark_output
 from structgstream.preparation.solvers import (
+    calibration_key,
     check_complete,
     describe_focals,
     describe_turns,
+    find_calibration,
+    given_cameras,
     packed,
     refined,
+    require_calibration,
     solve_cameras,
     stated_focals,
     summary,

@@ -12,9 +12,8 @@ from structgstream.atomic_files import atomic_file
 from structgstream.cameras import CameraRig
 from structgstream.data.calibration import NEAR_IN_RIG_RADII
 from structgstream.data.camera_files import REPORT
-from structgstream.data.held_out import best_surrounded
 from structgstream.data.masks import FOLDER as MASKS
-from structgstream.data.open import open_capture
+from structgstream.data.open import best_surrounded, open_capture
 from structgstream.data.points import initial_points
 from structgstream.data.prepared import (
     PreparedCamera,
@@ -23,15 +22,15 @@ from structgstream.data.prepared import (
     prepared_rig,
     write_prepared,
 )
-from structgstream.data.rectilinear import rectilinear
 from structgstream.data.source import FrameSource
 from structgstream.data.timeline import Clock
+from structgstream.data.undistortion import rectilinear
 from structgstream.data.video import measured_fps
 from structgstream.data.wrappers import WithRig
 from structgstream.pose_check.findings import Finding
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.checking.check import Examination, check_capture, examine_capture
-from structgstream.preparation.checking.scales import nearest_depth, observed_depths
+from structgstream.preparation.checking.overlap import nearest_depth, observed_depths
 from structgstream.preparation.footage import Footage
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.output_folder import link, remove_others, unlink
@@ -125,7 +124,7 @@ class CaptureSteps:
         return content
 
     def check(self, content: PreparedCapture) -> tuple[Finding, ...]:
-        from structgstream.preparation.report.page import write_report
+        from structgstream.preparation.report import write_report
 
         def look() -> tuple[Finding, ...]:
             source = self._source(content)

@@ -19,7 +19,7 @@ from structgstream.preparation.checking.check import Checked, check_capture
 from structgstream.preparation.footage import Footage
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.output_folder import lock_output
-from structgstream.preparation.report.page import write_report
+from structgstream.preparation.report import write_report
 from structgstream.preparation.steps import Job, Listener, Silent, Steps
 
 

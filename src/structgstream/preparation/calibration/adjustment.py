@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.data.lenses import Fisheye, LensCamera
+from structgstream.geometry import Floats
 from structgstream.preparation.calibration.bundle import BodyObservations, Bundle, Parameters, linearized, solved
-from structgstream.preparation.calibration.lens_prior import usual_prior
-from structgstream.preparation.calibration.lens_terms import row_of, with_row
+from structgstream.preparation.calibration.lens_terms import row_of, usual_prior, with_row
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
 
 _log = logging.getLogger(__name__)

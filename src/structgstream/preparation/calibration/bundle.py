@@ -4,7 +4,7 @@
 Apart from cameras, bodies are adjusted: points, or poses of a board whose corners are known. They are eliminated
 from the normal equations (Brown, 1958; Triggs et al., Bundle adjustment: a modern synthesis, 2000), which are solved by
 Levenberg's and Marquardt's method with Huber's loss. Terms of intrinsics may have a prior that cameras share
-(``lens_prior.py``).
+(``lens_terms.py``).
 """
 
 from dataclasses import dataclass, replace
@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.data.calibration import rotation_matrix
-from structgstream.preparation.calibration.lens_prior import LensPrior
-from structgstream.preparation.calibration.lens_terms import derivatives, projected
+from structgstream.geometry import Floats
+from structgstream.preparation.calibration.lens_terms import LensPrior, derivatives, projected
 
 Indices = NDArray[np.intp]
 

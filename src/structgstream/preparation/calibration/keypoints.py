@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv, reduced_picture
+from structgstream.geometry import Floats
 from structgstream.preparation.calibration.colmap import pycolmap_module
 
 MAX_KEYPOINTS = 6000  # of one picture, the largest first

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.alignment import Alignment, alignment
-from structgstream.data.arrays import Floats
+from structgstream.data.calibration import Alignment, alignment
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import level_normal
 from structgstream.errors import CalibrationError
+from structgstream.geometry import Floats
 
 Indices = NDArray[np.intp]
 

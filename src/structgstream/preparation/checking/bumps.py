@@ -13,12 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
-from structgstream.data.arrays import Floats
 from structgstream.data.calibration import listed
 from structgstream.data.images import opencv
-from structgstream.data.matching import epipolar_errors, fundamental_matrix, sift_features
-from structgstream.data.pair_matches import KEYPOINT_SIDE, mutual_matches
+from structgstream.data.matching import (
+    KEYPOINT_SIDE,
+    epipolar_errors,
+    fundamental_matrix,
+    mutual_matches,
+    sift_features,
+)
 from structgstream.frames import MultiViewFrame
+from structgstream.geometry import Floats
 from structgstream.pose_check.findings import Finding
 from structgstream.pose_check.tracks import AGREE_PIXELS, Evidence, gather, pixel_scale
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv
+from structgstream.geometry import Floats
 from structgstream.pose_check.findings import Finding
 from structgstream.pose_check.tracks import Evidence
 

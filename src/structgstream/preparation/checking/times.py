@@ -25,7 +25,7 @@ from structgstream.preparation.synchronization.motion_signals import (
     reduced_changes,
     reduced_grey,
 )
-from structgstream.preparation.synchronization.result import WARNED_SECONDS
+from structgstream.preparation.synchronization.synchronize import WARNED_SECONDS
 
 LESS_THAN_A_FRAME = (
     "less than a frame, which choosing frames cannot mend; what moves fast will blur there. Cameras that one signal "

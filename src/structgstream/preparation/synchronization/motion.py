@@ -18,13 +18,14 @@ from structgstream.data.matching import connected_groups
 from structgstream.data.timeline import period_seconds
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.correlation import (
+    Line,
     Signal,
     best_lag,
     chance_deviation,
+    fitted_line,
     lag_changes,
     resampled,
 )
-from structgstream.preparation.synchronization.lines import Line, fitted_line
 from structgstream.preparation.synchronization.motion_signals import Changes, Geometry, line_signals
 from structgstream.preparation.synchronization.solving import Solution, TimeCorrespondence, camera_pairs, solve_clocks
 
@@ -214,7 +215,7 @@ def _control(pair: PairSignals, min_overlap: int) -> float:
 def _near(pair: PairSignals, near: Solution, edges: NDArray[np.float64] | None) -> list[TimeCorrespondence]:
     """The correspondence of a whole take near known clocks.
 
-    Where there are blocks it has its changes without each of them and with the shapes of ``lines.py``: an event
+    Where there are blocks it has its changes without each of them and with the shapes of ``correlation.py``: an event
     that is shorter than a frame lies on one of two frames, so that the peak of few such events is that of the majority,
     whichever block is left out.
     """

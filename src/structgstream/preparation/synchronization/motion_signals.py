@@ -15,11 +15,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv, reduced_picture
 from structgstream.data.lenses import LensCamera
-from structgstream.data.matching import Features, sift_features
-from structgstream.data.pair_matches import mutual_matches
+from structgstream.data.matching import Features, mutual_matches, sift_features
+from structgstream.geometry import Floats
 
 CHANGES_SIDE = 160  # of reduced pictures, pixels: events are compared along lines, so positions need not be finer
 SMOOTHING = 1.0  # standard deviation, reduced pixels

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.data.matching import Pair
+from structgstream.geometry import Floats
 
 TREES = 200
 ITERATIONS = 30

@@ -20,10 +20,10 @@ from pathlib import Path
 
 import numpy as np
 
-from structgstream.data.arrays import Floats
 from structgstream.data.text_files import Unreadable, number, read_text, reason, whole
 from structgstream.data.timeline import Clock, period_seconds
 from structgstream.errors import CaptureError
+from structgstream.geometry import Floats
 
 COLUMNS = ("camera", "frame", "seconds")
 MAX_DEVIATION = 0.5  # of a row from a steady clock, in frame periods
