@@ -307,11 +307,7 @@ def is_cut_jpeg(data: bytes) -> bool:
 
 
 def _converted_heif(path: Path, data: bytes) -> bytes:
-    """A picture of HEIC or AVIF as PNG, turned as it is shown.
-
-    Raises:
-        CaptureError: it cannot be decoded, or what reads it is not installed.
-    """
+    """A picture of HEIC or AVIF as PNG, turned as it is shown."""
     is_avif = data[8:12] in (b"avif", b"avis")
     needs = "AVIF, which needs Pillow 11.3 or later" if is_avif else "HEIC, which needs the Python package pillow-heif"
     missing = CaptureError(f"The picture {path} is {needs}; install it, or convert the pictures to JPEG or PNG.")
@@ -358,11 +354,7 @@ def turned(picture: NDArray[Pixel], orientation: int) -> NDArray[Pixel]:
 
 
 def reduced_picture(picture: NDArray[np.uint8], longest_side: int) -> NDArray[np.uint8]:
-    """A picture ``[H, W]`` or ``[H, W, C]`` averaged over areas so that no side exceeds ``longest_side`` pixels.
-
-    Raises:
-        MissingExtraError: cv2 is not installed.
-    """
+    """A picture ``[H, W]`` or ``[H, W, C]`` averaged over areas so that no side exceeds ``longest_side`` pixels."""
     height, width = picture.shape[:2]
     factor = longest_side / max(width, height)
     if factor >= 1:
@@ -390,7 +382,6 @@ def picture_size(path: Path) -> tuple[int, int]:
 
     Raises:
         CaptureError: the file cannot be read or is not a picture.
-        MissingExtraError: Pillow is not installed.
     """
     with _opened(path) as picture:
         if picture is not None and picture.format in ("PNG", "JPEG", "MPO"):
@@ -420,12 +411,7 @@ def check_one_series(camera: str, files: Iterable[Path]) -> None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator["ImageFile | None"]:
-    """The picture with its header read; None if Pillow does not read it.
-
-    Raises:
-        CaptureError: the file cannot be read.
-        MissingExtraError: Pillow is not installed.
-    """
+    """The picture with its header read; None if Pillow does not read it."""
     try:
         from PIL import Image, UnidentifiedImageError
     except ImportError:
@@ -482,7 +468,6 @@ def read_exif(path: Path) -> StatedOptics:
 
     Raises:
         CaptureError: the file cannot be read.
-        MissingExtraError: Pillow is not installed.
     """
     with _opened(path) as picture:
         if picture is None:

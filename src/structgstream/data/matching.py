@@ -47,9 +47,6 @@ def sift_features(
     Larger pictures are reduced to ``longest_side`` pixels; keypoints are in pixels of ``image`` all the same.
     Descriptors are square-rooted after L1 normalisation, so that their dot product is the Hellinger kernel
     (Arandjelovic and Zisserman, CVPR 2012).
-
-    Raises:
-        MissingExtraError: cv2 is not installed.
     """
     cv2 = opencv()
     height, width = image.shape[:2]
@@ -429,11 +426,7 @@ class PairMatcher:
         self._found: dict[Pair, NDArray[np.intp]] = {}
 
     def matches(self, pairs: Sequence[Pair]) -> dict[Pair, tuple[Floats, Floats]]:
-        """Pixels ``[S, 2]`` in the first and in the second picture of each pair; none where too few agree.
-
-        Raises:
-            MissingExtraError: cv2 is not installed.
-        """
+        """Pixels ``[S, 2]`` in the first and in the second picture of each pair; none where too few agree."""
         found = self.indices(pairs)
         return {
             (first, second): (
@@ -510,11 +503,7 @@ def neighbor_pairs(cameras: Mapping[str, Camera], *, count: int = 2) -> list[Pai
 
 
 def neighbor_errors(cameras: Mapping[str, Camera], matcher: PairMatcher) -> dict[Pair, PairError | None]:
-    """The error of each pair of neighbours; None where their pictures do not match.
-
-    Raises:
-        MissingExtraError: cv2 is not installed.
-    """
+    """The error of each pair of neighbours; None where their pictures do not match."""
     matches = matcher.matches(neighbor_pairs(cameras))
     return {
         pair: pair_error(cameras[pair[0]], cameras[pair[1]], *pixels) if len(pixels[0]) else None

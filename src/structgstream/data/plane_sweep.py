@@ -205,9 +205,6 @@ def sweep_points(
 
     A later level adds points only where earlier ones have none nearby, because large windows extend surfaces over
     outlines.
-
-    Raises:
-        MissingExtraError: cv2 is not installed.
     """
     cv2 = opencv()
     names = [name for name in cameras if neighbours[name]]

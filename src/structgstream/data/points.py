@@ -102,9 +102,6 @@ def initial_points(
     Absent cameras and pixels that do not count give no points.
 
     The result does not depend on the number of threads; ``seed`` is used for random points only.
-
-    Raises:
-        MissingExtraError: cv2 is not installed.
     """
     cameras = {name: rig[name] for name in frame.showing(rig.training)}
     images, masks = {name: frame.images[name] for name in cameras}, frame.masks

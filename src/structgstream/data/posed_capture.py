@@ -216,11 +216,7 @@ def orientations(calibration: Calibration, firsts: Mapping[str, Path]) -> dict[s
 
 
 def _orientation(file: Path, posed: PosedCamera, calibration: Calibration) -> int:
-    """The EXIF orientation by which a camera's pictures are turned: that of the pictures that were calibrated.
-
-    Raises:
-        CalibrationError: neither the calibration nor the size of the pictures decides.
-    """
+    """The EXIF orientation by which a camera's pictures are turned: that of the pictures that were calibrated."""
     orientation = read_exif(file).orientation
     if orientation == 1:
         return 1
@@ -265,9 +261,6 @@ def _poses(calibration: Calibration, cameras: Collection[str]) -> dict[str, Pose
 
     Where no name is the same, a calibrated camera's may be one of the words of a file's (``take2_cam1``), or both may
     have the same numbers (``cam_1`` and ``Camera01``), provided that every file finds its own.
-
-    Raises:
-        CalibrationError: pictures of one camera have different poses.
     """
     names = [*(posed.name for posed in calibration.cameras), *calibration.unposed]
     parts = [_parts(name) for name in names]
@@ -332,11 +325,7 @@ def _still(calibration: Calibration, names: Sequence[str | None]) -> dict[str, P
 def _check(
     poses: Mapping[str, PosedCamera], pictured: Collection[str], *, calibration: Calibration, root: Path
 ) -> None:
-    """Pictures and calibration belong together.
-
-    Raises:
-        CalibrationError: they do not.
-    """
+    """Pictures and calibration belong together."""
     if poses:
         check_names(poses, sorted(pictured, key=natural), calibration=calibration.where, pictures=root)
         used = {posed.name for posed in poses.values()}

@@ -246,11 +246,7 @@ def _first_frame(packet: "Packet") -> "VideoFrame | None":
 
 
 def _quarter_turns(path: Path, stream: "VideoStream", frame: "VideoFrame | None") -> int:
-    """How the stored picture must be turned to be shown.
-
-    Raises:
-        CaptureError: it is mirrored, turned by another angle, or two fields.
-    """
+    """How the stored picture must be turned to be shown."""
     if stream.codec_context.field_order > PROGRESSIVE or (frame is not None and frame.interlaced_frame):
         raise CaptureError(
             f"The video {path} is interlaced: its lines are of two instants; set the camera to a progressive mode "

@@ -168,11 +168,7 @@ def _key_before(track: VideoTrack, stamp: int) -> int | None:
 
 
 def _shown(frame: "VideoFrame", reformatter: "VideoReformatter", track: VideoTrack, size: tuple[int, int]) -> Picture:
-    """The picture as it is shown, at ``size``.
-
-    Raises:
-        CaptureError: it has another size than the video's first ones, so the calibration cannot be of both.
-    """
+    """The picture as it is shown, at ``size``."""
     turned = track.quarter_turns % 2
     width, height = (frame.height, frame.width) if turned else (frame.width, frame.height)
     if (width, height) != (track.width, track.height):

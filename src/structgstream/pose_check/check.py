@@ -59,11 +59,7 @@ class PoseCheck:
 def examine_poses(
     frame: MultiViewFrame, cameras: Mapping[str, Camera], *, matcher: PairMatcher | None = None
 ) -> tuple[Evidence, Verdict]:
-    """Matches of one instant's pictures, and which cameras are off by them.
-
-    Raises:
-        MissingExtraError: cv2 or scipy is not installed.
-    """
+    """Matches of one instant's pictures, and which cameras are off by them."""
     evidence = gather(frame, cameras, matcher=matcher)
     verdict = judge(evidence, cameras)
     matches = sum(map(len, evidence.matches.values()))
@@ -81,7 +77,6 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig) -> PoseCheck:
 
     Raises:
         CalibrationError: most cameras are off, and most good matches violate the epipolar geometry of the poses.
-        MissingExtraError: cv2 or scipy is not installed.
     """
     cameras = {name: rig[name] for name in frame.showing(rig.training)}
     matcher = PairMatcher(frame.images, masks=frame.masks)

@@ -66,9 +66,6 @@ def gather(
         cameras: as given.
         matcher: of the same pictures, where some pairs were matched before.
         readings: other poses of the same cameras.
-
-    Raises:
-        MissingExtraError: cv2 is not installed.
     """
     names = [name for name in cameras if name in frame.images]
     if len(names) <= ALL_PAIRS:

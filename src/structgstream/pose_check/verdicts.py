@@ -122,9 +122,6 @@ def resect(tracks: Tracks, camera: Camera, name: str) -> Resection | None:
         tracks: with the camera among those that are off, so that no point is made of its keypoints.
         camera: as given.
         name: of the camera.
-
-    Raises:
-        MissingExtraError: cv2 or scipy is not installed.
     """
     own = tracks.of(name) if name in tracks.names else np.zeros(len(tracks.point), bool)
     if own.sum() < MIN_SEEN:
@@ -378,9 +375,6 @@ def judge(evidence: Evidence, cameras: Mapping[str, Camera]) -> Verdict:
 
     Pairs raise a suspicion; then points of the other cameras decide. A camera is off when another pose or focal length
     explains these points much better than the given one, and it is not when none explains more of them.
-
-    Raises:
-        MissingExtraError: cv2 or scipy is not installed.
     """
     errors = pair_errors(evidence, cameras)
     suspects = find_suspects(errors, cameras)

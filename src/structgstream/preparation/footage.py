@@ -207,11 +207,7 @@ def find_footage(where: Path, *, picture_fps: float | None = None) -> Footage:
 
 
 def _of_size(picture: NDArray[np.uint8], size: tuple[int, int], name: str, file: Path) -> NDArray[np.uint8]:
-    """The picture itself.
-
-    Raises:
-        CaptureError: it has another size than the camera's first one.
-    """
+    """The picture itself."""
     height, width = picture.shape[:2]
     if (width, height) != size:
         raise CaptureError(
@@ -291,11 +287,7 @@ def _found(root: Path) -> dict[str, Path]:
 
 
 def _check_left(root: Path, found: Mapping[str, Path]) -> None:
-    """Warns of files and folders that are no camera, so that none is lost unnoticed.
-
-    Raises:
-        CaptureError: an empty folder among those of cameras.
-    """
+    """Warns of files and folders that are no camera, so that none is lost unnoticed."""
     taken = next(iter(found.values()))
     for entry in sorted(entry for entry in root.iterdir() if not is_hidden(entry)):
         if entry.is_file() and entry.suffix.lower() in FILMED and entry not in found.values():

@@ -57,7 +57,6 @@ def prepare_capture(
         CaptureError: the videos cannot be read, synchronised or calibrated, or ``capture`` holds something else.
         ConfigError: options that the cameras do not allow.
         StorageError: the capture cannot be written.
-        MissingExtraError: a package is missing that a step needs.
     """
     options = options or PrepareOptions()
     job = Job(videos, capture, options, Steps(capture, listener or Silent()))
@@ -97,7 +96,6 @@ def check_folder(path: Path, *, report: Path | None, listener: Listener | None =
 
     Raises:
         CaptureError: the capture cannot be opened or read.
-        MissingExtraError: a package is missing that the check or the report needs.
         StorageError: the report cannot be written.
     """
     listener = listener or Silent()

@@ -45,7 +45,6 @@ def draw_matrix(path: Path, report: CheckReport, *, limit_pixels: float, stray: 
     """Median epipolar error of every pair; pairs without matches stay white, pairs ``stray`` have a cross.
 
     Raises:
-        MissingExtraError: matplotlib is not installed.
         StorageError: the file cannot be written.
     """
     names = list(report.cameras)
@@ -85,7 +84,6 @@ def draw_coverage(path: Path, examined: Examination, *, near: float, unit: str) 
     """The rig and the points from above and from the side, coloured by the number of cameras that see them.
 
     Raises:
-        MissingExtraError: matplotlib is not installed.
         StorageError: the file cannot be written.
     """
     cameras = examined.cameras
@@ -137,7 +135,6 @@ def draw_colors(path: Path, report: CheckReport) -> None:
     """Exposure and white balance of each camera against the median camera.
 
     Raises:
-        MissingExtraError: matplotlib is not installed.
         StorageError: the file cannot be written.
     """
     names = [name for name, camera in report.cameras.items() if camera.exposure_stops is not None]
@@ -164,7 +161,6 @@ def draw_times(path: Path, report: CheckReport) -> None:
     """Time offset that is left between cameras, with its uncertainty and the limit of 5 ms.
 
     Raises:
-        MissingExtraError: matplotlib is not installed.
         StorageError: the file cannot be written.
     """
     known = {name: camera for name, camera in report.cameras.items() if camera.offset_ms is not None}
@@ -264,7 +260,6 @@ def draw_overlay(path: Path, examined: Examination, report: CheckReport, name: s
     """A camera's picture; each keypoint is joined with where the point of the other cameras falls.
 
     Raises:
-        MissingExtraError: matplotlib is not installed.
         StorageError: the file cannot be written.
     """
     camera, tracks = examined.cameras[name], examined.tracks
@@ -317,7 +312,6 @@ def draw_epipolar(path: Path, examined: Examination, pair: Pair) -> None:
     """Both pictures of a pair: matched keypoints, and in the second the lines on which they lie by the poses.
 
     Raises:
-        MissingExtraError: matplotlib is not installed.
         StorageError: the file cannot be written.
     """
     first, second = (examined.cameras[name] for name in pair)
@@ -487,7 +481,6 @@ def write_report(folder: Path, checked: Checked, *, listener: Listener | None = 
     """The report in ``folder``, in place of an earlier one; returns the page.
 
     Raises:
-        MissingExtraError: matplotlib is not installed.
         StorageError: a file cannot be written.
     """
     report, examined = checked.report, checked.examination

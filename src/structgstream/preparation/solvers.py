@@ -61,7 +61,6 @@ def solve_cameras(
     Raises:
         CalibrationError: the cameras see too little in common, or too little of the board.
         CaptureError: pictures cannot be read.
-        MissingExtraError: pycolmap or cv2 is not installed.
     """
     if method == "sfm":
         pictures = matched_pictures(footage, clocks, options)
@@ -158,7 +157,6 @@ def stated_focals(footage: Footage) -> dict[str, float]:
 
     Raises:
         CaptureError: a picture cannot be read.
-        MissingExtraError: Pillow is not installed.
     """
     stated = {name: read_exif(files[0]).focal_pixels for name, files in footage.stills.items()}
     return {name: focal for name, focal in stated.items() if focal is not None}
@@ -183,7 +181,6 @@ def describe_turns(footage: Footage) -> str:
 
     Raises:
         CaptureError: a picture cannot be read.
-        MissingExtraError: Pillow is not installed.
     """
     turned = [name for name, files in footage.stills.items() if read_exif(files[0]).orientation != 1]
     if not turned:

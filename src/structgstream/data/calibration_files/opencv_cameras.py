@@ -161,11 +161,7 @@ def _own_pose(content: dict[str, Any]) -> bool:
 
 
 def _pose(content: dict[str, Any]) -> np.ndarray:
-    """World to camera, ``[4, 4]``.
-
-    Raises:
-        NoPose: there is none.
-    """
+    """World to camera, ``[4, 4]``."""
     for key in ("pose", "inverse pose"):
         if (matrix := _value(content, key)) is not None:
             viewmat = rigid(matrix[:3, :3], matrix[:3, 3])

@@ -70,7 +70,6 @@ class CalibrationFormat:
 
         Raises:
             CalibrationError: a file is missing or broken, or a camera has a model that is not known here.
-            MissingExtraError: a package that parses the files is not installed.
         """
         where = self.where(files)
         with readable(where, self.expected):
@@ -187,7 +186,6 @@ def read_storage(file: Path) -> dict[str, Any]:
     Raises:
         Unreadable: it cannot be parsed, or a matrix has not as many numbers as it states.
         OSError: it cannot be read.
-        MissingExtraError: PyYAML is not installed.
     """
     text = read_text(file)
     if "<opencv_storage" in text[:400]:
@@ -200,7 +198,6 @@ def parsed_yaml(text: str) -> Any:
 
     Raises:
         Unreadable: it is not YAML.
-        MissingExtraError: PyYAML is not installed.
     """
     try:
         import yaml
@@ -272,11 +269,7 @@ class _Arrays(pickle.Unpickler):
     """See Note [Pickles are programs]."""
 
     def find_class(self, module: str, name: str, /) -> Any:
-        """The stand-in for a function of numpy.
-
-        Raises:
-            UnpicklingError: another one is asked for.
-        """
+        """The stand-in for a function of numpy."""
         if (known := KNOWN.get((module.replace("numpy._core", "numpy.core"), name))) is None:
             raise _Refused(f"it asks for {module}.{name}")
         return known

@@ -79,7 +79,6 @@ class Board:
 
         Raises:
             ConfigError: a dictionary that OpenCV lacks, or with too few markers.
-            MissingExtraError: cv2 is not installed.
         """
         aruco = opencv().aruco
         number = getattr(aruco, self.dictionary, None)
@@ -285,7 +284,6 @@ def write_board_pdf(path: Path, board: Board, paper: Paper = "A4") -> None:
 
     Raises:
         ConfigError: the board does not fit the paper.
-        MissingExtraError: matplotlib or cv2 is not installed.
         StorageError: the file cannot be written.
     """
     width, height = board_page(board, paper)

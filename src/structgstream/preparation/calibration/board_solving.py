@@ -67,7 +67,6 @@ def solve_board(
     Raises:
         CalibrationError: a camera that does not show the board well enough, or at no instant at which it connects to
             the others; another board than given.
-        MissingExtraError: pycolmap or cv2 is not installed.
     """
     pycolmap_module()
     sightings = board_sightings(pictures, board)

@@ -67,7 +67,6 @@ def camera_keypoints(
 
     Raises:
         CancelledError: ``stopping`` was set.
-        MissingExtraError: cv2 or pycolmap is not installed.
     """
     extractor = _extractor()
     count = len(pictures)

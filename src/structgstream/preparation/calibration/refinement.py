@@ -73,7 +73,6 @@ def refine(
     Raises:
         CalibrationError: too few matches agree with the given poses, or not all cameras are connected by them.
         ConfigError: the model ``brown``.
-        MissingExtraError: pycolmap or cv2 is not installed.
     """
     if lens == "brown":
         raise ConfigError(

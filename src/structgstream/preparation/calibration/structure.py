@@ -82,7 +82,6 @@ def solve_structure(
 
     Raises:
         CalibrationError: fewer than three cameras, pictures that do not belong together, or too little in common.
-        MissingExtraError: pycolmap or cv2 is not installed.
     """
     pycolmap_module()
     if len(pictures) < 3:

@@ -64,9 +64,6 @@ def picture_movement(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Moveme
 
     It moved if hardly a keypoint stayed and most of them follow one homography (a camera that turns on the spot makes
     exactly that). A flat thing that moves in front of a plain background does that too.
-
-    Raises:
-        MissingExtraError: cv2 is not installed.
     """
     before, after = (sift_features(picture, count=KEYPOINTS, longest_side=KEYPOINT_SIDE) for picture in (one, other))
     if min(len(before.pixels), len(after.pixels)) < MIN_MATCHES:
@@ -97,9 +94,6 @@ def bump_findings(
         last: a later one.
         evidence: matches of the first frame.
         cameras: by name.
-
-    Raises:
-        MissingExtraError: cv2 is not installed.
     """
     names = [name for name in cameras if name in first.images and name in last.images]
     movements = {name: picture_movement(first.images[name], last.images[name]) for name in names}

@@ -176,11 +176,7 @@ class Checked:
 
 
 def examine(frame: MultiViewFrame, cameras: Mapping[str, Camera]) -> Examination:
-    """Matches one instant's pictures and holds them against the poses.
-
-    Raises:
-        MissingExtraError: cv2 or scipy is not installed.
-    """
+    """Matches one instant's pictures and holds them against the poses."""
     seen = {name: camera for name, camera in cameras.items() if name in frame.images}
     evidence, verdict = examine_poses(frame, seen)
     return Examination(frame, seen, evidence, verdict, compare_colors(evidence))
@@ -191,7 +187,6 @@ def examine_capture(source: FrameSource) -> Examination:
 
     Raises:
         CaptureError: a frame cannot be read.
-        MissingExtraError: cv2 or scipy is not installed.
     """
     presence = stated_presence(source)
     return replace(examine(whole_frame(source, presence), source.rig.cameras), presence=presence)
@@ -214,7 +209,6 @@ def check_capture(
 
     Raises:
         CaptureError: a frame cannot be read.
-        MissingExtraError: cv2 or scipy is not installed.
     """
     cameras = source.rig.cameras
     listener = listener or Silent()

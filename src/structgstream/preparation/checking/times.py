@@ -85,7 +85,6 @@ def check_synchronization(source: FrameSource) -> SynchronizationCheck:
 
     Raises:
         CaptureError: the pictures cannot be read.
-        MissingExtraError: cv2 or scipy is not installed.
     """
     require_scipy()
     period = 1 / source.fps

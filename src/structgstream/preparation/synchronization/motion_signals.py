@@ -55,11 +55,7 @@ class Changes:
 
 
 def picture_changes(pictures: Iterable[NDArray[np.uint8]], stamps: Floats) -> Changes:
-    """Changes of pictures ``[H, W, 3]`` that follow each other at ``stamps`` ``[T]``; only reduced ones stay in memory.
-
-    Raises:
-        MissingExtraError: cv2 is not installed.
-    """
+    """Changes of pictures ``[H, W, 3]`` that follow each other at ``stamps`` ``[T]``; only reduced ones stay in memory."""
     reduced: list[NDArray[np.uint8]] = []
     size = (0, 0)
     for picture in pictures:

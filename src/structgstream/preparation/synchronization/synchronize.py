@@ -214,7 +214,6 @@ def synchronize(
     Raises:
         CaptureError: the cameras cannot be synchronised so; the message names camera and reason.
         ConfigError: ``method`` is unknown, or csv without a table.
-        MissingExtraError: scipy or cv2 is not installed.
     """
     if method not in METHODS:
         raise ConfigError(f"The method of synchronisation must be one of {', '.join(METHODS)}, got {method!r}.")
