@@ -24,21 +24,14 @@ from structgstream.similarity import rig_radius
 
 @dataclass(frozen=True)
 class PosedCamera:
-    """One camera of a calibration, or one picture that a camera took.
+    """One camera of a calibration, or one picture that a camera took."""
 
-    Args:
-        name: the camera's, or a path of which its name is a part (``cam00/000017.png``).
-        viewmat: ``[4, 4]`` float64, world to camera, OpenCV axes.
-        K: ``[3, 3]`` float64, pixels, the top-left pixel's centre at (0.5, 0.5).
-        size: width and height, pixels, that ``K`` is for; None if the file does not state it: that of the pictures.
-        lens: its distortion.
-    """
-
-    name: str
-    viewmat: NDArray[np.float64]
-    K: NDArray[np.float64]
+    name: str  # the camera's, or a path of which its name is a part (``cam00/000017.png``)
+    viewmat: NDArray[np.float64]  # ``[4, 4]`` float64, world to camera, OpenCV axes
+    K: NDArray[np.float64]  # ``[3, 3]`` float64, pixels, the top-left pixel's centre at (0.5, 0.5)
     size: tuple[int, int] | None
-    lens: Lens = field(default_factory=Pinhole)
+    """Width and height, pixels, that ``K`` is for; None if the file does not state it: that of the pictures."""
+    lens: Lens = field(default_factory=Pinhole)  # its distortion
 
     @property
     def center(self) -> NDArray[np.float64]:
@@ -48,24 +41,16 @@ class PosedCamera:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Cameras of one capture.
+    """Cameras of one capture."""
 
-    Args:
-        where: the file or folder that they come from, for messages.
-        cameras: as :class:`PosedCamera`; several of one camera must agree.
-        points: ``[P, 3]`` points of the scene, or None.
-        held_out: names of cameras that are held out in published results.
-        unposed: names of cameras without a pose.
-        turned_by_exif: whether it is for pictures turned by their EXIF orientation, as OpenCV reads them; None
-            where that depends on how it was made.
-    """
-
-    where: Path
-    cameras: tuple[PosedCamera, ...]
-    points: NDArray[np.float64] | None = None
-    held_out: Sequence[str] = ()
-    unposed: Sequence[str] = ()
+    where: Path  # the file or folder that they come from, for messages
+    cameras: tuple[PosedCamera, ...]  # as :class:`PosedCamera`; several of one camera must agree
+    points: NDArray[np.float64] | None = None  # ``[P, 3]`` points of the scene, or None
+    held_out: Sequence[str] = ()  # names of cameras that are held out in published results
+    unposed: Sequence[str] = ()  # names of cameras without a pose
     turned_by_exif: bool | None = None
+    """Whether it is for pictures turned by their EXIF orientation, as OpenCV reads them; None where that depends on how
+    it was made."""
 
 
 def rigid(rotation: ArrayLike, translation: ArrayLike) -> NDArray[np.float64]:
@@ -195,17 +180,11 @@ def listed(names: Collection[str], limit: int = 5) -> str:
 
 @dataclass(frozen=True)
 class Alignment:
-    """``aligned = scale * rotation @ point + translation``.
+    """``aligned = scale * rotation @ point + translation``."""
 
-    Args:
-        scale: positive.
-        rotation: ``[3, 3]``.
-        translation: ``[3]``.
-    """
-
-    scale: float
-    rotation: Floats
-    translation: Floats
+    scale: float  # positive
+    rotation: Floats  # ``[3, 3]``
+    translation: Floats  # ``[3]``
 
     def points(self, points: Floats) -> Floats:
         """Points ``[..., 3]``, aligned."""

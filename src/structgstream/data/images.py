@@ -45,28 +45,19 @@ Pixel = TypeVar("Pixel", np.uint8, np.bool_)
 
 @dataclass(frozen=True)
 class ImageSource:
-    """A :class:`~structgstream.data.source.FrameSource` over picture files.
+    """A :class:`~structgstream.data.source.FrameSource` over picture files."""
 
-    Args:
-        name: the capture's name.
-        rig: its cameras, at the size of the pictures.
-        fps: frames a second.
-        files: camera name to its picture in each frame; None where it has none.
-        points: ``[P, 3]`` points that came with the capture, or None.
-        instants: name of each frame in the files; empty if frames have no names.
-        apart_seconds: camera name to how long after its instant its picture of each frame was taken, ``[N]``; empty
-            where that is not known.
-        turns: camera name to the EXIF orientation, 1 to 8, by which its pictures are turned; 1 where it is missing.
-    """
-
-    name: str
-    rig: CameraRig
-    fps: float
-    files: Mapping[str, tuple[Path | None, ...]]
-    points: NDArray[np.float64] | None = None
-    instants: tuple[str, ...] = ()
+    name: str  # the capture's name
+    rig: CameraRig  # its cameras, at the size of the pictures
+    fps: float  # frames a second
+    files: Mapping[str, tuple[Path | None, ...]]  # camera name to its picture in each frame; None where it has none
+    points: NDArray[np.float64] | None = None  # ``[P, 3]`` points that came with the capture, or None
+    instants: tuple[str, ...] = ()  # name of each frame in the files; empty if frames have no names
     apart_seconds: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    """Camera name to how long after its instant its picture of each frame was taken, ``[N]``; empty where that is not
+    known."""
     turns: Mapping[str, int] = field(default_factory=dict)
+    """Camera name to the EXIF orientation, 1 to 8, by which its pictures are turned; 1 where it is missing."""
     _bits: dict[int, int] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __len__(self) -> int:
@@ -446,15 +437,10 @@ MIN_FOCAL_SHARE, MAX_FOCAL_SHARE = 0.2, 20.0
 
 @dataclass(frozen=True)
 class StatedOptics:
-    """Focal length and orientation of a picture by its header.
+    """Focal length and orientation of a picture by its header."""
 
-    Args:
-        focal_pixels: focal length in pixels of the picture; None if not stated.
-        orientation: how the stored picture is to be turned (1 to 8; 1 is not at all).
-    """
-
-    focal_pixels: float | None
-    orientation: int
+    focal_pixels: float | None  # focal length in pixels of the picture; None if not stated
+    orientation: int  # how the stored picture is to be turned (1 to 8; 1 is not at all)
 
 
 def read_exif(path: Path) -> StatedOptics:

@@ -384,22 +384,15 @@ def _distinct_nearest(
 
 @dataclass(frozen=True)
 class MatchConfig:
-    """Thresholds of the matches.
+    """Thresholds of the matches."""
 
-    Args:
-        features: SIFT keypoints per picture.
-        ratio: largest ratio of the best to the second-best descriptor distance.
-        inlier_pixels: largest epipolar distance of inliers of a pair's own epipolar geometry, in pixels of a picture of
-            the reference size (``cameras.enlargement``).
-        min_inliers: least number of inliers of a pair that is used.
-        min_inlier_share: least share of inliers among the matches of a pair that is used.
-    """
-
-    features: int = 1500
-    ratio: float = 0.75
+    features: int = 1500  # SIFT keypoints per picture
+    ratio: float = 0.75  # largest ratio of the best to the second-best descriptor distance
     inlier_pixels: float = 1.5
-    min_inliers: int = 20
-    min_inlier_share: float = 0.5
+    """Largest epipolar distance of inliers of a pair's own epipolar geometry, in pixels of a picture of the reference
+    size (``cameras.enlargement``)."""
+    min_inliers: int = 20  # least number of inliers of a pair that is used
+    min_inlier_share: float = 0.5  # least share of inliers among the matches of a pair that is used
 
 
 class PairMatcher:

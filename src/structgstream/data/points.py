@@ -76,17 +76,11 @@ class PointsConfig:
 
 @dataclass(frozen=True)
 class InitialPoints:
-    """Points to start the first frame from.
+    """Points to start the first frame from."""
 
-    Args:
-        positions: ``[P, 3]`` float64, in the capture's units.
-        colors: ``[P, 3]`` uint8 sRGB.
-        counts: number of points from ``"sift"``, ``"sweep"`` and ``"random"``.
-    """
-
-    positions: Floats
-    colors: NDArray[np.uint8]
-    counts: Mapping[str, int]
+    positions: Floats  # ``[P, 3]`` float64, in the capture's units
+    colors: NDArray[np.uint8]  # ``[P, 3]`` uint8 sRGB
+    counts: Mapping[str, int]  # number of points from ``"sift"``, ``"sweep"`` and ``"random"``
 
     @property
     def random(self) -> bool:

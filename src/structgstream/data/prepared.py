@@ -42,40 +42,24 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PreparedCamera:
-    """A camera of a prepared capture.
+    """A camera of a prepared capture."""
 
-    Args:
-        files: its video, or the folder of its pictures, relative to the capture.
-        filmed: pose, intrinsics, size and lens of the pictures as they are stored.
-        pinhole: what they are undistorted to; its pose is that of ``filmed``.
-        clock: from the stamps of the file to the time that all cameras share.
-    """
-
-    files: str
-    filmed: LensCamera
-    pinhole: Camera
-    clock: Clock = Clock()
+    files: str  # its video, or the folder of its pictures, relative to the capture
+    filmed: LensCamera  # pose, intrinsics, size and lens of the pictures as they are stored
+    pinhole: Camera  # what they are undistorted to; its pose is that of ``filmed``
+    clock: Clock = Clock()  # from the stamps of the file to the time that all cameras share
 
 
 @dataclass(frozen=True)
 class PreparedCapture:
-    """The content of ``capture.json``.
+    """The content of ``capture.json``."""
 
-    Args:
-        cameras: by name.
-        fps: frames a second of the common timeline.
-        near: near plane, in the capture's units.
-        unit: of poses and points; ``arbitrary`` where no length was given.
-        held_out: names of the held-out cameras.
-        points: file of points ``[P, 3]`` (``.npy``) relative to the capture, or None.
-    """
-
-    cameras: Mapping[str, PreparedCamera]
-    fps: float
-    near: float
-    unit: Unit = "arbitrary"
-    held_out: frozenset[str] = field(default_factory=frozenset)
-    points: str | None = None
+    cameras: Mapping[str, PreparedCamera]  # by name
+    fps: float  # frames a second of the common timeline
+    near: float  # near plane, in the capture's units
+    unit: Unit = "arbitrary"  # of poses and points; ``arbitrary`` where no length was given
+    held_out: frozenset[str] = field(default_factory=frozenset)  # names of the held-out cameras
+    points: str | None = None  # file of points ``[P, 3]`` (``.npy``) relative to the capture, or None
 
     def only(self, names: Collection[str]) -> "PreparedCapture":
         """These cameras, in the order of the capture, without points."""

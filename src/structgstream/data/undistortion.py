@@ -128,19 +128,14 @@ SCALE_SAMPLES = 33
 
 @dataclass(frozen=True)
 class Level:
-    """The part of the pinhole's picture that is sampled from one level of the lens picture's pyramid.
+    """The part of the pinhole's picture that is sampled from one level of the lens picture's pyramid."""
 
-    Args:
-        rows: of the pinhole's picture.
-        columns: of the pinhole's picture.
-        maps: source positions of its pixels, OpenCV's fixed-point numbers of 1/32 pixel.
-        weights: blending weight ``[h, w]`` float32 of this level over the finer ones; None for the first (weight 1).
-    """
-
-    rows: slice
-    columns: slice
+    rows: slice  # of the pinhole's picture
+    columns: slice  # of the pinhole's picture
     maps: tuple[NDArray[np.generic], NDArray[np.generic]]
+    """Source positions of its pixels, OpenCV's fixed-point numbers of 1/32 pixel."""
     weights: NDArray[np.float32] | None
+    """Blending weight ``[h, w]`` float32 of this level over the finer ones; None for the first (weight 1)."""
 
 
 @dataclass(frozen=True)

@@ -34,21 +34,13 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PoseCheck:
-    """Result of the pose check.
+    """Result of the pose check."""
 
-    Args:
-        matches: number of good matches.
-        share_violating: share of these that violate the poses; nan without matches.
-        off: cameras that are off; empty where all is right.
-        unmatched: cameras without a match to any other that was tried.
-        findings: what is off, in sentences.
-    """
-
-    matches: int
-    share_violating: float
-    off: tuple[str, ...] = ()
-    unmatched: tuple[str, ...] = ()
-    findings: tuple[Finding, ...] = ()
+    matches: int  # number of good matches
+    share_violating: float  # share of these that violate the poses; nan without matches
+    off: tuple[str, ...] = ()  # cameras that are off; empty where all is right
+    unmatched: tuple[str, ...] = ()  # cameras without a match to any other that was tried
+    findings: tuple[Finding, ...] = ()  # what is off, in sentences
 
     @property
     def conclusive(self) -> bool:

@@ -37,33 +37,19 @@ CAUSES: tuple[tuple[slice, ...], ...] = ((TURN,), (FOCAL,), (MOVE,), (TURN, FOCA
 
 @dataclass(frozen=True)
 class Resection:
-    """A camera corrected to points of the others; errors are standard errors.
+    """A camera corrected to points of the others; errors are standard errors."""
 
-    Args:
-        points: number of points that it explains.
-        given_points: number of points that the given camera explains.
-        seen: number of points that have a keypoint in its picture.
-        given_pixels: median distance of the keypoints of ``points`` to where the given camera sees these.
-        corrected_pixels: the same of the corrected one.
-        degrees: by how much its axis and picture turn.
-        degrees_error: of that.
-        share_of_distance: by how much it moves, as a share of its distance to the points.
-        share_error: of that.
-        focal_percent: by how much its focal length grows.
-        focal_error: of that.
-    """
-
-    points: int
-    given_points: int
-    seen: int
-    given_pixels: float
-    corrected_pixels: float
-    degrees: float
-    degrees_error: float
-    share_of_distance: float
-    share_error: float
-    focal_percent: float
-    focal_error: float
+    points: int  # number of points that it explains
+    given_points: int  # number of points that the given camera explains
+    seen: int  # number of points that have a keypoint in its picture
+    given_pixels: float  # median distance of the keypoints of ``points`` to where the given camera sees these
+    corrected_pixels: float  # the same of the corrected one
+    degrees: float  # by how much its axis and picture turn
+    degrees_error: float  # of that
+    share_of_distance: float  # by how much it moves, as a share of its distance to the points
+    share_error: float  # of that
+    focal_percent: float  # by how much its focal length grows
+    focal_error: float  # of that
 
     @property
     def better(self) -> bool:
@@ -257,19 +243,12 @@ MIN_MATCHES = 60  # of a camera's pairs, from which on they count without points
 
 @dataclass(frozen=True)
 class Suspects:
-    """The verdict on a rig.
+    """The verdict on a rig."""
 
-    Args:
-        off: cameras that disagree with the others, the worst first.
-        bad: pairs that the poses do not explain.
-        limit_pixels: error above which a pair counts as such.
-        everything: whether so much disagrees that no camera can be singled out.
-    """
-
-    off: tuple[str, ...]
-    bad: tuple[Pair, ...]
-    limit_pixels: float
-    everything: bool
+    off: tuple[str, ...]  # cameras that disagree with the others, the worst first
+    bad: tuple[Pair, ...]  # pairs that the poses do not explain
+    limit_pixels: float  # error above which a pair counts as such
+    everything: bool  # whether so much disagrees that no camera can be singled out
 
     @property
     def stray(self) -> tuple[Pair, ...]:
@@ -353,21 +332,14 @@ def _amount(name: str, errors: Mapping[Pair, PairError], off: Collection[str]) -
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is off, and by what evidence.
+    """What is off, and by what evidence."""
 
-    Args:
-        suspects: the cameras that are off.
-        tracks: points of the others.
-        resections: corrections of cameras that are off, where there are points for that.
-        doubtful: cameras that matches contradict, but others fit.
-        unchecked: cameras that so few matches contradict that chance may have made them.
-    """
-
-    suspects: Suspects
-    tracks: Tracks
+    suspects: Suspects  # the cameras that are off
+    tracks: Tracks  # points of the others
     resections: Mapping[str, Resection] = field(default_factory=dict)
-    doubtful: tuple[str, ...] = ()
-    unchecked: tuple[str, ...] = ()
+    """Corrections of cameras that are off, where there are points for that."""
+    doubtful: tuple[str, ...] = ()  # cameras that matches contradict, but others fit
+    unchecked: tuple[str, ...] = ()  # cameras that so few matches contradict that chance may have made them
 
 
 def judge(evidence: Evidence, cameras: Mapping[str, Camera]) -> Verdict:

@@ -23,19 +23,12 @@ SURE_PERIODS = 0.5
 
 @dataclass(frozen=True)
 class Clocks:
-    """The clocks of all cameras.
+    """The clocks of all cameras."""
 
-    Args:
-        clocks: by camera.
-        method: how they were found, see ``preparation.synchronization``.
-        summary: the method and its warnings, for users.
-        sure: whether pictures of one moment can be chosen by them.
-    """
-
-    clocks: Mapping[str, Clock]
-    method: str
-    summary: str
-    sure: bool = True
+    clocks: Mapping[str, Clock]  # by camera
+    method: str  # how they were found, see ``preparation.synchronization``
+    summary: str  # the method and its warnings, for users
+    sure: bool = True  # whether pictures of one moment can be chosen by them
 
 
 def synchronized(

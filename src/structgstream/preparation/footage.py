@@ -55,21 +55,14 @@ class NoFootage(CaptureError):
 
 @dataclass(frozen=True)
 class Footage:
-    """What the cameras filmed.
+    """What the cameras filmed."""
 
-    Args:
-        where: the folder it lies in, for messages.
-        files: name of a camera to its video, folder of pictures or picture, in natural order of the names.
-        tracks: of the cameras with videos.
-        stills: of the cameras with pictures, these in order.
-        picture_fps: frames a second of pictures.
-    """
-
-    where: Path
+    where: Path  # the folder it lies in, for messages
     files: Mapping[str, Path]
-    tracks: Mapping[str, VideoTrack]
-    stills: Mapping[str, tuple[Path, ...]]
-    picture_fps: float = PICTURE_FPS
+    """Name of a camera to its video, folder of pictures or picture, in natural order of the names."""
+    tracks: Mapping[str, VideoTrack]  # of the cameras with videos
+    stills: Mapping[str, tuple[Path, ...]]  # of the cameras with pictures, these in order
+    picture_fps: float = PICTURE_FPS  # frames a second of pictures
 
     @property
     def cameras(self) -> tuple[str, ...]:

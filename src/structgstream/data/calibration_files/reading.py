@@ -47,23 +47,16 @@ def json_files_with(folder: Path, key: str) -> Iterator[tuple[Path]]:
 
 @dataclass(frozen=True)
 class CalibrationFormat:
-    """The calibration files of a tool.
-
-    Args:
-        find: gives the sets of files in a folder that are a calibration of the tool each.
-        entries: gives the cameras of such a set by name, with what the files state of them.
-        camera: makes the camera of an entry.
-        expected: what the files contain, for messages.
-        turned_by_exif: see :class:`~structgstream.data.calibration.Calibration`.
-        where: gives the file or folder that messages name.
-    """
+    """The calibration files of a tool."""
 
     find: Callable[[Path], Iterator[tuple[Path, ...]]]
+    """Gives the sets of files in a folder that are a calibration of the tool each."""
     entries: Callable[[tuple[Path, ...]], Iterable[tuple[str, Any]]]
-    camera: Callable[[str, Any], PosedCamera]
-    expected: str
-    turned_by_exif: bool | None = None
-    where: Callable[[tuple[Path, ...]], Path] = operator.itemgetter(0)
+    """Gives the cameras of such a set by name, with what the files state of them."""
+    camera: Callable[[str, Any], PosedCamera]  # makes the camera of an entry
+    expected: str  # what the files contain, for messages
+    turned_by_exif: bool | None = None  # see :class:`~structgstream.data.calibration.Calibration`
+    where: Callable[[tuple[Path, ...]], Path] = operator.itemgetter(0)  # gives the file or folder that messages name
 
     def read(self, files: tuple[Path, ...]) -> Calibration:
         """The cameras of a set of files.

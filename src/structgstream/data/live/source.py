@@ -43,19 +43,12 @@ from structgstream.frames import MIN_CAMERAS, MultiViewFrame
 
 @dataclass(frozen=True)
 class LivePictures:
-    """Pictures as cameras sent them, as a capture, so that the wrappers of captures apply to them.
+    """Pictures as cameras sent them, as a capture, so that the wrappers of captures apply to them."""
 
-    Args:
-        name: of the stream.
-        rig: the cameras of the stored pictures.
-        fps: frames a second.
-        arriving: frames in the order of their arrival.
-    """
-
-    name: str
-    rig: CameraRig
-    fps: float
-    arriving: Iterator[MultiViewFrame]
+    name: str  # of the stream
+    rig: CameraRig  # the cameras of the stored pictures
+    fps: float  # frames a second
+    arriving: Iterator[MultiViewFrame]  # frames in the order of their arrival
     points: NDArray | None = None
 
     def __len__(self) -> int:
@@ -130,25 +123,15 @@ MAX_CAPTURE_TIMES = 16  # of the last frames
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """Options of a live run.
+    """Options of a live run."""
 
-    Args:
-        frames: number of frames after which the stream ends; None for no end.
-        held_out: see ``open_capture``.
-        scale: see ``open_capture``.
-        near: see ``open_capture``.
-        record: folder for the cameras' packets; None for none.
-        resume: whether the stream is continued.
-        denoising: over how many sets frame 0 is averaged.
-    """
-
-    frames: int | None = None
-    held_out: tuple[str, ...] | None = None
-    scale: float = 1.0
-    near: float | None = None
-    record: Path | None = None
-    resume: bool = False
-    denoising: DenoisingConfig = field(default_factory=DenoisingConfig)
+    frames: int | None = None  # number of frames after which the stream ends; None for no end
+    held_out: tuple[str, ...] | None = None  # see ``open_capture``
+    scale: float = 1.0  # see ``open_capture``
+    near: float | None = None  # see ``open_capture``
+    record: Path | None = None  # folder for the cameras' packets; None for none
+    resume: bool = False  # whether the stream is continued
+    denoising: DenoisingConfig = field(default_factory=DenoisingConfig)  # over how many sets frame 0 is averaged
 
 
 class LiveSource:

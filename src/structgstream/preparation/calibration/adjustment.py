@@ -24,15 +24,10 @@ NORMAL_MEDIAN = 1.1774  # of the length of a pair of standard normal numbers
 
 @dataclass(frozen=True)
 class Limits:
-    """Which observations stay.
+    """Which observations stay."""
 
-    Args:
-        pixels: largest reprojection error.
-        degrees: smallest angle between the rays of a point.
-    """
-
-    pixels: float
-    degrees: float = 1.5
+    pixels: float  # largest reprojection error
+    degrees: float = 1.5  # smallest angle between the rays of a point
 
     @classmethod
     def for_pictures(cls, longest_side: int) -> "Limits":

@@ -24,22 +24,15 @@ from structgstream.geometry import Floats
 class Board:
     """What is printed.
 
-    Args:
-        columns: squares across.
-        rows: squares down.
-        square_metres: side of a square.
-        marker_share: side of a marker, of a square's.
-        dictionary: name of one of OpenCV's predefined dictionaries.
-
     Raises:
         ConfigError: sizes that make no board, or an unknown dictionary.
     """
 
-    columns: int = 7
-    rows: int = 5
-    square_metres: float = 0.05
-    marker_share: float = 0.75
-    dictionary: str = "DICT_5X5_100"
+    columns: int = 7  # squares across
+    rows: int = 5  # squares down
+    square_metres: float = 0.05  # side of a square
+    marker_share: float = 0.75  # side of a marker, of a square's
+    dictionary: str = "DICT_5X5_100"  # name of one of OpenCV's predefined dictionaries
 
     def __post_init__(self) -> None:
         if self.columns < 3 or self.rows < 3 or not self.square_metres > 0 or not 0.3 <= self.marker_share <= 0.9:
@@ -110,17 +103,11 @@ MANY_MARKERS = 6
 
 @dataclass(frozen=True)
 class Sighting:
-    """The board in one picture.
+    """The board in one picture."""
 
-    Args:
-        instant: index of the picture.
-        corners: ``[S]`` indices into the board's corners.
-        pixels: ``[S, 2]``, the top-left pixel's centre at (0.5, 0.5).
-    """
-
-    instant: int
-    corners: NDArray[np.intp]
-    pixels: NDArray[np.float64]
+    instant: int  # index of the picture
+    corners: NDArray[np.intp]  # ``[S]`` indices into the board's corners
+    pixels: NDArray[np.float64]  # ``[S, 2]``, the top-left pixel's centre at (0.5, 0.5)
 
 
 def board_sightings(

@@ -177,21 +177,13 @@ MIN_DIFFERENCE = 0.01  # of the usual differences
 
 @dataclass(frozen=True)
 class LensPrior:
-    """A normal prior of terms of lenses about means that groups share.
+    """A normal prior of terms of lenses about means that groups share."""
 
-    Args:
-        group: ``[L]``, of each lens.
-        terms: which terms of the rows have one.
-        means: ``[G, T]``, standard deviations of the means.
-        differences: ``[G, T]``, of lenses of a group from its mean.
-        usual: ``[T]``, of ``differences`` before any were estimated.
-    """
-
-    group: NDArray[np.intp]
-    terms: tuple[int, ...]
-    means: Floats
-    differences: Floats
-    usual: Floats
+    group: NDArray[np.intp]  # ``[L]``, of each lens
+    terms: tuple[int, ...]  # which terms of the rows have one
+    means: Floats  # ``[G, T]``, standard deviations of the means
+    differences: Floats  # ``[G, T]``, of lenses of a group from its mean
+    usual: Floats  # ``[T]``, of ``differences`` before any were estimated
 
     def cost(self, rows: Floats) -> float:
         """Minus the logarithm of the density, but for a constant."""

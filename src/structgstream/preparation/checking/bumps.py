@@ -40,15 +40,10 @@ Judgement = Literal["bumped", "stood", "unknown"]
 
 @dataclass(frozen=True)
 class Movement:
-    """How what is seen in a picture moved.
+    """How what is seen in a picture moved."""
 
-    Args:
-        pixels: median shift; 0 for a picture that stayed.
-        homography: ``[3, 3]``, from pixels of the first picture to pixels of the other.
-    """
-
-    pixels: float
-    homography: Floats
+    pixels: float  # median shift; 0 for a picture that stayed
+    homography: Floats  # ``[3, 3]``, from pixels of the first picture to pixels of the other
 
     @property
     def stayed(self) -> bool:

@@ -45,50 +45,31 @@ from structgstream.preparation.steps import Listener, Silent
 
 @dataclass(frozen=True)
 class PairCheck:
-    """Matches of two pictures against the given poses.
+    """Matches of two pictures against the given poses."""
 
-    Args:
-        first: name of a camera.
-        second: name of another.
-        matches: good matches, found without the poses; 0 where the cameras see too little in common.
-        epipolar_pixels: their median distance to the epipolar lines of the poses; None without matches.
-        share_violating: share of them that the poses cannot explain; None without matches.
-    """
-
-    first: str
-    second: str
-    matches: int
-    epipolar_pixels: float | None
-    share_violating: float | None
+    first: str  # name of a camera
+    second: str  # name of another
+    matches: int  # good matches, found without the poses; 0 where the cameras see too little in common
+    epipolar_pixels: float | None  # their median distance to the epipolar lines of the poses; None without matches
+    share_violating: float | None  # share of them that the poses cannot explain; None without matches
 
 
 @dataclass(frozen=True)
 class CameraCheck:
-    """What was found of one camera.
-
-    Args:
-        reprojection_pixels: median distance of its keypoints to points that other cameras agree on; None without any.
-        reprojection_pixels_90: their 90th percentile.
-        points: number of these points.
-        overlaps: number of cameras that it has matches with.
-        exposure_stops: exposure relative to the median camera, as a power of two; None without matches.
-        red_stops: red against green, relative to the median camera.
-        blue_stops: blue against green, relative to the median camera.
-        offset_ms: time against the other cameras, milliseconds; None where it was not estimated.
-        offset_uncertainty_ms: its standard deviation.
-        frames_lacking: number of the capture's frames that it has no picture of.
-    """
+    """What was found of one camera."""
 
     reprojection_pixels: float | None
-    reprojection_pixels_90: float | None
-    points: int
-    overlaps: int
+    """Median distance of its keypoints to points that other cameras agree on; None without any."""
+    reprojection_pixels_90: float | None  # their 90th percentile
+    points: int  # number of these points
+    overlaps: int  # number of cameras that it has matches with
     exposure_stops: float | None = None
-    red_stops: float | None = None
-    blue_stops: float | None = None
-    offset_ms: float | None = None
-    offset_uncertainty_ms: float | None = None
-    frames_lacking: int = 0
+    """Exposure relative to the median camera, as a power of two; None without matches."""
+    red_stops: float | None = None  # red against green, relative to the median camera
+    blue_stops: float | None = None  # blue against green, relative to the median camera
+    offset_ms: float | None = None  # time against the other cameras, milliseconds; None where it was not estimated
+    offset_uncertainty_ms: float | None = None  # its standard deviation
+    frames_lacking: int = 0  # number of the capture's frames that it has no picture of
 
 
 @dataclass(frozen=True)
@@ -143,18 +124,14 @@ FAR_AWAY = 30.0  # radii of the rig: a camera that stands further away is in ano
 
 @dataclass(frozen=True)
 class Examination:
-    """All that was found at one instant; the pictures of a report are drawn from it.
-
-    Args:
-        presence: by camera, which frames of the capture it has a picture of.
-    """
+    """All that was found at one instant; the pictures of a report are drawn from it."""
 
     frame: MultiViewFrame
     cameras: Mapping[str, Camera]
     evidence: Evidence
     verdict: Verdict
     colors: Mapping[str, Color]
-    presence: Presence = field(default_factory=dict)
+    presence: Presence = field(default_factory=dict)  # by camera, which frames of the capture it has a picture of
 
     @property
     def suspects(self) -> Suspects:

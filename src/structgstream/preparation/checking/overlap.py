@@ -19,17 +19,11 @@ MIN_OVERLAPS = 2
 
 @dataclass(frozen=True)
 class Coverage:
-    """How much of the scene how many cameras see.
+    """How much of the scene how many cameras see."""
 
-    Args:
-        points: number of points that were triangulated.
-        seen_by_three: share of them that at least three cameras see.
-        median_cameras: median number of cameras that see a point.
-    """
-
-    points: int
-    seen_by_three: float
-    median_cameras: float
+    points: int  # number of points that were triangulated
+    seen_by_three: float  # share of them that at least three cameras see
+    median_cameras: float  # median number of cameras that see a point
 
 
 def cameras_per_point(points: Floats, cameras: Mapping[str, Camera]) -> NDArray[np.intp]:

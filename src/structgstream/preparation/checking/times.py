@@ -41,25 +41,19 @@ SIGMAS, SURE_SIGMAS = 3.0, 2.0
 
 @dataclass(frozen=True)
 class SynchronizationCheck:
-    """Result of the check.
-
-    Args:
-        late_seconds: camera to how much later than stated its pictures were taken, relative to most cameras; of the
-            cameras that can be judged. Stated are their own time stamps, where the capture has them.
-        uncertainty_seconds: the standard errors of these.
-        off: cameras that are late or early by more than a quarter of a frame period, and more than chance.
-        undecided: cameras in whose pictures too little moves that others see.
-        period_seconds: the frame period.
-        apart_seconds: camera to how long after their instants its pictures were taken by their time stamps, relative to
-            most cameras; empty where the capture has no time stamps.
-    """
+    """Result of the check."""
 
     late_seconds: Mapping[str, float]
-    uncertainty_seconds: Mapping[str, float]
+    """Camera to how much later than stated its pictures were taken, relative to most cameras; of the cameras that can
+    be judged. Stated are their own time stamps, where the capture has them."""
+    uncertainty_seconds: Mapping[str, float]  # the standard errors of these
     off: tuple[str, ...]
-    undecided: tuple[str, ...]
-    period_seconds: float
+    """Cameras that are late or early by more than a quarter of a frame period, and more than chance."""
+    undecided: tuple[str, ...]  # cameras in whose pictures too little moves that others see
+    period_seconds: float  # the frame period
     apart_seconds: Mapping[str, float] = field(default_factory=dict)
+    """Camera to how long after their instants its pictures were taken by their time stamps, relative to most cameras;
+    empty where the capture has no time stamps."""
 
     @property
     def between(self) -> dict[str, float]:

@@ -36,18 +36,13 @@ RIVAL_POWER = 6  # of a peak's share of the best one: how likely it is the right
 
 @dataclass(frozen=True)
 class Window:
-    """The lag of one window.
+    """The lag of one window."""
 
-    Args:
-        middle: its second by the first camera's clock.
-        seconds: the lag where phases agree best, by the second clock minus by the first.
-        curve: ``[N]`` correlation at lags up to ``REACH_SECONDS`` on both sides of ``seconds``, in units of its root
-            mean square; 0 where it was not looked at.
-    """
-
-    middle: float
-    seconds: float
+    middle: float  # its second by the first camera's clock
+    seconds: float  # the lag where phases agree best, by the second clock minus by the first
     curve: Floats
+    """``[N]`` correlation at lags up to ``REACH_SECONDS`` on both sides of ``seconds``, in units of its root mean
+    square; 0 where it was not looked at."""
 
 
 @dataclass(frozen=True)
@@ -148,25 +143,16 @@ ALL_PAIRS = 12
 
 @dataclass(frozen=True)
 class PairLag:
-    """What is known of the clocks of two cameras.
+    """What is known of the clocks of two cameras."""
 
-    Args:
-        first: name of a camera.
-        second: name of another.
-        instants: seconds by the first camera's clock, and the lag there: the second camera's second minus that.
-        sigma_seconds: standard error of each lag.
-        ambiguity_seconds: standard error that all of them share, because another peak may be the right one.
-        confidence: how distinct it is.
-        fine: whether the lag comes from phases, so that loops close.
-    """
-
-    first: str
-    second: str
+    first: str  # name of a camera
+    second: str  # name of another
     instants: tuple[tuple[float, float], ...]
-    sigma_seconds: float
-    ambiguity_seconds: float
-    confidence: float
-    fine: bool = True
+    """Seconds by the first camera's clock, and the lag there: the second camera's second minus that."""
+    sigma_seconds: float  # standard error of each lag
+    ambiguity_seconds: float  # standard error that all of them share, because another peak may be the right one
+    confidence: float  # how distinct it is
+    fine: bool = True  # whether the lag comes from phases, so that loops close
 
     def at(self, seconds: float) -> float:
         """The second camera's second at a second of the first camera's, by a line through the lags."""

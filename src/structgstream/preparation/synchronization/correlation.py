@@ -44,25 +44,16 @@ class Signal:
 
 @dataclass(frozen=True)
 class Lag:
-    """Where two signals agree best.
+    """Where two signals agree best."""
 
-    Args:
-        seconds: time in the second signal minus time in the first.
-        sigma_seconds: standard error, from the peaks without each group of channels; half a step with a single channel.
-        peak: correlation there, at most 1.
-        judged: correlation times the square root of the overlap's share of the longest one.
-        rival: largest such value outside the peak.
-        deviation: standard deviation of such values over all lags, as chance makes them.
-        middle: the middle of the overlap, by the first signal's time.
-    """
-
-    seconds: float
+    seconds: float  # time in the second signal minus time in the first
     sigma_seconds: float
-    peak: float
-    judged: float
-    rival: float
-    deviation: float
-    middle: float
+    """Standard error, from the peaks without each group of channels; half a step with a single channel."""
+    peak: float  # correlation there, at most 1
+    judged: float  # correlation times the square root of the overlap's share of the longest one
+    rival: float  # largest such value outside the peak
+    deviation: float  # standard deviation of such values over all lags, as chance makes them
+    middle: float  # the middle of the overlap, by the first signal's time
 
 
 def require_scipy() -> None:
@@ -255,23 +246,14 @@ MIN_ENERGY = 0.05  # of a block, of the mean one: below it is no more reliable
 
 @dataclass(frozen=True)
 class Line:
-    """A lag that changes in proportion to time.
+    """A lag that changes in proportion to time."""
 
-    Args:
-        middle: second by the first signal's time at which the lag is ``lag_seconds``.
-        lag_seconds: time in the second signal minus time in the first.
-        rate: change of the lag a second; None where the signals do not determine it.
-        spread_seconds: standard deviation of the blocks' times.
-        lag_changes: ``[K]`` seconds, change of the lag without each of the blocks.
-        rate_changes: ``[K]``, that of the rate.
-    """
-
-    middle: float
-    lag_seconds: float
-    rate: float | None
-    spread_seconds: float
-    lag_changes: Floats
-    rate_changes: Floats
+    middle: float  # second by the first signal's time at which the lag is ``lag_seconds``
+    lag_seconds: float  # time in the second signal minus time in the first
+    rate: float | None  # change of the lag a second; None where the signals do not determine it
+    spread_seconds: float  # standard deviation of the blocks' times
+    lag_changes: Floats  # ``[K]`` seconds, change of the lag without each of the blocks
+    rate_changes: Floats  # ``[K]``, that of the rate
 
     @property
     def lag_sigma(self) -> float:

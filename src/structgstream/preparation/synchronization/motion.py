@@ -53,18 +53,13 @@ OPTIMISM = 1.5  # true errors of pairs over their jackknife errors, measured on 
 
 @dataclass(frozen=True)
 class PairSignals:
-    """Signals of two cameras that rise and fall together.
-
-    Args:
-        epipolar: whether they belong to corresponding epipolar lines, else to whole pictures.
-        estimated: whether the epipolar geometry is an estimate that may be wrong.
-    """
+    """Signals of two cameras that rise and fall together."""
 
     first: str
     second: str
     signals: tuple[Signal, Signal]
-    epipolar: bool
-    estimated: bool = False
+    epipolar: bool  # whether they belong to corresponding epipolar lines, else to whole pictures
+    estimated: bool = False  # whether the epipolar geometry is an estimate that may be wrong
 
 
 def pair_signals(changes: Mapping[str, Changes], geometry: Geometry | None) -> list[PairSignals]:

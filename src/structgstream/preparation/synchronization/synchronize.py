@@ -44,37 +44,25 @@ WARNED_SECONDS = 5e-3
 
 @dataclass(frozen=True)
 class ClockEstimate:
-    """A camera's clock.
+    """A camera's clock."""
 
-    Args:
-        clock: from the camera's stamps to common time.
-        method: ``csv``, ``stamps``, ``audio``, ``motion`` or ``none``.
-        uncertainty_seconds: standard error of its common times, relative to the mean of all cameras.
-        residual_seconds: how much later than the common instants the camera's frames are that are nearest to them: the
-            misalignment that choosing frames leaves; of the frames of the take, the one with the largest amount.
-    """
-
-    clock: Clock
-    method: str
-    uncertainty_seconds: float
+    clock: Clock  # from the camera's stamps to common time
+    method: str  # ``csv``, ``stamps``, ``audio``, ``motion`` or ``none``
+    uncertainty_seconds: float  # standard error of its common times, relative to the mean of all cameras
     residual_seconds: float
+    """How much later than the common instants the camera's frames are that are nearest to them: the misalignment that
+    choosing frames leaves; of the frames of the take, the one with the largest amount."""
 
 
 @dataclass(frozen=True)
 class Synchronization:
-    """The clocks of all cameras.
-
-    Args:
-        clocks: camera to its clock; the common clock is that of the first camera, or the one that stamps are of.
-        method: how they were found.
-        reason: why this method was chosen, a sentence.
-        warnings: what the user should know, sentences.
-    """
+    """The clocks of all cameras."""
 
     clocks: Mapping[str, ClockEstimate]
-    method: str
-    reason: str
-    warnings: tuple[str, ...]
+    """Camera to its clock; the common clock is that of the first camera, or the one that stamps are of."""
+    method: str  # how they were found
+    reason: str  # why this method was chosen, a sentence
+    warnings: tuple[str, ...]  # what the user should know, sentences
 
 
 def synchronization(
