@@ -13,9 +13,9 @@ from structgstream.data.calibration import Calibration, PosedCamera
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
-from structgstream.preparation.camera_steps import check_enough, check_used, chosen_method
 from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import PrepareOptions
+from structgstream.preparation.prepare import check_enough, check_used, chosen_method
 from structgstream.preparation.solvers import check_complete, given_cameras, packed, summary, unpacked
 from structgstream.preparation.steps import Stored
 from tests.support.captures import write_video
