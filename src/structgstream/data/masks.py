@@ -26,7 +26,7 @@ from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, opencv, red
 from structgstream.data.source import FrameSource
 from structgstream.data.timeline import natural
 from structgstream.data.undistortion import UndistortedSource
-from structgstream.data.wrappers import SourceWrapper, resized_to
+from structgstream.data.wrappers import SourceWrapper, innermost, resized_to
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
 
@@ -160,8 +160,7 @@ def _masks(folder: Path) -> list[Path]:
 
 def _instants(name: str, source: FrameSource) -> tuple[str, ...]:
     """What the frames of a camera are called in its files; nothing for videos."""
-    while isinstance(source, SourceWrapper):
-        source = source.source
+    source = innermost(source)
     if not isinstance(source, ImageSource):
         return ()
     return source.instants or tuple("" if file is None else file.stem for file in source.files[name])

@@ -173,11 +173,6 @@ def prepared_rig(path: Path, capture: PreparedCapture) -> CameraRig:
     return _rig({name: camera.pinhole for name, camera in capture.cameras.items()}, capture, path)
 
 
-def lens_model(lens: Lens) -> str:
-    """The name of a lens model in files."""
-    return next(model for model, kind in LENSES.items() if isinstance(lens, kind))
-
-
 def camera_of(viewmat: Any, K: Any, size: Sequence[int]) -> Camera:
     """A camera from plain numbers.
 
@@ -243,15 +238,24 @@ def _read_points(path: Path, capture: PreparedCapture) -> NDArray[np.float64] | 
 
 
 def _camera_entry(camera: PreparedCamera) -> dict[str, Any]:
-    filmed, pinhole, lens = camera.filmed.camera, camera.pinhole, camera.filmed.lens
+    pinhole = camera.pinhole
     return {
         "files": camera.files,
-        "size": [filmed.width, filmed.height],
-        "K": filmed.K.tolist(),
-        "lens": {"model": lens_model(lens), **asdict(lens)},
-        "viewmat": filmed.viewmat.tolist(),
+        **filmed_entry(camera.filmed),
         "clock": asdict(camera.clock),
         "pinhole": {"size": [pinhole.width, pinhole.height], "K": pinhole.K.tolist()},
+    }
+
+
+def filmed_entry(filmed: LensCamera) -> dict[str, Any]:
+    """A camera with its lens as plain values."""
+    camera, lens = filmed.camera, filmed.lens
+    model = next(model for model, kind in LENSES.items() if isinstance(lens, kind))
+    return {
+        "size": [camera.width, camera.height],
+        "K": camera.K.tolist(),
+        "lens": {"model": model, **asdict(lens)},
+        "viewmat": camera.viewmat.tolist(),
     }
 
 

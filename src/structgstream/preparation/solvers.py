@@ -3,9 +3,7 @@
 
 import shlex
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +14,7 @@ from structgstream.data.images import read_exif
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.posed_capture import filmed_by, orientations
 from structgstream.data.prepared import FILE as PREPARED
-from structgstream.data.prepared import LENSES, camera_of, lens_model, read_prepared
+from structgstream.data.prepared import LENSES, camera_of, filmed_entry, read_prepared
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.calibration.board_solving import solve_board
 from structgstream.preparation.calibration.refinement import refine
@@ -203,15 +201,7 @@ def summary(solved: SolvedCalibration) -> str:
 
 def packed(solved: SolvedCalibration) -> Stored:
     """The calibration as plain values."""
-    cameras: dict[str, Any] = {}
-    for name, filmed in solved.cameras.items():
-        camera = filmed.camera
-        cameras[name] = {
-            "size": [camera.width, camera.height],
-            "K": camera.K.tolist(),
-            "viewmat": camera.viewmat.tolist(),
-            "lens": {"model": lens_model(filmed.lens), **asdict(filmed.lens)},
-        }
+    cameras = {name: filmed_entry(filmed) for name, filmed in solved.cameras.items()}
     seen = solved.observations
     arrays = {
         "points": solved.points, "point": seen.point, "camera": seen.camera, "pixels": seen.pixels,

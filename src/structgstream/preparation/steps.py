@@ -39,31 +39,19 @@ class Listener(Protocol):
 
     def begin(self, step: str, *, skipped: bool) -> None:
         """A step begins; ``skipped`` when its result is there already."""
-        ...
 
     def progress(self, done: int, total: int, what: str) -> None:
         """A part of the running step is done."""
-        ...
 
     def end(self, step: str, summary: str) -> None:
         """A step is done; ``summary`` describes its result."""
-        ...
 
 
-class Silent:
+class Silent(Listener):
     """A listener that does nothing."""
 
-    def begin(self, step: str, *, skipped: bool) -> None:
-        """Does nothing."""
 
-    def progress(self, done: int, total: int, what: str) -> None:
-        """Does nothing."""
-
-    def end(self, step: str, summary: str) -> None:
-        """Does nothing."""
-
-
-class Steps:
+class Steps(Listener):
     """Runs the steps of one capture, reports them, and records their summaries.
 
     Args:

@@ -77,6 +77,12 @@ def _find_anipose(folder: Path) -> Iterator[tuple[Path, ...]]:
                 yield (file,)
 
 
+def _named(folder: Path, *names: str) -> Iterator[tuple[Path, ...]]:
+    """The files of these names in ``folder``, if the first is there."""
+    if (folder / names[0]).is_file():
+        yield tuple(folder / name for name in names)
+
+
 def _anipose_entries(files: tuple[Path, ...]) -> Entries:
     content = read_toml(files[0])
     tables = content.get("cameras", content)
@@ -97,11 +103,6 @@ def _anipose_camera(name: str, table: dict[str, Any]) -> PosedCamera:
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
 EASYMOCAP_EXPECTED = "names, K_NAME and D_NAME in intri.yml, and R_NAME or Rot_NAME and T_NAME in extri.yml"
-
-
-def _find_easymocap(folder: Path) -> Iterator[tuple[Path, ...]]:
-    if (folder / INTRINSICS).is_file():
-        yield (folder / INTRINSICS, folder / EXTRINSICS)
 
 
 def _easymocap_entries(files: tuple[Path, ...]) -> Entries:
@@ -219,11 +220,6 @@ def _cmu_camera(name: str, entry: dict[str, Any]) -> PosedCamera:
 
 # ZJU-MoCap: annots.npy, in millimetres. ``cams`` has lists K, D, R and T; ``ims`` the pictures of each instant,
 # ``CAMERA/FRAME.jpg`` in the order of the cameras.
-
-
-def _find_zju(folder: Path) -> Iterator[tuple[Path, ...]]:
-    if (folder / "annots.npy").is_file():
-        yield (folder / "annots.npy",)
 
 
 def _zju_entries(files: tuple[Path, ...]) -> Entries:
@@ -362,7 +358,11 @@ ANIPOSE = CalibrationFormat(
     turned_by_exif=True,
 )
 EASYMOCAP = CalibrationFormat(
-    _find_easymocap, _easymocap_entries, _easymocap_camera, EASYMOCAP_EXPECTED, turned_by_exif=True
+    lambda folder: _named(folder, INTRINSICS, EXTRINSICS),
+    _easymocap_entries,
+    _easymocap_camera,
+    EASYMOCAP_EXPECTED,
+    turned_by_exif=True,
 )
 MULTICAL = CalibrationFormat(
     partial(json_files_with, key="camera_poses"),
@@ -390,7 +390,10 @@ QUALISYS = CalibrationFormat(
     "cameras of video with fov_video, transform and intrinsic, as Qualisys Track Manager exports it",
 )
 ZJU_MOCAP = CalibrationFormat(
-    _find_zju, _zju_entries, _zju_camera, "a dictionary with cams (lists K, D, R and T) and ims, as ZJU-MoCap has it"
+    lambda folder: _named(folder, "annots.npy"),
+    _zju_entries,
+    _zju_camera,
+    "a dictionary with cams (lists K, D, R and T) and ims, as ZJU-MoCap has it",
 )
 PROJECTIONS = CalibrationFormat(
     _find_projections,

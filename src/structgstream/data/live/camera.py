@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 import numpy as np
 
 from structgstream.data.live.clock import ClockMapper
+from structgstream.data.live.recorder import CameraRecorder
 from structgstream.data.live.rig_file import LiveCamera, TimeBase
 from structgstream.data.live.status import Fault, FaultLog
 from structgstream.data.live.synchronizer import LivePicture
@@ -48,14 +49,6 @@ class Receiver(Protocol):
 
     def others_changed_at(self, camera: str) -> float:
         """When the picture of another camera last changed, monotonic seconds."""
-        ...
-
-
-class PacketRecorder(Protocol):
-    """Records a camera's packets unchanged."""
-
-    def record(self, packet: "Packet", *, shift_seconds: float) -> None:
-        """Records a packet, whose time on the common clock is its stamp plus ``shift_seconds``."""
         ...
 
 
@@ -96,7 +89,7 @@ class CameraFeed:
         unix_offset: float,
         silent_seconds: float,
         stuck_seconds: float,
-        recorder: PacketRecorder | None = None,
+        recorder: CameraRecorder | None = None,
         open_camera: OpenCamera | None = None,
         wait: Callable[[float], object] | None = None,
     ) -> None:

@@ -172,7 +172,7 @@ class CameraRecorder:
         self._lock = threading.Lock()
 
     def record(self, packet: "Packet", *, shift_seconds: float) -> None:
-        """See ``camera.PacketRecorder``."""
+        """Records a packet, whose time on the common clock is its stamp plus ``shift_seconds``."""
         if self._failed or packet.pts is None or packet.time_base is None:
             return
         try:

@@ -157,7 +157,7 @@ def _slack(frames: int, fps: float) -> int:
 def _stopped(ends: Mapping[str, int], last: int, fps: float) -> Finding:
     """What cameras that end a little early leave, by the number of frames at which each ends."""
     names = list(ends)
-    listed = ", ".join(repr(name) for name in names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
+    listed = ", ".join(map(repr, names[:8])) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
     first = min(ends.values())
     return Finding(
         "note",

@@ -5,9 +5,8 @@ from structgstream.preparation.synchronization.synchronize import (
     METHODS,
     ClockEstimate,
     Method,
-    Streams,
     Synchronization,
     synchronize,
 )
 
-__all__ = ["METHODS", "ClockEstimate", "Method", "Streams", "Synchronization", "synchronize"]
+__all__ = ["METHODS", "ClockEstimate", "Method", "Synchronization", "synchronize"]

@@ -10,7 +10,6 @@ Zisserman, chapter 9.) The geometry comes from a calibration, or from what stand
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -183,14 +182,6 @@ def _summed(view: Changes, angles: Floats, edges: Floats) -> Floats:
     return np.sqrt(sums / counts, dtype=np.float64)
 
 
-class Geometry(Protocol):
-    """Says how the views of two cameras are related."""
-
-    def pair(self, first: str, second: str, /) -> PairGeometry | None:
-        """None where it is not known."""
-        ...
-
-
 @dataclass(frozen=True)
 class CalibratedGeometry:
     """Epipolar geometry of calibrated cameras; the cameras of a pair need different positions."""
@@ -237,6 +228,9 @@ class StaticGeometry:
         if F is None or F.shape != (3, 3) or int(inliers.sum()) < MIN_INLIERS:
             return None
         return PairGeometry(F, (_same, _same), estimated=True)
+
+
+Geometry = CalibratedGeometry | StaticGeometry
 
 
 def static_features(pictures: list[NDArray[np.uint8]]) -> Features:

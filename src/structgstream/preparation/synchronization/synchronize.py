@@ -2,11 +2,11 @@
 """Synchronises the files of still cameras that run freely."""
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from structgstream.data.lenses import LensCamera
 from structgstream.data.timeline import Clock, counted_rate, period_seconds
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.geometry import Floats
+from structgstream.preparation.footage import Footage
 from structgstream.preparation.synchronization.audio import (
     SPEED_OF_SOUND,
     UnusableSoundError,
@@ -154,36 +155,8 @@ STATIC_PICTURES = 9
 MOTION_SECONDS = 60.0  # of the beginning of each take, in which motion is compared
 
 
-class Streams(Protocol):
-    """The files of each camera as filmed. Names of cameras are arguments of every function."""
-
-    @property
-    def cameras(self) -> tuple[str, ...]: ...
-
-    def stamps(self, name: str, /) -> NDArray[np.float64]:
-        """Seconds ``[T]`` of every frame by the camera's own clock, ascending."""
-        ...
-
-    def pictures(self, name: str, indices: NDArray[np.intp], /) -> Iterator[NDArray[np.uint8]]:
-        """The pictures ``[H, W, 3]`` sRGB of these frames (ascending), one after another."""
-        ...
-
-    def audio(self, name: str, /) -> tuple[NDArray[np.float32], float] | None:
-        """Mono samples ``[N]`` and their rate in hertz, the first sample at the second 0 of :meth:`stamps`; None
-        without sound."""
-        ...
-
-    def size(self, name: str, /) -> tuple[int, int]:
-        """Width and height of the pictures, pixels."""
-        ...
-
-    def metadata(self, name: str, /) -> Mapping[str, str]:
-        """What the camera's file states as text, by lower-case key: ``creation_time``, ``timecode``."""
-        ...
-
-
 def synchronize(
-    streams: Streams,
+    footage: Footage,
     *,
     method: Method = "auto",
     timestamps: Path | None = None,
@@ -192,7 +165,7 @@ def synchronize(
     """The clocks of the cameras.
 
     Args:
-        streams: the files of each camera.
+        footage: the files of each camera.
         method: ``csv`` (``timestamps``), ``stamps`` (of the files, which share a clock), ``audio``, ``motion``,
             ``none`` (the cameras were started by one signal: stamps hold as they are), or ``auto``: csv if given,
             else audio if all cameras have sound in which something is common, else motion.
@@ -209,7 +182,7 @@ def synchronize(
         raise ConfigError(
             "Synchronisation by csv needs timestamps.csv with the columns camera,frame,seconds; give its path."
         )
-    stamps = {name: np.asarray(streams.stamps(name), np.float64) for name in streams.cameras}
+    stamps = {name: np.asarray(footage.stamps(name), np.float64) for name in footage.cameras}
     for name, own in stamps.items():
         if not len(own):
             raise CaptureError(f"Camera {name!r} has no frames; add them or remove the camera.")
@@ -218,28 +191,28 @@ def synchronize(
     if method == "none":
         return _unchanged(stamps)
     if method == "stamps":
-        return _by_stamps(streams, stamps)
+        return _by_stamps(footage, stamps)
     require_scipy()
     if method == "motion":
-        return _by_motion(streams, stamps, cameras, "motion was requested")
+        return _by_motion(footage, stamps, cameras, "motion was requested")
     if method == "audio":
-        return _by_audio(streams, stamps, "audio was requested")
-    return _automatic(streams, stamps, cameras)
+        return _by_audio(footage, stamps, "audio was requested")
+    return _automatic(footage, stamps, cameras)
 
 
 def _automatic(
-    streams: Streams,
+    footage: Footage,
     stamps: Mapping[str, NDArray[np.float64]],
     cameras: Mapping[str, LensCamera] | None,
 ) -> Synchronization:
     try:
-        return _by_audio(streams, stamps, "all cameras have sound")
+        return _by_audio(footage, stamps, "all cameras have sound")
     except CaptureError as problem:
         unusable = problem.reason if isinstance(problem, UnusableSoundError) else str(problem).rstrip(".")
     reason = f"sound cannot be used ({unusable})"
     _log.info("synchronised by motion: %s", reason)
     try:
-        return _by_motion(streams, stamps, cameras, reason)
+        return _by_motion(footage, stamps, cameras, reason)
     except CaptureError as problem:
         raise CaptureError(f"{problem} Nor can sound be used: {unusable}.") from None
 
@@ -260,8 +233,8 @@ def _unchanged(stamps: Mapping[str, NDArray[np.float64]]) -> Synchronization:
     return synchronization(stamps, clocks, exact, method="none", reason="the cameras are said to be synchronous")
 
 
-def _by_stamps(streams: Streams, stamps: Mapping[str, NDArray[np.float64]]) -> Synchronization:
-    found = wall_clocks(stamps, {name: streams.metadata(name) for name in stamps})
+def _by_stamps(footage: Footage, stamps: Mapping[str, NDArray[np.float64]]) -> Synchronization:
+    found = wall_clocks(stamps, {name: footage.metadata(name) for name in stamps})
     return synchronization(
         stamps,
         {name: own.clock for name, own in found.items()},
@@ -271,8 +244,8 @@ def _by_stamps(streams: Streams, stamps: Mapping[str, NDArray[np.float64]]) -> S
     )
 
 
-def _by_audio(streams: Streams, stamps: Mapping[str, NDArray[np.float64]], reason: str) -> Synchronization:
-    recorded = {name: streams.audio(name) for name in stamps}
+def _by_audio(footage: Footage, stamps: Mapping[str, NDArray[np.float64]], reason: str) -> Synchronization:
+    recorded = {name: footage.audio(name) for name in stamps}
     mute = next((name for name, sound in recorded.items() if sound is None), None)
     if mute is not None:
         raise UnusableSoundError(f"Camera {mute!r} has no sound", "synchronise by motion or timestamps.csv")
@@ -302,7 +275,7 @@ def _by_audio(streams: Streams, stamps: Mapping[str, NDArray[np.float64]], reaso
 
 
 def _by_motion(
-    streams: Streams,
+    footage: Footage,
     stamps: Mapping[str, NDArray[np.float64]],
     cameras: Mapping[str, LensCamera] | None,
     reason: str,
@@ -310,9 +283,9 @@ def _by_motion(
     if len(stamps) < 2:
         return _unchanged(stamps)
     used = {name: own[own <= own[0] + MOTION_SECONDS] for name, own in stamps.items()}
-    changes = {name: picture_changes(streams.pictures(name, np.arange(len(own))), own) for name, own in used.items()}
+    changes = {name: picture_changes(footage.pictures(name, np.arange(len(own))), own) for name, own in used.items()}
     require_motion(changes)
-    geometry: Geometry = CalibratedGeometry(cameras) if cameras else _static_geometry(streams, used)
+    geometry: Geometry = CalibratedGeometry(cameras) if cameras else _static_geometry(footage, used)
     period = max(period_seconds(own) for own in stamps.values())
     takes = {name: (float(own[0]), float(own[-1])) for name, own in used.items()}
     solution = solve_by_motion(takes, pair_signals(changes, geometry), slack_seconds=period / 2, drift=True)
@@ -340,9 +313,9 @@ def require_motion(changes: Mapping[str, Changes]) -> None:
         )
 
 
-def _static_geometry(streams: Streams, stamps: Mapping[str, NDArray[np.float64]]) -> StaticGeometry:
+def _static_geometry(footage: Footage, stamps: Mapping[str, NDArray[np.float64]]) -> StaticGeometry:
     features = {}
     for name, own in stamps.items():
         indices = np.unique(np.linspace(0, len(own) - 1, STATIC_PICTURES).round().astype(int))
-        features[name] = static_features(list(streams.pictures(name, indices)))
-    return StaticGeometry(features, {name: streams.size(name) for name in stamps})
+        features[name] = static_features(list(footage.pictures(name, indices)))
+    return StaticGeometry(features, {name: footage.size(name) for name in stamps})
