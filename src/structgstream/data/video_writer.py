@@ -27,7 +27,7 @@ class VideoWriter(AbstractContextManager["VideoWriter"]):
     Args:
         path: the file to write; its folder is made when it is missing.
         fps: frames a second.
-        crf: constant rate factor of x264; 18 is hard to tell from the source.
+        crf: constant rate factor of x264; 18 is visually lossless.
 
     Raises:
         StorageError: the file cannot be written, or this PyAV has no H.264 encoder.

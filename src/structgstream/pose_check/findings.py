@@ -212,7 +212,7 @@ def _doubtful(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verd
 
 
 def _unchecked(evidence: Evidence, cameras: Mapping[str, Camera], name: str, verdict: Verdict) -> Finding:
-    """A camera with too few matches to tell wrong ones from a wrong pose."""
+    """A camera with too few matches to distinguish wrong ones from a wrong pose."""
     sentence = (
         f"The pose of camera {name!r} could not be checked: its few matches, with "
         f"{_bad_pairs(evidence, cameras, name, verdict)}, do not lie on the epipolar lines, as wrong matches do not "

@@ -65,7 +65,7 @@ def test_a_near_plane_in_metres_before_positions_in_millimetres_is_told() -> Non
     assert scale_findings(100 * depths, None, cameras, radius=300.0, unit=None) == []
     (found,) = scale_findings(1000 * depths, None, cameras, radius=3000.0, unit=None)
     assert found.severity == "warning"
-    assert "positions in millimetres beside a near plane in metres" in found.sentence
+    assert "positions in millimetres and a near plane in metres" in found.sentence
     assert float(found.sentence.split("--near ")[1].rstrip(".")) == pytest.approx(500 * nearest, rel=0.01)
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bundle adjustment of cameras that are alike, which COLMAP's has no terms for.
 
-Apart from cameras, bodies are adjusted: points, or poses of a board whose corners are known. They are eliminated
+Cameras and bodies are adjusted; bodies are points, or poses of a board whose corners are known. They are eliminated
 from the normal equations (Brown, 1958; Triggs et al., Bundle adjustment: a modern synthesis, 2000), which are solved by
 Levenberg's and Marquardt's method with Huber's loss. Terms of intrinsics may have a prior that cameras share
 (``lens_terms.py``).

@@ -120,7 +120,7 @@ def _judged(
     enough = [(stood, bumped) for stood, bumped in votes if stood + bumped >= MIN_VOTES]
     if any(bumped > stood for stood, bumped in enough):
         return "bumped"
-    # By its calibration at the first instant alone a camera that was bumped later would stand, too.
+    # At the first instant a camera that was bumped later fits its calibration, too.
     return "stood" if enough and votes[1] in enough else "unknown"
 
 
@@ -158,8 +158,8 @@ def _bumped(name: str, movement: Movement, frames: tuple[int, int]) -> Finding:
 def _undecided(names: list[str], frames: tuple[int, int]) -> Finding:
     return Finding(
         "note",
-        f"Whether {listed(names)} stood still between frame {frames[0]} and frame {frames[1]} cannot be told: nearly "
-        "all that their pictures show moved, and no other camera confirms it; let something with texture stand still "
-        "in the pictures.",
+        f"It cannot be determined whether {listed(names)} stood still between frame {frames[0]} and frame {frames[1]}: "
+        "nearly all that their pictures show moved, and no other camera confirms it; let something with texture stand "
+        "still in the pictures.",
         tuple(names),
     )

@@ -154,7 +154,7 @@ def scale_findings(
             Finding(
                 "warning",
                 f"The near plane lies at {near:.4g}, and the nearest points at {nearest:.4g}: poses and near plane look"
-                " like different units of length, as of positions in millimetres beside a near plane in metres; convert"
+                " like different units of length, as of positions in millimetres and a near plane in metres; convert"
                 f" one of them, or set --near {0.5 * nearest:.3g}.",
             )
         )
