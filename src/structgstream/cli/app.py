@@ -10,7 +10,7 @@ import importlib
 import os
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import ModuleType
 
@@ -38,6 +38,19 @@ COMMANDS = {
     "inspect": "show the content of a stream file",
     "doctor": "show available back-ends and packages, and how to install missing ones",
 }
+SHARED = {
+    "archive": "conversion.archive",
+    "board": "prepare.board",
+    "export": "conversion.export",
+    "fit-group": "groups.fit_group",
+    "import": "conversion.import_files",
+    "join": "groups.join",
+    "plan": "parallel.plan",
+    "play": "serve.play",
+    "token": "serve.token",
+    "track": "groups.track",
+}
+"""Module and function of the commands that share a module; each of the others is ``main`` of the module of its name."""
 ENTRY_POINTS = "structgstream.commands"
 """Entry-point group for other distributions' commands: packages with ``COMMANDS`` and a module with ``main`` each."""
 DONE, PROBLEM, USAGE, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
@@ -175,7 +188,14 @@ def _run(command: str, arguments: list[str]) -> None:
         near = difflib.get_close_matches(command, packages, n=1)
         hint = f" Did you mean {near[0]!r}?" if near else ""
         raise UsageError(f"there is no command {command!r}.{hint} Commands: {', '.join(packages)}.")
-    importlib.import_module(f"{packages[command]}.{command.replace('-', '_')}").main(arguments)
+    entry_of(command, packages[command])(arguments)
+
+
+def entry_of(command: str, package: str = "structgstream.cli") -> Callable[[list[str]], None]:
+    """The function of a command of a package of commands."""
+    own = SHARED.get(command) if package == "structgstream.cli" else None
+    module, function = own.split(".") if own else (command.replace("-", "_"), "main")
+    return getattr(importlib.import_module(f"{package}.{module}"), function)
 
 
 def _packages() -> list[ModuleType]:

@@ -3,8 +3,8 @@
 
 import math
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol
 
@@ -35,6 +35,20 @@ def print_lines(console: Console, *lines: str) -> None:
     """Prints lines without rich's markup, colours and line breaks, so that paths can be copied and parsed."""
     for line in lines:
         console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
+
+
+def frames_text(count: int) -> str:
+    """A number of frames as text."""
+    return "1 frame" if count == 1 else f"{count} frames"
+
+
+@contextmanager
+def frame_bar(title: str, total: int) -> Iterator[Callable[[], None]]:
+    """A bar of ``total`` frames on standard error while the block runs; call what it gives after each frame."""
+    columns = [TextColumn(title), BarColumn(bar_width=32), MofNCompleteColumn(), TimeRemainingColumn()]
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("frames", total=total)
+        yield lambda: bar.advance(task)
 
 
 MAX_NAMES = 5
