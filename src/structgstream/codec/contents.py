@@ -12,13 +12,16 @@ from typing import overload
 from structgstream.codec.container.blocks import field_sizes, iterate_blocks
 from structgstream.codec.container.byte_source import ByteSlice, ByteSource
 from structgstream.codec.container.damage import Damage, PacketSearch, Standing
-from structgstream.codec.container.index import Index, Period, indexed_frames, period_at
 from structgstream.codec.container.records import (
     FRAME,
     PACKET_KINDS,
     RECORD,
+    Index,
+    Period,
     Record,
     RecordType,
+    indexed_frames,
+    period_at,
     read_head,
     read_record,
     scan_records,

@@ -19,8 +19,15 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera
 from structgstream.codec.container.byte_source import ByteSource, FileBytes
 from structgstream.codec.container.damage import Damage
-from structgstream.codec.container.index import Period, read_index
-from structgstream.codec.container.records import PREFIX, RecordType, check_prefix, incomplete_reason, read_record
+from structgstream.codec.container.records import (
+    PREFIX,
+    Period,
+    RecordType,
+    check_prefix,
+    incomplete_reason,
+    read_index,
+    read_record,
+)
 from structgstream.codec.contents import PacketInfo, Packets, PeriodTable, Scan, contents_by_index, first_run
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader

@@ -16,7 +16,6 @@ from structgstream.codec.packets import PacketKind
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import select_cameras
 from structgstream.errors import CaptureError
-from structgstream.evaluation.affine import ChannelFit, channel_fit
 from structgstream.evaluation.environment import environment
 from structgstream.evaluation.facts import (
     check_same_frames,
@@ -27,10 +26,11 @@ from structgstream.evaluation.facts import (
     training_facts,
 )
 from structgstream.evaluation.ghosts import Ghosts, GhostSearch
-from structgstream.evaluation.metrics import blackened, both
+from structgstream.evaluation.metrics import ChannelFit, Mask, Picture, blackened, both, channel_fit, counting, score
 from structgstream.evaluation.optional_metrics import (
     OF_WHOLE_PICTURES,
     ComparedFrame,
+    Flow,
     MetricSelection,
     OptionalMetrics,
     load_optional_metrics,
@@ -38,9 +38,7 @@ from structgstream.evaluation.optional_metrics import (
 )
 from structgstream.evaluation.recording import Drawable, Recording, to_device
 from structgstream.evaluation.report import FrameScores, Report, Scores, drawing_facts, mean_scores, psnr_trend
-from structgstream.evaluation.scoring import Mask, Picture, counting, score
 from structgstream.evaluation.sizes import StoredSize, half_scores, halved, stored_size
-from structgstream.evaluation.temporal import Flow
 from structgstream.evaluation.worst import worst_facts
 from structgstream.kernels.backend import Backend
 from structgstream.memory import PeakMeter

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from structgstream.atomic_files import atomic_file
-from structgstream.codec.container.index import pack_index
+from structgstream.codec.container.records import pack_index
 from structgstream.codec.reader import open_stream
 from structgstream.errors import ConfigError, StreamError, TaskError
 from structgstream.executors.executor import TaskQueue

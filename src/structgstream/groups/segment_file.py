@@ -16,7 +16,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from structgstream.codec.container.byte_source import ByteSource, FileBytes
-from structgstream.codec.container.index import pack_index
 from structgstream.codec.container.records import (
     FRAME,
     PREFIX,
@@ -24,6 +23,7 @@ from structgstream.codec.container.records import (
     RecordType,
     check_prefix,
     incomplete_reason,
+    pack_index,
     packed,
     read_record,
 )

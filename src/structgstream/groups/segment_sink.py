@@ -7,8 +7,15 @@ from pathlib import Path
 
 from structgstream.atomic_files import partial_path
 from structgstream.codec.container.byte_source import check_room, free_bytes
-from structgstream.codec.container.index import INDEX_ENTRY, Period, pack_index
-from structgstream.codec.container.records import PREFIX, RecordType, packed, read_record
+from structgstream.codec.container.records import (
+    INDEX_ENTRY,
+    PREFIX,
+    Period,
+    RecordType,
+    pack_index,
+    packed,
+    read_record,
+)
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet
 from structgstream.codec.reader import PacketInfo

@@ -12,9 +12,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.entropy import reference_decisions as reference
+from structgstream.codec.entropy import decisions as reference
 from structgstream.codec.entropy.bits import Bins, Flags, Naturals
-from structgstream.codec.entropy.models import (
+from structgstream.codec.entropy.decisions import (
     ACTIVITY_CONTEXTS,
     BLOCK_CONTEXTS,
     LARGEST_NUMBER,
