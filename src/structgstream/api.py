@@ -30,7 +30,7 @@ from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.prepare import Preparation, check_folder, prepare_capture
 from structgstream.preparation.steps import Listener
 from structgstream.recorder import check_output, record, segments_at, segments_folder
-from structgstream.serve.stream_file import StreamFile, write_page, write_site
+from structgstream.serve.pages import StreamFile, write_page, write_site
 from structgstream.session.frame_report import FrameReport
 from structgstream.session.presets import DEFAULT_PRESET, StreamConfig, preset_named, with_budget
 from structgstream.session.struct_gstream import stream_pipeline

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.cli import main, serve
-from structgstream.serve.tokens import EVERY_STREAM, Access, read_keys
+from structgstream.serve.access import EVERY_STREAM, Access, read_keys
 from tests.support.quick_streams import error_of
 
 NOW = 1.7e9

@@ -143,7 +143,7 @@ def _list_formats(console: Console) -> None:
 
 
 def _export_page(path: Path, output: Path, format: PageFormat) -> None:
-    from structgstream.serve.stream_file import StreamFile, write_page, write_site
+    from structgstream.serve.pages import StreamFile, write_page, write_site
 
     stream = StreamFile(path)
     if format == "html":

@@ -20,7 +20,7 @@ from structgstream.cli.signals import Terminated, Termination
 if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
     from structgstream.groups.base import GroupBase
-    from structgstream.groups.blending import Border
+    from structgstream.groups.seam_blend import Border
     from structgstream.groups.track_pass import TrackOptions
     from structgstream.groups.unit import SegmentTask
     from structgstream.kernels.backend import Backend
@@ -70,9 +70,8 @@ def track(arguments: list[str]) -> None:
     options = parse_options(Track, "track", arguments=arguments)
     check_ending(options.output, command="track")
     from structgstream.atomic_files import partial_path
-    from structgstream.groups.base import GroupBase
+    from structgstream.groups.base import GroupBase, open_for
     from structgstream.groups.boundaries import check_length, groups_path
-    from structgstream.groups.pictures import open_for
     from structgstream.groups.segment_file import open_segment
     from structgstream.groups.track_pass import TrackOptions
     from structgstream.groups.tracking import TrackConfig

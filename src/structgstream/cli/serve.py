@@ -17,8 +17,8 @@ from structgstream.cli.progress import print_lines
 from structgstream.errors import MissingExtraError
 
 if TYPE_CHECKING:
+    from structgstream.serve.pages import StreamFile
     from structgstream.serve.play import Truth
-    from structgstream.serve.stream_file import StreamFile
 
 MAX_CONNECTIONS = 100_000
 
@@ -77,7 +77,7 @@ def main(arguments: list[str]) -> None:
         )
     except ModuleNotFoundError as error:
         raise MissingExtraError(error.name or "starlette", "serve") from None
-    from structgstream.serve.tokens import read_keys
+    from structgstream.serve.access import read_keys
 
     if not 1 <= options.connections <= MAX_CONNECTIONS:
         raise UsageError(f"--connections {options.connections} is not one of 1 to {MAX_CONNECTIONS}.")
@@ -140,7 +140,7 @@ def play(arguments: list[str]) -> None:
         from structgstream.serve.play import application
     except ModuleNotFoundError as error:
         raise MissingExtraError(error.name or "starlette", "serve") from None
-    from structgstream.serve.stream_file import StreamFile
+    from structgstream.serve.pages import StreamFile
 
     stream = StreamFile(options.stream)
     if options.wait:
@@ -218,7 +218,7 @@ def token(arguments: list[str]) -> None:
         raise UsageError(f"--hours {options.hours:g} is not above 0 and at most {MAX_HOURS}, a year.")
     if bool(options.stream) == options.every:
         raise UsageError("name one stream, or say --every.")
-    from structgstream.serve.tokens import EVERY_STREAM, read_keys
+    from structgstream.serve.access import EVERY_STREAM, read_keys
 
     with usage_errors():
         expires = int(time.time() + options.hours * 3600.0)

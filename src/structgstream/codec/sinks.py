@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
-from structgstream.atomic_files import sync_folder
+from structgstream.atomic_files import lock_file, sync_folder
 from structgstream.codec.container.byte_source import ByteSlice, ByteSource, FileBytes, check_room, free_bytes
 from structgstream.codec.container.damage import readable_part
 from structgstream.codec.container.records import (
@@ -31,7 +31,6 @@ from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsS
 from structgstream.codec.segments.store import Store
 from structgstream.codec.segments.stored_bytes import StoredBytes
 from structgstream.errors import StorageError
-from structgstream.file_locks import lock_file
 from structgstream.scene.scene import Scene
 
 
