@@ -30,7 +30,7 @@ from structgstream.cli.options import (
 )
 from structgstream.cli.progress import human_bytes, print_lines
 from structgstream.cli.tables import compact_table, literal_cells
-from structgstream.executors.opening import ExecutorName, ExecutorOptions
+from structgstream.executors.executor import ExecutorName, ExecutorOptions
 
 if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
@@ -47,8 +47,7 @@ class WorkerOptions:
     """Options that say what runs the groups."""
 
     executor: ExecutorName = "local"
-    """local: processes of this machine; inline: this process, one group after the other; ray: a Ray cluster, which
-    needs the extra cluster (docs/cluster.md)."""
+    """local: processes of this machine; ray: a Ray cluster, which needs the extra cluster (docs/cluster.md)."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Groups at a time. Default: one a GPU, or one a core. A cluster that is joined has its own number."""
     threads: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
@@ -123,8 +122,7 @@ def main(arguments: list[str]) -> None:
     if options.groups is not None and options.groups < 1:
         raise UsageError(f"--groups counts frames, from 1; got {options.groups}.")
     from structgstream.owned_folders import Owner
-    from structgstream.parallel.exchange import ObjectStore
-    from structgstream.parallel.object_folder import ObjectFolder
+    from structgstream.parallel.exchange import ObjectFolder, ObjectStore
     from structgstream.parallel.parts import PURPOSE, Parts
 
     parts, console = Parts(parts_folder(options.output)), Console()
@@ -180,7 +178,7 @@ def open_tasks(options: ExecutorOptions, device: Device) -> "TaskQueue":
         MissingExtraError: a package is missing.
     """
     from structgstream.evaluation.environment import usable_cores
-    from structgstream.executors.opening import open_executor
+    from structgstream.executors.executor import open_executor
 
     return open_executor(options, cores=usable_cores(), gpus=gpus_of(device))
 
@@ -203,13 +201,11 @@ def join_arguments(options: WorkerOptions, device: Device) -> tuple[str, ...]:
         return ()
     cores = usable_cores()
     slots = allocate_slots(workers=options.workers, cores=cores, threads=options.threads)
-    threads = 1 if options.executor == "inline" else min(cores, sum(slot.threads for slot in slots))
-    return ("--workers", str(threads))
+    return ("--workers", str(min(cores, sum(slot.threads for slot in slots))))
 
 
 def _job(options: Parallel, rest: list[str]) -> "Job":
-    from structgstream.parallel.driver import Job
-    from structgstream.parallel.unit import Unit
+    from structgstream.parallel.driver import Job, Unit
 
     capture = options.capture
     header = [*_option("preset", options.preset), *_option("quality", options.quality), *_option("seed", options.seed)]
