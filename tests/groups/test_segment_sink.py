@@ -173,7 +173,7 @@ def test_a_nearly_full_disk_keeps_the_packets_before(tmp_path: Path, monkeypatch
 def so_far(count: int) -> GroupSoFar:
     with_records = []
     for packet in encoded()[0][:count]:
-        kind = segment_sink._TYPES[packet.kind]
+        kind = segment_sink.RECORD_TYPES[packet.kind]
         with_records.append(segment_sink.packed(kind, packet.payload))
     return GroupSoFar(base(), FIRST, with_records)
 
