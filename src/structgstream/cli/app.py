@@ -113,46 +113,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The reader of our output has exited (`| head`). Python would raise again while it closes stdout.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return PROBLEM
-    except StructGStreamError as error:
-        if debug:
-            traceback.print_exc()
-        _print_error(f"structgstream: {error}")
-        return PROBLEM
-    except OSError as error:
-        if debug:
-            traceback.print_exc()
-        _print_error(f"structgstream: {_file_error(error)}")
-        return PROBLEM
-    except MemoryError as error:
-        if debug:
-            traceback.print_exc()
-        detail = f" ({error})" if str(error) else ""
-        _print_error(
-            f"structgstream: not enough memory{detail}; close other programs, or use smaller pictures (--scale 0.5)."
-        )
-        return PROBLEM
     except Exception as error:
         if debug:
             traceback.print_exc()
-        _print_error(f"structgstream: {_unexpected_error(error)}")
+        _print_error(f"structgstream: {_sentence(error)}")
         return PROBLEM
     return DONE
 
 
-def _unexpected_error(error: Exception) -> str:
+def _sentence(error: Exception) -> str:
+    """What an error says to the user: one of this package, of the operating system, or an unexpected one."""
+    if isinstance(error, StructGStreamError):
+        return str(error)
+    if isinstance(error, PermissionError) and error.filename is not None:
+        return f"no permission for {error.filename}; change its permissions or its owner, or use another place."
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        where = "" if error.filename is None else f" of {error.filename}"
+        return f"the disk{where} is full ({error.strerror}); make room, and run the command again."
+    if isinstance(error, MemoryError):
+        detail = f" ({error})" if str(error) else ""
+        return f"not enough memory{detail}; close other programs, or use smaller pictures (--scale 0.5)."
     return (
         f"unexpected error, {type(error).__name__}: {error}. Run the command again with --debug and report the output."
     )
-
-
-def _file_error(error: OSError) -> str:
-    """The message of an error of the operating system: missing permissions, a full disk."""
-    if isinstance(error, PermissionError) and error.filename is not None:
-        return f"no permission for {error.filename}; change its permissions or its owner, or use another place."
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        where = "" if error.filename is None else f" of {error.filename}"
-        return f"the disk{where} is full ({error.strerror}); make room, and run the command again."
-    return _unexpected_error(error)
 
 
 def overview() -> str:

@@ -20,7 +20,6 @@ from structgstream.cli.progress import change, frames_text, human_bytes, print_l
 from structgstream.cli.tables import SHOWN_FRAMES, compact_table, literal_cells, name_value_table
 
 if TYPE_CHECKING:
-    from structgstream.cameras import CameraRig
     from structgstream.codec.reader import StreamReader
     from structgstream.data.source import FrameSource
     from structgstream.data.video_index import VideoTrack
@@ -146,25 +145,11 @@ def describe_stream(
             "dynamic": sorted(header.dynamic),
             "fields": periods[0]["fields"],
             "distance_input": header.distance_input,
-            "cameras": _cameras(header.rig),
+            "cameras": header.rig.plain(),
             "config": dict(header.config),
             "metadata": dict(header.metadata),
         },
         "packets": [_packet(row, log.get(row.index, {})) for row in rows],
-    }
-
-
-def _cameras(rig: "CameraRig") -> dict[str, dict[str, Any]]:
-    return {
-        name: {
-            "width": camera.width,
-            "height": camera.height,
-            "K": camera.K.tolist(),
-            "viewmat": camera.viewmat.tolist(),
-            "near": camera.near,
-            "held_out": name in rig.held_out,
-        }
-        for name, camera in rig.cameras.items()
     }
 
 
@@ -261,11 +246,8 @@ def period_table(periods: Sequence[Mapping[str, Any]]) -> Table | None:
     """A row per period; None for a stream of one."""
     if len(periods) < 2:
         return None
-    table = compact_table()
-    table.title = "periods"
-    for name in ("period", "frame", "frames", "seconds", "anchors", "header", "packets"):
-        table.add_column(name, justify="right")
-    table.add_column("begins")
+    titles = ("period", "frame", "frames", "seconds", "anchors", "header", "packets", "begins")
+    table = compact_table(*titles, left=("begins",), title="periods")
     for one in periods:
         anchors = one["fields"]["anchor_positions"]["shape"][0] if "anchor_positions" in one["fields"] else ""
         table.add_row(
@@ -283,11 +265,8 @@ def period_table(periods: Sequence[Mapping[str, Any]]) -> Table | None:
 
 def header_table(header: Mapping[str, Any]) -> Table:
     """The fields of an init record, largest first."""
-    table = compact_table()
-    table.title = f"header of period {header['period']}" if header["period"] else "header"
-    table.add_column("field")
-    for name in ("shape", "bytes", "share", "bits a value"):
-        table.add_column(name, justify="right")
+    title = f"header of period {header['period']}" if header["period"] else "header"
+    table = compact_table("field", "shape", "bytes", "share", "bits a value", left=("field",), title=title)
     whole = header["header_bytes"]
     rest = whole
     for name, field in sorted(header["fields"].items(), key=lambda item: -item[1]["bytes"]):
@@ -406,11 +385,8 @@ def capture_tables(name: str, content: dict[str, Any]) -> tuple[Table, ...]:
     if len(colors) == 1:
         facts.add_row(*literal_cells("colours", *colors))
     facts.add_row("points", "none" if content["points"] is None else f"{content['points']:,}")
-    cameras = compact_table()
-    cameras.title = "cameras"
-    titles = ["camera", "size", "lens", "frames", "from s", "to s", "turned"]
-    for title in titles + ["colours"] * (len(colors) > 1):
-        cameras.add_column(title, justify="left" if title in ("camera", "lens", "colours") else "right")
+    titles = ["camera", "size", "lens", "frames", "from s", "to s", "turned", *["colours"] * (len(colors) > 1)]
+    cameras = compact_table(*titles, left=("camera", "lens", "colours"), title="cameras")
     for camera, own in content["cameras"].items():
         times = ["-" if own[key] is None else f"{own[key]:.3f}" for key in ("first_seconds", "last_seconds")]
         size = "x".join(map(str, own["size"]))

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
@@ -304,9 +303,7 @@ class ParallelDisplay:
             self._live.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         if self._console.is_terminal:
             self._live.stop()
 
@@ -477,9 +474,7 @@ def _serial(header: float, serial: float, alone: float, frames: int) -> str:
 
 
 def _table(console: Console, estimates: list[tuple[int, "Estimate"]]) -> None:
-    table = compact_table()
-    for head in ("machines", "workers", "time", "after tracking", "times faster", "efficiency"):
-        table.add_column(head, justify="right")
+    table = compact_table("machines", "workers", "time", "after tracking", "times faster", "efficiency")
     for count, each in estimates:
         cells = (str(count), str(each.workers), _time(each.seconds), _time(each.tail_seconds))
         table.add_row(*literal_cells(*cells, f"{each.speedup:.2f}", f"{100 * each.efficiency:.0f} %"))

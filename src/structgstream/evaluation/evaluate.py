@@ -30,7 +30,6 @@ from structgstream.evaluation.metrics import ChannelFit, Mask, Picture, blackene
 from structgstream.evaluation.optional_metrics import (
     OF_WHOLE_PICTURES,
     ComparedFrame,
-    Flow,
     MetricSelection,
     OptionalMetrics,
     load_optional_metrics,
@@ -84,7 +83,6 @@ def evaluate(
     log: Mapping[int, Mapping[str, Any]] | None = None,
     observer: Observer | None = None,
     metrics: MetricSelection = "all",
-    flow: Flow | None = None,
     lpips_weights: Path | None = None,
     stored: FrameSource | None = None,
 ) -> Report:
@@ -98,7 +96,6 @@ def evaluate(
         log: the trainer's log by frame number (``run_log.read_log``).
         observer: called with frame number and comparison for every picture.
         metrics: "basic" leaves out the metrics that take longer than rendering: MS-SSIM, FLIP, LPIPS, temporal ones.
-        flow: exact flow to the frame before, if the capture has it; None estimates it.
         lpips_weights: folder or file with the weights of LPIPS (``lpips.py``, Note [Weights]).
         stored: the same frames at the capture's own, larger size (``capture.stored_capture``); None to leave out these
             scores.
@@ -116,7 +113,7 @@ def evaluate(
     optional_metrics = None
     if metrics == "all":
         optional_metrics = load_optional_metrics(
-            views.items(), frames=len(recording.packets), device=backend.device, flow=flow, lpips_weights=lpips_weights
+            views.items(), frames=len(recording.packets), device=backend.device, lpips_weights=lpips_weights
         )
     size = len(recording.packets)
     selected = select_cameras(source, names)

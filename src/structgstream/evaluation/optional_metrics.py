@@ -136,7 +136,6 @@ def load_optional_metrics(
     *,
     frames: int,
     device: torch.device,
-    flow: Flow | None = None,
     lpips_weights: Path | None = None,
 ) -> OptionalMetrics:
     """The metrics that are available here for these cameras (by name) and this number of frames.
@@ -145,7 +144,6 @@ def load_optional_metrics(
         cameras: the scored cameras; a metric that needs larger pictures than one of them has is left out.
         frames: number of frames; temporal metrics need two.
         device: device that computes LPIPS.
-        flow: exact flow; None estimates it.
         lpips_weights: folder or file with the trunks' weights (``lpips.py``, Note [Weights]).
 
     Raises:
@@ -158,11 +156,11 @@ def load_optional_metrics(
         measure = features_of
     except MissingExtraError as error:
         missing |= dict.fromkeys(("flip", "temporal_flip"), str(error))
-    if flow is None:
-        try:
-            flow = dis_flow()
-        except MissingExtraError as error:
-            missing["e_warp"] = str(error)
+    flow = None
+    try:
+        flow = dis_flow()
+    except MissingExtraError as error:
+        missing["e_warp"] = str(error)
     sides = {name: min(camera.width, camera.height) for name, camera in cameras}
     found: dict[str, Lpips] = {}
     weights: dict[str, str] = {}

@@ -4,7 +4,6 @@
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from types import TracebackType
 from typing import Literal, Protocol
 
 from structgstream.errors import ConfigError
@@ -69,9 +68,7 @@ class TaskQueue:
     def __enter__(self) -> "TaskQueue":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self.close()
 
     @property

@@ -378,17 +378,7 @@ def check_resumable(header: StreamHeader, facts: StreamFacts) -> None:
 
 def _capture_facts(rig: CameraRig, fps: float, metadata: Mapping[str, object]) -> dict[str, object]:
     """The properties of a capture that must be equal to continue a stream, as plain values."""
-    cameras = {
-        name: {
-            "viewmat": rig[name].viewmat.tolist(),
-            "K": rig[name].K.tolist(),
-            "size": [rig[name].width, rig[name].height],
-            "near": rig[name].near,
-            "held out": name in rig.held_out,
-        }
-        for name in rig
-    }
-    return {"order of cameras": [*rig], "cameras": cameras, "fps": fps, **metadata}
+    return {"order of cameras": [*rig], "cameras": rig.plain(), "fps": fps, **metadata}
 
 
 def _differences(old: object, new: object, path: str = "") -> Iterator[str]:
