@@ -10,7 +10,7 @@ import pytest
 from structgstream.codec.contents import LOST
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import StreamReader
-from structgstream.codec.segments.retention import SegmentsOptions
+from structgstream.codec.segments.sink import SegmentsOptions
 from structgstream.codec.sinks import StoredSegments, resume_segments
 from tests.support.segment_streams import as_file, folder, header, packets, written
 from tests.support.streams import same

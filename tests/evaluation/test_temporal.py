@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from structgstream.cameras import Camera
-from structgstream.evaluation.temporal import FlowField, difference_of_change, dis_flow, flicker, warping_error
+from structgstream.evaluation.optional_metrics import FlowField, difference_of_change, dis_flow, flicker, warping_error
 from structgstream.flow import inside
 from tests.support.rigs import look_at
 
