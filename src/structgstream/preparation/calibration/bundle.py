@@ -72,7 +72,6 @@ class Bundle:
         sizes: ``[C, 2]``, width and height of the pictures.
         fisheye: ``[C]``, whether a camera's terms are a fisheye's.
         free: the terms of the rows that are estimated.
-        fixed: ``[L]``, lenses that stay.
         rotating: whether bodies have rotations.
         prior: of the terms.
         noise: standard deviation of the pixels.
@@ -83,7 +82,6 @@ class Bundle:
     sizes: Floats
     fisheye: NDArray[np.bool_]
     free: tuple[int, ...]
-    fixed: NDArray[np.bool_]
     rotating: bool
     prior: LensPrior
     noise: float = 0.5
@@ -91,7 +89,7 @@ class Bundle:
     @property
     def columns(self) -> tuple[int, int, int]:
         """Number of parameters of poses, of lenses, and of a body."""
-        return 6 * len(self.lens), len(self.fixed) * len(self.free), 6 if self.rotating else 3
+        return 6 * len(self.lens), (int(self.lens.max()) + 1) * len(self.free), 6 if self.rotating else 3
 
     def residuals(self, parameters: Parameters) -> Floats:
         """Projected minus observed ``[M, 2]``, pixels; infinite behind a camera."""
@@ -192,7 +190,7 @@ def linearized(bundle: Bundle, parameters: Parameters) -> System:
             A[np.ix_(where, where)] += np.einsum("m,mai,maj->ij", w, J, J, optimize=True)
             gradient[where] += np.einsum("m,mai,ma->i", w, J, residuals[own])
     bundle.prior.add(A, gradient, parameters.rows, start=poses, free=bundle.free)
-    stuck = np.diag(A) == 0  # what is fixed, or observed by no camera
+    stuck = np.diag(A) == 0  # what no camera observes
     A[stuck, stuck] = 1.0
     count = len(parameters.body_positions)
     V, body_gradient = np.zeros((count, size, size)), np.zeros((count, size))
@@ -211,7 +209,6 @@ def _derivatives(bundle: Bundle, parameters: Parameters) -> tuple[Floats, Floats
     turned = np.einsum("mab,mb->ma", parameters.rotations[own], on_body + parameters.body_positions[seen.body])
     local = turned + parameters.translations[own]
     by_point, by_row = derivatives(local, parameters.rows[lens], bundle.sizes[own], bundle.fisheye[own], bundle.free)
-    by_row[bundle.fixed[lens]] = 0.0
     by_camera = np.concatenate([by_point @ _crosses(-turned), by_point, by_row], 2)
     by_world = by_point @ parameters.rotations[own]
     by_body = np.concatenate([by_world @ _crosses(-on_body), by_world], 2) if bundle.rotating else by_world

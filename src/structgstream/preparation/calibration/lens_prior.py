@@ -48,7 +48,7 @@ class LensPrior:
     """A normal prior of terms of lenses about means that groups share.
 
     Args:
-        group: ``[L]``, of each lens; -1 for lenses without a prior.
+        group: ``[L]``, of each lens.
         terms: which terms of the rows have one.
         means: ``[G, T]``, standard deviations of the means.
         differences: ``[G, T]``, of lenses of a group from its mean.

@@ -14,7 +14,7 @@ from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.adjustment import Limits, adjust_together
 from structgstream.preparation.calibration.colmap import MODELS, LensModel, holding
 from structgstream.preparation.calibration.lens_terms import ASPECT, DISTORTION, FOCAL
-from structgstream.preparation.calibration.mapping import Freedom, adjust, cameras_of, filtered, observed
+from structgstream.preparation.calibration.mapping import adjust, cameras_of, filtered, observed
 from structgstream.preparation.calibration.matching import epipolar_pixels
 from structgstream.preparation.calibration.solved import SolvedCalibration, normalized, rig_alignment
 from structgstream.preparation.calibration.triangulation import (
@@ -86,7 +86,6 @@ def refine(
     judges = {pair: graph.matches[pair][judging[pair]] for pair in graph.matches}
     refined = dict(cameras)
     models = {name: MODELS[lens] if lens else holding(filmed.lens) for name, filmed in cameras.items()}
-    freedom = Freedom(lens=lens is not None, center=False)
     limits = Limits.for_pictures(max(max(filmed.camera.width, filmed.camera.height) for filmed in cameras.values()))
     model = None
     for share in ROUNDS:
@@ -94,9 +93,9 @@ def refine(
         focal = max(float(filmed.camera.K[0, 0]) for filmed in refined.values())
         loose = max(limits.pixels, focal * float(np.radians(slack)))
         model = posed_model(learning, refined, pixels=loose, slack_degrees=slack, models=models)
-        adjust(model, freedom=freedom)
+        adjust(model, lens=lens is not None)
         filtered(model, pixels=limits.pixels, degrees=limits.degrees)
-        adjust(model, freedom=freedom)
+        adjust(model, lens=lens is not None)
         found = cameras_of(model)
         refined = {name: found[name] for name in cameras}
     result = SolvedCalibration(refined, *observed(model, graph.keypoints, cameras))
@@ -127,7 +126,6 @@ def _completed(
         normalized(triangulated(graph, refined.cameras, limits=limits)),
         lens=range(count),
         free=terms,
-        fixed=np.zeros(count, np.bool_),
         limits=limits,
     )
 
