@@ -16,7 +16,7 @@ from structgstream.executors.executor import TaskQueue
 from structgstream.executors.local import LocalEngine
 from structgstream.executors.task import PYTHON, Task, TaskResult, WorkerSlot, thread_environment
 from structgstream.groups.boundaries import Groups, groups_path, read_groups
-from structgstream.parallel.exchange import SharedFolder
+from structgstream.parallel.exchange import CutsTrack, SharedFolder
 from structgstream.parallel.parts import Parts, group_name, key_of, sha256_of
 
 HEADER, TRACK, JOIN = "header", "track", "join"
@@ -27,12 +27,6 @@ class ReadsTrack(Protocol):
     """Gives the frames at which a group may start, of a track that is finished or growing."""
 
     def __call__(self, track: Path, /) -> Collection[int]: ...
-
-
-class CutsTrack(Protocol):
-    """Extracts from a track the start of a single group."""
-
-    def __call__(self, track: Path, first: int, /) -> bytes: ...
 
 
 def starts_in(track: Path) -> Collection[int]:

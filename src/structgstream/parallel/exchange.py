@@ -21,7 +21,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 from structgstream.atomic_files import atomic_write, partial_path
 from structgstream.errors import StorageError, StructGStreamError
@@ -29,7 +29,6 @@ from structgstream.evaluation.run_log import log_path
 from structgstream.executors.task import PYTHON, Task, argv_of
 from structgstream.groups.boundaries import groups_path
 from structgstream.owned_folders import MARKER, Owner, own_folder, owner_of, parse_owner, remove_own
-from structgstream.parallel.driver import CutsTrack
 from structgstream.parallel.parts import PART_NAMES, Parts
 from structgstream.remote_folders import open_url, reason_of, shown_address
 
@@ -163,6 +162,12 @@ class ObjectFolder:
 
 STAGED = (PYTHON, "-m", "structgstream.parallel.exchange")
 POLL_SECONDS = 1.0
+
+
+class CutsTrack(Protocol):
+    """Extracts from a track the start of a single group."""
+
+    def __call__(self, track: Path, first: int, /) -> bytes: ...
 
 
 class SharedFolder:
