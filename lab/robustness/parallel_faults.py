@@ -27,7 +27,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from structgstream.data.json_videos import bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.errors import StorageError, TaskError
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.local import LocalEngine

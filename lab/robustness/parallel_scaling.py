@@ -21,7 +21,7 @@ import time
 from collections import defaultdict
 from pathlib import Path
 
-from structgstream.data.json_videos import bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.executors.executor import ExecutorName, ExecutorOptions, open_executor
 from structgstream.executors.task import PYTHON, Task
 from structgstream.parallel.driver import Job, Status, Unit, drive

@@ -23,7 +23,7 @@ import torch
 from benchmarks.machine import load_average, machine
 from structgstream.cameras import Camera
 from structgstream.codec.reader import open_stream
-from structgstream.data.json_videos import bundled_clip
+from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import SourceWrapper, resized
 from structgstream.evaluation.evaluate import evaluate

@@ -118,7 +118,7 @@ def real_writer(frames: int) -> Writer:
     """Reconstructs the bundled clip with the preset tiny."""
 
     def write(path: Path, report: Report) -> None:
-        from structgstream.data.json_videos import bundled_clip_path
+        from structgstream.data.dataset_layouts import bundled_clip_path
         from structgstream.data.open import open_capture
         from structgstream.data.plane_sweep import SweepConfig
         from structgstream.data.points import PointsConfig

@@ -13,7 +13,7 @@ from typing import Literal
 
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.sink import SegmentsOptions
-from structgstream.data.json_videos import bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.data.open import open_capture
 from structgstream.data.source import FrameSource, FrameStream
 from structgstream.errors import ConfigError
@@ -25,7 +25,7 @@ from structgstream.evaluation.run_log import read_log
 from structgstream.exporters.formats import Format, FrameOptions, PageFormat, check_page, choose_frames, destination
 from structgstream.exporters.write import write_frames
 from structgstream.kernels.backend import Backend, BackendName, select_backend
-from structgstream.preparation.checking.findings import CheckReport
+from structgstream.preparation.checking.check import CheckReport
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.prepare import Preparation, check_folder, prepare_capture
 from structgstream.preparation.steps import Listener

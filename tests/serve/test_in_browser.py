@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.sinks import FileSink, resume_segments
-from structgstream.data.json_videos import bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.data.open import open_capture
 from structgstream.evaluation.evaluate import rendered
 from structgstream.exporters.write import write_gaussians

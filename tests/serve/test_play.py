@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from structgstream.data.json_videos import bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.data.open import open_capture
 from structgstream.serve.pages import StreamFile, bundle
 from structgstream.serve.play import Truth

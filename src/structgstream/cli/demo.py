@@ -51,7 +51,7 @@ def main(arguments: list[str]) -> None:
     check_ending(options.output, command="demo", folder=True)
     if options.output.exists() and not options.output.is_dir():
         raise UsageError(f"--output is a folder, and {options.output} is a file.")
-    from structgstream.data.json_videos import bundled_clip_path
+    from structgstream.data.dataset_layouts import bundled_clip_path
     from structgstream.data.open import open_capture
     from structgstream.kernels.backend import select_backend
     from structgstream.recorder import check_output

@@ -201,7 +201,7 @@ def board(arguments: list[str]) -> None:
     """Writes the board and says how to name it to prepare."""
     options = parse_options(BoardCommand, "board", arguments=arguments)
     check_ending(options.output, ".pdf", command="board")
-    from structgstream.preparation.calibration.board_page import write_board_pdf
+    from structgstream.preparation.calibration.board import write_board_pdf
     from structgstream.preparation.options import board_text, parse_board
 
     with usage_errors():

@@ -6,8 +6,7 @@ import pytest
 
 from structgstream.data.calibration import rotation_matrix
 from structgstream.preparation.calibration.bundle import BodyObservations, Bundle, Parameters, linearized, solved
-from structgstream.preparation.calibration.lens_prior import usual_prior
-from structgstream.preparation.calibration.lens_terms import ACROSS, DOWN, FOCAL, K1, K2, K3, TERMS
+from structgstream.preparation.calibration.lens_terms import ACROSS, DOWN, FOCAL, K1, K2, K3, TERMS, usual_prior
 
 CAMERAS, POINTS = 6, 120
 FREE = (FOCAL, ACROSS, DOWN, K1, K2, K3)

@@ -2,8 +2,7 @@
 import numpy as np
 import pytest
 
-from structgstream.preparation.calibration.lens_prior import usual_prior
-from structgstream.preparation.calibration.lens_terms import ACROSS, FOCAL, TERMS
+from structgstream.preparation.calibration.lens_terms import ACROSS, FOCAL, TERMS, usual_prior
 
 FREE = (FOCAL, ACROSS)
 LENSES = 40

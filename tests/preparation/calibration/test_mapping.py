@@ -9,9 +9,17 @@ import pytest
 
 from structgstream.data.lenses import LensCamera
 from structgstream.preparation.calibration.colmap import colmap_camera
-from structgstream.preparation.calibration.mapping import Mapper, adjust, cameras_of, filtered, mapped, size_of
+from structgstream.preparation.calibration.mapping import (
+    Mapper,
+    adjust,
+    cameras_of,
+    filtered,
+    mapped,
+    size_of,
+    verified_pairs,
+    write_database,
+)
 from structgstream.preparation.calibration.triangulation import PosedGraph, posed_model
-from structgstream.preparation.calibration.view_graph import verified_pairs, write_database
 from tests.support.calibration_errors import calibration_errors
 from tests.support.filmed import ring
 from tests.support.views_made import cloud, keypoints_of, matches_of

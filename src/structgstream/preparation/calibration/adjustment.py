@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.data.lenses import Fisheye, LensCamera
+from structgstream.geometry import Floats
 from structgstream.preparation.calibration.bundle import BodyObservations, Bundle, Parameters, linearized, solved
-from structgstream.preparation.calibration.lens_prior import usual_prior
-from structgstream.preparation.calibration.lens_terms import row_of, with_row
+from structgstream.preparation.calibration.lens_terms import row_of, usual_prior, with_row
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
 
 _log = logging.getLogger(__name__)
@@ -25,15 +24,10 @@ NORMAL_MEDIAN = 1.1774  # of the length of a pair of standard normal numbers
 
 @dataclass(frozen=True)
 class Limits:
-    """Which observations stay.
+    """Which observations stay."""
 
-    Args:
-        pixels: largest reprojection error.
-        degrees: smallest angle between the rays of a point.
-    """
-
-    pixels: float
-    degrees: float = 1.5
+    pixels: float  # largest reprojection error
+    degrees: float = 1.5  # smallest angle between the rays of a point
 
     @classmethod
     def for_pictures(cls, longest_side: int) -> "Limits":

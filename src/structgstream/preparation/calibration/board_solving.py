@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera
 from structgstream.errors import CalibrationError
+from structgstream.geometry import Floats
 from structgstream.preparation.calibration.adjustment import cameras_in, estimated, posed_problem
 from structgstream.preparation.calibration.board import Board, Sighting, board_sightings
 from structgstream.preparation.calibration.bundle import BodyObservations, Parameters, solved
@@ -55,7 +55,7 @@ def solve_board(
 
     The lens of each camera is estimated from its own sightings, poses between cameras from the instants that they
     share, and all of them, with the board's pose at each instant, are then adjusted together, at last with what alike
-    lenses share (lens_prior.py, Note [Alike lenses]).
+    lenses share (lens_terms.py, Note [Alike lenses]).
 
     Args:
         pictures: camera name to pictures ``[H, W, 3]`` of the same instants for all cameras.
@@ -67,7 +67,6 @@ def solve_board(
     Raises:
         CalibrationError: a camera that does not show the board well enough, or at no instant at which it connects to
             the others; another board than given.
-        MissingExtraError: pycolmap or cv2 is not installed.
     """
     pycolmap_module()
     sightings = board_sightings(pictures, board)

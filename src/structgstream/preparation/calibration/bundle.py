@@ -4,7 +4,7 @@
 Apart from cameras, bodies are adjusted: points, or poses of a board whose corners are known. They are eliminated
 from the normal equations (Brown, 1958; Triggs et al., Bundle adjustment: a modern synthesis, 2000), which are solved by
 Levenberg's and Marquardt's method with Huber's loss. Terms of intrinsics may have a prior that cameras share
-(``lens_prior.py``).
+(``lens_terms.py``).
 """
 
 from dataclasses import dataclass, replace
@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.data.calibration import rotation_matrix
-from structgstream.preparation.calibration.lens_prior import LensPrior
-from structgstream.preparation.calibration.lens_terms import derivatives, projected
+from structgstream.geometry import Floats
+from structgstream.preparation.calibration.lens_terms import LensPrior, derivatives, projected
 
 Indices = NDArray[np.intp]
 
@@ -28,63 +27,37 @@ SMALL = 1e-6
 
 @dataclass(frozen=True)
 class BodyObservations:
-    """What was observed.
+    """What was observed."""
 
-    Args:
-        camera: ``[M]``.
-        body: ``[M]``.
-        offset: ``[M, 3]``, from the body's origin in its axes; zeros for points.
-        pixels: ``[M, 2]``.
-    """
-
-    camera: Indices
-    body: Indices
-    offset: Floats
-    pixels: Floats
+    camera: Indices  # ``[M]``
+    body: Indices  # ``[M]``
+    offset: Floats  # ``[M, 3]``, from the body's origin in its axes; zeros for points
+    pixels: Floats  # ``[M, 2]``
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """Everything that is adjusted: poses and lenses of cameras, poses of bodies.
+    """Everything that is adjusted: poses and lenses of cameras, poses of bodies."""
 
-    Args:
-        rotations: ``[C, 3, 3]``, world to camera.
-        translations: ``[C, 3]``.
-        rows: ``[L, TERMS]`` of the lenses.
-        body_rotations: ``[B, 3, 3]`` of the bodies, body to world; identities for points.
-        body_positions: ``[B, 3]`` of the bodies.
-    """
-
-    rotations: Floats
-    translations: Floats
-    rows: Floats
-    body_rotations: Floats
-    body_positions: Floats
+    rotations: Floats  # ``[C, 3, 3]``, world to camera
+    translations: Floats  # ``[C, 3]``
+    rows: Floats  # ``[L, TERMS]`` of the lenses
+    body_rotations: Floats  # ``[B, 3, 3]`` of the bodies, body to world; identities for points
+    body_positions: Floats  # ``[B, 3]`` of the bodies
 
 
 @dataclass(frozen=True)
 class Bundle:
-    """A problem of bundle adjustment.
+    """A problem of bundle adjustment."""
 
-    Args:
-        observations: of the bodies.
-        lens: ``[C]``, which row of lenses a camera has.
-        sizes: ``[C, 2]``, width and height of the pictures.
-        fisheye: ``[C]``, whether a camera's terms are a fisheye's.
-        free: the terms of the rows that are estimated.
-        rotating: whether bodies have rotations.
-        prior: of the terms.
-        noise: standard deviation of the pixels.
-    """
-
-    observations: BodyObservations
-    lens: Indices
-    sizes: Floats
-    fisheye: NDArray[np.bool_]
-    free: tuple[int, ...]
-    rotating: bool
-    prior: LensPrior
-    noise: float = 0.5
+    observations: BodyObservations  # of the bodies
+    lens: Indices  # ``[C]``, which row of lenses a camera has
+    sizes: Floats  # ``[C, 2]``, width and height of the pictures
+    fisheye: NDArray[np.bool_]  # ``[C]``, whether a camera's terms are a fisheye's
+    free: tuple[int, ...]  # the terms of the rows that are estimated
+    rotating: bool  # whether bodies have rotations
+    prior: LensPrior  # of the terms
+    noise: float = 0.5  # standard deviation of the pixels
 
     @property
     def columns(self) -> tuple[int, int, int]:

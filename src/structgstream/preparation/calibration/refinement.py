@@ -35,21 +35,14 @@ MIN_HELD_OUT = 30
 
 @dataclass(frozen=True)
 class Refinement:
-    """The result of a refinement.
-
-    Args:
-        solved: refined cameras, in the coordinates of the given ones; these themselves if refining did not help.
-        before_pixels: median distance of matches that were held out to the epipolar lines of the given cameras.
-        after_pixels: the same of the refined cameras, before they are adjusted to these matches, too.
-        held_out: number of these matches.
-        changed: whether ``solved`` has refined cameras.
-    """
+    """The result of a refinement."""
 
     solved: SolvedCalibration
-    before_pixels: float
-    after_pixels: float
-    held_out: int
-    changed: bool
+    """Refined cameras, in the coordinates of the given ones; these themselves if refining did not help."""
+    before_pixels: float  # median distance of matches that were held out to the epipolar lines of the given cameras
+    after_pixels: float  # the same of the refined cameras, before they are adjusted to these matches, too
+    held_out: int  # number of these matches
+    changed: bool  # whether ``solved`` has refined cameras
 
 
 def refine(
@@ -73,7 +66,6 @@ def refine(
     Raises:
         CalibrationError: too few matches agree with the given poses, or not all cameras are connected by them.
         ConfigError: the model ``brown``.
-        MissingExtraError: pycolmap or cv2 is not installed.
     """
     if lens == "brown":
         raise ConfigError(

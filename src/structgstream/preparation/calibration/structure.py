@@ -31,21 +31,19 @@ from structgstream.preparation.calibration.colmap import (
 from structgstream.preparation.calibration.keypoints import Keypoints, all_keypoints
 from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL
 from structgstream.preparation.calibration.mapping import (
+    Matches,
     adjust,
     cameras_of,
     filtered,
     mapped,
     observed,
     size_of,
+    verified_pairs,
+    write_database,
 )
 from structgstream.preparation.calibration.matching import all_matches
 from structgstream.preparation.calibration.solved import SolvedCalibration, normalized
 from structgstream.preparation.calibration.triangulation import rematched
-from structgstream.preparation.calibration.view_graph import (
-    Matches,
-    verified_pairs,
-    write_database,
-)
 
 _log = logging.getLogger(__name__)
 
@@ -84,7 +82,6 @@ def solve_structure(
 
     Raises:
         CalibrationError: fewer than three cameras, pictures that do not belong together, or too little in common.
-        MissingExtraError: pycolmap or cv2 is not installed.
     """
     pycolmap_module()
     if len(pictures) < 3:
