@@ -11,7 +11,7 @@ from structgstream.codec.container.records import FRAME, footer_offset
 from structgstream.codec.packets import Packet, PacketSink, StreamHeader
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.segments.recovery import find
-from structgstream.codec.segments.retention import SegmentsOptions
+from structgstream.codec.segments.sink import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest, write_archive
 from structgstream.codec.sinks import FileSink, MemorySink, resume_segments

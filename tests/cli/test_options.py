@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.cli.app import UsageError, main
-from structgstream.cli.join import Join
+from structgstream.cli.groups import Join
 from structgstream.cli.options import (
     RENAMED,
     CaptureOptions,

@@ -108,7 +108,7 @@ def _look_at(stream: Path, source: "FrameSource", backend: "Backend") -> tuple["
     from structgstream.codec.reader import open_stream
     from structgstream.evaluation.evaluate import compared_frames
     from structgstream.evaluation.pictures import side_by_side
-    from structgstream.serve.stream_file import StreamFile, write_page
+    from structgstream.serve.pages import StreamFile, write_page
 
     folder, camera = stream.parent, source.rig.testing[0]
     reader = open_stream(stream)
