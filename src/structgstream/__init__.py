@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from structgstream.frames import MultiViewFrame
     from structgstream.kernels.backend import Backend, select_backend
     from structgstream.memory import PeakKind
-    from structgstream.preparation.checking.check import CheckReport, Finding
+    from structgstream.pose_check.findings import Finding
+    from structgstream.preparation.checking.check import CheckReport
     from structgstream.preparation.options import PrepareOptions
     from structgstream.preparation.prepare import Preparation
     from structgstream.scene.render import Rendering, render
@@ -45,9 +46,9 @@ _HOMES = {
     "Backend": "kernels.backend",
     "Camera": "cameras",
     "CameraRig": "cameras",
-    "CheckReport": "preparation.checking.findings",
+    "CheckReport": "preparation.checking.check",
     "FileSink": "codec.sinks",
-    "Finding": "preparation.checking.findings",
+    "Finding": "pose_check.findings",
     "FrameOptions": "exporters.formats",
     "FrameReport": "session.frame_report",
     "FrameScores": "evaluation.report",
