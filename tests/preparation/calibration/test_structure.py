@@ -3,6 +3,7 @@
 
 import logging
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,8 @@ from numpy.typing import NDArray
 from structgstream.data.lenses import RadialTangential
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration import structure
-<<<<<<< HEAD
-=======
 from structgstream.preparation.calibration.keypoints import Keypoints, all_keypoints
 from structgstream.preparation.calibration.solved import SolvedCalibration
->>>>>>> s7-a
 from structgstream.preparation.calibration.structure import solve_structure
 from tests.support.calibration_errors import calibration_errors
 from tests.support.filmed import filmed_room, noise_texture
@@ -28,16 +26,11 @@ def noise(seed: int) -> NDArray[np.uint8]:
 
 @cache
 def solved() -> SolvedCalibration:
-    return solve_structure(filmed_room()[1], lens="radial", centers=False)
+    return solve_structure(filmed_room()[1], lens="radial")
 
 
 def test_a_rig_is_found_from_its_pictures() -> None:
-<<<<<<< HEAD
-    rig, pictures = filmed_room()
-    found = solve_structure(pictures, lens="radial")
-=======
     rig, found = filmed_room()[0], solved()
->>>>>>> s7-a
     assert found.missing == ()
     assert list(found.cameras) == list(rig)
     assert not found.metres
@@ -60,7 +53,7 @@ def test_principal_points_that_all_cameras_have_off_the_middle_are_found(monkeyp
         left = (own.pixels < (312, 234)).all(1)
         found[name] = Keypoints(own.pixels[left], own.descriptors[left], own.seen[left])
     monkeypatch.setattr(structure, "all_keypoints", lambda pictures, **options: found)
-    solved = solve_structure(cut, lens="radial", field_of_view=57.0)
+    solved = solve_structure(cut, lens="radial")
     errors = calibration_errors(solved.cameras, rig).values()
     assert np.median([error.rotation_degrees for error in errors]) < 0.2  # half as much as the middle is off
     assert max(error.rotation_degrees for error in errors) < 0.3
@@ -77,25 +70,19 @@ def test_shared_intrinsics_are_one() -> None:
 
 
 def test_the_same_pictures_give_the_same_numbers() -> None:
-<<<<<<< HEAD
-    pictures = {name: shots for name, shots in filmed_room()[1].items() if name in ("cam01", "cam02", "cam03")}
-    one, two = (solve_structure(pictures, lens="radial") for _ in range(2))
-=======
-    one, two = solved(), solve_structure(filmed_room()[1], lens="radial", centers=False)
->>>>>>> s7-a
+    one, two = solved(), solve_structure(filmed_room()[1], lens="radial")
     np.testing.assert_array_equal(one.points, two.points)
     for name in one.cameras:
         np.testing.assert_array_equal(one.cameras[name].camera.viewmat, two.cameras[name].camera.viewmat)
 
 
-def test_a_camera_that_looks_elsewhere_is_named(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_camera_that_looks_elsewhere_is_named(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(structure, "FIELDS_OF_VIEW", {"radial": (60.0,)})
     pictures = {name: filmed_room()[1][name] for name in ("cam01", "cam02", "cam03")}
     with caplog.at_level(logging.WARNING):
-<<<<<<< HEAD
-        found = solve_structure(pictures | {"alone": [noise(99)]}, lens="radial")
-=======
-        found = solve_structure(pictures | {"alone": [noise(99)[:120, :160]]}, lens="radial", field_of_view=60.0)
->>>>>>> s7-a
+        found = solve_structure(pictures | {"alone": [noise(99)[:120, :160]]}, lens="radial")
     assert found.missing == ("alone",)
     assert "alone" not in found.cameras
     assert "camera 'alone' could not be placed: 'alone' (0 of " in caplog.text
@@ -121,7 +108,7 @@ def test_shared_intrinsics_of_two_sizes_are_refused() -> None:
 
 
 def test_observations_are_of_the_pictures_as_filmed() -> None:
-    found = solve_structure(filmed_room()[1], lens="radial")
+    found = solved()
     straight = {name: replace(one, lens=RadialTangential()) for name, one in found.cameras.items()}
     assert np.nanmedian(replace(found, cameras=straight).errors()) > 2 * np.nanmedian(found.errors())
 
