@@ -135,9 +135,9 @@ def _measure(title: str, shifted: Shifted, *, calibrated: bool) -> None:
 
 def _told(found: Synchronization, shifted: Shifted) -> str:
     truth = {name: taken[0] / shifted.fps for name, taken in shifted.taken.items()}
-    errors = np.array([found.clocks[name].clock.offset_seconds - truth[name] for name in truth])
+    errors = np.array([found.clocks[name].offset_seconds - truth[name] for name in truth])
     errors -= np.median(errors)
-    sigmas = np.array([found.clocks[name].uncertainty_seconds for name in truth])
+    sigmas = np.array([found.uncertainty_seconds[name] for name in truth])
     wrong = int((np.abs(errors) > shifted.period / 2).sum())
     return (
         f"{len(truth)} cameras, rms {1e3 * np.sqrt(np.mean(errors**2)):.1f} ms, largest "

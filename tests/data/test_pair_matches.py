@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from structgstream import cameras
-from structgstream.data.matching import KEYPOINT_SIDE, Features, MatchConfig, PairMatcher
+from structgstream.data import matching
+from structgstream.data.matching import KEYPOINT_SIDE, Features, PairMatcher
 from tests.support.filmed import noise_texture
 
 SIDE, SHIFT = 256, 17
@@ -38,12 +39,17 @@ def test_what_is_not_the_same_has_none(second: str) -> None:
     assert one.shape == two.shape == (0, 2)
 
 
-def test_a_pair_needs_its_number_and_share_of_inliers() -> None:
+def test_a_pair_needs_its_number_and_share_of_inliers(monkeypatch: pytest.MonkeyPatch) -> None:
     known = pictures()
-    found = len(PairMatcher(known).indices([("a", "b")])["a", "b"])
-    assert len(PairMatcher(known, MatchConfig(min_inliers=found)).indices([("a", "b")])["a", "b"]) == found
-    for config in (MatchConfig(min_inliers=10 * found), MatchConfig(min_inlier_share=1.01)):
-        assert len(PairMatcher(known, config).indices([("a", "b")])["a", "b"]) == 0
+
+    def count(**limits: float) -> int:
+        for name, limit in limits.items():
+            monkeypatch.setattr(matching, name, limit)
+        return len(PairMatcher(known).indices([("a", "b")])["a", "b"])
+
+    found = count()
+    assert count(MIN_INLIERS=found) == found
+    assert count(MIN_INLIERS=10 * found) == count(MIN_INLIERS=20, MIN_INLIER_SHARE=1.01) == 0
 
 
 def test_masked_pixels_have_no_keypoints() -> None:
@@ -79,11 +85,12 @@ def test_inliers_lie_as_near_in_larger_pictures(monkeypatch: pytest.MonkeyPatch)
             descriptors = np.random.default_rng(8).random((400, 128)).astype(np.float32)
             features[name] = Features(times * pixels, descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True))
         images = {name: np.zeros((times * SIDE, times * SIDE, 3), np.uint8) for name in features}
-        matcher = PairMatcher(images, MatchConfig(min_inlier_share=0.0))
+        matcher = PairMatcher(images)
         monkeypatch.setattr(matcher, "_extract", features.__getitem__)
         return len(matcher.indices([("a", "b")])["a", "b"])
 
     monkeypatch.setattr(cameras, "REFERENCE_PIXELS", SIDE)
+    monkeypatch.setattr(matching, "MIN_INLIER_SHARE", 0.0)
     assert count(4) > 0.9 * count(1) > 200
 
 

@@ -382,17 +382,11 @@ def _distinct_nearest(
     return nearest, top, (first_distance < ratio * second_distance) & (first_distance < distance)
 
 
-@dataclass(frozen=True)
-class MatchConfig:
-    """Thresholds of the matches."""
-
-    features: int = 1500  # SIFT keypoints per picture
-    ratio: float = 0.75  # largest ratio of the best to the second-best descriptor distance
-    inlier_pixels: float = 1.5
-    """Largest epipolar distance of inliers of a pair's own epipolar geometry, in pixels of a picture of the reference
-    size (``cameras.enlargement``)."""
-    min_inliers: int = 20  # least number of inliers of a pair that is used
-    min_inlier_share: float = 0.5  # least share of inliers among the matches of a pair that is used
+FEATURES, RATIO = 1500, 0.75  # SIFT keypoints per picture; largest ratio of the best to the second-best distance
+INLIER_PIXELS = 1.5
+"""Largest epipolar distance of inliers of a pair's own epipolar geometry, in pixels of a picture of the reference size
+(``cameras.enlargement``)."""
+MIN_INLIERS, MIN_INLIER_SHARE = 20, 0.5  # of the matches of a pair that is used
 
 
 class PairMatcher:
@@ -401,20 +395,17 @@ class PairMatcher:
 
     Args:
         images: name of a camera to its picture ``[H, W, 3]``.
-        config: the thresholds.
         masks: name of a camera to ``[H, W]``, False where its picture does not count.
     """
 
     def __init__(
         self,
         images: Mapping[str, NDArray[np.uint8]],
-        config: MatchConfig = MatchConfig(),
         *,
         masks: Mapping[str, NDArray[np.bool_]] | None = None,
     ) -> None:
         self._images = images
         self._masks = masks or {}
-        self._config = config
         self._features: dict[str, Features] = {}
         self._found: dict[Pair, NDArray[np.intp]] = {}
 
@@ -444,23 +435,23 @@ class PairMatcher:
 
     def _extract(self, name: str) -> Features:
         mask = self._masks.get(name)
-        return sift_features(self._images[name], count=self._config.features, mask=mask, longest_side=KEYPOINT_SIDE)
+        return sift_features(self._images[name], count=FEATURES, mask=mask, longest_side=KEYPOINT_SIDE)
 
     def _match(self, pair: Pair) -> NDArray[np.intp]:
-        config, empty = self._config, np.empty((0, 2), np.intp)
+        empty = np.empty((0, 2), np.intp)
         first, second = (self._features[name] for name in pair)
-        if min(len(first.pixels), len(second.pixels)) < config.min_inliers:
+        if min(len(first.pixels), len(second.pixels)) < MIN_INLIERS:
             return empty
-        rows, columns = mutual_matches(first.descriptors, second.descriptors, ratio=config.ratio).T
-        if len(rows) < config.min_inliers:
+        rows, columns = mutual_matches(first.descriptors, second.descriptors, ratio=RATIO).T
+        if len(rows) < MIN_INLIERS:
             return empty
         cv2 = opencv()
         pixels1, pixels2 = first.pixels[rows], second.pixels[columns]
         height, width = np.maximum(*(self._images[name].shape[:2] for name in pair))
-        most = config.inlier_pixels * enlargement(width, height)
+        most = INLIER_PIXELS * enlargement(width, height)
         _, mask = cv2.findFundamentalMat(pixels1, pixels2, cv2.FM_RANSAC, most, 0.999, 2000)
         agree = np.zeros(len(rows), bool) if mask is None else mask.ravel().astype(bool)
-        if agree.sum() < config.min_inliers or agree.mean() < config.min_inlier_share:
+        if agree.sum() < MIN_INLIERS or agree.mean() < MIN_INLIER_SHARE:
             return empty
         return np.stack([rows[agree], columns[agree]], 1)
 

@@ -62,12 +62,10 @@ def synchronized(
         if chosen != "auto":
             raise
         raise CaptureError(f"{error} Cameras that one signal starts need none of this: --synchronize none.") from None
-    clocks = {name: estimate.clock for name, estimate in found.clocks.items()}
-    shared_seconds(footage, clocks)
+    shared_seconds(footage, found.clocks)
     summary = " ".join([f"{found.method}: {found.reason}" + ("." if found.warnings else ""), *found.warnings])
-    largest_error = max(estimate.uncertainty_seconds for estimate in found.clocks.values())
-    sure = found.method != "motion" or largest_error <= SURE_PERIODS / footage.fps
-    return Clocks(clocks, found.method, summary, sure)
+    sure = found.method != "motion" or max(found.uncertainty_seconds.values()) <= SURE_PERIODS / footage.fps
+    return Clocks(found.clocks, found.method, summary, sure)
 
 
 def first_clocks(footage: Footage, options: PrepareOptions) -> Clocks:

@@ -42,11 +42,7 @@ LABEL_REACH = 0.06  # of the rig's radius: closer cameras share a label
 
 
 def draw_matrix(path: Path, report: CheckReport, *, limit_pixels: float, stray: Collection[Pair] = ()) -> None:
-    """Median epipolar error of every pair; pairs without matches stay white, pairs ``stray`` have a cross.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Median epipolar error of every pair; pairs without matches stay white, pairs ``stray`` have a cross."""
     names = list(report.cameras)
     values = np.full((len(names), len(names)), np.nan)
     for pair in report.pairs:
@@ -81,11 +77,7 @@ def draw_matrix(path: Path, report: CheckReport, *, limit_pixels: float, stray: 
 
 
 def draw_coverage(path: Path, examined: Examination, *, near: float, unit: str) -> None:
-    """The rig and the points from above and from the side, coloured by the number of cameras that see them.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """The rig and the points from above and from the side, coloured by the number of cameras that see them."""
     cameras = examined.cameras
     centers = np.stack([camera.center.numpy() for camera in cameras.values()])
     axes = np.stack([camera.viewmat.numpy()[2, :3] for camera in cameras.values()])
@@ -132,11 +124,7 @@ def draw_coverage(path: Path, examined: Examination, *, near: float, unit: str) 
 
 
 def draw_colors(path: Path, report: CheckReport) -> None:
-    """Exposure and white balance of each camera against the median camera.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Exposure and white balance of each camera against the median camera."""
     names = [name for name, camera in report.cameras.items() if camera.exposure_stops is not None]
     figure = figure_of(max(6.0, 0.36 * len(names) + 2.4), 3.6)
     axis = figure.subplots()
@@ -158,11 +146,7 @@ def draw_colors(path: Path, report: CheckReport) -> None:
 
 
 def draw_times(path: Path, report: CheckReport) -> None:
-    """Time offset that is left between cameras, with its uncertainty and the limit of 5 ms.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Time offset that is left between cameras, with its uncertainty and the limit of 5 ms."""
     known = {name: camera for name, camera in report.cameras.items() if camera.offset_ms is not None}
     names = list(known)
     values = np.array([camera.offset_ms for camera in known.values()], float)
@@ -257,11 +241,7 @@ MAX_PAIRS = 6
 
 
 def draw_overlay(path: Path, examined: Examination, report: CheckReport, name: str) -> None:
-    """A camera's picture; each keypoint is joined with where the point of the other cameras falls.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """A camera's picture; each keypoint is joined with where the point of the other cameras falls."""
     camera, tracks = examined.cameras[name], examined.tracks
     figure = figure_of(WIDTH_INCHES, 0.9 * WIDTH_INCHES * camera.height / camera.width + 0.4)
     axis = figure.subplots()
@@ -309,11 +289,7 @@ def chosen_pairs(examined: Examination) -> list[Pair]:
 
 
 def draw_epipolar(path: Path, examined: Examination, pair: Pair) -> None:
-    """Both pictures of a pair: matched keypoints, and in the second the lines on which they lie by the poses.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Both pictures of a pair: matched keypoints, and in the second the lines on which they lie by the poses."""
     first, second = (examined.cameras[name] for name in pair)
     pixels1, pixels2 = examined.evidence.pixels(pair)
     error = pair_errors(examined.evidence, examined.cameras)[pair]

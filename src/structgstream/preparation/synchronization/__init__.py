@@ -3,10 +3,9 @@
 
 from structgstream.preparation.synchronization.synchronize import (
     METHODS,
-    ClockEstimate,
     Method,
     Synchronization,
     synchronize,
 )
 
-__all__ = ["METHODS", "ClockEstimate", "Method", "Synchronization", "synchronize"]
+__all__ = ["METHODS", "Method", "Synchronization", "synchronize"]

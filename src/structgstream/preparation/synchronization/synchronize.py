@@ -44,24 +44,16 @@ WARNED_SECONDS = 5e-3
 
 
 @dataclass(frozen=True)
-class ClockEstimate:
-    """A camera's clock."""
-
-    clock: Clock  # from the camera's stamps to common time
-    method: str  # ``csv``, ``stamps``, ``audio``, ``motion`` or ``none``
-    uncertainty_seconds: float  # standard error of its common times, relative to the mean of all cameras
-    residual_seconds: float
-    """How much later than the common instants the camera's frames are that are nearest to them: the misalignment that
-    choosing frames leaves; of the frames of the take, the one with the largest amount."""
-
-
-@dataclass(frozen=True)
 class Synchronization:
     """The clocks of all cameras."""
 
-    clocks: Mapping[str, ClockEstimate]
-    """Camera to its clock; the common clock is that of the first camera, or the one that stamps are of."""
-    method: str  # how they were found
+    clocks: Mapping[str, Clock]
+    """Camera to its clock, from the camera's stamps to common time: that of the first camera, or the one that stamps
+    are of."""
+    uncertainty_seconds: Mapping[str, float]
+    """Camera to the standard error of its common times, relative to the mean of all cameras."""
+    residual_seconds: Mapping[str, float]  # see :func:`frame_residuals`
+    method: str  # how they were found: ``csv``, ``stamps``, ``audio``, ``motion`` or ``none``
     reason: str  # why this method was chosen, a sentence
     warnings: tuple[str, ...]  # what the user should know, sentences
 
@@ -83,9 +75,6 @@ def synchronization(
     common = {name: clocks[name].common_seconds(own) for name, own in stamps.items()}
     _require_overlap(common)
     residuals = frame_residuals(common)
-    estimates = {
-        name: ClockEstimate(clocks[name], method, float(uncertainties[name]), residuals[name]) for name in stamps
-    }
     late = [name for name in stamps if abs(residuals[name]) > WARNED_SECONDS]
     if late:
         worst = max(late, key=lambda name: abs(residuals[name]))
@@ -100,11 +89,11 @@ def synchronization(
             f"The clocks of {listed(vague, 8)} are known to {max(uncertainties[name] for name in vague) * 1e3:.0f} ms "
             "only, so a frame may be wrong by one.",
         )
-    return Synchronization(estimates, method, reason, warnings)
+    return Synchronization(clocks, uncertainties, residuals, method, reason, warnings)
 
 
 def frame_residuals(common: Mapping[str, Floats]) -> dict[str, float]:
-    """For each camera by how much its nearest frames are late, at worst.
+    """For each camera by how much its nearest frames are late, at worst: the misalignment that choosing frames leaves.
 
     Args:
         common: camera to the common seconds ``[T]`` of its frames. The instants have the rate of the slowest camera
