@@ -98,12 +98,10 @@ def calibrated_camera(name: str, *, viewmat: ArrayLike, K: ArrayLike, width: int
     """One camera of the calibration file ``where``.
 
     Args:
-        name: the camera's name, for messages.
         viewmat: ``[4, 4]`` or ``[3, 4]``, world to camera, OpenCV axes.
         K: ``[3, 3]`` intrinsics, pixels.
         width: picture width that ``K`` belongs to, pixels.
         height: picture height that ``K`` belongs to, pixels.
-        where: the file that the numbers come from.
 
     Raises:
         CalibrationError: invalid values (see :class:`Camera`), or a principal point for a picture of another size.

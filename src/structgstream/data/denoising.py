@@ -54,8 +54,6 @@ class Denoised(SourceWrapper):
     """The same frames; the training pictures of some of them are means over the frames after them.
 
     Args:
-        source: the recording.
-        config: what is averaged.
         at: numbers of the frames that are.
     """
 
@@ -88,10 +86,8 @@ def mean_of_still(
     """``frame`` with the means of its pixels over the frames ``later``, as long as they stand still, rounded to 8 bits.
 
     Args:
-        frame: its pictures.
         later: the frames after it, of which as many are read as ``config`` says.
         names: cameras whose pictures are averaged; the others' stay.
-        config: what is averaged.
 
     Returns:
         the frame; ``mean_of`` is the mean number of pictures over which a pixel was averaged.

@@ -49,10 +49,6 @@ def recognizes_calibrated(path: Path) -> bool:
 def read_calibrated(path: Path, file: Path | None = None) -> Calibration | None:
     """The cameras of the other tools' calibration file in the folder ``path``; None when there is none.
 
-    Args:
-        path: the folder.
-        file: the only file to consider; None for any.
-
     Raises:
         CalibrationError: a broken file, one that only running it could read, or several that differ.
     """

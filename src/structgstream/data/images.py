@@ -117,7 +117,6 @@ def common_pictures(
 
     Args:
         files: camera name to its pictures, by the name of the instant.
-        where: the capture, for messages.
         training: names of the cameras that are not held out; None for all.
 
     Raises:
@@ -152,7 +151,6 @@ def read_picture(path: Path, *, bits: int = 16) -> NDArray[np.uint8]:
     """One picture as ``[H, W, 3]`` sRGB, as its pixels are stored.
 
     Args:
-        path: the file.
         bits: of which the values of pictures of 16 bits are (:func:`significant_bits`).
 
     Raises:

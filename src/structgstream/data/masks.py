@@ -117,7 +117,6 @@ def with_masks(source: FrameSource, folder: Path) -> FrameSource:
 
     Args:
         source: the whole capture, as its layout is read.
-        folder: its folder ``masks``.
 
     Raises:
         CaptureError: a mask of an unknown camera, of no frame, of another size, or in a lossy format.

@@ -249,8 +249,6 @@ def mutually_best(
     """Matches ``[S, 2]`` among candidates that are each other's best and pass the ratio test both ways.
 
     Args:
-        first: keypoints of one picture.
-        second: those of the other.
         row: ``[C]``, of each candidate the index into ``first``.
         column: ``[C]``, the index into ``second``.
         ratio: see :func:`distinct_best`.

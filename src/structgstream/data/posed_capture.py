@@ -79,8 +79,6 @@ def open_posed(
     """The capture at ``path`` with these cameras; with the calibration's points.
 
     Args:
-        path: the folder with pictures or videos.
-        calibration: its cameras.
         target: chooses the pinhole to undistort a camera to, see :func:`~structgstream.data.undistortion.rectilinear`.
         complete: whether every video must be calibrated; else the others are left out with a warning.
         fps: frames a second of pictures; None for :data:`PICTURE_FPS`. Videos state theirs.

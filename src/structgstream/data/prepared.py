@@ -26,7 +26,7 @@ from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, Radial
 from structgstream.data.source import FrameSource
 from structgstream.data.text_files import Unreadable, mapping, number, pixels, read_json
 from structgstream.data.timeline import Clock, common_slots, natural, picture_slots
-from structgstream.data.undistortion import UndistortedSource
+from structgstream.data.undistortion import undistorted_to
 from structgstream.data.video import synchronised
 from structgstream.data.video_index import scan_videos
 from structgstream.errors import CalibrationError, CaptureError
@@ -151,8 +151,7 @@ def open_prepared(path: Path) -> FrameSource:
 def undistorted(source: FrameSource, path: Path, capture: PreparedCapture) -> FrameSource:
     """Pictures of :func:`filmed_rig` for the pinholes of the capture; the source itself if that changes nothing."""
     filmed = {name: camera.filmed for name, camera in capture.cameras.items()}
-    made = UndistortedSource(source, prepared_rig(path, capture), filmed)
-    return source if all(made.is_unchanged(name) for name in filmed) else made
+    return undistorted_to(prepared_rig(path, capture), source, filmed)
 
 
 def filmed_rig(path: Path, capture: PreparedCapture) -> CameraRig:

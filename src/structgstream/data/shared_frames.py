@@ -21,7 +21,6 @@ class SharedFrames:
     """A source that is read once (Note [Readers]). Thread-safe.
 
     Args:
-        source: the capture, or live cameras.
         starts: number of the frame with which each reader begins.
         first: number of the frame that each one needs again when it is resumed, until it states another
             (``RetainsFrames``).

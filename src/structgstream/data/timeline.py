@@ -132,7 +132,6 @@ def common_slots(
 
     Args:
         slots: camera name to the slots it has, ascending; a slot is one instant of the common timeline.
-        where: the capture, for messages.
         label: names the instant of a slot, for messages ("at 0.133 s", "000017").
         training: names of the cameras that are not held out; None for all.
 

@@ -49,7 +49,6 @@ def stated_colors(path: Path, frame: "VideoFrame | None") -> str:
     """What a video states of its colours, in words.
 
     Args:
-        path: the video, for messages.
         frame: one of its frames; None where none decodes.
 
     Raises:

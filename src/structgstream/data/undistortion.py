@@ -78,7 +78,6 @@ def shows(filmed: LensCamera, normalised: Floats) -> NDArray[np.bool_]:
     """Which directions a lens has in its picture, within the outermost pixel centres.
 
     Args:
-        filmed: the camera with its lens.
         normalised: ``[..., 2]``, x and y at depth 1.
 
     Returns:
@@ -316,7 +315,6 @@ def undistort(
 
     Args:
         source: its rig has the intrinsics and sizes of ``filmed``.
-        filmed: the same cameras with their lenses.
         target: chooses the pinhole for a camera, see :func:`rectilinear`.
 
     Raises:
@@ -328,5 +326,10 @@ def undistort(
             cameras[name] = replace(target(filmed[name]), near=source.rig[name].near)
         except CalibrationError as error:
             raise CalibrationError(f"Camera {name!r} of {source.name}: {error}") from None
-    made = UndistortedSource(source, source.rig.mapped(cameras), filmed)
-    return source if all(made.is_unchanged(name) for name in made.rig) else made
+    return undistorted_to(source.rig.mapped(cameras), source, filmed)
+
+
+def undistorted_to(pinholes: CameraRig, source: FrameSource, filmed: Mapping[str, LensCamera]) -> FrameSource:
+    """``source``, taken with lenses, for these pinholes; the source itself if that changes nothing."""
+    made = UndistortedSource(source, pinholes, filmed)
+    return source if all(made.is_unchanged(name) for name in pinholes) else made

@@ -105,10 +105,8 @@ def synchronised(
 
     Args:
         tracks: camera name to its video.
-        rig: the same cameras.
         where: the capture, for messages and for its name.
         fps: frames a second; measured from the time stamps when None.
-        points: passed on to the source.
         clocks: camera name to its clock; None if time stamps are of one clock, are taken at the rate ``fps`` if that
             is given, and no camera has two frames for one instant.
 

@@ -47,7 +47,6 @@ def pictures_at(
     The second is None where all is opaque.
 
     Args:
-        track: the video.
         stamps: time stamps of its frames, ascending, in ticks; None where no picture is wanted.
         size: width and height of the pictures.
         on_damage: called for frames that cannot be decoded, whose pictures are None.

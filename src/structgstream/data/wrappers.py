@@ -210,7 +210,6 @@ class EveryNthFrame(SourceWrapper):
     """Every ``step``-th frame, counted from 0.
 
     Args:
-        source: the recording.
         step: from one frame that is used to the next.
         rate: frames a second; None for a ``step``-th of the source's, so that the time stays.
     """
@@ -264,7 +263,6 @@ class Prefetch(SourceWrapper):
     """The same frames, decoded ahead in a background thread; results are unchanged.
 
     Args:
-        source: the capture.
         depth: number of frames decoded ahead, at least 1; each costs its pictures' bytes.
     """
 

@@ -57,8 +57,6 @@ def gather(
     of their poses.
 
     Args:
-        frame: the pictures.
-        cameras: as given.
         matcher: of the same pictures, where some pairs were matched before.
         readings: other poses of the same cameras.
     """

@@ -106,8 +106,6 @@ def resect(tracks: Tracks, camera: Camera, name: str) -> Resection | None:
 
     Args:
         tracks: with the camera among those that are off, so that no point is made of its keypoints.
-        camera: as given.
-        name: of the camera.
     """
     own = tracks.of(name) if name in tracks.names else np.zeros(len(tracks.point), bool)
     if own.sum() < MIN_SEEN:

@@ -40,7 +40,6 @@ def synchronized(
     """The clocks of the cameras.
 
     Args:
-        footage: what they filmed.
         options: ``synchronize`` is the method.
         cameras: their calibration, where it is known.
 

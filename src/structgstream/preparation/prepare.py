@@ -73,11 +73,7 @@ MIN_SOLVED = 3  # cameras, for poses that can be checked
 
 
 class CameraSteps:
-    """The steps of one preparation up to a calibration in a unit.
-
-    Args:
-        job: what is prepared, and how.
-    """
+    """The steps of one preparation up to a calibration in a unit."""
 
     def __init__(self, job: Job) -> None:
         self.videos, self.capture, self.options = job.videos, job.capture, job.options
@@ -310,11 +306,7 @@ NEAR_SHARE = 0.5  # of the depth of the nearest points: what comes closer later 
 
 
 class CaptureSteps:
-    """The steps of one preparation from a calibration on.
-
-    Args:
-        job: what is prepared, and how.
-    """
+    """The steps of one preparation from a calibration on."""
 
     def __init__(self, job: Job) -> None:
         self.videos, self.capture, self.options = job.videos, job.capture, job.options
@@ -541,9 +533,7 @@ def check_folder(path: Path, *, report: Path | None, listener: Listener | None =
     """The check of a capture.
 
     Args:
-        path: its folder.
         report: folder for the report; None writes none.
-        listener: receives the progress.
 
     Raises:
         CaptureError: the capture cannot be opened or read.

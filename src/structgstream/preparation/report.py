@@ -374,7 +374,6 @@ def page(report: CheckReport, *, off: Sequence[str], sections: Mapping[str, Sequ
     """The page's HTML.
 
     Args:
-        report: the numbers.
         off: cameras to mark.
         sections: heading to file names of pictures in the folder.
     """

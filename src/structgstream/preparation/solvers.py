@@ -50,10 +50,6 @@ def solve_cameras(
     """Cameras by ``sfm`` or ``board``.
 
     Args:
-        method: either.
-        footage: what the cameras filmed.
-        clocks: of the cameras.
-        options: of the preparation.
         focals: focal lengths in pixels that cameras state, with which structure from motion begins.
 
     Raises:

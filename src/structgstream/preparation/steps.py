@@ -97,11 +97,9 @@ class Steps(Listener):
         """The result of a step, from the disk when its inputs are the same.
 
         Args:
-            step: its name.
             inputs: what it depends on apart from other steps, as JSON can hold it.
             compute: makes the result.
             pack: the result as numbers and arrays.
-            unpack: the reverse.
             summary: the result in one line.
             after: steps whose results it uses.
 

@@ -41,7 +41,6 @@ def opencv_camera(
     """A camera in OpenCV's conventions.
 
     Args:
-        name: the camera's.
         K: intrinsics ``[3, 3]``, pixels, the top-left pixel's centre at (0, 0).
         dist: coefficients in OpenCV's order, of any shape; None for none.
         R: rotation, world to camera, as matrix ``[3, 3]`` or vector ``[3]``.

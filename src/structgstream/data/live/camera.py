@@ -59,18 +59,10 @@ class CameraFeed:
     """Reads one camera until it is stopped, or until its file ends or cannot be read.
 
     Args:
-        name: of the camera.
-        camera: how it is read.
         size: width and height of the calibration's pictures.
-        receiver: receives its pictures.
-        clock: maps time stamps to the common clock.
-        faults: counts and logs faults.
-        base: which clock states when a picture was taken.
         now: monotonic seconds; ``unix_offset`` added, Unix time.
-        unix_offset: see ``now``.
         silent_seconds: without packets for this time, the camera is opened again.
         stuck_seconds: a picture that does not change for this time is not used if others change.
-        recorder: records its packets, or None.
         open_camera: opens a camera with a timeout in seconds; None for PyAV.
         wait: waits some seconds before reconnecting; None for a wait that :meth:`stop` ends.
     """

@@ -78,9 +78,7 @@ class ClockMapper:
     """Maps the time stamps of one camera to the common clock, in the order of presentation, across all its connections.
 
     Args:
-        base: which clock states when a picture was taken.
         offset_seconds: added to every time.
-        resets: shared by the cameras.
     """
 
     def __init__(self, base: TimeBase, *, offset_seconds: float = 0.0, resets: ClockResets | None = None) -> None:

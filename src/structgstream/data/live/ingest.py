@@ -62,12 +62,8 @@ class Ingest:
     """Cameras' pictures on their way to a buffer, as complete sets.
 
     Args:
-        rig: the content of the rig file.
         sizes: width and height of each camera's pictures as they were calibrated, pixels.
         fps: maximum number of sets per second.
-        faults: counts and logs faults.
-        buffer: receives the sets.
-        recording: records packets, or None.
         now: monotonic seconds.
         unix_offset: Unix time minus ``now``, seconds.
         open_camera: opens a camera with a timeout; None for PyAV.

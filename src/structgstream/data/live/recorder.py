@@ -47,8 +47,6 @@ class Recording:
 
     Args:
         folder: created; a recording in it is continued in its next part.
-        calibration: of the cameras.
-        fps: of the common timeline.
 
     Raises:
         StorageError: the folder cannot be written.

@@ -72,7 +72,6 @@ class ResumeCache:
         """Stores a frame's pictures, and removes those that are no longer needed.
 
         Args:
-            frame: the frame.
             origin_seconds: the common clock at presentation time 0.
 
         Raises:
@@ -145,7 +144,6 @@ def write_pictures(path: Path, frame: MultiViewFrame, **facts: Any) -> None:
     """Writes a frame's pictures atomically and durably.
 
     Args:
-        path: the file.
         frame: its pictures ``[H, W, 3]`` and masks ``[H, W]``.
         facts: plain JSON values to store with them.
 

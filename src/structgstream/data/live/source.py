@@ -138,9 +138,7 @@ class LiveSource:
     """Frames of live cameras (docs/live.md). Cameras are opened when the first live frame is asked for.
 
     Args:
-        path: the rig file.
         stream: the stream to write, next to which the resume cache lies (:class:`ResumeCache`).
-        options: see :class:`LiveOptions`.
         now: monotonic seconds.
         unix: Unix time, asked once.
 

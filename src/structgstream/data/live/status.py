@@ -35,7 +35,6 @@ class FaultLog:
     """Counts faults by camera, and logs each kind at most once in ``interval_seconds``. Thread-safe.
 
     Args:
-        name: of the rig, for messages.
         now: monotonic seconds.
         interval_seconds: after which a kind of fault of a camera is logged again.
     """

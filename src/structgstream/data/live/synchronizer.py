@@ -69,7 +69,6 @@ class FrameSynchronizer:
         tolerance_seconds: maximum distance of a picture from the instant.
         deadline_seconds: how long a set waits for its pictures.
         queue_frames: maximum number of waiting pictures of a camera; the oldest are dropped.
-        count: counts dropped and unmatched pictures.
         started: when the cameras were opened; until the deadline they count as present.
     """
 

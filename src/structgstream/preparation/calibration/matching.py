@@ -114,10 +114,8 @@ def guided_matches(
     """Matches of cameras that look the same way: each other's best ones among those near one epipolar plane.
 
     Args:
-        keypoints: by camera.
         cameras: with their rough poses.
         pixels: how far from the plane a keypoint may lie.
-        workers: threads.
 
     Returns:
         ``[S, 2]`` by pair of cameras: indices of the keypoints of the first and of the second.

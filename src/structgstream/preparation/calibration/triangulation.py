@@ -140,10 +140,7 @@ def rematched(
 
     Args:
         found: a first solution (Note [What a first solution lacks]).
-        keypoints: of its cameras, by name.
-        limits: which observations stay.
         adjust: adjusts cameras and points together.
-        workers: threads.
     """
     before = _counts(found)
     if before.min() >= ENOUGH:

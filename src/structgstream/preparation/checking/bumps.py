@@ -86,9 +86,6 @@ def bump_findings(
 
     Args:
         first: the frame of ``evidence``.
-        last: a later one.
-        evidence: matches of the first frame.
-        cameras: by name.
     """
     names = [name for name in cameras if name in first.images and name in last.images]
     movements = {name: picture_movement(first.images[name], last.images[name]) for name in names}

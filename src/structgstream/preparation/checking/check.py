@@ -179,10 +179,7 @@ def check_capture(
     """Checks the first frame that all cameras have and the last; held-out cameras are checked, too.
 
     Args:
-        source: the opened capture.
         unit: of length, where it is known.
-        listener: receives the progress.
-        examination: of this capture, where it was made already.
 
     Raises:
         CaptureError: a frame cannot be read.

@@ -131,8 +131,6 @@ def scale_findings(
     Args:
         depths: of points that the pictures confirm, see :func:`observed_depths`.
         points: ``[P, 3]`` that came with the capture, or None.
-        cameras: of the rig.
-        radius: of the rig.
         unit: of length, where the capture states it.
     """
     findings = []

@@ -44,7 +44,6 @@ def read_timestamps(file: Path, stamps: Mapping[str, Floats]) -> dict[str, State
     """The clocks that a table states.
 
     Args:
-        file: the table.
         stamps: camera to the seconds ``[T]`` of all its frames by its own clock.
 
     Raises:

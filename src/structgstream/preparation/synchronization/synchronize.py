@@ -154,7 +154,6 @@ def synchronize(
     """The clocks of the cameras.
 
     Args:
-        footage: the files of each camera.
         method: ``csv`` (``timestamps``), ``stamps`` (of the files, which share a clock), ``audio``, ``motion``,
             ``none`` (the cameras were started by one signal: stamps hold as they are), or ``auto``: csv if given,
             else audio if all cameras have sound in which something is common, else motion.
