@@ -16,6 +16,7 @@ from structgstream.executors.task import TaskResult
 from structgstream.owned_folders import MARKER, Owner
 from structgstream.parallel.exchange import ObjectFolder
 from structgstream.parallel.parts import PURPOSE, Parts
+from tests.support.backends import QUICKEST
 from tests.support.inline_engine import InlineEngine
 from tests.support.quick_streams import CLIP, QUARTER, error_of
 
@@ -44,14 +45,23 @@ def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_the_result_is_an_ordinary_stream(stream: Path) -> None:
+def test_the_result_is_a_stream_of_what_the_commands_of_its_parts_make(
+    stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with open_stream(stream) as reader:
-        assert len(reader) == 4
-    parts = stream.with_name("clip.sgs.parts")
-    assert sorted(path.name for path in (parts / "segments").glob("*.sgs")) == [
-        "group-000000-000002.sgs",
-        "group-000002-000004.sgs",
-    ]
+        assert (len(reader), reader.complete) == (4, True)
+    parts, out = stream.with_name("clip.sgs.parts"), tmp_path / "joined.sgs"
+    segments = sorted((parts / "segments").glob("*.sgs"))
+    assert [path.name for path in segments] == ["group-000000-000002.sgs", "group-000002-000004.sgs"]
+    assert main(["join", *map(str, reversed(segments)), "-o", str(out), "--check", "--device", QUICKEST]) == 0
+    assert out.read_bytes() == stream.read_bytes()
+    given = [CLIP, "--init", str(parts / "header.sgs"), "--device", QUICKEST]
+    track = str(parts / "track.sgt")
+    capsys.readouterr()
+    assert main(["track", *given, "-o", track, "--groups", "2", "--allow-unaligned", "--frames", "4"]) == 0
+    assert "2 groups in" in capsys.readouterr().out
+    assert main(["fit-group", *given, "--track", track, "--frames", "2:4", "-o", str(segments[1])]) == 0
+    assert "is finished" in capsys.readouterr().out
 
 
 def test_again_it_says_so_and_makes_nothing(stream: Path, capsys: pytest.CaptureFixture[str]) -> None:

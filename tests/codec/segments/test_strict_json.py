@@ -97,12 +97,6 @@ def test_bounds_belong_to_what_is_allowed() -> None:
     assert isinstance(fields(x=3).number("x"), float)
 
 
-def test_pairs_do_not_fall() -> None:
-    assert fields(x=[1, 1]).pair("x") == (1.0, 1.0)
-    with pytest.raises(StreamError, match="do not fall"):
-        fields(x=[2, 1]).pair("x")
-
-
 @pytest.mark.parametrize("text", ["\ud800", "a\udfffb"])
 def test_halves_of_characters_are_no_text(text: str) -> None:
     """Nobody could print them; JSON writes them as an escape."""
