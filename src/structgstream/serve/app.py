@@ -380,7 +380,7 @@ async def _unrouted(request: Request, error: Exception) -> Response:
 
 
 async def _broken(request: Request, error: Exception) -> Response:
-    return PlainTextResponse(f"The stream's manifest.json is no manifest: {error}.", 502, NO_STORE_HEADERS)
+    return PlainTextResponse(f"The stream's manifest.json is no manifest: {error}", 502, NO_STORE_HEADERS)
 
 
 async def _unreadable(request: Request, error: Exception) -> Response:
