@@ -9,7 +9,7 @@ import torch
 from structgstream.cameras import Camera
 from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import LensCamera, RadialTangential
-from structgstream.preparation.calibration.adjustment import Limits, adjust_together, cleaned
+from structgstream.preparation.calibration.bundle import Limits, adjust_together, cleaned
 from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
 from tests.support.calibration_errors import calibration_errors

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from structgstream.preparation.calibration import triangulation
-from structgstream.preparation.calibration.adjustment import Limits, adjust_together
+from structgstream.preparation.calibration.bundle import Limits, adjust_together
 from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DOWN, FOCAL
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
 from structgstream.preparation.calibration.triangulation import rematched

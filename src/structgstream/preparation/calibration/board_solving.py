@@ -16,9 +16,15 @@ from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera
 from structgstream.errors import CalibrationError
 from structgstream.geometry import Floats
-from structgstream.preparation.calibration.adjustment import cameras_in, estimated, posed_problem
 from structgstream.preparation.calibration.board import Board, Sighting, board_sightings
-from structgstream.preparation.calibration.bundle import BodyObservations, Parameters, solved
+from structgstream.preparation.calibration.bundle import (
+    BodyObservations,
+    Parameters,
+    cameras_in,
+    estimated,
+    posed_problem,
+    solved,
+)
 from structgstream.preparation.calibration.colmap import (
     LensModel,
     colmap_camera,

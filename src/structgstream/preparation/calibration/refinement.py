@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Pair, connected_groups
 from structgstream.errors import CalibrationError, ConfigError
-from structgstream.preparation.calibration.adjustment import Limits, adjust_together
+from structgstream.preparation.calibration.bundle import Limits, adjust_together
 from structgstream.preparation.calibration.colmap import MODELS, LensModel, holding
 from structgstream.preparation.calibration.lens_terms import ASPECT, DISTORTION, FOCAL
 from structgstream.preparation.calibration.mapping import adjust, cameras_of, filtered, observed
@@ -55,7 +55,7 @@ def refine(
     """Adjust ``cameras`` to pictures of the same instants.
 
     One track in five is held out. Only if the refined cameras fit these better than the given ones do, they are
-    returned, after a last adjustment to all tracks (adjustment.py); they are moved, turned and scaled to lie as close
+    returned, after a last adjustment to all tracks (bundle.py); they are moved, turned and scaled to lie as close
     to the given ones as they can.
 
     Args:

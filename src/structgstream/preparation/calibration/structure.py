@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from structgstream.data.calibration import listed
 from structgstream.data.matching import Pair, connected_groups
 from structgstream.errors import CalibrationError
-from structgstream.preparation.calibration.adjustment import Limits, adjust_together
+from structgstream.preparation.calibration.bundle import Limits, adjust_together
 from structgstream.preparation.calibration.colmap import (
     LensModel,
     field_of_view,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Pair
-from structgstream.preparation.calibration.adjustment import Limits, chosen
+from structgstream.preparation.calibration.bundle import Limits, chosen
 from structgstream.preparation.calibration.colmap import colmap_camera, colmap_pose, pycolmap_module
 from structgstream.preparation.calibration.keypoints import Keypoints, all_keypoints
 from structgstream.preparation.calibration.mapping import filtered, observed, verified_pairs, write_database
