@@ -76,7 +76,8 @@ def solve_board(
     """
     pycolmap_module()
     sightings = board_sightings(pictures, board)
-    views = {name: _own_view(name, sightings[name], board, shots[0].shape, lens) for name, shots in pictures.items()}
+    sizes = {name: (shots[0].shape[1], shots[0].shape[0]) for name, shots in pictures.items()}
+    views = {name: _own_view(name, sightings[name], board, size, lens) for name, size in sizes.items()}
     sensors = _connected_sensors(views)
     poses = _rig_poses(views, sensors, sightings)
     filmed = {name: _placed(view.filmed, sensors[name]) for name, view in views.items()}
@@ -97,7 +98,7 @@ class _View:
 
 
 def _own_view(
-    name: str, own_sightings: Sequence[Sighting], board: Board, shape: tuple[int, ...], lens: LensModel
+    name: str, own_sightings: Sequence[Sighting], board: Board, size: tuple[int, int], lens: LensModel
 ) -> _View:
     """Intrinsics from the field of view that fits best, and a pose for each sighting that agrees with them."""
     chosen = sorted(own_sightings, key=lambda sighting: (-len(sighting.corners), sighting.instant))[
@@ -108,7 +109,7 @@ def _own_view(
     sample = [chosen[index] for index in picks]
     best: tuple[float, LensCamera] | None = None
     for degrees in FIELDS_OF_VIEW[lens]:
-        camera = filmed_camera(guessed_camera(lens, 1, shape[1::-1], degrees), pycolmap_module().Rigid3d())
+        camera = filmed_camera(guessed_camera(lens, 1, size, degrees), pycolmap_module().Rigid3d())
         poses = _poses(camera, sample, board)
         if len(poses) < max(3, len(sample) // 2):
             continue
