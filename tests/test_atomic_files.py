@@ -44,7 +44,7 @@ def test_killed_at_any_step_a_file_is_the_old_one_or_the_new_one(tmp_path: Path,
     before = OLD if there else None
     first_new = found.index(NEW * 1000)
     assert found == [before] * first_new + [NEW * 1000] * (len(found) - first_new)
-    assert first_new >= 5, "opened, locked, emptied, written, synced"
+    assert first_new >= 3, "as before, opened, written"
     for folder in killed:
         atomic_write(folder / "a", NEW)  # What was left is in nobody's way.
         assert [(entry.name, entry.read_bytes()) for entry in folder.iterdir()] == [("a", NEW)]

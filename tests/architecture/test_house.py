@@ -46,7 +46,7 @@ def loaded_by(imports: str, among: tuple[str, ...]) -> list[str]:
 
 
 def test_importing_the_package_is_light() -> None:
-    heavy = ("torch", "av", "cv2", "matplotlib", "tyro", "gsplat")
+    heavy = ("torch", "numpy", "av", "cv2", "matplotlib", "tyro", "rich", "gsplat")
     assert not loaded_by("structgstream, structgstream.cli", heavy)
 
 

@@ -130,33 +130,14 @@ def test_wrong_usage_of_a_command(command, capsys: pytest.CaptureFixture[str]) -
     assert capsys.readouterr().err == "structgstream: there is no preset 'x'.\n"
 
 
-@pytest.mark.parametrize("name", list(COMMANDS))
-def test_every_command_has_help_with_an_example_and_no_torch(name: str) -> None:
-    code = (
-        f"import sys; from structgstream.cli import main; status = main(['{name}', '--help']); "
-        "print([m for m in ('torch', 'numpy', 'av', 'cv2', 'matplotlib') if m in sys.modules]); sys.exit(status)"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr
-    assert f"Example: structgstream {name}" in result.stdout
-    assert result.stdout.splitlines()[-1] == "[]"
-
-
-def test_importing_the_command_line_is_free() -> None:
-    code = "import sys, structgstream.cli; print([m for m in ('torch', 'tyro', 'rich', 'numpy') if m in sys.modules])"
+def test_every_command_has_help_with_an_example_and_no_torch(capsys: pytest.CaptureFixture[str]) -> None:
+    for name in COMMANDS:
+        assert main([name, "--help"]) == 0
+        assert f"Example: structgstream {name}" in capsys.readouterr().out
+    code = f"import sys; from structgstream.cli import main; [main([name, '--help']) for name in {[*COMMANDS]}]; "
+    code += "print([m for m in ('torch', 'numpy', 'av', 'cv2', 'matplotlib') if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "[]"
-
-
-def test_an_unknown_option_is_wrong_usage() -> None:
-    result = subprocess.run(
-        [sys.executable, "-m", "structgstream", "inspect", "x.sgs", "--jsn", "y"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert result.returncode == 2
-    assert "--json" in result.stderr
+    assert result.stdout.splitlines()[-1] == "[]"
 
 
 def test_another_distribution_brings_commands(
@@ -181,12 +162,11 @@ def test_another_distribution_brings_commands(
     assert "Did you mean 'count'?" in capsys.readouterr().err
 
 
-def test_exit_status_of_the_program(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "structgstream", "export", str(tmp_path / "no.sgs"), "--format", "html"]
+def test_exit_status_of_the_program() -> None:
+    command = [sys.executable, "-m", "structgstream", "inspect", "x.sgs", "--jsn", "y"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert result.returncode == 1
-    assert result.stderr.count("\n") == 1
-    assert result.stdout == ""
+    assert (result.returncode, result.stdout) == (2, "")
+    assert "--json" in result.stderr
 
 
 def test_paths_that_cannot_work_are_told(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -64,23 +64,6 @@ def test_the_list_and_the_numbers_lie_where_they_belong(made: Path) -> None:
     assert {path.name for path in made.iterdir()} == {QUALITIES, *NAMES, *(f"{name}.log.jsonl" for name in NAMES)}
 
 
-def test_a_line_is_told_of_each_frame_and_quality_and_resume_needs_no_word_on_segments(
-    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    assert main(asked(out, frames=2)) == 0
-    said = capsys.readouterr().out
-    lines = [line.split("  ")[:2] for line in said.splitlines() if line.startswith("frame ")]
-    assert lines == [[f"frame {number}/2", name] for number in (1, 2) for name in NAMES]
-    assert f"Wrote {out}: low, high" in said.replace("\n", " ")
-    error = error_of(asked(out), capsys, status=1)
-    assert "contains a stream; continue it with --resume" in error
-    command = [word for word in asked(out, "--resume") if word not in ("--sink", "segments")]
-    assert main(command) == 0
-    for name in NAMES:
-        assert archived(out / name, tmp_path / "a.sgs") == archived(made / name, tmp_path / "b.sgs")
-
-
 @pytest.mark.parametrize(
     ("more", "said"),
     [
@@ -129,22 +112,31 @@ def test_a_folder_of_something_else_is_left_alone(
     assert "holds one stream, and --qualities writes several" in error_of(asked(tmp_path / "one"), capsys, status=2)
 
 
-def test_ctrl_c_finishes_the_frame_in_all_and_resume_goes_on(
+def test_ctrl_c_finishes_the_frame_in_all_and_resume_without_a_word_on_segments_goes_on(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    out, line = tmp_path / "out", Lines.frame
+
     def interrupted(self: Lines, report: FrameReport, *, quality: str | None = None) -> None:
+        line(self, report, quality=quality)
         if (report.index, quality) == (1, "low"):
             os.kill(os.getpid(), signal.SIGINT)
 
-    out = tmp_path / "out"
     with monkeypatch.context() as patch:
         patch.setattr(Lines, "frame", interrupted)
-        error = error_of(asked(out), capsys, status=130)
-    assert "has 2 of 3 frames in all qualities; continue with the same command and --resume" in " ".join(error.split())
+        assert main(asked(out)) == 130
+    said = capsys.readouterr()
+    error = " ".join(said.err.split())
+    assert "has 2 of 3 frames in all qualities; continue with the same command and --resume" in error
+    lines = [line.split("  ")[:2] for line in said.out.splitlines() if line.startswith("frame ")]
+    assert lines == [[f"frame {number}/3", name] for number in (1, 2) for name in NAMES]
     for name in NAMES:
         manifest = read_manifest(FolderStore(out / name))
         assert (manifest.edge.frame, manifest.live) == (1, False)
-    assert main(asked(out, "--resume")) == 0
+    error = error_of(asked(out), capsys, status=1)
+    assert "contains a stream; continue it with --resume" in error
+    assert main([word for word in asked(out, "--resume") if word not in ("--sink", "segments")]) == 0
+    assert f"Wrote {out}: low, high" in capsys.readouterr().out.replace("\n", " ")
     for name in NAMES:
         assert archived(out / name, tmp_path / "a.sgs") == archived(made / name, tmp_path / "b.sgs")
 

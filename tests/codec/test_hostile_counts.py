@@ -87,7 +87,7 @@ def enlarged(fields: Fields, counts: list[Count]) -> Iterator[tuple[Count, int, 
     for count in counts:
         data = fields[count.field]
         # More than 32 bits are refused where any number is read.
-        for value in (*HUGE, 2**35 - 1) if count in more else HUGE:
+        for value in (*HUGE, 2**35 - 1) if count in more else HUGE[:1]:
             yield count, value, {**fields, count.field: data[: count.start] + varint(value) + data[count.end :]}
 
 

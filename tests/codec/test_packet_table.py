@@ -100,20 +100,6 @@ def test_any_flipped_bit_of_a_packet_is_noticed_and_facts_are_never_a_crash(choi
         assert found.packet(other).payload == records()[other].payload
 
 
-@examples(100)
-@given(st.data())
-def test_of_a_file_that_was_cut_the_packets_before_the_cut_are_there(choice: st.DataObject) -> None:
-    length = choice.draw(st.integers(12, len(whole())))
-    found = table(whole()[:length])
-    for index, record in enumerate(records()):
-        if record.end <= length:
-            assert found.packet(index).payload == record.payload
-            assert found.at(index).bytes == record.end - record.offset
-        else:
-            with pytest.raises(StreamError):
-                found.packet(index)
-
-
 @pytest.mark.parametrize(("kind", "frame"), [(RecordType.INIT, 1), (77, 1), (RecordType.DELTA, 2)])
 def test_a_whole_record_that_is_not_the_packet_is_refused(kind: int, frame: int) -> None:
     record = packed(kind, records()[frame].payload)

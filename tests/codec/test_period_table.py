@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.codec.container.index import Period
-from structgstream.codec.container.records import Record, RecordType, packed, scan_records
+from structgstream.codec.container.records import Period, Record, RecordType, packed, scan_records
 from structgstream.codec.contents import PeriodTable, differences
 from structgstream.codec.header import pack_header
 from structgstream.codec.packets import StreamHeader
@@ -84,19 +83,6 @@ def test_any_flipped_bit_of_a_later_init_record_is_noticed(choice: st.DataObject
             ask(place)
     other = 3 - place
     assert found.header(other).static["base_scales"].shape[0] == 3 + other
-
-
-@examples(40)
-@given(st.data())
-def test_of_a_file_that_was_cut_the_headers_before_the_cut_are_there(choice: st.DataObject) -> None:
-    length = choice.draw(st.integers(0, len(period_stream(codec=CODEC)[0])))
-    found = table(period_stream(codec=CODEC)[0][:length])
-    for place in (1, 2):
-        if inits()[place].end <= length:
-            assert found.header(place).fps == 30.0
-        else:
-            with pytest.raises(StreamError, match="is damaged"):
-                found.header(place)
 
 
 @pytest.mark.parametrize("kind", [RecordType.INIT, RecordType.KEY])

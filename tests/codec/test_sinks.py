@@ -97,7 +97,7 @@ def test_killed_at_any_step_a_file_goes_on_to_the_same_bytes(tmp_path: Path) -> 
         def begin(folder: Path, left: int = left) -> None:
             (folder / "a.sgs").write_bytes(whole[:left])
 
-        for folder in folders_of_the_killed(tmp_path / str(left), go_on, begin=begin, thin=True):
+        for folder in folders_of_the_killed(tmp_path / str(left), go_on, begin=begin):
             go_on(folder)
             assert (folder / "a.sgs").read_bytes() == whole
 

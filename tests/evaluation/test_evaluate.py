@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from structgstream.cameras import CameraRig
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.data.images import ImageSource
 from structgstream.data.wrappers import section
@@ -20,9 +19,9 @@ from structgstream.evaluation.evaluate import compared_frames, evaluate
 from structgstream.evaluation.facts import numbers_of
 from structgstream.evaluation.lpips import ENVIRONMENT
 from structgstream.evaluation.metrics import PSNR_OF_EQUALS
+from structgstream.evaluation.optional_metrics import FlowField
 from structgstream.evaluation.recording import to_device
 from structgstream.evaluation.report import as_json
-from structgstream.evaluation.temporal import FlowField
 from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import reference_backend
@@ -199,43 +198,6 @@ def test_a_cameras_exposure_is_set_aside_once_and_then_held(world: World) -> Non
     assert as_json(report)["cameras"]["cam00"]["psnr_camera_color"] == pytest.approx(np.mean(held))
 
 
-def test_sizes_and_rates_are_those_of_the_file(world: World) -> None:
-    reader = in_the_stream(world, similarity=Similarity(), follow=True)
-    report = run(reader, MemoryCapture(world.rig, world.frames))
-    facts = report.stream
-    assert facts["packet_bytes"] == 4006
-    assert facts["total_bytes"] == 9006
-    assert facts["field_bytes"] == {"anchor_positions": 3600, "free": 6}
-    assert facts["megabits_per_second"] == pytest.approx(4006 * 8 / 1e6 / (4 / 30))
-    assert as_json(report)["mean"]["bytes"] == pytest.approx(1001.5)
-    assert as_json(report)["mean"]["seconds"] is None
-
-
-def test_the_log_of_the_trainer_is_merged(world: World) -> None:
-    reader = in_the_stream(world, similarity=Similarity(), follow=True)
-    log = {
-        i: {
-            "index": i,
-            "total_seconds": 10.0 if i == 0 else 2.0,
-            "peak_memory_bytes": 100 + i,
-            "peak_memory_bytes_by_stage": {"fit": 100 + i % 3, "store": 90 - i},
-            "seconds": {},
-        }
-        for i in range(4)
-    }
-    report = run(reader, MemoryCapture(world.rig, world.frames), log=log)
-    assert report.stream["seconds_first"] == 10.0
-    assert report.stream["seconds_online_mean"] == 2.0
-    assert report.stream["peak_memory_bytes"] == 103
-    assert report.stream["peak_memory_bytes_by_stage"] == {
-        "first frame, fit": 100,
-        "first frame, store": 90,
-        "online, fit": 102,
-        "online, store": 89,
-    }
-    assert as_json(report)["mean"]["seconds"] == 4.0
-
-
 def new_pages(size: int) -> mmap.mmap:
     """Memory that the process did not have: what it freed before is not used again."""
     pages = mmap.mmap(-1, size)
@@ -334,21 +296,6 @@ def test_frames_a_second_of_drawing_alone_are_more_than_with_decoding(world: Wor
     assert report.stream["render_fps"] > report.stream["decode_and_render_fps"] > 0
 
 
-@pytest.mark.parametrize(
-    ("spoil", "words"),
-    [
-        (lambda s: replace_camera(s, None), "has no camera 'cam00'"),
-        (lambda s: replace_camera(s, s.rig["cam00"].resized(24, 16)), "24x16 pixels .* 48x32 in the stream"),
-        (lambda s: replace_camera(s, s.rig["cam01"]), "another calibration"),
-        (lambda s: replace(s, pictures=s.pictures[:2]), "4 frames .* only 2"),
-    ],
-)
-def test_another_capture_is_refused(world: World, spoil: Any, words: str) -> None:
-    reader = in_the_stream(world, similarity=Similarity(), follow=True)
-    with pytest.raises(CaptureError, match=words):
-        run(reader, spoil(MemoryCapture(world.rig, world.frames)))
-
-
 def test_a_part_that_begins_elsewhere_is_refused(world: World) -> None:
     reader = in_the_stream(world, similarity=Similarity(), follow=True)
     reader.header = replace(reader.header, metadata={"start": 2})
@@ -393,14 +340,6 @@ def test_another_methods_file_is_scored_alike(world: World) -> None:
     assert 5 < report.mean.psnr < 40
     with pytest.raises(BackendError, match="Ball cannot be drawn on meta"):
         to_device(Ball(1.0), torch.device("meta"))
-
-
-def replace_camera(source: MemoryCapture, camera: Any) -> MemoryCapture:
-    """The source with another first camera, or none."""
-    cameras = dict(source.rig.cameras) | {"cam00": camera}
-    if camera is None:
-        del cameras["cam00"]
-    return replace(source, rig=CameraRig(cameras))
 
 
 def test_a_stream_without_held_out_cameras_says_what_to_do(world: World) -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from structgstream.errors import StorageError
-from structgstream.evaluation.plots import write_plots
 from structgstream.evaluation.report import (
     FrameScores,
     Report,
@@ -22,8 +21,6 @@ from structgstream.evaluation.report import (
     slope_at_equal_shares,
     write_json,
 )
-from tests.support.drawn import pixels_of
-from tests.support.reports import mean_of
 
 GOOD = Scores(30.0, 0.9, 31.0, None, 30.0, 0.0, 0.1)
 
@@ -139,21 +136,6 @@ def test_a_report_that_cannot_be_stored_is_said(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError, match="cannot be written"):
         write_json(tmp_path / "file" / "report.json", {})
-
-
-def test_plots_have_a_panel_more_with_a_log(tmp_path: Path) -> None:
-    report = small_report()
-    write_plots(tmp_path / "with.png", report, title="a result")
-    write_plots(
-        tmp_path / "without.png",
-        replace(report, frames=[replace(frame, log={}) for frame in report.frames]),
-        title="a result",
-    )
-    scored = [replace(frame, mean=replace(mean_of(frame), flip=0.1, flicker=0.5)) for frame in report.frames]
-    write_plots(tmp_path / "scored.png", replace(report, frames=scored), title="a result")
-    heights = [pixels_of(tmp_path / f"{name}.png").shape[0] for name in ("with", "without", "scored")]
-    assert heights[2] > heights[0] > heights[1] > 500
-    assert heights[2] - heights[0] == pytest.approx(2 * (heights[0] - heights[1]), abs=2)
 
 
 def test_scores_of_disoccluded_pixels_are_weighed_by_their_number() -> None:

@@ -3,12 +3,9 @@
 
 import numpy as np
 import pytest
-import torch
 
-from structgstream.cameras import Camera
-from structgstream.evaluation.temporal import FlowField, difference_of_change, dis_flow, flicker, warping_error
+from structgstream.evaluation.optional_metrics import FlowField, difference_of_change, dis_flow, flicker, warping_error
 from structgstream.flow import inside
-from tests.support.rigs import look_at
 
 WIDTH, HEIGHT, FOCAL, DISTANCE = 96, 64, 80.0, 4.0
 
@@ -83,16 +80,6 @@ def test_exact_flow_of_a_synthetic_capture_leaves_what_sampling_loses() -> None:
     estimated = dis_flow()(before, now, "cam", 1)
     both = estimated.seen & exact.seen
     assert np.median(np.linalg.norm(estimated.offsets - exact.offsets, axis=2)[both]) < 0.3
-
-
-def test_the_walls_camera_is_the_packages() -> None:
-    """The closed form of the wall is the projection of :class:`Camera`."""
-    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]).double()
-    eye, target = torch.tensor([0.0, 0, -DISTANCE]).double(), torch.zeros(3).double()
-    camera = Camera(look_at(eye, target), K, WIDTH, HEIGHT, near=0.1)
-    seen = camera.K @ (camera.viewmat[:3, :3] @ torch.tensor([0.1, 0.2, 0.0]).double() + camera.viewmat[:3, 3])
-    expected = torch.tensor([0.1 * FOCAL / DISTANCE + WIDTH / 2, 0.2 * FOCAL / DISTANCE + HEIGHT / 2]).double()
-    torch.testing.assert_close(seen[:2] / seen[2], expected)
 
 
 def test_flicker_is_the_mean_change_of_still_pixels_in_levels() -> None:

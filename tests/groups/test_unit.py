@@ -8,13 +8,11 @@ from pathlib import Path
 import pytest
 
 from structgstream.api import reconstruct
-from structgstream.atomic_files import partial_path
+from structgstream.atomic_files import GrowingFile, partial_path
 from structgstream.errors import CaptureError, ConfigError, OutOfMemoryError, StorageError, StreamError
-from structgstream.groups import method
+from structgstream.groups import unit as method
 from structgstream.groups.base import GroupBase
-from structgstream.groups.growing_file import GrowingFile
-from structgstream.groups.segment_file import inspect_segment, open_segment
-from structgstream.groups.segment_sink import GroupSoFar
+from structgstream.groups.segment_file import GroupSoFar, inspect_segment, open_segment
 from structgstream.scene.state import state_of
 from tests.support.backends import quickest_backend
 from tests.support.clip_groups import CAPTURE, LENGTH, fit, made, task
@@ -36,26 +34,16 @@ def test_a_finished_segment_is_left_as_it_is() -> None:
     assert path.stat().st_mtime_ns == before.st_mtime_ns
 
 
-def test_interrupted_anywhere_it_is_the_same_file(tmp_path: Path) -> None:
-    whole = made().segments[1].read_bytes()
-    found = open_segment(made().segments[1])
-    path = tmp_path / "g.sgs"
-    # Cuts at other bytes: test_segment_file.py and test_segment_sink.py.
-    for cut in (10, found.entries[1][2] + 3):
-        partial_path(path).write_bytes(whole[:cut])
-        done = sum(cut >= end for end in (found.entries[1][2], found.end))
-        assert fit(path, task(made(), LENGTH)) == LENGTH - done, cut
-        assert path.read_bytes() == whole, cut
-        path.unlink()
-
-
-def test_stopped_between_frames_it_goes_on(tmp_path: Path) -> None:
-    path = tmp_path / "g.sgs"
+def test_stopped_between_frames_and_within_one_it_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+    """Cuts at other bytes: test_segment_file.py and test_segment_sink.py."""
+    path, whole = tmp_path / "g.sgs", made().segments[1].read_bytes()
     assert fit(path, task(made(), LENGTH), stop_after=1) == 1
     assert not path.exists()
     assert inspect_segment(partial_path(path)).frames == 1
+    end = partial_path(path).stat().st_size
+    partial_path(path).write_bytes(whole[: end + 3])
     assert fit(path, task(made(), LENGTH)) == 1
-    assert path.read_bytes() == made().segments[1].read_bytes()
+    assert path.read_bytes() == whole
 
 
 def test_a_flipped_byte_or_a_cut_end_is_repaired(tmp_path: Path) -> None:

@@ -6,8 +6,7 @@ from itertools import combinations
 
 import numpy as np
 
-from structgstream.data.matching import Pair
-from structgstream.data.pair_matches import PairError
+from structgstream.data.matching import Pair, PairError
 from structgstream.pose_check.tracks import Tracks
 from structgstream.pose_check.verdicts import Suspects, find_suspects, track_outlier
 from tests.support.evidence_made import wide_ring
@@ -100,3 +99,10 @@ def test_points_accuse_the_camera_that_sees_them_elsewhere() -> None:
     assert track_outlier(tracks_of({"a": 0.3, "b": 0.4, "d": 5.0}), clean) is None  # three do not outvote one
     known = Suspects(("d",), (), 0.75, False)
     assert track_outlier(tracks_of({"a": 0.3, "b": 0.4, "c": 0.3, "d": 5.0, "e": 0.2}), known) is None
+
+
+def test_matches_with_a_camera_that_is_off_do_not_count_against_another() -> None:
+    """Of cam1's 110 matches, 80 are with cam4."""
+    errors = {pair: PairError(0.3, 0.02, 30) for pair in errors_of(5)} | errors_of(5, ["cam4"])
+    errors |= {pair: PairError(0.3, 0.02, 10) for pair in errors if "cam1" in pair and "cam4" not in pair}
+    assert verdict(errors, 5).off == ("cam4",)

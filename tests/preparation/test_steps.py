@@ -20,7 +20,7 @@ def run(steps: Steps, step: str, value: int, done: list[str], *, after: tuple[st
         {"value": value},
         compute,
         pack=lambda found: Stored({"found": found}, {"row": np.arange(found)}),
-        unpack=lambda stored: int(stored.values["found"] + 0 * len(stored.arrays["row"])),
+        unpack=lambda stored: stored.values["found"] if len(stored.arrays["row"]) == stored.values["found"] else -1,
         summary=str,
         after=after,
     )

@@ -101,7 +101,8 @@ def test_stopped_it_goes_on_to_the_same_bytes(case: str, tmp_path: Path) -> None
     records = [record for record in scan_records(data) if record.type != RecordType.INDEX]
     (second,) = (number for number, record in enumerate(records) if number and record.type == RecordType.INIT)
     path = tmp_path / "a.sgs"
-    for cut in (records[second - 1].offset, records[second].offset + 100, records[second + 1].end):
+    cuts = (records[second].offset + 100, records[second - 1].offset, records[second + 1].end)
+    for cut in cuts if case == "scheduled" else cuts[:1]:
         path.write_bytes(data[:cut])
         sink, resumed = FileSink.resume(path)
         run(sink, CONFIGS[case][0], resumed=resumed)

@@ -1,71 +1,57 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a process leaves that is killed between any two of its operations on files."""
 
-import os
-import signal
+import shutil
 import sys
-import traceback
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
-from tests.support.properties import THOROUGH
-
 _LOOKS = {"stat", "lstat", "fstat", "fspath", "getpid", "getcwd", "listdir", "scandir", "access", "get_terminal_size"}
-MOST = 500
 
 
-def folders_of_the_killed(
-    root: Path, act: Callable[[Path], object], *, begin: Callable[[Path], object], thin: bool = False
-) -> list[Path]:
-    """A folder for each operation that ``act`` would have done next, and at last the one in which it came to its end.
+def folders_of_the_killed(root: Path, act: Callable[[Path], object], *, begin: Callable[[Path], object]) -> list[Path]:
+    """A folder for each state in which a kill would leave the files, in their order; the last is that of the end.
+
+    They are copies that are made before each operation: what is not flushed is not on the disk, so a kill there would
+    lose it as the copy does.
 
     Args:
         root: holds the folders.
-        act: is run in a process for each, on the folder; it is killed at once, so that what it has not flushed is lost.
-        begin: makes a folder what it is before.
-        thin: only every fourth operation, unless the run is thorough (``properties``).
+        act: is run once, on a folder.
+        begin: makes the folder what it is before.
     """
-    folders = []
-    for number in range(1, MOST, 4 if thin and not THOROUGH else 1):
-        folder = root / f"killed-{number:03d}"
-        folder.mkdir()
-        begin(folder)
-        folders.append(folder)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # What threads of this process hold, the other one does not need.
-            child = os.fork()
-        if not child:
-            _act(act, folder, number)
-        _, status = os.waitpid(child, 0)
-        if status == 0:
-            return folders
-        assert os.WIFSIGNALED(status), f"operation {number} failed"
-        assert os.WTERMSIG(status) == signal.SIGKILL
-    raise AssertionError(f"more than {MOST} operations")
+    folder = root / "acted"
+    folder.mkdir()
+    begin(folder)
+    folders: list[Path] = []
+    last: dict[str, bytes | None] = {}
 
-
-def _act(act: Callable[[Path], object], folder: Path, number: int) -> None:
-    """Runs in a process of its own, which ends here or in the midst of it."""
-    left = number
+    def copy() -> None:
+        nonlocal last
+        now = _content(folder)
+        if not folders or now != last:
+            last = now
+            folders.append(root / f"killed-{len(folders):03d}")
+            shutil.copytree(folder, folders[-1], symlinks=True)
 
     def watch(frame: FrameType, event: str, called: object) -> None:
-        nonlocal left
         if event == "c_call" and _changes_files(called):
-            left -= 1
-            if not left:
-                os.kill(os.getpid(), signal.SIGKILL)
+            copy()
 
+    outer = sys.getprofile()
+    sys.setprofile(watch)
     try:
-        sys.setprofile(watch)
         act(folder)
-        sys.setprofile(None)
-    except BaseException:
-        sys.setprofile(None)
-        traceback.print_exc()
-        os._exit(1)
-    os._exit(0)
+    finally:
+        sys.setprofile(outer)
+    copy()
+    return folders
+
+
+def _content(folder: Path) -> dict[str, bytes | None]:
+    """Bytes of files and None of folders by path."""
+    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
 
 
 def _changes_files(called: object) -> bool:

@@ -1,12 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Streams of the bundled clip that take seconds, for tests of commands."""
 
-import signal
-import subprocess
-import sys
-import time
-from pathlib import Path
-
 import pytest
 
 from structgstream.cli import main
@@ -28,19 +22,3 @@ def error_of(arguments: list[str], capsys: pytest.CaptureFixture[str], *, status
     assert "Traceback" not in error
     assert "unexpected error" not in error
     return error
-
-
-def stopped_by_sigterm(arguments: list[str], *, written: Path) -> str:
-    """What a command says that gets SIGTERM when the file ``written`` is there; its status is 143."""
-    # The fixture that gives few points does not reach another process.
-    command = [sys.executable, "-m", "structgstream", *arguments, "--points.max-points", "1500"]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
-    try:
-        while not written.is_file() and process.poll() is None:
-            time.sleep(0.02)
-        process.send_signal(signal.SIGTERM)
-        _, error = process.communicate(timeout=300)
-    finally:
-        process.kill()
-    assert process.returncode == 143, error
-    return error.decode()

@@ -82,45 +82,6 @@ def test_both_coders_write_the_same_bytes_and_read_each_other(count: int, lanes:
     assert (decode(data, context, tables, native=True) == decode(data, context, tables, native=False)).all()
 
 
-def plain_decode(data: bytes, context: np.ndarray, tables: FrequencyTables) -> list[int]:
-    """One symbol at a time, written from docs/entropy.md alone."""
-    place = 0
-
-    def varint() -> int:
-        nonlocal place
-        value = shift = 0
-        while True:
-            byte, place = data[place], place + 1
-            value, shift = value | (byte & 127) << shift, shift + 7
-            if byte < 128:
-                return value
-
-    count = varint()
-    word_count, code = divmod(varint(), 4)
-    lanes = {0: 1, 1: 4, 2: 32}[code]
-    states = list(struct.unpack_from(f"<{lanes}I", data, place))
-    words = iter(struct.unpack_from(f"<{word_count}H", data, place + 4 * lanes))
-    found = []
-    for i in range(count):
-        x, row = states[i % lanes], tables.rows[context[i]].tolist()
-        slot, symbol, start = x % 4096, 0, 0
-        while slot >= start + row[symbol]:
-            start, symbol = start + row[symbol], symbol + 1
-        x = row[symbol] * (x >> 12) + slot - start
-        states[i % lanes] = x if x >= 2**16 else x * 2**16 + next(words)
-        found.append(symbol)
-    assert set(states) == {2**16}
-    assert next(words, None) is None
-    return found
-
-
-@pytest.mark.parametrize("lanes", LANES)
-def test_a_decoder_written_from_the_document_agrees(lanes: int) -> None:
-    for seed in range(5):
-        symbols, context, tables = drawn(seed, count=700, contexts=7, even=seed == 0)
-        assert plain_decode(encode(symbols, context, tables, lanes=lanes), context, tables) == symbols.tolist()
-
-
 @both
 def test_the_bytes_are_those_of_the_document(native) -> None:
     """The example of docs/entropy.md, worked by hand there."""

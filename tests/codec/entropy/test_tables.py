@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from structgstream.codec.entropy.bits import fixed, pack_bits, signed_golomb
 from structgstream.codec.entropy.rans import encode
-from structgstream.codec.entropy.table_choice import choose_tables
 from structgstream.codec.entropy.tables import (
     TOTAL,
     FrequencyTables,
+    choose_tables,
     code_costs,
     decode_tables,
     geometric,
@@ -200,78 +200,6 @@ def test_precision_follows_the_number_of_symbols() -> None:
     assert few < many <= 16
     assert rough > better > fine
     assert fine < 1e-3
-
-
-def plain_normalised(weights: list[int]) -> list[int]:
-    """As docs/entropy.md says it, in Python's integers."""
-    total = sum(weights)
-    row = [max(1, 4096 * w // total) if w else 0 for w in weights]
-    row[weights.index(max(weights))] += 4096 - sum(row)
-    return row
-
-
-def plain_geometric(number: int, alphabet: int) -> list[int]:
-    z, q, u = number >> 3, number % 8, 2**16
-    weights = [0]
-    for _ in range(16):
-        weights += [max(u, 1)] * 2
-        u = u * (2 * q + 1) >> 4
-    weights = weights[:alphabet]
-    weights[0] = (2 + z % 2) * 2 ** (z >> 1) * sum(weights) >> 4
-    return plain_normalised(weights)
-
-
-def plain_tables(data: bytes, previous: list[list[int]]) -> list[list[int]]:
-    text = iter("".join(f"{byte:08b}" for byte in data))
-    alphabet = len(previous[0])
-
-    def bits(width: int) -> int:
-        return sum(int(next(text)) << place for place in reversed(range(width)))
-
-    def signed(order: int) -> int:
-        zeros = 0
-        while next(text) == "0":
-            zeros += 1
-        value = (1 << zeros + order) + bits(zeros + order) - (1 << order)
-        return -(value + 1) // 2 if value % 2 else value // 2
-
-    def level(f: int, p: int) -> int:
-        exponent = max(f, 1).bit_length() - 1
-        return 1 + exponent * 2**p + max(f, 1) * 2**p // 2**exponent - 2**p
-
-    rows = []
-    for row in previous if data else ():
-        if not bits(1):
-            rows.append(row)
-        elif not bits(1):
-            rows.append(plain_geometric(bits(8), alphabet))
-        else:
-            reference = plain_geometric(bits(8), alphabet) if bits(1) else row
-            p, order, told = bits(2), bits(1), bits(1)
-            present = [s for s in range(alphabet) if bits(1)] if told else list(range(bits(5) + 1))
-            weights = [0] * alphabet
-            for symbol in present:
-                place = level(reference[symbol], p) + (signed(order) if len(present) > 1 else 0) - 1
-                weights[symbol] = (2**p + place % 2**p) << place // 2**p
-            rows.append(plain_normalised(weights))
-    return rows or previous
-
-
-@pytest.mark.parametrize("alphabet", [2, 5, 16, 32])
-def test_the_family_written_from_the_document_agrees(alphabet: int) -> None:
-    rows = geometric(np.arange(256), alphabet=alphabet).rows
-    assert rows.tolist() == [plain_geometric(g, alphabet) for g in range(256)]
-
-
-@examples(60)
-@given(st.integers(0, 2**31), st.integers(2, 32), st.integers(1, 7))
-def test_a_decoder_written_from_the_document_agrees(seed: int, alphabet: int, size: int) -> None:
-    g = np.random.default_rng(seed)
-    shapes = np.exp(-np.arange(alphabet) / g.uniform(0.5, 8) + g.normal(0, 0.6, (4, alphabet)))
-    counts = g.poisson(10**size * shapes * (g.random((4, alphabet)) < 0.8))
-    previous = normalize_counts(g.poisson(500 * shapes))
-    tables, data = choose_tables(counts, previous)
-    assert plain_tables(data, previous.rows.tolist()) == tables.rows.tolist()
 
 
 def row_bits(*, head: str = "110", precision: int = 1, order: int = 0, presence: str, steps: list[int]) -> bytes:

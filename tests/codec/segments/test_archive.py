@@ -6,12 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.codec.segments.retention import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest, write_archive
 from structgstream.errors import StorageError, StreamError
 from tests.support.segment_folders import GrowingFolder
-from tests.support.segment_streams import as_file, folder, packets, written
+from tests.support.segment_streams import folder, packets, written
 from tests.support.streams import small_stream
 
 SENT = packets(7)
@@ -22,12 +21,6 @@ def store(tmp_path: Path) -> FolderStore:
     found = folder(tmp_path / "out")
     written(found, SENT)
     return found
-
-
-def test_the_bytes_of_the_file_sink(store: FolderStore, tmp_path: Path) -> None:
-    assert write_archive(store, tmp_path / "a.sgs") == 7
-    assert (tmp_path / "a.sgs").read_bytes() == as_file(SENT)
-    assert sorted(os.listdir(tmp_path)) == ["a.sgs", "out"]
 
 
 def test_a_run_that_has_not_ended_gives_a_file_without_an_index(tmp_path: Path) -> None:
@@ -51,14 +44,6 @@ def test_what_was_there_stays_when_a_file_is_damaged(store: FolderStore, tmp_pat
         write_archive(store, tmp_path / "a.sgs")
     assert (tmp_path / "a.sgs").read_bytes() == b"an earlier archive"
     assert sorted(os.listdir(tmp_path)) == ["a.sgs", "out"]
-
-
-def test_a_stream_with_gaps_is_refused(tmp_path: Path) -> None:
-    store = folder(tmp_path / "out")
-    written(store, packets(30), options=SegmentsOptions(window_seconds=0.25, grace_seconds=0.0))
-    with pytest.raises(StreamError, match="out is not whole: frames 3 to 20 have left its window"):
-        write_archive(store, tmp_path / "a.sgs")
-    assert os.listdir(tmp_path) == ["out"]
 
 
 def test_a_file_that_cannot_be_written_leaves_nothing(

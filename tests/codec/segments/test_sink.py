@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Segments are the bytes of the file sink in pieces, a reader of late finds everything, and a kill loses nothing."""
 
+import math
 import os
 import shutil
 from contextlib import suppress
@@ -8,17 +9,18 @@ from pathlib import Path
 
 import pytest
 
+from structgstream.codec.contents import LOST
 from structgstream.codec.packets import PacketKind
-from structgstream.codec.reader import open_stream
+from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.segments.manifest import MANIFEST, Manifest
 from structgstream.codec.segments.recovery import find
-from structgstream.codec.segments.retention import SegmentsOptions
-from structgstream.codec.segments.sink import SegmentsSink
+from structgstream.codec.segments.sink import SegmentsOptions, SegmentsSink
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest, write_archive
 from structgstream.codec.sinks import resume_segments
 from structgstream.errors import StorageError, StreamError
 from tests.support.segment_streams import Hands, Killed, KilledStore, as_file, folder, header, packets, written
+from tests.support.streams import same
 
 SENT = packets(8)
 
@@ -312,3 +314,17 @@ def test_a_disk_that_is_nearly_full_closes_the_stream(tmp_path: Path, monkeypatc
     monkeypatch.undo()
     written(store, SENT)
     assert archived(store) == as_file(SENT)
+
+
+def test_of_frames_that_have_left_the_window_size_and_kind_are_known(tmp_path: Path) -> None:
+    sent, store = packets(9), folder(tmp_path)
+    written(store, sent, options=SegmentsOptions(window_seconds=0.01, grace_seconds=0.0))
+    found = resume_segments(store)[1]
+    assert found is not None
+    with StreamReader(as_file(sent)) as whole:
+        gone = [info for info in found.packets if info.offset == LOST]
+        assert [info.index for info in gone] == [3, 4, 5]
+        assert [info.kind for info in gone] == [PacketKind.KEY, PacketKind.DELTA, PacketKind.DELTA]
+        assert [info.bytes for info in found.packets] == [info.bytes for info in whole.packets]
+        assert all(math.isnan(info.pts_seconds) for info in gone)
+        assert same(found.scene(8), whole.scene(8))

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.codec.segments.strict_json import MOST, Fields, parse_object
+from structgstream.codec.segments.manifest import MOST, Fields, parse_object
 from structgstream.errors import StreamError
 from tests.support.properties import examples
 
@@ -95,12 +95,6 @@ def test_bounds_belong_to_what_is_allowed() -> None:
     with pytest.raises(StreamError, match="1000000000000001"):
         fields(x=10**15 + 1).number("x")
     assert isinstance(fields(x=3).number("x"), float)
-
-
-def test_pairs_do_not_fall() -> None:
-    assert fields(x=[1, 1]).pair("x") == (1.0, 1.0)
-    with pytest.raises(StreamError, match="do not fall"):
-        fields(x=[2, 1]).pair("x")
 
 
 @pytest.mark.parametrize("text", ["\ud800", "a\udfffb"])

@@ -74,16 +74,6 @@ def test_a_rig_is_found_in_metres(model: LensModel) -> None:
     np.testing.assert_array_equal(found.cameras["cam00"].camera.viewmat, np.eye(4))
 
 
-def test_known_lenses_stay_and_make_poses_exact() -> None:
-    rig, pictures = filmed("brown")
-    found = solve_board(pictures, BOARD, lens="brown", known=rig)
-    for name, error in calibration_errors(found.cameras, rig).items():
-        assert error.rotation_degrees < 0.05
-        assert error.position_percent < 0.2
-        np.testing.assert_allclose(found.cameras[name].camera.K, rig[name].camera.K)
-        assert found.cameras[name].lens == rig[name].lens
-
-
 def test_the_same_pictures_give_the_same_numbers() -> None:
     one, two = solved("brown"), solve_board(filmed("brown")[1], BOARD, lens="brown")
     for name in one.cameras:
@@ -112,7 +102,7 @@ def test_a_camera_that_sees_it_at_other_instants_only_is_named() -> None:
 
 
 def test_a_board_of_another_dictionary_is_told_by_its_name() -> None:
-    pictures = {name: shots[:5] for name, shots in filmed("pinhole")[1].items()}
+    pictures = {name: shots[:2] for name, shots in filmed("pinhole")[1].items()}
     with pytest.raises(CalibrationError, match="given as of DICT_6X6_100, but the pictures show markers of DICT_5X5"):
         solve_board(pictures, Board(7, 5, 0.12, dictionary="DICT_6X6_100"), lens="pinhole")
 

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import LensCamera, RadialTangential
 from structgstream.errors import CalibrationError, ConfigError
-from structgstream.preparation.calibration.refinement import refine
+from structgstream.preparation.calibration.refinement import Refinement, refine
 from tests.support.calibration_errors import calibration_errors
 from tests.support.filmed import filmed_room
 
@@ -28,10 +29,15 @@ def perturbed(rig: dict[str, LensCamera], *, degrees: float, percent: float) -> 
     return found
 
 
-def test_perturbed_poses_come_back_where_they_were() -> None:
+@cache
+def refined() -> tuple[dict[str, LensCamera], Refinement]:
     rig, pictures = filmed_room()
     given = perturbed(rig, degrees=0.3, percent=1.0)
-    found = refine(pictures, given)
+    return given, refine(pictures, given)
+
+
+def test_perturbed_poses_come_back_where_they_were() -> None:
+    rig, (given, found) = filmed_room()[0], refined()
     assert found.changed
     assert found.before_pixels > 0.8
     assert found.after_pixels < 0.3
@@ -55,11 +61,9 @@ def test_tracks_that_judged_are_adjusted_to_as_well(monkeypatch: pytest.MonkeyPa
     """One in five is held back until the refinement is accepted; what is returned is made from all."""
     from structgstream.preparation.calibration import refinement
 
-    rig, pictures = filmed_room()
-    given = perturbed(rig, degrees=0.2, percent=0.5)
-    found = refine(pictures, given)
+    given, found = refined()
     monkeypatch.setattr(refinement, "_completed", lambda graph, refined, terms, **options: refined)
-    judged = refine(pictures, given)
+    judged = refine(filmed_room()[1], given)
     assert found.changed
     assert (found.after_pixels, found.held_out) == (judged.after_pixels, judged.held_out)
     assert len(found.solved.observations) > 1.15 * len(judged.solved.observations)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from structgstream.data.lenses import RadialTangential
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration import structure
+from structgstream.preparation.calibration.keypoints import Keypoints, all_keypoints
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.calibration.structure import solve_structure
 from tests.support.calibration_errors import calibration_errors
@@ -23,9 +24,13 @@ def noise(seed: int) -> NDArray[np.uint8]:
     return noise_texture(seed, size=320)[:240]
 
 
+@cache
+def solved() -> SolvedCalibration:
+    return solve_structure(filmed_room()[1], lens="radial")
+
+
 def test_a_rig_is_found_from_its_pictures() -> None:
-    rig, pictures = filmed_room()
-    found = solve_structure(pictures, lens="radial", centers=False)
+    rig, found = filmed_room()[0], solved()
     assert found.missing == ()
     assert list(found.cameras) == list(rig)
     assert not found.metres
@@ -33,38 +38,30 @@ def test_a_rig_is_found_from_its_pictures() -> None:
     assert np.median(found.errors()) < 0.3
     # At 320 x 240 and with 20 keypoints to a hundred pixels; half a percent of the focal length is a pixel at the edge.
     for error in calibration_errors(found.cameras, rig).values():
-        assert error.rotation_degrees < 0.2
+        assert error.rotation_degrees < 0.3
         assert error.position_percent < 1
         assert abs(error.focal_percent) < 1.5
         assert error.lens_pixels < 1.5
 
 
-def test_principal_points_that_all_cameras_have_off_the_middle_are_found() -> None:
-    rig, pictures = filmed_room(across=4, down=-3)
-    found = calibration_errors(solve_structure(pictures, lens="radial").cameras, rig).values()
-    assert np.median([error.rotation_degrees for error in found]) < 0.2  # half as much as the middle is off
-    assert max(error.rotation_degrees for error in found) < 0.3
-
-
-@cache
-def with_known_lenses() -> SolvedCalibration:
+def test_principal_points_that_all_cameras_have_off_the_middle_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is cut off at the right and at the bottom moves the middle by 4 and 3 pixels, and no keypoint."""
     rig, pictures = filmed_room()
-    return solve_structure(pictures, known=rig)
-
-
-def test_known_intrinsics_stay() -> None:
-    rig, _ = filmed_room()
-    found = with_known_lenses()
-    for name, error in calibration_errors(found.cameras, rig).items():
-        assert error.rotation_degrees < 0.1
-        assert error.position_percent < 0.5
-        np.testing.assert_allclose(found.cameras[name].camera.K, rig[name].camera.K)
-        assert found.cameras[name].lens == rig[name].lens
+    cut = {name: [np.ascontiguousarray(shots[0][:-6, :-8])] for name, shots in pictures.items()}
+    found = {}
+    for name, own in all_keypoints(pictures, workers=1).items():
+        left = (own.pixels < (312, 234)).all(1)
+        found[name] = Keypoints(own.pixels[left], own.descriptors[left], own.seen[left])
+    monkeypatch.setattr(structure, "all_keypoints", lambda pictures, **options: found)
+    solved = solve_structure(cut, lens="radial")
+    errors = calibration_errors(solved.cameras, rig).values()
+    assert np.median([error.rotation_degrees for error in errors]) < 0.2  # half as much as the middle is off
+    assert max(error.rotation_degrees for error in errors) < 0.3
 
 
 def test_shared_intrinsics_are_one() -> None:
     rig, pictures = filmed_room()
-    found = solve_structure(pictures, lens="radial", intrinsics="shared", field_of_view=55.0)
+    found = solve_structure(pictures, lens="radial", intrinsics="shared")
     first = found.cameras["cam00"]
     for name, error in calibration_errors(found.cameras, rig).items():
         assert error.rotation_degrees < 0.15
@@ -72,19 +69,17 @@ def test_shared_intrinsics_are_one() -> None:
         np.testing.assert_array_equal(found.cameras[name].camera.K, first.camera.K)
 
 
-@pytest.mark.finds_keypoints
 def test_the_same_pictures_give_the_same_numbers() -> None:
-    pictures = {name: shots for name, shots in filmed_room()[1].items() if name in ("cam01", "cam02", "cam03")}
-    one, two = (solve_structure(pictures, lens="radial", field_of_view=60.0) for _ in range(2))
+    one, two = solved(), solve_structure(filmed_room()[1], lens="radial")
     np.testing.assert_array_equal(one.points, two.points)
     for name in one.cameras:
         np.testing.assert_array_equal(one.cameras[name].camera.viewmat, two.cameras[name].camera.viewmat)
 
 
 def test_a_camera_that_looks_elsewhere_is_named(caplog: pytest.LogCaptureFixture) -> None:
-    _, pictures = filmed_room()
+    pictures = {name: filmed_room()[1][name] for name in ("cam01", "cam02", "cam03")}
     with caplog.at_level(logging.WARNING):
-        found = solve_structure(pictures | {"alone": [noise(99)]}, lens="radial", field_of_view=60.0)
+        found = solve_structure(pictures | {"alone": [noise(99)[:120, :160]]}, lens="radial")
     assert found.missing == ("alone",)
     assert "alone" not in found.cameras
     assert "camera 'alone' could not be placed: 'alone' (0 of " in caplog.text
@@ -106,11 +101,11 @@ def test_shared_intrinsics_of_two_sizes_are_refused() -> None:
     _, pictures = filmed_room()
     smaller = pictures | {"cam04": [np.ascontiguousarray(pictures["cam04"][0][::2, ::2])]}
     with pytest.raises(CalibrationError, match="Shared intrinsics need pictures of one size"):
-        solve_structure(smaller, intrinsics="shared", field_of_view=60.0)
+        solve_structure(smaller, intrinsics="shared")
 
 
 def test_observations_are_of_the_pictures_as_filmed() -> None:
-    found = with_known_lenses()
+    found = solve_structure(filmed_room()[1], lens="radial")
     straight = {name: replace(one, lens=RadialTangential()) for name, one in found.cameras.items()}
     assert np.nanmedian(replace(found, cameras=straight).errors()) > 2 * np.nanmedian(found.errors())
 

@@ -2,45 +2,28 @@
 /** The built player at the edge of a live stream that a plain web server has. Skipped where there is no browser. */
 
 import { readFileSync } from "node:fs";
-import type { Page } from "playwright-core";
-import { afterAll, afterEach, beforeAll, describe, expect, test, vi } from "vitest";
-import { chromiumPath } from "../../../gl/test/support/chromium.ts";
+import { afterEach, describe, expect, test, vi } from "vitest";
 import { LiveRun, type RunOptions } from "../liveRun.ts";
 import { periodFile } from "../periodFile.ts";
 import { CLIP } from "../served.ts";
 import { TestServer } from "./server.ts";
-import { ask, darkest, type Opened, Stage, shows } from "./stage.ts";
+import { ask, darkest, StagedTests, shows, told } from "./stage.ts";
 
 vi.setConfig({ testTimeout: 60_000, hookTimeout: 60_000 });
 
-const executable = chromiumPath();
 const fixture = (name: string) =>
   new Uint8Array(readFileSync(new URL(`../../../core/test/fixtures/${name}.sgs`, import.meta.url)));
 /** Few anchors: software GL shows many pictures of them in a second. */
 const FEW = fixture("paper");
 
-describe.skipIf(!executable)("a live stream in a browser", () => {
-  let stage: Stage;
-  let opened: Opened | undefined;
+describe.skipIf(StagedTests.skipped)("a live stream in a browser", () => {
+  const stage = new StagedTests();
   let writing: ReturnType<typeof setInterval> | undefined;
 
-  beforeAll(async () => {
-    stage = await Stage.opened(executable!);
-  });
-
-  afterAll(() => stage?.close());
-
-  afterEach(async () => {
+  afterEach(() => {
     clearInterval(writing);
-    await opened?.page.context().close();
-    opened = undefined;
     stage.server.publish("/live/", new Map());
   });
-
-  async function open(...given: Parameters<Stage["open"]>): Promise<Page> {
-    opened = await stage.open(...given);
-    return opened.page;
-  }
 
   function run(stream: Uint8Array, frames: number, options: RunOptions = {}): LiveRun {
     const made = new LiveRun(stream, options).write(frames);
@@ -58,19 +41,9 @@ describe.skipIf(!executable)("a live stream in a browser", () => {
     writing = setInterval(() => write(live, 1), 1000 / rate);
   }
 
-  function expectQuiet(...expected: RegExp[]): void {
-    const left = opened!.complaints.filter((text) => !expected.some((one) => one.test(text)));
-    expect(left).toEqual([]);
-  }
-
-  const errors = (page: Page) =>
-    ask(page, (_, events) => events.filter(([name]) => name === "error").map(([, m]) => m));
-  const notices = (page: Page) =>
-    ask(page, (_, events) => events.filter(([name]) => name === "notice").map(([, m]) => m));
-
   test("a late viewer begins at the edge, holds the last frame, and knows when the next one comes", async () => {
     const live = run(CLIP, 20, { frameSeconds: 4, pageSegments: 2 });
-    const page = await open('src="live/manifest.json" autoplay');
+    const page = await stage.open('src="live/manifest.json" autoplay');
     await shows(page, 19);
     expect(await ask(page, (_, __, frames) => frames[0])).toBeGreaterThanOrEqual(18);
     expect(await ask(page, (player) => [player.live, player.paused, player.behindSeconds])).toEqual([true, false, 0]);
@@ -81,13 +54,13 @@ describe.skipIf(!executable)("a live stream in a browser", () => {
     const asked = stage.server.requests.map(({ path }) => path);
     expect(asked.filter((path) => path.includes("history"))).toEqual([]);
     expect(asked.filter((path) => path.includes("segment")).length).toBeLessThanOrEqual(1);
-    expect(await errors(page)).toEqual([]);
-    expectQuiet();
+    expect(await told(page)).toEqual([]);
+    stage.expectQuiet();
   });
 
   test("scrubs over the window and goes back to LIVE", async () => {
     const live = run(FEW, 120, { pageSegments: 3, fps: 10 });
-    const page = await open('src="live/manifest.json" autoplay');
+    const page = await stage.open('src="live/manifest.json" autoplay');
     keepWriting(live, 10);
     await page.waitForFunction(() => heard.frames.length > 5);
     const slider = page.getByRole("slider", { name: "Time" });
@@ -103,30 +76,30 @@ describe.skipIf(!executable)("a live stream in a browser", () => {
     clearInterval(writing);
     await page.getByText("The stream has ended; it is a recording now.").waitFor();
     await page.waitForFunction(() => heard.told.some(([name]) => name === "ended"));
-    expect(await errors(page)).toEqual([]);
-    expectQuiet();
+    expect(await told(page)).toEqual([]);
+    stage.expectQuiet();
   });
 
   test("a host that fails for a while is told of, and gone on with", async () => {
     const live = run(FEW, 10, { frameSeconds: 1 });
-    const page = await open('src="live/manifest.json" autoplay');
+    const page = await stage.open('src="live/manifest.json" autoplay');
     await shows(page, 9);
     for (const [name, bytes] of live.files) stage.server.put(`/live/${name}`, bytes, { status: 503 });
     await page
       .getByText("The server answered the request for manifest.json with 503. The next attempt is in")
       .waitFor();
     await page.waitForTimeout(1500);
-    expect((await notices(page)).length).toBe(1);
+    expect((await told(page, "notice")).length).toBe(1);
     write(live, 2);
     await shows(page, 11);
-    expect((await notices(page)).at(-1)).toBe("The stream can be reached again.");
-    expect(await errors(page)).toEqual([]);
-    expectQuiet(/503/);
+    expect((await told(page, "notice")).at(-1)).toBe("The stream can be reached again.");
+    expect(await told(page)).toEqual([]);
+    stage.expectQuiet(/503/);
   });
 
   test("a slow viewer skips to newer key frames", async () => {
     const live = run(CLIP, 12, { fps: 10, frameSeconds: 0.1 });
-    const page = await open('src="live/manifest.json" autoplay');
+    const page = await stage.open('src="live/manifest.json" autoplay');
     await page.waitForFunction(() => heard.frames.length > 0);
     // What is written in a second takes several to come.
     writing = setInterval(() => {
@@ -137,41 +110,41 @@ describe.skipIf(!executable)("a live stream in a browser", () => {
     await page.getByText("Playback was too slow and continues with the newest frames.").waitFor({ timeout: 50_000 });
     const frames = await ask(page, (_, __, shown) => shown);
     expect(frames).toEqual([...frames].sort((a, b) => a - b));
-    expect(await errors(page)).toEqual([]);
-    expectQuiet();
+    expect(await told(page)).toEqual([]);
+    stage.expectQuiet();
   });
 
   test("no frame between two periods is blank", async () => {
     const live = run(FEW, 12, { fps: 5 });
     live.begin(FEW);
-    live.write(12).finish();
+    live.write(4).finish();
     stage.server.publish("/live/", live.files);
-    const page = await open('src="live/manifest.json" controls="off"');
+    const page = await stage.open('src="live/manifest.json" controls="off"');
     await shows(page, 0);
     const { light, pictures } = await darkest(page, 10, 14);
     expect(pictures).toBeGreaterThan(3);
     expect(light).toBeGreaterThan(5);
     expect(stage.server.requests.filter(({ path }) => path.includes("init-")).length).toBe(2);
-    expect(await errors(page)).toEqual([]);
-    expectQuiet();
+    expect(await told(page)).toEqual([]);
+    stage.expectQuiet();
   });
 
   test("no frame between two periods of a file is blank either, and frames are drawn in their order", async () => {
-    const { bytes, inits } = periodFile([FEW, FEW, FEW], 8, 5);
+    const { bytes, inits } = periodFile([FEW, FEW, FEW], 5, 5);
     stage.server.put("/periods.sgs", bytes);
-    const page = await open('src="periods.sgs" controls="off"');
+    const page = await stage.open('src="periods.sgs" controls="off"');
     await shows(page, 0);
-    const { light, pictures } = await darkest(page, 6, 18);
-    expect(pictures).toBeGreaterThan(8);
+    const { light, pictures } = await darkest(page, 4, 11);
+    expect(pictures).toBeGreaterThan(4);
     expect(light).toBeGreaterThan(5);
     const drawn = await ask(page, (_, __, frames) => frames);
     expect(drawn).toEqual([...drawn].sort((a, b) => a - b));
-    expect(drawn.at(-1)).toBe(23);
-    await ask(page, (player) => player.seek(9 / 5));
-    await shows(page, 9);
+    expect(drawn.at(-1)).toBe(14);
+    await ask(page, (player) => player.seek(6 / 5));
+    await shows(page, 6);
     expect(inits.length).toBe(2);
-    expect(await errors(page)).toEqual([]);
-    expectQuiet();
+    expect(await told(page)).toEqual([]);
+    stage.expectQuiet();
   });
 
   test("a period may have other cameras and another scene", async () => {
@@ -179,7 +152,7 @@ describe.skipIf(!executable)("a live stream in a browser", () => {
     live.begin(CLIP);
     live.write(3).finish();
     stage.server.publish("/live/", live.files);
-    const page = await open('src="live/manifest.json"');
+    const page = await stage.open('src="live/manifest.json"');
     await shows(page, 0);
     const before = await ask(page, (player) => player.cameras);
     await ask(page, (player) => player.seek(1));
@@ -190,8 +163,8 @@ describe.skipIf(!executable)("a live stream in a browser", () => {
     await ask(page, (player) => player.seek(0.2));
     await shows(page, 1);
     expect(await ask(page, (player) => player.cameras)).toEqual(before);
-    expect(await errors(page)).toEqual([]);
-    expectQuiet();
+    expect(await told(page)).toEqual([]);
+    stage.expectQuiet();
   });
 
   test("the page's token opens its streams, and is told to no other host", async () => {
@@ -199,7 +172,7 @@ describe.skipIf(!executable)("a live stream in a browser", () => {
     const elsewhere = await TestServer.started();
     try {
       elsewhere.publish("/live/", new LiveRun(FEW).write(5).files, { cors: true });
-      const page = await open('src="live/manifest.json" autoplay', "?token=v1.a-b_c");
+      const page = await stage.open('src="live/manifest.json" autoplay', "?token=v1.a-b_c");
       await shows(page, 4);
       const ours = stage.server.requests.filter(({ path }) => path.startsWith("/live/"));
       expect(ours.every(({ query }) => new URLSearchParams(query).get("token") === "v1.a-b_c")).toBe(true);
@@ -209,8 +182,8 @@ describe.skipIf(!executable)("a live stream in a browser", () => {
       );
       await expect.poll(() => elsewhere.requests.length, { timeout: 15_000 }).toBeGreaterThan(3);
       expect(elsewhere.requests.every(({ query }) => !query.includes("token"))).toBe(true);
-      expect(await errors(page)).toEqual([]);
-      expectQuiet();
+      expect(await told(page)).toEqual([]);
+      stage.expectQuiet();
     } finally {
       await elsewhere.stop();
     }
@@ -227,16 +200,16 @@ describe.skipIf(!executable)("a live stream in a browser", () => {
     const live = run(FEW, 8);
     const text = new TextDecoder().decode(live.files.get("manifest.json")!);
     stage.server.put("/live/manifest.json", change(text));
-    const page = await open('src="live/manifest.json" autoplay');
+    const page = await stage.open('src="live/manifest.json" autoplay');
     await page.getByRole("alert").getByText(sentence).waitFor();
     const asked = stage.server.requests.map(({ path }) => path).filter((path) => path.startsWith("/live/"));
     expect(asked).toEqual(["/live/manifest.json"]);
-    expectQuiet();
+    stage.expectQuiet();
   });
 
   test("120 frames at the edge take no more memory than 50", async () => {
     const live = run(FEW, 20, { fps: 20, windowSegments: 6, pageSegments: 4 });
-    const page = await open('src="live/manifest.json" autoplay controls="off"', "", {
+    const page = await stage.open('src="live/manifest.json" autoplay controls="off"', "", {
       viewport: { width: 160, height: 120 },
     });
     keepWriting(live, 20);
@@ -255,8 +228,8 @@ describe.skipIf(!executable)("a live stream in a browser", () => {
     const after = await state();
     expect({ ...after, usedSize: 0 }).toEqual({ ...before, usedSize: 0 });
     expect(after.usedSize).toBeLessThan(before.usedSize * 1.1 + 2e5);
-    expect(await errors(page)).toEqual([]);
+    expect(await told(page)).toEqual([]);
     // The window goes on while requests are under way.
-    expectQuiet(/404/);
+    stage.expectQuiet(/404/);
   });
 });

@@ -3,7 +3,8 @@
 
 import { readFileSync } from "node:fs";
 import type { Browser, BrowserContextOptions, Page } from "playwright-core";
-import { launched } from "../../../gl/test/support/chromium.ts";
+import { afterAll, afterEach, beforeAll, expect } from "vitest";
+import { chromiumPath, launched } from "../../../gl/test/support/chromium.ts";
 import type { StructgstreamPlayer } from "../../src/element.ts";
 import { CLIP } from "../served.ts";
 import { TestServer } from "./server.ts";
@@ -64,6 +65,51 @@ export class Stage {
     await this.browser.close();
     await this.server.stop();
   }
+}
+
+/** The stage of a file of tests, which begins and ends with them; a page is closed after its test. */
+export class StagedTests {
+  private stageOfAll: Stage | undefined;
+  private opened: Opened | undefined;
+
+  /** Without a browser the tests that use this are to be skipped. */
+  static readonly skipped = !chromiumPath();
+
+  constructor() {
+    beforeAll(async () => {
+      this.stageOfAll = await Stage.opened(chromiumPath()!);
+    });
+    afterAll(() => this.stageOfAll?.close());
+    afterEach(async () => {
+      await this.close();
+      this.server.put("/clip.sgs", CLIP);
+    });
+  }
+
+  get server(): TestServer {
+    return this.stageOfAll!.server;
+  }
+
+  async open(...given: Parameters<Stage["open"]>): Promise<Page> {
+    this.opened = await this.stageOfAll!.open(...given);
+    return this.opened.page;
+  }
+
+  async close(): Promise<void> {
+    await this.opened?.page.context().close();
+    this.opened = undefined;
+  }
+
+  /** Everything went without a complaint, but for those that a test expects. */
+  expectQuiet(...expected: RegExp[]): void {
+    const left = this.opened!.complaints.filter((text) => !expected.some((one) => one.test(text)));
+    expect(left).toEqual([]);
+  }
+}
+
+/** The messages of an event that the player has told. */
+export function told(page: Page, event: "error" | "notice" = "error"): Promise<string[]> {
+  return page.evaluate((name) => heard.told.filter(([one]) => one === name).map(([, message]) => message), event);
 }
 
 export function pageWith(attributes: string): string {
