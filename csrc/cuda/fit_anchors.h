@@ -38,6 +38,7 @@ struct Model {
     // Rows: k of each anchor, then the free Gaussians.
     float *means, *quats, *scales, *opacities, *colors, *inverse_norms, *to_means, *to_scales;
     Splat* splats;
+    int32_t* slots;                   // number of slots of each
 
     SGS_ELEMENT int64_t rows() const { return anchors * k + free; }
     SGS_ELEMENT bool trains_inputs() const {
@@ -150,6 +151,7 @@ struct Dress {
                 m.opacities[row] = 0.0f;
                 for (int axis = 0; axis < 3; ++axis) m.scales[3 * row + axis] = 0.0f;
                 m.splats[row] = Splat{};
+                m.slots[row] = 0;
                 return;
             }
             if (m.anchor_intervals != nullptr) interval = m.anchor_intervals + i;
@@ -161,6 +163,7 @@ struct Dress {
             camera, m.means + 3 * row, m.quats + 4 * row, m.scales + 3 * row, m.opacities[row], m.colors + 3 * row,
             interval);
         m.splats[row] = s;
+        m.slots[row] = slots_of(s);
         count_tiles(s, drawn, camera.columns(), tile_counts);
     }
 

@@ -130,7 +130,7 @@ class Fit {
         m.opacities = a.take<float>(rows), m.colors = a.take<float>(3 * rows), m.inverse_norms = a.take<float>(rows);
         m.to_means = a.take<float>(3 * rows), m.to_scales = a.take<float>(3 * rows);
         m.splats = a.take<Splat>(rows);
-        slots_ = a.take<int32_t>(rows);
+        m.slots = slots_ = a.take<int32_t>(rows);
         counts_ = a.take<int32_t>(tiles_), cursors_ = a.take<int32_t>(tiles_), starts_ = a.take<int32_t>(tiles_ + 1);
         state_ = a.take<State>(1);
         totals_ = a.take<int64_t>(f_.view_count);
@@ -163,7 +163,7 @@ class Fit {
                 return error;
             const StaticSplats project = {views_[v], camera, s.drawn, s.splats, counts_};
             if (const int error = for_each(project, count, stream_)) return error;
-            const Starts starts = {counts_, tiles, s.starts, cursors_, nullptr, 0, nullptr, nullptr, nullptr, 0, 0, nullptr,
+            const Starts starts = {counts_, tiles, s.starts, cursors_, 0, nullptr, nullptr, nullptr, 0, 0, nullptr,
                                    totals_ + v, nullptr};
             if (const int error = for_blocks(starts, 1, stream_)) return error;
         }
@@ -260,7 +260,7 @@ class Fit {
         if (const int error = for_each<kAnchorThreads>(AnchorInputs{m, seen, v.center}, m.anchors, stream_)) return error;
         if (const int error = for_each<kAnchorThreads>(AnchorHead{m}, kHeads * m.anchors, stream_)) return error;
         if (const int error = for_each<kAnchorThreads>(Dress{m, camera, drawn, counts_}, m.rows(), stream_)) return error;
-        const Starts starts = {counts_, camera.tiles(), starts_, cursors_, m.splats, m.rows(), slots_,
+        const Starts starts = {counts_, camera.tiles(), starts_, cursors_, m.rows(), slots_,
                                f_.volume == 0.0f ? nullptr : m.scales, m.opacities, i, capacity_, state_, nullptr, nullptr};
         return for_blocks(starts, 1, stream_);
     }

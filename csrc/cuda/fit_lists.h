@@ -85,9 +85,8 @@ struct Starts {
     int64_t tiles;
     int32_t* starts;         // [tiles + 1]
     int32_t* cursors;        // [tiles], the starts again, which the scatter advances
-    const Splat* splats;     // [rows]
     int64_t rows;
-    int32_t* slots;          // [rows] first slot of each, or null
+    int32_t* slots;          // [rows] number of slots of each, then the first one; or null
     const float *scales, *opacities;  // [rows] of which the volume is summed, or null
     int32_t iteration;
     int64_t capacity;        // slots
@@ -99,7 +98,7 @@ struct Starts {
         if (state != nullptr && state->stopped >= 0) return;
         if (slots != nullptr) {
             scan(
-                rows, s, threads, [&](int64_t i) { return slots_of(splats[i]); },
+                rows, s, threads, [&](int64_t i) { return slots[i]; },
                 [&](int64_t i, int64_t sum) { slots[i] = static_cast<int32_t>(sum < capacity ? sum : capacity); },
                 [&](int64_t sum) {
                     if (total_slots != nullptr) *total_slots = sum;

@@ -17,7 +17,7 @@ struct Project {
     Camera camera;
     const float *means, *quats, *scales, *opacities, *colors, *intervals;
     Splat* splats;    // or null
-    int32_t* counts;
+    int32_t *counts, *slots;
     float* radii;     // or null
 
     SGS_LANES_FN void operator()(int64_t i) const {
@@ -26,7 +26,7 @@ struct Project {
             camera, means + 3 * i, quats + 4 * i, scales + 3 * i, opacities[i], colors == nullptr ? black : colors + 3 * i,
             intervals == nullptr ? nullptr : intervals + i, radii == nullptr ? nullptr : radii + i);
         if (splats == nullptr) return;
-        splats[i] = s;
+        splats[i] = s, slots[i] = slots_of(s);
         count_tiles(s, nullptr, camera.columns(), counts);
     }
 };
@@ -143,9 +143,9 @@ class Picture {
         Arena arena(memory_);
         lay_out(arena, alpha == nullptr);
         if (const int error = fill(counts_, 0, sizeof(int32_t) * camera_.tiles(), stream_)) return error;
-        project.splats = splats_, project.counts = counts_;
+        project.splats = splats_, project.counts = counts_, project.slots = slots_;
         if (const int error = for_each(project, count, stream_)) return error;
-        const Starts starts = {counts_, camera_.tiles(), starts_, cursors_, splats_, count, slots_, nullptr, nullptr, 0,
+        const Starts starts = {counts_, camera_.tiles(), starts_, cursors_, count, slots_, nullptr, nullptr, 0,
                                INT32_MAX, nullptr, totals_, totals_ + 1};
         if (const int error = for_blocks(starts, 1, stream_)) return error;
         int64_t totals[2];
@@ -212,7 +212,7 @@ int sgs_cuda_radii(
     void* stream) {
     using namespace structgstream::cuda;
     const fit::Camera camera = {viewmat, K, nullptr, near_plane, width, height};
-    const fit::Project project = {camera, means, quats, scales, opacities, nullptr, intervals, nullptr, nullptr, radii};
+    const fit::Project project = {camera, means, quats, scales, opacities, nullptr, intervals, nullptr, nullptr, nullptr, radii};
     return for_each(project, count, stream);
 }
 
@@ -223,7 +223,7 @@ int sgs_cuda_picture(
     float* alpha, float* radii, void* stream) {
     using namespace structgstream::cuda;
     const fit::Camera camera = {viewmat, K, nullptr, near_plane, width, height};
-    const fit::Project project = {camera, means, quats, scales, opacities, colors, intervals, nullptr, nullptr, radii};
+    const fit::Project project = {camera, means, quats, scales, opacities, colors, intervals, nullptr, nullptr, nullptr, radii};
     return fit::Picture(stream).draw(project, count, background, maps, channels, weights, image, alpha);
 }
 

@@ -20,7 +20,7 @@ def test_own_operations_are_the_kernels_or_it_says_why_not(
 ) -> None:
     functions: Any = SimpleNamespace(**{name: SimpleNamespace() for name in CUDA_PROTOTYPES})
     library = KernelLibrary(functions, "cuda", lambda device: 0) if compiled else None
-    monkeypatch.setattr(cuda, "cuda_reason", lambda: None)
+    monkeypatch.setattr(cuda, "cuda_reason", lambda **_: None)
     monkeypatch.setattr(cuda_library, "kernel_library", lambda: (library, "this is why"))
     with caplog.at_level(logging.INFO):
         found = backend.cuda_backend()

@@ -41,7 +41,7 @@ def refused_by_the_type_checker(backend: Backend, opacities: Tensor) -> None:
 def pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     functions: Any = SimpleNamespace(**{name: SimpleNamespace() for name in CUDA_PROTOTYPES})
     library = KernelLibrary(functions, "cuda", lambda device: 0)
-    monkeypatch.setattr(cuda, "cuda_reason", lambda: None)
+    monkeypatch.setattr(cuda, "cuda_reason", lambda **_: None)
     monkeypatch.setattr(cuda_library, "kernel_library", lambda: (library, "compiled"))
 
 

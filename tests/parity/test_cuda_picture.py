@@ -37,6 +37,9 @@ def test_what_the_cpu_finds(emulation: Callable[[int], KernelLibrary], channels:
         found.append((radii, weights, image))
     assert all(torch.equal(one, two) for one, two in zip(*found, strict=True))
     radii, weights, image = found[0]
+    drawn = cuda_picture.rasterize(emulation(0), cpu_raster.rasterize, gaussians, view, background=background)
+    assert all(torch.equal(one, two) for one, two in ((drawn.image, image), (drawn.radii, radii)))
+    assert torch.allclose(drawn.alpha, cpu_raster.rasterize(gaussians, view).alpha, atol=1e-6)
     assert torch.allclose(radii, cpu_raster.projected_radii(gaussians, view), rtol=1e-5)
     exact, exact_weights = cpu_raster.picture_and_weights(gaussians, view, maps, background=background)
     assert (image - exact).abs().max() < 1e-6

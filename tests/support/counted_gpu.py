@@ -176,7 +176,7 @@ def counted_gpu(
         recorder=lambda: _Recorder(counts),
         iterations=partial(_counted_iterations, plain, counts) if native else None,
     ).with_functions(
-        rasterize=draw,
+        rasterize=partial(cuda_picture.rasterize, library, draw),
         projected_radii=partial(cuda_picture.projected_radii, library),
         blending_weights=partial(cuda_picture.blending_weights, library),
         picture_and_weights=partial(cuda_picture.picture_and_weights, library),

@@ -83,7 +83,7 @@ class Backend:
     recorder: Callable[[], Recorder[Any]] | None = None
     iterations: Callable[[FitFrame], Callable[[int, int], None]] | None = None
 
-    rasterize = Operation(reference_raster.rasterize)  # cuda: gsplat
+    rasterize = Operation(reference_raster.rasterize)  # cuda: gsplat; own kernels without gradients
     projected_radii = Operation(reference_raster.projected_radii)  # cuda: own kernels, or a picture of gsplat
     blending_weights = Operation(reference_raster.blending_weights)  # cuda: own kernels, or gsplat's gradients
     picture_and_weights = Operation(reference_raster.picture_and_weights)  # cuda: own kernels, or gsplat
@@ -145,15 +145,18 @@ def processor_backend() -> Backend:
     return cpu_backend() if native_reason() is None else reference_backend()
 
 
-def cuda_backend() -> Backend:
-    """An NVIDIA GPU: gsplat's rasteriser, this package's kernels of loss, anchors and sweeps, and torch for the rest.
+def cuda_backend(*, needs_gsplat: bool = True) -> Backend:
+    """An NVIDIA GPU: gsplat's rasteriser where gradients are needed, this package's kernels, and torch for the rest.
+
+    Args:
+        needs_gsplat: False for who only draws and fits later frames with ``iterations``.
 
     Raises:
         BackendError: no GPU, or gsplat is not installed or does not load.
     """
     from structgstream.kernels import cuda, cuda_anchors, cuda_fit, cuda_library, cuda_picture
 
-    reason = cuda.cuda_reason()
+    reason = cuda.cuda_reason(needs_gsplat=needs_gsplat)
     if reason is not None:
         raise BackendError(reason)
     library, sentence = cuda_library.kernel_library()
@@ -178,6 +181,7 @@ def cuda_backend() -> Backend:
     return replace(backend, iterations=partial(cuda_fit.iterations, library)).with_functions(
         generate_structured=partial(cuda_anchors.generate_structured, library),
         l1_ssim=partial(cuda.l1_ssim, library),
+        rasterize=partial(cuda_picture.rasterize, library, rasterize),
         projected_radii=partial(cuda_picture.projected_radii, library),
         blending_weights=partial(cuda_picture.blending_weights, library),
         picture_and_weights=partial(cuda_picture.picture_and_weights, library),

@@ -30,12 +30,12 @@ from structgstream.kernels.reference_raster import (
 from structgstream.kernels.values import TILE_PIXELS, RasterOutput, SweepView, Swept, TileSelection, tile_grid
 
 
-def cuda_reason() -> str | None:
+def cuda_reason(*, needs_gsplat: bool = True) -> str | None:
     """Why the back-end is not available on this machine and how to get it; None if it is."""
     if not torch.cuda.is_available():
         built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "built without CUDA"
         return f"torch {torch.__version__}, {built}, sees no NVIDIA GPU; install a driver and a CUDA build of torch."
-    if importlib.util.find_spec("gsplat") is None:
+    if needs_gsplat and importlib.util.find_spec("gsplat") is None:
         return "gsplat is not installed; install it with: pip install 'structgstream[cuda]'"
     return None
 

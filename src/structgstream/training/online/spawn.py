@@ -9,6 +9,7 @@ Gaussians that are outliers in several views are pruned first.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -295,7 +296,7 @@ class Missing:
     picture: Tensor | None = None
     drawn: Tensor | None = None
 
-    @property
+    @cached_property
     def any(self) -> bool:
         """Whether there are any."""
         return bool((self.residual.missing_share > 0.5).any())
