@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.serve.files import OpenedFile, open_below
 from structgstream.serve.manifest_watch import BrokenManifest, ManifestWatch, snapshot
+from structgstream.serve.streams import OpenedFile, open_below
 from tests.support.segment_folders import GrowingFolder
 from tests.support.streams import small_stream
 

@@ -11,7 +11,6 @@ checksum is verified then. With the ``raw`` codec packets are independent, so ra
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +18,15 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera
 from structgstream.codec.container.byte_source import ByteSource, FileBytes
 from structgstream.codec.container.damage import Damage
-from structgstream.codec.container.index import Period, read_index
-from structgstream.codec.container.records import PREFIX, RecordType, check_prefix, incomplete_reason, read_record
+from structgstream.codec.container.records import (
+    PREFIX,
+    Period,
+    RecordType,
+    check_prefix,
+    incomplete_reason,
+    read_index,
+    read_record,
+)
 from structgstream.codec.contents import PacketInfo, Packets, PeriodTable, Scan, contents_by_index, first_run
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
@@ -190,9 +196,7 @@ class StreamReader:
     def __enter__(self) -> "StreamReader":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self.close()
 
     def close(self) -> None:

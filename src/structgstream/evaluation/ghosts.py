@@ -30,11 +30,17 @@ from numpy.typing import NDArray
 
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import every_nth_frame, section
-from structgstream.evaluation.metrics import blackened, decibels, differing, dilate, mean_of_squares, squared_errors
+from structgstream.evaluation.metrics import (
+    Mask,
+    Picture,
+    blackened,
+    decibels,
+    differing,
+    dilate,
+    mean_of_squares,
+    squared_errors,
+)
 from structgstream.evaluation.sizes import block_mask, block_means
-
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 OCCUPIED, RESTORED, WRONG = 20, 8, 8  # levels of 255; noise of cameras and compression is 2 to 4 after the 3x3 mean
 REACH, MARGIN = 12 / 640, 6 / 640  # shares of the longer side: soft edges, and shadows next to moving objects

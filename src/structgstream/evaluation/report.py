@@ -19,8 +19,8 @@ class Scores:
     Args:
         psnr: dB, the main result.
         ssim: see ``metrics.ssim``.
-        psnr_affine: dB after the best affine change of colour towards the truth (``affine.py``).
-        psnr_camera_color: dB after a gain and a bias per channel, fitted to the camera's first frame (``affine.py``,
+        psnr_affine: dB after the best affine change of colour towards the truth (``metrics.py``).
+        psnr_camera_color: dB after a gain and a bias per channel, fitted to the camera's first frame (``metrics.py``,
             Note [Colour of a camera]); None without a fit.
         psnr_changed: dB over the pixels that changed since the camera's first picture; None without any.
         psnr_still: dB over the other, static pixels; None without any.
@@ -31,7 +31,7 @@ class Scores:
         flip: mean LDR-FLIP (``flip.py``).
         lpips_alex: LPIPS with AlexNet (``lpips.py``).
         lpips_vgg: LPIPS with VGG16.
-        e_warp: squared warping error (``temporal.py``). This and the following scores compare consecutive frames, so
+        e_warp: squared warping error. This and the following scores compare consecutive frames, so
             they are None in frame 0.
         temporal_flip: difference between the change from the previous frame by FLIP, of rendering and truth.
         t_lpips: the same by LPIPS with AlexNet.

@@ -44,8 +44,7 @@ from starlette.routing import Route
 from structgstream.codec.container.records import footer_offset
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.quality_list import MAX_LIST_BYTES, QUALITIES
-from structgstream.serve.access import Authorizer, Refused, query_of, refusal
-from structgstream.serve.files import OpenedFile, hash_in_name, is_plain_path, is_stream_name
+from structgstream.serve.access import EVERY_STREAM, Access, Authorizer, Refused, TokenKeys, query_of, refusal
 from structgstream.serve.listening import LOOPBACK_NAMES
 from structgstream.serve.manifest_watch import BrokenManifest, Manifests, Snapshot
 from structgstream.serve.metrics import CONTENT_TYPE, CountRequests, Metrics, exposition, run_numbers, stream_families
@@ -55,8 +54,15 @@ from structgstream.serve.responses import (
     content_response,
     file_response,
 )
-from structgstream.serve.streams import Catalog, ServedStream, StreamKind
-from structgstream.serve.tokens import EVERY_STREAM, Access, TokenKeys
+from structgstream.serve.streams import (
+    Catalog,
+    OpenedFile,
+    ServedStream,
+    StreamKind,
+    hash_in_name,
+    is_plain_path,
+    is_stream_name,
+)
 
 YEAR_SECONDS: Final = 31536000
 MAX_RUN_BYTES: Final = 256 * 1024

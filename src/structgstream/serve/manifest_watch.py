@@ -19,8 +19,7 @@ from typing import Any, Final
 from anyio import to_thread
 
 from structgstream.codec.segments.manifest import MANIFEST
-from structgstream.serve.files import FileStamp, OpenedFile
-from structgstream.serve.streams import ServedStream
+from structgstream.serve.streams import FileStamp, OpenedFile, ServedStream
 
 POLL_SECONDS: Final = 0.1
 TICK_NS: Final = 100_000_000

@@ -11,8 +11,7 @@ import pytest
 from structgstream.codec.segments.manifest import MANIFEST, manifest_from_json
 from structgstream.codec.segments.mirror import AnotherStreamError, MirroredStore, MirrorOptions
 from structgstream.codec.segments.recovery import stale_files
-from structgstream.codec.segments.retention import SegmentsOptions
-from structgstream.codec.segments.sink import SegmentsSink
+from structgstream.codec.segments.sink import SegmentsOptions, SegmentsSink
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest
 from structgstream.errors import StorageError

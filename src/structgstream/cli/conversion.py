@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``structgstream export``."""
+"""Commands between formats: ``export``, ``import`` and ``archive``."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from structgstream.cli.app import UsageError, usage_errors
-from structgstream.cli.options import EXPORTS, Device, Flag, check_ending, parse_options
-from structgstream.cli.progress import human_bytes, print_lines
+from structgstream.cli.options import EXPORTS, Device, Flag, Folder, check_ending, check_new, parse_options
+from structgstream.cli.progress import frame_bar, frames_text, human_bytes, print_lines
 from structgstream.exporters.formats import FORMATS, Format, FrameOptions, PageFormat, SpzVersion
 
 
@@ -71,7 +70,7 @@ class Export:
     """Back-end that evaluates the MLPs."""
 
 
-def main(arguments: list[str]) -> None:
+def export(arguments: list[str]) -> None:
     """Exports and prints the path of the result."""
     options = parse_options(Export, "export", arguments=arguments)
     if options.list:
@@ -81,7 +80,7 @@ def main(arguments: list[str]) -> None:
         raise UsageError("export needs a stream file, or --list.")
     stream = options.stream
     check_ending(options.output, *EXPORTS, ".zip", ".html", command="export", folder=True)
-    from structgstream.exporters.request import check_page, choose_frames, destination
+    from structgstream.exporters.formats import check_page, choose_frames, destination
 
     frame, frames = options.frame, options.frames
     chosen = FrameOptions(
@@ -101,7 +100,7 @@ def main(arguments: list[str]) -> None:
             return
         chosen.check(format)
     from structgstream.codec.reader import open_stream
-    from structgstream.exporters.frames import write_frames
+    from structgstream.exporters.write import write_frames
     from structgstream.kernels.backend import select_backend
 
     reader = open_stream(stream, by_index=options.frame is not None)
@@ -109,25 +108,17 @@ def main(arguments: list[str]) -> None:
         numbers = choose_frames(reader.runs, output, frame=frame, frames=frames)
     backend = select_backend(options.device)
     gaussians, files, loss = 0, set[Path](), None
-    bar = Progress(
-        TextColumn("exporting"),
-        BarColumn(bar_width=32),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-        transient=True,
-    )
-    with bar:
-        task = bar.add_task("frames", total=len(numbers))
+    with frame_bar("exporting", len(numbers)) as advance:
         for written in write_frames(reader, numbers, output, format=format, backend=backend, options=chosen):
             files.add(written.path)
             gaussians += written.gaussians
             loss = loss or written.loss
-            bar.advance(task)
-    what = "1 frame" if len(numbers) == 1 else f"{len(numbers)} frames"
+            advance()
     size_bytes = sum(path.stat().st_size for path in files)
     console = Console()
-    print_lines(console, f"Wrote {output}: {what}, {gaussians:,} Gaussians, {human_bytes(size_bytes)}")
+    print_lines(
+        console, f"Wrote {output}: {frames_text(len(numbers))}, {gaussians:,} Gaussians, {human_bytes(size_bytes)}"
+    )
     if loss is not None:
         held_out = "" if loss.held_out is None else f", {loss.held_out:.1f} dB at the held-out ones"
         print_lines(
@@ -152,7 +143,7 @@ def _list_formats(console: Console) -> None:
 
 
 def _export_page(path: Path, output: Path, format: PageFormat) -> None:
-    from structgstream.serve.stream_file import StreamFile, write_page, write_site
+    from structgstream.serve.pages import StreamFile, write_page, write_site
 
     stream = StreamFile(path)
     if format == "html":
@@ -161,5 +152,120 @@ def _export_page(path: Path, output: Path, format: PageFormat) -> None:
     else:
         size_bytes = write_site(output, stream)
         then = "put the folder on any web server"
-    text = f"Wrote {output}, {human_bytes(size_bytes)}; {then}"
-    print_lines(Console(), text)
+    print_lines(Console(), f"Wrote {output}, {human_bytes(size_bytes)}; {then}")
+
+
+UP = {"x": (-1.0, 0.0, 0.0), "y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, -1.0)}
+
+
+@dataclass(frozen=True)
+class Import:
+    """Makes a stream of a numbered .ply sequence of another trainer, which the player plays (docs/export.md).
+
+    Gaussians keep their shapes; each gets one colour, the mean of its spherical harmonics over the cameras. If all
+    files have the same Gaussians in the same order, the stream contains their changes; otherwise every frame whole.
+
+    Example: structgstream import plys -o ball.sgs --fps 25
+    """
+
+    sequence: tyro.conf.Positional[Folder]
+    """Folder of the files: frame_0000.ply and so on."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
+    """The stream file to write."""
+    fps: Annotated[float, tyro.conf.arg(metavar="N")] = 30.0
+    """Frames per second."""
+    capture: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
+    """Capture in the units of the files, for its cameras. Default: a ring of cameras around the Gaussians."""
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "-y"
+    """Axis that points up, for the ring."""
+    max_splats: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    """Largest number of Gaussians of a frame; the smallest and most transparent are left out."""
+    overwrite: Flag = False
+    """Replace OUT.sgs when it exists."""
+    device: Device = "auto"
+    """Back-end that draws the pictures for the PSNR."""
+
+
+def import_files(arguments: list[str]) -> None:
+    """Writes the file; prints its size and what is lost."""
+    options = parse_options(Import, "import", arguments=arguments)
+    output = options.output
+    check_ending(output, ".sgs", command="import")
+    check_new(output, overwrite=options.overwrite)
+    if not 0.0 < options.fps <= 1000.0:
+        raise UsageError(f"--fps {options.fps:g} is no number of frames per second.")
+    from structgstream.codec.fields.rows import MAX_FREE
+    from structgstream.data.open import open_capture
+    from structgstream.exporters.ply import find_sequence
+    from structgstream.kernels.backend import select_backend
+    from structgstream.sequence_import import import_sequence
+
+    if options.max_splats is not None and not 0 < options.max_splats <= MAX_FREE:
+        raise UsageError(f"--max-splats {options.max_splats} is not one of 1 to {MAX_FREE}.")
+    files = find_sequence(options.sequence)
+    sign = -1.0 if options.up.startswith("-") else 1.0
+    x, y, z = UP[options.up[-1]]
+    with frame_bar("importing", len(files)) as advance:
+        found = import_sequence(
+            files,
+            output,
+            fps=options.fps,
+            backend=select_backend(options.device),
+            rig=None if options.capture is None else open_capture(options.capture).rig,
+            down=(sign * x, sign * y, sign * z),
+            max_splats=options.max_splats or MAX_FREE,
+            on_frame=advance,
+        )
+    console, size_bytes = Console(), output.stat().st_size
+    low, high = found.counts
+    count = f"{high:,}" if low == high else f"{low:,} to {high:,}"
+    print_lines(
+        console,
+        f"Wrote {output}: {frames_text(found.frames)} of {count} Gaussians, {human_bytes(size_bytes)}, "
+        f"{human_bytes(round(size_bytes / found.frames))} a frame",
+    )
+    print_lines(
+        console,
+        "All files have the same Gaussians; the stream contains their changes."
+        if found.linked
+        else "The files have different Gaussians, so every frame is stored by itself.",
+    )
+    colors = (
+        ""
+        if not found.degree
+        else (
+            f"; one colour a Gaussian in place of spherical harmonics of degree {found.degree} alone gives "
+            f"{found.color_psnr:.1f} dB"
+        )
+    )
+    print_lines(console, f"Pictures of frame 0 against those of the file: PSNR {found.psnr:.1f} dB{colors}.")
+
+
+@dataclass(frozen=True)
+class Archive:
+    """Turns a folder of segments into one stream file: the very bytes that reconstruct would have written as a file.
+
+    The SHA-256 of every file is verified. A stream of which frames have left the window (--window) is refused.
+
+    Example: structgstream archive ball -o ball.sgs
+    """
+
+    segments: tyro.conf.Positional[Folder]
+    """The folder that reconstruct --sink segments has written."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
+    """The stream file to write."""
+    overwrite: Flag = False
+    """Replace OUT.sgs when it exists."""
+
+
+def archive(arguments: list[str]) -> None:
+    """Writes the file and prints its size."""
+    options = parse_options(Archive, "archive", arguments=arguments)
+    output = options.output
+    check_ending(output, ".sgs", command="archive")
+    check_new(output, overwrite=options.overwrite)
+    from structgstream.codec.segments.store import FolderStore
+    from structgstream.codec.segments.stored_bytes import write_archive
+
+    frames = write_archive(FolderStore(options.segments), output)
+    print_lines(Console(), f"Wrote {output}: {frames_text(frames)}, {human_bytes(output.stat().st_size)}")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The engine ``inline``: tasks run in this process, one after the other, which suits a debugger."""
+"""An engine that runs tasks in this process, one after the other: patches of a test reach them."""
 
 import io
 import os
@@ -13,16 +13,15 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import IO
 
-from structgstream.executors.local import CommandProcess, opened_log, tail_of, waited_for
-from structgstream.executors.task import PYTHON, Task, TaskResult
+from structgstream.executors.local import opened_log, tail_of
+from structgstream.executors.task import Task, TaskResult
 
-WAIT_SECONDS = 3600.0
 INTERRUPTED = 130
 """Exit status of a command that was ended by Ctrl-C."""
 
 
 class InlineEngine:
-    """Runs ``{python} -m MODULE ...`` in this process, and other commands as processes, one at a time."""
+    """Runs ``{python} -m MODULE ...``."""
 
     name = "inline"
     repeats = False
@@ -46,8 +45,6 @@ class InlineEngine:
         task, self._next = self._next, None
         if task is None:
             return []
-        if task.command[:2] != (PYTHON, "-m"):
-            return [_in_a_process(task)]
         begun = time.monotonic()
         status, output = _called(task.command[2], list(task.command[3:]), task.environment, log=task.log)
         return [TaskResult(task.name, status, time.monotonic() - begun, output=output)]
@@ -55,18 +52,6 @@ class InlineEngine:
     def stop(self) -> None:
         """See ``Engine.stop``."""
         self._next = None
-
-
-def _in_a_process(task: Task) -> TaskResult:
-    process = CommandProcess(task, environment={})
-    try:
-        while True:
-            waited_for([process], WAIT_SECONDS)
-            if (result := process.ended()) is not None:
-                return result
-    except BaseException:
-        process.stop()
-        raise
 
 
 def _called(module: str, arguments: list[str], environment: Mapping[str, str], *, log: Path | None) -> tuple[int, str]:
