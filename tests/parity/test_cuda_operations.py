@@ -17,7 +17,7 @@ from tests.support.worlds import moving_world
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
-MAX_OPERATIONS, MAX_WAITS = 5_700, 230
+MAX_OPERATIONS, MAX_WAITS = 3_300, 180
 """Of the frame below: what it takes now, with little room. Whoever needs fewer lowers them."""
 
 

@@ -9,7 +9,7 @@ import ctypes
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -18,10 +18,10 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
-from structgstream.kernels import cpu_raster, cuda, cuda_anchors, cuda_library, reference_raster
+from structgstream.kernels import cpu_raster, cuda, cuda_anchors, cuda_fit, cuda_library, cuda_picture
 from structgstream.kernels.backend import Backend, reference_backend
 from structgstream.kernels.cuda_library import KernelLibrary
-from structgstream.kernels.values import RasterOutput
+from structgstream.kernels.values import FitFrame, RasterOutput
 from tests.support.pretended_gpu import DEVICE, lies_there, pretended_device, rasterize, values_of
 
 _VIEWS = (
@@ -77,12 +77,34 @@ class _Library(KernelLibrary):
     counts: Counts
 
     def call(self, name: str, *arguments: Any, device: torch.device) -> None:
-        launches = {"sgs_cuda_anchor_inputs": 2, "sgs_cuda_l1_ssim": 2}.get(name, 1)
-        self.counts.add(name, launches)
+        launches = {"sgs_cuda_anchor_inputs": 2, "sgs_cuda_l1_ssim": 2, "sgs_cuda_picture": 8}.get(name, 1)
+        self.counts.add(name, launches, waits=int(name == "sgs_cuda_picture"))
         super().call(name, *(values_of(argument) for argument in arguments), device=device)
 
     def check_devices(self, *tensors: Tensor | None) -> None:
         assert all(tensor is None or lies_there(tensor) for tensor in tensors)
+
+
+def _with_values(value: Any) -> Any:
+    """``value`` with the memory of its tensors on the device (``values_of``)."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(value, **{f.name: _with_values(getattr(value, f.name)) for f in fields(value)})
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return type(value)(*map(_with_values, value))
+    return list(map(_with_values, value)) if isinstance(value, list) else values_of(value)
+
+
+def _counted_iterations(library: KernelLibrary, counts: Counts, frame: FitFrame) -> Callable[[int, int], None]:
+    """The native iterations, which are one operation and one wait for each call."""
+    counts.add("iterations begin", waits=1)
+    with counts.paused():
+        run = cuda_fit.iterations(library, _with_values(frame))
+
+    def counted(first: int, last: int) -> None:
+        counts.add("iterations", waits=1)
+        run(first, last)
+
+    return counted
 
 
 class _Recorder:
@@ -130,21 +152,34 @@ def _counted_rasterizer(counts: Counts) -> Callable[..., RasterOutput]:
 
 
 @contextmanager
-def counted_gpu(emulation: ctypes.CDLL, patch: pytest.MonkeyPatch) -> Iterator[tuple[Backend, Counts]]:
-    """The cuda back-end on ``DEVICE`` within, and what was counted there so far."""
+def counted_gpu(
+    emulation: ctypes.CDLL, patch: pytest.MonkeyPatch, *, native: bool = True
+) -> Iterator[tuple[Backend, Counts]]:
+    """The cuda back-end on ``DEVICE`` within, and what was counted there so far.
+
+    Args:
+        emulation: the kernels on the processor.
+        patch: to replace gsplat's rasteriser.
+        native: with the iterations of ``kernels.cuda_fit``.
+    """
     counts = Counts()
     library = _Library(emulation, DEVICE.type, lambda device: 0)
     object.__setattr__(library, "counts", counts)
     draw = _counted_rasterizer(counts)
     patch.setattr(cuda_library, "kernel_library", lambda: (library, "emulated"))
     patch.setattr(cuda, "rasterize", draw)
+    plain = KernelLibrary(emulation, "cpu", lambda device: 0)
     backend = replace(
-        reference_backend(), name="cuda", device=DEVICE, recorder=lambda: _Recorder(counts)
+        reference_backend(),
+        name="cuda",
+        device=DEVICE,
+        recorder=lambda: _Recorder(counts),
+        iterations=partial(_counted_iterations, plain, counts) if native else None,
     ).with_functions(
         rasterize=draw,
-        projected_radii=partial(reference_raster.radii_by_drawing, draw),
-        blending_weights=partial(reference_raster.weights_by_gradient, draw),
-        picture_and_weights=partial(reference_raster.picture_and_weights_by_gradient, draw),
+        projected_radii=partial(cuda_picture.projected_radii, library),
+        blending_weights=partial(cuda_picture.blending_weights, library),
+        picture_and_weights=partial(cuda_picture.picture_and_weights, library),
         adam_step=cuda.adam_step,
         generate_structured=partial(cuda_anchors.generate_structured, library),
         l1_ssim=partial(cuda.l1_ssim, library),

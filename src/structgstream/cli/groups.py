@@ -266,7 +266,7 @@ def join(arguments: list[str]) -> None:
         check=options.check,
         backend=backend,
         workers=_workers(options.workers, backend),
-        on_border=lambda border: _tell(border, console),
+        on_border=lambda border: _print_border(border, console),
     )
     size = human_bytes(output.stat().st_size)
     print_lines(console, f"Wrote {output}: {frames_text(frames)} of {len(options.segments)} groups, {size}")
@@ -280,7 +280,7 @@ def _workers(asked: int | None, backend: "Backend | None") -> int:
     return 1 if backend.name == "cuda" else usable_cores()
 
 
-def _tell(border: "Border", console: Console) -> None:
+def _print_border(border: "Border", console: Console) -> None:
     print_lines(
         console,
         f"Border at frame {border.frame}: {border.blended:,} anchors keep their values of the frame before; "

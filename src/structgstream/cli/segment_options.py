@@ -149,7 +149,7 @@ class SegmentOptions:
                 if left := mirror.finish(wait_seconds=FINISH_SECONDS):
                     report(
                         f"{left} files of {output} are not yet in {remote.name}; the next run with --resume, or any "
-                        "program that copies folders, brings them there."
+                        "program that copies folders, copies them."
                     )
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading a stream: header, packets, scenes; complete files and files truncated anywhere.
 
-Note [Nothing is kept]
-~~~~~~~~~~~~~~~~~~~~~~
+Note [Nothing is cached]
+~~~~~~~~~~~~~~~~~~~~~~~~
 Streams can be long, so a reader keeps only two headers, eight bytes per packet and the scene rendered last. Everything
 else is read on demand: the facts of a packet from the heads of its record and fields, a scene from its record, whose
 checksum is verified then. With the ``raw`` codec packets are independent, so random access costs one packet.
@@ -72,7 +72,7 @@ NOTHING = -2  # index of the last decoded frame if there is none: no frame follo
 
 
 class StreamReader:
-    """A stream in memory or in a file; nearly constant memory (Note [Nothing is kept]).
+    """A stream in memory or in a file; nearly constant memory (Note [Nothing is cached]).
 
     Opening verifies every record's checksum, one record at a time. After a damaged record reading continues at the next
     whole packet: :meth:`scene` decodes every frame of :attr:`runs`, while :attr:`packets`, the length and
@@ -224,7 +224,7 @@ class StreamReader:
         return scene
 
     def render(self, index: int, camera: Camera | str, *, backend: BackendName | Backend = "auto") -> NDArray[np.uint8]:
-        """Renders one frame: ``[H, W, 3]`` 8-bit sRGB. The scene is kept for further pictures of the same frame.
+        """Renders one frame: ``[H, W, 3]`` 8-bit sRGB. The scene is stored for further pictures of the same frame.
 
         Args:
             index: the frame.
@@ -247,7 +247,7 @@ class StreamReader:
 
     def _missing(self, index: int) -> StreamError:
         if any(index in frames for frames in self._gone):
-            return StreamError(f"Frame {index} of {self._name} has left the window of frames that are kept.")
+            return StreamError(f"Frame {index} of {self._name} has left the window of the stream.")
         for damage in self.damage:
             if index in damage.frames:
                 return StreamError(

@@ -169,7 +169,7 @@ class FileSink:
         Raises:
             StorageError: another sink writes to the file now.
         """
-        with suppress(OSError), self.path.open("rb+") as file:  # What cannot be opened is told by open().
+        with suppress(OSError), self.path.open("rb+") as file:  # open() reports what cannot be opened.
             self._lock(file)
 
     def open(self, header: StreamHeader) -> int:

@@ -8,7 +8,6 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Protocol
 
 from structgstream.atomic_files import atomic_write, partial_path
 from structgstream.errors import StorageError, StreamError, TaskError
@@ -16,17 +15,11 @@ from structgstream.executors.executor import TaskQueue
 from structgstream.executors.local import LocalEngine
 from structgstream.executors.task import PYTHON, Task, TaskResult, WorkerSlot, thread_environment
 from structgstream.groups.boundaries import Groups, groups_path, read_groups
-from structgstream.parallel.exchange import CutsTrack, SharedFolder
+from structgstream.parallel.exchange import SharedFolder
 from structgstream.parallel.parts import Parts, group_name, key_of, sha256_of
 
 HEADER, TRACK, JOIN = "header", "track", "join"
 PROGRAM = (PYTHON, "-m", "structgstream")
-
-
-class ReadsTrack(Protocol):
-    """Gives the frames at which a group may start, of a track that is finished or growing."""
-
-    def __call__(self, track: Path, /) -> Collection[int]: ...
 
 
 def starts_in(track: Path) -> Collection[int]:
@@ -70,7 +63,7 @@ class Unit:
         device: further arguments of all commands: the back-end.
         join: further arguments of ``join``: number of processes.
         program: runs the commands.
-        starts: reads a track.
+        starts: the frames at which a group may start, of a track that is finished or growing.
         cut: extracts from a track what one group needs.
     """
 
@@ -82,8 +75,8 @@ class Unit:
     device: tuple[str, ...] = ()
     join: tuple[str, ...] = ()
     program: tuple[str, ...] = PROGRAM
-    starts: ReadsTrack = field(default=starts_in, compare=False)
-    cut: CutsTrack = field(default=cut_track, compare=False)
+    starts: Callable[[Path], Collection[int]] = field(default=starts_in, compare=False)
+    cut: Callable[[Path, int], bytes] = field(default=cut_track, compare=False)
 
     def header_task(self, parts: Parts) -> Task:
         """Fits frame 0, which all groups share."""

@@ -21,7 +21,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from structgstream.atomic_files import atomic_write, partial_path
 from structgstream.errors import StorageError, StructGStreamError
@@ -164,12 +164,6 @@ STAGED = (PYTHON, "-m", "structgstream.parallel.exchange")
 POLL_SECONDS = 1.0
 
 
-class CutsTrack(Protocol):
-    """Extracts from a track the start of a single group."""
-
-    def __call__(self, track: Path, first: int, /) -> bytes: ...
-
-
 class SharedFolder:
     """All machines see the parts at the same path, so that nothing is copied."""
 
@@ -201,7 +195,7 @@ class ObjectStore(SharedFolder):
         cut: extracts from a track what one group needs.
     """
 
-    def __init__(self, store: ObjectFolder, parts: Parts, *, cut: CutsTrack) -> None:
+    def __init__(self, store: ObjectFolder, parts: Parts, *, cut: Callable[[Path, int], bytes]) -> None:
         self._store, self._parts, self._cut = store, parts, cut
         self._asked = 0.0
         self._fetched_bytes: int | None = None  # of the growing track

@@ -79,7 +79,7 @@ def test_the_writer_goes_on_while_the_other_store_cannot_be_reached(tmp_path: Pa
     here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
     told: list[str] = []
     remote.reachable.clear()
-    mirror = MirroredStore(here, remote, options=MirrorOptions(tell=told.append))
+    mirror = MirroredStore(here, remote, options=MirrorOptions(report=told.append))
     written(mirror, SENT)
     for _ in range(2):
         assert remote.refused.acquire(timeout=60)
@@ -129,7 +129,7 @@ def test_another_stream_that_is_found_after_an_outage_is_not_replaced(tmp_path: 
     written(first, packets(4))
     assert first.finish(wait_seconds=60) == 0
     before = contents(remote)
-    options = MirrorOptions(grace_seconds=0.0, tell=told.append)
+    options = MirrorOptions(grace_seconds=0.0, report=told.append)
     second = MirroredStore(folder(tmp_path / "second"), remote, options=options)
     written(second, SENT)
     assert second.finish(wait_seconds=1.0) > 0
@@ -202,7 +202,7 @@ def test_a_file_that_is_to_go_while_it_is_copied_goes_when_its_manifest_is_there
             assert done.wait(60)
 
     remote.before = before
-    mirror = MirroredStore(here, remote, options=MirrorOptions(tell=told.append))
+    mirror = MirroredStore(here, remote, options=MirrorOptions(report=told.append))
     mirror.copy_all()
     assert inside.wait(60)
     written(mirror, SENT, options=SegmentsOptions(grace_seconds=0.5))

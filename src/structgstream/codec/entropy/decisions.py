@@ -256,9 +256,9 @@ class _Coder:
 
     def even(self, yes: int) -> int:
         """Codes a decision of probability one half."""
-        return self._told(yes, HALF)
+        return self._decide(yes, HALF)
 
-    def _told(self, yes: int, chance: int) -> int:
+    def _decide(self, yes: int, chance: int) -> int:
         bound = (self._range >> 16) * chance
         if not self._encodes:
             yes = int(self._low < bound)
@@ -286,7 +286,7 @@ class _Coder:
         cells = [(start + context) * self._nodes + node for start, context in zip(self._starts, contexts, strict=True)]
         logits = [stretch[chances[cell] >> 4] for cell in cells]
         chance = squashed(sum(weight * logit >> 16 for weight, logit in zip(weights, logits)))
-        yes = self._told(yes, chance)
+        yes = self._decide(yes, chance)
         target = 65536 if yes else 0
         error = target - chance >> 4
         for k, cell in enumerate(cells):
@@ -407,7 +407,7 @@ def _residual_contexts(
     past: list[int], row: list[int], own: int, above: int, below: int, column: int, level: int, other: int
 ) -> tuple[int, ...]:
     columns, beside = len(past), abs(above) + abs(below)
-    told = sum(map(abs, row[:column]))
+    size = sum(map(abs, row[:column]))
     first = row[column - 1] if column else 0
     off = first - past[column - 1] if column else 0
     beginning = 8 * (above + below)
@@ -418,7 +418,7 @@ def _residual_contexts(
         (_limited(own, 8) + 8) * columns + column,
         (_limited(above, 4) + 4) * 9 + _limited(below, 4) + 4,
         ((-expected if led < 0 else expected) + 15) * 5 + level,
-        (min(told, 9) * 6 + min(beside, 5)) * columns + column,
+        (min(size, 9) * 6 + min(beside, 5)) * columns + column,
         (other * columns + column) * 16 + size_class(2 * abs(own) + beside),
         ((_limited(first, 3) + 3) * 7 + _limited(off, 3) + 3) * 7 + _limited(own, 3) + 3,
     )

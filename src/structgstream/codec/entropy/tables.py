@@ -92,7 +92,7 @@ def normalize_counts(counts: NDArray[np.integer]) -> FrequencyTables:
         rows[short, _largest(n[short], 2 * rows[short] + 1)] += 1
     while len(over := np.flatnonzero(rows.sum(1) > TOTAL)):
         f = rows[over]
-        # The least n / d is the largest d / n; a frequency of 1 is kept.
+        # The least n / d is the largest d / n; a frequency of 1 stays.
         rows[over, _largest(np.where(f > 1, 2 * f - 1, 0), np.maximum(n[over], 1))] -= 1
     return FrequencyTables(rows.astype(np.uint16))
 
@@ -309,7 +309,7 @@ def choose_tables(counts: NDArray[np.integer], previous: FrequencyTables) -> tup
 
     Args:
         counts: ``[C, A]``, number of occurrences of each symbol in each context.
-        previous: the decoder's tables; a row is kept where a new one would cost more bits than it saves.
+        previous: the decoder's tables; a row stays where a new one would cost more bits than it saves.
 
     Raises:
         StreamError: counts have another shape than the previous tables, or are too large.

@@ -20,7 +20,7 @@ from structgstream.codec.container.records import PacketKind
 from structgstream.errors import StreamError
 
 MOST = 1e15
-"""The largest number where nothing else is said: beyond it seconds are no longer told apart."""
+"""The largest number where nothing else is stated; whole numbers up to it are exact in a double."""
 
 _FILE = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,127}", re.ASCII)
 _SHA256 = re.compile(r"[0-9a-f]{64}", re.ASCII)

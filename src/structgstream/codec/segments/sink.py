@@ -50,7 +50,7 @@ from structgstream.errors import StorageError, StreamError
 
 @dataclass(frozen=True)
 class SegmentsOptions:
-    """What of a stream is kept.
+    """How long files of a stream stay.
 
     Args:
         window_seconds: media seconds before the edge that viewers can go back; None for everything.
@@ -81,7 +81,7 @@ class Retention:
 
     Args:
         store: where the files are.
-        options: what is kept.
+        options: how long files stay.
         elapsed: seconds that never jump.
     """
 
@@ -180,7 +180,7 @@ class SegmentsSink:
     Args:
         store: where the files go.
         overwrite: whether a stream that is there may be replaced.
-        options: what is kept.
+        options: how long files stay.
         clocks: where times come from.
         found: what is there already, to go on after it (``recovery.find``).
     """
