@@ -3,6 +3,7 @@
 
 import logging
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
