@@ -13,8 +13,7 @@ from benchmarks.benchmark import Benchmark, Growth, Target, Variant
 from benchmarks.contest import Contestant, Quantity, Results
 from structgstream.codec.entropy import rans
 from structgstream.codec.entropy.bits import ALPHABET, residuals_to_symbols
-from structgstream.codec.entropy.table_choice import choose_tables
-from structgstream.codec.entropy.tables import FrequencyTables, decode_tables, geometric
+from structgstream.codec.entropy.tables import FrequencyTables, choose_tables, decode_tables, geometric
 
 CONTEXTS = 50
 Symbols = tuple[np.ndarray, np.ndarray, np.ndarray]

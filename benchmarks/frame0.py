@@ -9,7 +9,7 @@ import torch
 from benchmarks.benchmark import Benchmark, Variant
 from benchmarks.contenders import torch_but_raster
 from benchmarks.contest import Contestant, Quantity, Results
-from structgstream.data.json_videos import bundled_clip
+from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.data.points import initial_points
 from structgstream.data.wrappers import resized
 from structgstream.kernels.backend import Backend, cpu_backend

@@ -11,7 +11,7 @@ import torch
 
 import structgstream
 from structgstream.cli import main
-from structgstream.data.json_videos import bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.errors import CaptureError, ConfigError, StorageError, StreamError
 from structgstream.evaluation.evaluate import rendered
 from structgstream.evaluation.report import as_json

@@ -15,6 +15,7 @@ import shlex
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -29,12 +30,16 @@ DOCUMENTS = sorted(
     for path in ROOT.glob(pattern)
     if path.is_file()
 )
-HOMES = dict.fromkeys(COMMANDS, "structgstream.cli")
-PROGRAM = re.compile(rf"(?:^|[\s`/=])structgstream ((?:{'|'.join(HOMES)})\b[^`]*)")
+PROGRAM = re.compile(rf"(?:^|[\s`/=])structgstream ((?:{'|'.join(COMMANDS)})\b[^`]*)")
 SCRIPT = re.compile(
     r"python (-m (?:benchmarks|tools|tests|lab)[\w.]*|(?:benchmarks|tools|tests|lab)/[\w/]+\.py)([^`]*)"
 )
 OPTION = re.compile(r"(?<![\w-])--[a-z][\w.-]*\w")
+
+
+def home_of(command: str) -> ModuleType:
+    """The module of a command."""
+    return importlib.import_module(app.entry_of(command).__module__)
 
 
 def blocks(text: str) -> Iterator[str]:
@@ -69,12 +74,11 @@ def documented(read: Any, pattern: re.Pattern[str]) -> list[Any]:
 def examples() -> list[Any]:
     """The examples in the help of commands, and in that of the program."""
     texts = [("overview", app.overview())]
-    for name, home in HOMES.items():
-        texts.append((name, inspect.getsource(importlib.import_module(f"{home}.{name.replace('-', '_')}"))))
+    texts += [(name, inspect.getsource(home_of(name))) for name in COMMANDS]
     pattern = re.compile(r"^\s*(?:Example: )?structgstream (\w.*)$", re.MULTILINE)
     found = [(name, line) for name, text in texts for line in pattern.findall(text)]
-    assert {name for name, _ in found} == {"overview", *HOMES}
-    return [pytest.param(line, id=f"{name}: {line}"[:90]) for name, line in found]
+    assert {name for name, _ in found} == {"overview", *COMMANDS}
+    return [pytest.param(line, id=line[:90]) for line in dict.fromkeys(line for _, line in found)]
 
 
 def words_of(line: str) -> list[str]:
@@ -95,7 +99,7 @@ def parsed(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         Parsed: it was taken.
     """
     command, *arguments = words
-    module = importlib.import_module(f"{HOMES[command]}.{command.replace('-', '_')}")
+    module = home_of(command)
 
     def known(kind: type[Any], name: str, *, arguments: list[str]) -> None:
         found, rest = options.parse_known_options(kind, name, arguments=arguments)
@@ -110,7 +114,7 @@ def parsed(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     for name, replaced in (("parse_known_options", known), ("parse_options", whole)):
         if hasattr(module, name):
             monkeypatch.setattr(module, name, replaced)
-    module.main(arguments)
+    app.entry_of(command)(arguments)
 
 
 @cache
@@ -138,7 +142,7 @@ def test_there_is_something_to_look_at() -> None:
 def test_a_command_that_is_shown_can_be_given(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     words = words_of(line)
     if words == [words[0]] or set(words) & {"...", "COMMAND"}:
-        assert words[0] in {*HOMES, "COMMAND"}
+        assert words[0] in {*COMMANDS, "COMMAND"}
         return
     with pytest.raises(Parsed):
         parsed(words, monkeypatch)

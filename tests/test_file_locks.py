@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.file_locks import lock_file, open_lockable
+from structgstream.atomic_files import lock_file, open_lockable
 
-TRY = "import sys; from structgstream.file_locks import lock_file\n"
+TRY = "import sys; from structgstream.atomic_files import lock_file\n"
 TRY += "print(lock_file(open(sys.argv[1], 'w'), holder=sys.argv[2]))"
 
 

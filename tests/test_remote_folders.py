@@ -9,7 +9,7 @@ import pytest
 from structgstream.codec.segments.store import CloudStore
 from structgstream.data.live.rig_file import read_rig
 from structgstream.errors import CaptureError, MissingExtraError, StorageError
-from structgstream.parallel.object_folder import ObjectFolder
+from structgstream.parallel.exchange import ObjectFolder
 from structgstream.remote_folders import open_url, reason_of, shown_address, without_secrets
 
 

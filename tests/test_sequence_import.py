@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from structgstream.cli import main
-from structgstream.codec.fields.free_rows import MAX_FREE
+from structgstream.codec.fields.rows import MAX_FREE
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import open_stream
 from structgstream.errors import CaptureError
-from structgstream.exporters.baked_gaussians import BakedGaussians
+from structgstream.exporters.bake import BakedGaussians
 from structgstream.exporters.ply import ply_bytes
 from structgstream.exporters.write import write_gaussians
 from structgstream.scene.harmonics import Y0

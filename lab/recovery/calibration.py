@@ -39,8 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"held back {found.held_out}: {found.before_pixels:.2f} to {found.after_pixels:.2f} pixels")
         solved = found.solved
     else:
-        known = given if options.known else None
-        solved = solve_structure(pictures, lens=options.lens, known=known)
+        solved = solve_structure(pictures, lens=options.lens)
     _print("found", calibration_errors(solved.cameras, given).values())
     print(
         f"placed {len(solved.cameras)} of {len(given)}, {len(solved.points)} points, {len(solved.observations)} "
@@ -96,7 +95,6 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("capture", type=Path, nargs="?", help="a calibrated capture; the bundled clip without one")
     parser.add_argument("--instants", type=int, nargs="+", default=[0])
     parser.add_argument("--lens", default="pinhole", choices=["pinhole", "radial", "opencv", "fisheye"])
-    parser.add_argument("--known", action="store_true", help="intrinsics are given, poses are not")
     parser.add_argument("--refine", action="store_true", help="from the given calibration, perturbed")
     parser.add_argument("--degrees", type=float, default=0.3)
     parser.add_argument("--percent", type=float, default=1.0)

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.data.timeline import Clock
+from structgstream.geometry import Floats
 from structgstream.preparation.synchronization.audio import audio_lags, connected_by, solve_by_audio, sound_of
 
 HERTZ = 96_000  # of the made sound

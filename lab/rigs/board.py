@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from lab.rigs.optics import SUBPIXELS, normalised_subpixels
 from lab.rigs.rig import turned
-from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv
 from structgstream.data.lenses import LensCamera
+from structgstream.geometry import Floats
 from structgstream.preparation.calibration.board import Board
 
 PAPER, INK = 0.82, 0.035  # reflectances

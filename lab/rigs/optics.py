@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 
 from lab.rigs.filming import Filming
-from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv
 from structgstream.data.lenses import Lens, LensCamera, Pinhole, RadialTangential
+from structgstream.geometry import Floats
 
 SIZE = (640, 480)
 FOCAL_PIXELS = 600.0

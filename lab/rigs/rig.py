@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
-from structgstream.data.arrays import Floats
 from structgstream.data.lenses import Fisheye, LensCamera, Pinhole
+from structgstream.geometry import Floats
 
 TARGET = (0.02, 0.12, 0.155)  # metres; the middle of the table is the origin, z points up
 RADIUS_METRES = 1.5

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from structgstream.data.arrays import Floats
+from structgstream.geometry import Floats
 
 SAMPLE_RATE = 48_000
 SPEED = 343.0  # metres a second, air at 20 degrees Celsius

@@ -27,7 +27,7 @@ from lab.robustness.load_trainer import renumbered
 from lab.robustness.outside import chromium
 from lab.robustness.stream_writers import Sent, content, edge_of
 from structgstream.codec.packets import PacketSink
-from structgstream.codec.segments.retention import SegmentsOptions
+from structgstream.codec.segments.sink import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.sinks import MemorySink, resume_segments
 

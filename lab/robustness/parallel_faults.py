@@ -27,16 +27,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from structgstream.data.json_videos import bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.errors import StorageError, TaskError
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.local import LocalEngine
 from structgstream.executors.task import PYTHON, WorkerSlot
-from structgstream.parallel.driver import Job, drive
-from structgstream.parallel.exchange import ObjectStore
-from structgstream.parallel.object_folder import ObjectFolder
+from structgstream.parallel.driver import Job, Unit, drive
+from structgstream.parallel.exchange import ObjectFolder, ObjectStore
 from structgstream.parallel.parts import Parts
-from structgstream.parallel.unit import Unit
 from tests.support import stand_in
 from tests.support.flaky_store import flaky_store
 

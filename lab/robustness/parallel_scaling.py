@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What engines cost, and what workers bring: seconds and memory, inline, in processes and on Ray, on this machine.
+"""What engines cost, and what workers bring: seconds and memory, in processes and on Ray, on this machine.
 
     python -m lab.robustness.parallel_scaling --folder FOLDER
     python -m lab.robustness.parallel_scaling --folder FOLDER --runs local-1 local-2    (a part)
@@ -21,15 +21,14 @@ import time
 from collections import defaultdict
 from pathlib import Path
 
-from structgstream.data.json_videos import bundled_clip_path
-from structgstream.executors.opening import ExecutorName, ExecutorOptions, open_executor
+from structgstream.data.dataset_layouts import bundled_clip_path
+from structgstream.executors.executor import ExecutorName, ExecutorOptions, open_executor
 from structgstream.executors.task import PYTHON, Task
-from structgstream.parallel.driver import Job, Status, drive
+from structgstream.parallel.driver import Job, Status, Unit, drive
 from structgstream.parallel.parts import Parts
-from structgstream.parallel.unit import Unit
 from tests.support import stand_in
 
-ROWS = ("inline-1", "local-1", "local-2", "ray-1", "ray-2")
+ROWS = ("local-1", "local-2", "ray-1", "ray-2")
 EMPTY_TASKS = 40
 PLANNED = 10_000
 ENOUGH = 40  # groups done, after which memory no longer changes
@@ -38,7 +37,7 @@ ENOUGH = 40  # groups done, after which memory no longer changes
 def options_of(row: str) -> ExecutorOptions:
     """The engine and the workers that a row names."""
     name, _, workers = row.partition("-")
-    engine: ExecutorName = "inline" if name == "inline" else "ray" if name == "ray" else "local"
+    engine: ExecutorName = "ray" if name == "ray" else "local"
     return ExecutorOptions(engine, int(workers), threads=1)
 
 

@@ -23,7 +23,7 @@ import torch
 from benchmarks.machine import load_average, machine
 from structgstream.cameras import Camera
 from structgstream.codec.reader import open_stream
-from structgstream.data.json_videos import bundled_clip
+from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import SourceWrapper, resized
 from structgstream.evaluation.evaluate import evaluate
@@ -32,7 +32,7 @@ from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend, select_backend
 from structgstream.recorder import record
 from structgstream.scene.scene import Scene
-from structgstream.session.initialization import frame_seed, initial_points_of
+from structgstream.session.loop import frame_seed, initial_points_of
 from structgstream.session.periods import PeriodConfig
 from structgstream.session.presets import FAST, StreamConfig
 from structgstream.session.struct_gstream import stream_pipeline

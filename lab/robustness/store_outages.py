@@ -218,7 +218,7 @@ def one_event(row: Row, sent: Sent, rng: random.Random, folder: Path, *, seconds
     here = FolderStore(folder)
     here.prepare()
     told: list[str] = []
-    mirror = MirroredStore(here, service.store(name), options=MirrorOptions(tell=told.append))
+    mirror = MirroredStore(here, service.store(name), options=MirrorOptions(report=told.append))
     reader = Reader(other.store(name), sent.whole)
     reader.start()
     begin = rng.randrange(1, len(sent.packets) // 4)

@@ -11,7 +11,7 @@ from structgstream.codec.container.records import FRAME, footer_offset
 from structgstream.codec.packets import Packet, PacketSink, StreamHeader
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.segments.recovery import find
-from structgstream.codec.segments.retention import SegmentsOptions
+from structgstream.codec.segments.sink import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest, write_archive
 from structgstream.codec.sinks import FileSink, MemorySink, resume_segments
@@ -118,7 +118,7 @@ def real_writer(frames: int) -> Writer:
     """Reconstructs the bundled clip with the preset tiny."""
 
     def write(path: Path, report: Report) -> None:
-        from structgstream.data.json_videos import bundled_clip_path
+        from structgstream.data.dataset_layouts import bundled_clip_path
         from structgstream.data.open import open_capture
         from structgstream.data.plane_sweep import SweepConfig
         from structgstream.data.points import PointsConfig

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from structgstream.frames import MultiViewFrame
     from structgstream.kernels.backend import Backend, select_backend
     from structgstream.memory import PeakKind
-    from structgstream.preparation.checking.findings import CheckReport, Finding
+    from structgstream.preparation.checking.check import CheckReport, Finding
     from structgstream.preparation.options import PrepareOptions
     from structgstream.preparation.prepare import Preparation
     from structgstream.scene.render import Rendering, render

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Literal
 
 from structgstream.codec.reader import open_stream
-from structgstream.codec.segments.retention import SegmentsOptions
-from structgstream.data.json_videos import bundled_clip_path
+from structgstream.codec.segments.sink import SegmentsOptions
+from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.data.open import open_capture
 from structgstream.data.source import FrameSource, FrameStream
 from structgstream.errors import ConfigError
@@ -22,16 +22,15 @@ from structgstream.evaluation.optional_metrics import MetricSelection
 from structgstream.evaluation.recording import capture_of, part_metadata, stored_capture
 from structgstream.evaluation.report import Report
 from structgstream.evaluation.run_log import read_log
-from structgstream.exporters.formats import Format, FrameOptions, PageFormat
-from structgstream.exporters.frames import write_frames
-from structgstream.exporters.request import check_page, choose_frames, destination
+from structgstream.exporters.formats import Format, FrameOptions, PageFormat, check_page, choose_frames, destination
+from structgstream.exporters.write import write_frames
 from structgstream.kernels.backend import Backend, BackendName, select_backend
-from structgstream.preparation.checking.findings import CheckReport
+from structgstream.preparation.checking.check import CheckReport
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.prepare import Preparation, check_folder, prepare_capture
 from structgstream.preparation.steps import Listener
 from structgstream.recorder import check_output, record, segments_at, segments_folder
-from structgstream.serve.stream_file import StreamFile, write_page, write_site
+from structgstream.serve.pages import StreamFile, write_page, write_site
 from structgstream.session.frame_report import FrameReport
 from structgstream.session.presets import DEFAULT_PRESET, StreamConfig, preset_named, with_budget
 from structgstream.session.struct_gstream import stream_pipeline

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Atomic writes of files.
+"""Atomic writes of files, files that grow, and locks on open files between processes, which end with the process.
 
 Note [Atomic files]
 ~~~~~~~~~~~~~~~~~~
@@ -10,14 +10,48 @@ file of a killed process. The partial file is locked, because concurrent writers
 """
 
 import errno
+import fcntl
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, Any, BinaryIO, Literal, cast
 
 from structgstream.errors import StorageError
-from structgstream.file_locks import lock_file, open_lockable
+
+_HELD = (errno.EACCES, errno.EAGAIN)  # the errors that POSIX allows for a lock that is held
+
+
+def lock_file(file: IO[Any], *, holder: Literal["file", "process"] = "file") -> bool:
+    """Acquires the lock of ``file``, which must be open for writing; returns False if it is held already.
+
+    On a file system without locks, such as some network file systems, it always succeeds.
+
+    Args:
+        file: holds the lock until it is closed.
+        holder: the owner of the lock: the open file, so that a second one in the same process is refused, or the
+            process.
+    """
+    take = fcntl.flock if holder == "file" else fcntl.lockf
+    try:
+        take(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        return error.errno not in _HELD
+    return True
+
+
+def open_lockable(path: Path, *, buffering: int = -1) -> BinaryIO:
+    """The file ``path``, created if it is missing, open for writing at its beginning and not truncated.
+
+    A link is followed only to a device, because a file that it points to may belong to somebody else.
+
+    Raises:
+        OSError: it cannot be opened, or is a link.
+    """
+    if path.is_symlink() and not path.is_char_device():
+        raise OSError(errno.ELOOP, f"{path.name} in it is a link, which is not followed", str(path))
+    return cast(BinaryIO, os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o666), "wb", buffering))
+
 
 _WITHOUT_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EACCES, errno.EPERM, errno.EBADF, errno.ENOSYS)
 """Errors of file systems that cannot sync a folder, and of folders without read permission."""
@@ -195,3 +229,88 @@ def _as_storage_error(path: Path, called: str) -> Iterator[None]:
         reason = f"{path.parent} is a file" if os.path.isfile(path.parent) else error.strerror or str(error)
         name = f"{called} {path}".lstrip()
         raise StorageError(f"{name} cannot be written ({reason}){_ADVICE.get(error.errno or 0, '')}.") from error
+
+
+def name_finished(path: Path) -> None:
+    """Renames a complete file whose writer was killed just before it renamed it.
+
+    Raises:
+        StorageError: it cannot be renamed, or another process writes it.
+    """
+    partial = partial_path(path)
+    GrowingFile(path, keep=partial.stat().st_size if partial.exists() else 0).finish()
+
+
+class GrowingFile:
+    """A locked file that grows under the name ``PATH.partial`` and is renamed at the end.
+
+    Data is on the disk when :meth:`append` returns; a failed write is truncated.
+
+    Args:
+        path: of the finished file.
+        keep: existing bytes to retain; the file is truncated after them.
+
+    Raises:
+        StorageError: it cannot be written, another process writes it, or has changed it since ``keep`` was found.
+    """
+
+    def __init__(self, path: Path, *, keep: int = 0) -> None:
+        self.path, self.partial = path, partial_path(path)
+        try:
+            self._file = open_exclusive(self.partial, of=path, buffering=0)
+            try:
+                self._begin(keep)
+            except BaseException:
+                self._file.close()
+                raise
+        except OSError as error:
+            raise self._failed(error) from error
+        self.size = keep
+
+    def _begin(self, keep: int) -> None:
+        if self._file.seek(0, os.SEEK_END) < keep:
+            raise StorageError(f"Another process has changed {self.partial}; run the same command again.")
+        self._file.truncate(keep)
+        self._file.seek(keep)
+
+    def append(self, data: bytes) -> int:
+        """Adds ``data``; returns its length.
+
+        Raises:
+            StorageError: it cannot be written; earlier data stays.
+        """
+        try:
+            rest = memoryview(data)
+            while rest:
+                rest = rest[self._file.write(rest) :]
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            with suppress(OSError):
+                self._file.truncate(self.size)
+                self._file.seek(self.size)
+            raise self._failed(error) from error
+        self.size += len(data)
+        return len(data)
+
+    def finish(self) -> None:
+        """Renames the file to its final name and closes it.
+
+        Raises:
+            StorageError: it cannot be renamed.
+        """
+        try:
+            give_name(self.partial, self.path)
+        except OSError as error:
+            raise self._failed(error) from error
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Closes the file, which can be resumed later. A second call does nothing."""
+        self._file.close()
+
+    def _failed(self, error: OSError) -> StorageError:
+        return StorageError(
+            f"{self.partial} cannot be written ({error.strerror}); make room or correct its permissions, and "
+            "run the same command again."
+        )

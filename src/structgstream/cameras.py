@@ -7,7 +7,7 @@ top-left pixel at (0.5, 0.5). See ``docs/conventions.md``.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -171,6 +171,20 @@ class CameraRig:
     def centers(self) -> Tensor:
         """Camera positions, ``[V, 3]`` float64, in rig order."""
         return torch.stack([camera.center for camera in self.cameras.values()])
+
+    def plain(self) -> dict[str, dict[str, Any]]:
+        """Each camera as plain JSON values, by name."""
+        return {
+            name: {
+                "width": camera.width,
+                "height": camera.height,
+                "K": camera.K.tolist(),
+                "viewmat": camera.viewmat.tolist(),
+                "near": camera.near,
+                "held_out": name in self.held_out,
+            }
+            for name, camera in self.cameras.items()
+        }
 
     def with_held_out(self, names: frozenset[str]) -> "CameraRig":
         """The same cameras with another held-out set."""

@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rotations and covariances."""
+"""Rotations, covariances, and the type of float64 arrays."""
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+
+Floats = NDArray[np.float64]
 
 
 def quaternion_matrices(quats: Tensor) -> Tensor:

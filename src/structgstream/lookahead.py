@@ -4,7 +4,6 @@
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from types import TracebackType
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
@@ -30,9 +29,7 @@ class Lookahead(Generic[T]):
             self._pending.append(self._worker.submit(self._compute))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self._worker.shutdown(wait=True, cancel_futures=True)
         if close := getattr(self._items, "close", None):
             close()

@@ -8,8 +8,7 @@ without Python.
 from pathlib import Path
 
 from structgstream.errors import MissingExtraError
-from structgstream.serve.pages import bundle
-from structgstream.serve.stream_file import StreamFile, check_has_header
+from structgstream.serve.pages import StreamFile, bundle, check_has_header
 
 try:
     import anywidget

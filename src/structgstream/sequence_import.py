@@ -21,16 +21,15 @@ from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.codec.encoder import SceneEncoder
-from structgstream.codec.fields.free_rows import MAX_FREE
 from structgstream.codec.fields.quantization import float32
+from structgstream.codec.fields.rows import MAX_FREE
 from structgstream.codec.fields.static_fields import UNCODED_FIELDS
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.codec.sinks import FileSink
 from structgstream.errors import CaptureError
-from structgstream.exporters.baked_gaussians import BakedGaussians
-from structgstream.exporters.frames import pictures_psnr
-from structgstream.exporters.ply import MIN_OPACITY
-from structgstream.exporters.ply_reader import read_header, read_ply
+from structgstream.exporters.bake import BakedGaussians
+from structgstream.exporters.ply import MIN_OPACITY, read_header, read_ply
+from structgstream.exporters.write import pictures_psnr
 from structgstream.kernels.backend import Backend
 from structgstream.kernels.values import HeadWeights, MLPWeights
 from structgstream.scene.anchors import AnchorCloud
@@ -90,7 +89,7 @@ def import_sequence(
     """Writes a stream of ``.ply`` files, one for each frame (Note [Imported sequences]).
 
     Args:
-        files: the files, in order (``ply_reader.find_sequence``).
+        files: the files, in order (``ply.find_sequence``).
         output: the stream file; replaced if it exists.
         fps: frames per second.
         backend: draws the pictures that are compared.

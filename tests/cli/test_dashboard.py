@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from structgstream.cli.dashboard import Dashboard, LiveLines, live_display
+from structgstream.cli.live_run import Dashboard, LiveLines, live_display
 from structgstream.data.live.status import CameraStatus, LiveStatus
 from structgstream.run_metrics import RunMetrics
 from structgstream.training.result import Step

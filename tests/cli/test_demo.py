@@ -9,7 +9,7 @@ import pytest
 
 from structgstream.cli import main, render
 from structgstream.cli.progress import Lines
-from structgstream.data.json_videos import bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.session.loop import FrameReport
 from tests.support.quick_streams import QUICK, error_of
 

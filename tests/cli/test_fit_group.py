@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from structgstream.cli import fit_group, main
+from structgstream.cli import groups, main
 from structgstream.groups import unit
 from structgstream.groups.first_frame import GroupStartConfig
 from tests.support.quick_streams import CLIP, error_of
@@ -49,7 +49,7 @@ class Shown:
 @pytest.fixture
 def shown(monkeypatch: pytest.MonkeyPatch) -> Shown:
     made = Shown()
-    monkeypatch.setattr(fit_group, "display", made)
+    monkeypatch.setattr(groups, "display", made)
     return made
 
 

@@ -10,7 +10,7 @@ import pytest
 
 import structgstream
 from structgstream.cli import main
-from structgstream.cli.capture_table import describe_capture
+from structgstream.cli.inspect import describe_capture
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
 from structgstream.errors import CaptureError

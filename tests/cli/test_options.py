@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.cli.app import UsageError, main
-from structgstream.cli.join import Join
+from structgstream.cli.groups import Join
 from structgstream.cli.options import (
     RENAMED,
     CaptureOptions,
@@ -17,7 +17,7 @@ from structgstream.cli.options import (
     parse_options,
     resolve_config,
 )
-from structgstream.data.json_videos import bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.errors import ConfigError
 from structgstream.session.presets import DEFAULT_PRESET, PRESETS
 

@@ -1,24 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
 """``parallel`` on the bundled clip, and what it says when something is wrong."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from structgstream.cli import main
+from structgstream.cli import main, parallel
 from structgstream.cli.options import CaptureOptions
 from structgstream.cli.parallel import Parallel, WorkerOptions, _job, join_arguments
 from structgstream.codec.reader import open_stream
 from structgstream.evaluation.environment import usable_cores
+from structgstream.executors.executor import ExecutorOptions, TaskQueue, open_executor
 from structgstream.executors.task import TaskResult
 from structgstream.owned_folders import MARKER, Owner
-from structgstream.parallel.object_folder import ObjectFolder
+from structgstream.parallel.exchange import ObjectFolder
 from structgstream.parallel.parts import PURPOSE, Parts
 from tests.support.backends import QUICKEST
+from tests.support.inline_engine import InlineEngine
 from tests.support.quick_streams import CLIP, QUARTER, error_of
 
-GROUPS = ["--frames", "4", "--groups", "2", "--allow-unaligned", "--executor", "inline"]
+GROUPS = ["--frames", "4", "--groups", "2", "--allow-unaligned"]
 pytestmark = pytest.mark.usefixtures("quick_tiny")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def in_this_process() -> Iterator[None]:
+    """Tasks run in this process, where the preset is the quick one."""
+
+    def opened(options: ExecutorOptions, device: str) -> TaskQueue:
+        open_executor(options, cores=1).close()
+        return TaskQueue(InlineEngine())
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(parallel, "open_tasks", opened)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +81,7 @@ def test_again_it_says_so_and_makes_nothing(stream: Path, capsys: pytest.Capture
         (["--preset", "tny"], 2, "there is no preset 'tny'"),
         (["--online.iteration", "5"], 2, "--online.iterations"),
         (
-            ["--groups", "7", "--frames", "8", "--executor", "inline", *QUARTER],
+            ["--groups", "7", "--frames", "8", *QUARTER],
             1,
             "Groups of 7 frames cost a key packet each",
         ),
@@ -133,7 +149,7 @@ def test_folders_and_stores_of_others_are_refused_with_every_option_and_nothing_
         assert owner is not None
         ObjectFolder(f"file://{store}").write(MARKER, owner.content)
     before = snapshot(tmp_path)
-    words = ["parallel", capture, "-o", str(output), "--store", f"file://{store}", "--executor", "inline"]
+    words = ["parallel", capture, "-o", str(output), "--store", f"file://{store}"]
     assert said in error_of([*words, "--frames", "3", *QUARTER, *more], capsys, status=status)
     assert snapshot(tmp_path) == before
 
@@ -147,7 +163,6 @@ def test_a_wrong_capture_leaves_nothing_behind(tmp_path: Path, capsys: pytest.Ca
     ("options", "words"),
     [
         (WorkerOptions(workers=1, threads=1), ("--workers", "1")),
-        (WorkerOptions("inline"), ("--workers", "1")),
         (WorkerOptions("ray"), ()),
     ],
 )

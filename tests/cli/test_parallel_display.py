@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from structgstream.cli.parallel_display import ROWS, SHOWN, ParallelDisplay, cells, counted
+from structgstream.cli.parallel import ROWS, SHOWN, ParallelDisplay, cells, counted
 from structgstream.parallel.driver import State, Status
 
 STATUS = Status(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.cli import app, main, plan
+from structgstream.cli import app, main, parallel
 from tests.support.measured_runs import finished_run
 from tests.support.quick_streams import CLIP, error_of
 
@@ -98,7 +98,7 @@ def test_a_probe_is_a_short_run_with_the_same_options(
     assert asked[:4] == ["parallel", CLIP, "-o", str(tmp_path / "probe" / "probe.sgs")]
     text = " ".join(asked)
     same = ("--preset tiny", "--held-out cam01", "--scale 0.5", "--every 2")
-    for part in (f"--frames {plan.PROBE_FRAMES}", *same, "--workers 1"):
+    for part in (f"--frames {parallel.PROBE_FRAMES}", *same, "--workers 1"):
         assert part in text
     assert text.endswith("--online.iterations 9")
 

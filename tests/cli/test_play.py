@@ -19,7 +19,7 @@ import pytest
 
 from structgstream.cli import main
 from structgstream.codec.sinks import FileSink
-from structgstream.data.json_videos import bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.serve import listening
 from tests.support.rigs import random_scene
 from tests.support.streams import header_for, small_stream, write_stream

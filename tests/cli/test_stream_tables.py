@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from structgstream.cli.stream_tables import bit_rate_text, facts_table, header_table, packet_table, period_table
+from structgstream.cli.inspect import bit_rate_text, facts_table, header_table, packet_table, period_table
 from structgstream.cli.tables import SHOWN_FRAMES
 from structgstream.evaluation.byte_count import Row
 

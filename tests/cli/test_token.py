@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.cli import main, token
-from structgstream.serve.tokens import EVERY_STREAM, Access, read_keys
+from structgstream.cli import main, serve
+from structgstream.serve.access import EVERY_STREAM, Access, read_keys
 from tests.support.quick_streams import error_of
 
 NOW = 1.7e9
@@ -20,7 +20,7 @@ def secret(tmp_path: Path) -> Path:
 
 @pytest.fixture(autouse=True)
 def still(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(token.time, "time", lambda: NOW)
+    monkeypatch.setattr(serve.time, "time", lambda: NOW)
 
 
 def printed(secret: Path, capsys: pytest.CaptureFixture[str], *arguments: str) -> str:

@@ -14,7 +14,7 @@ import pytest
 from structgstream.atomic_files import partial_path
 from structgstream.cli import main
 from structgstream.codec.sinks import FileSink
-from structgstream.groups import pictures, track_pass
+from structgstream.groups import base, track_pass
 from structgstream.groups.boundaries import groups_path
 from structgstream.groups.track_file import TrackHead, TrackWriter
 from structgstream.session.presets import TINY, to_json
@@ -30,7 +30,7 @@ def words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     scene = small_scene()
     header = replace(header_for(scene), config=to_json(TINY))
     write_stream(FileSink(tmp_path / "header.sgs"), [scene], header=header)
-    monkeypatch.setattr(pictures, "open_for", lambda header, capture, *, frames: range(frames or FRAMES))
+    monkeypatch.setattr(base, "open_for", lambda header, capture, *, frames: range(frames or FRAMES))
     given = ["--init", str(tmp_path / "header.sgs"), "-o", str(tmp_path / "new" / "track"), "--device", "cpu"]
     return ["track", CLIP, *given]
 

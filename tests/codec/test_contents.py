@@ -7,13 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.codec.container.index import INDEX_ENTRY, pack_index, read_index
 from structgstream.codec.container.records import (
+    INDEX_ENTRY,
     MINOR_WITH_PERIODS,
     PREFIX,
     RecordType,
+    pack_index,
     packed,
     prefix,
+    read_index,
     scan_records,
 )
 from structgstream.codec.header import pack_header

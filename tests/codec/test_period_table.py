@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.codec.container.index import Period
-from structgstream.codec.container.records import Record, RecordType, packed, scan_records
+from structgstream.codec.container.records import Period, Record, RecordType, packed, scan_records
 from structgstream.codec.contents import PeriodTable, differences
 from structgstream.codec.header import pack_header
 from structgstream.codec.packets import StreamHeader

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from structgstream.cameras import CameraRig
-from structgstream.data.alignment import aligned_points
 from structgstream.data.calibration import Calibration, PosedCamera, rigid
+from structgstream.data.dataset_layouts import aligned_points
 from tests.support.planes import room_rig
 
 RIG = room_rig(5)

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from structgstream.cameras import Camera
-from structgstream.data.alignment import Alignment, alignment
-from structgstream.data.calibration import rotation_matrix
+from structgstream.data.calibration import Alignment, alignment, rotation_matrix
 from structgstream.data.matching import project
 from tests.support.rigs import arc_rig
 

@@ -7,9 +7,9 @@ import av
 import numpy as np
 import pytest
 
-from structgstream.data import audio
-from structgstream.data.audio import read_audio
 from structgstream.errors import CaptureError
+from structgstream.preparation import footage as audio
+from structgstream.preparation.footage import read_audio
 from tests.support.captures import write_video
 
 RATE = 48_000

@@ -14,14 +14,13 @@ import pytest
 
 from structgstream.data.colmap import read_model
 from structgstream.data.found_calibrations import read_calibration
-from structgstream.data.images import read_picture
+from structgstream.data.images import picture_size, read_exif, read_picture
 from structgstream.data.lenses import Fisheye, LensCamera, Pinhole, RadialTangential
 from structgstream.data.open import open_capture
-from structgstream.data.picture_headers import picture_size, read_exif
 from structgstream.data.posed_capture import filmed_by
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
-from structgstream.data.rectilinear import rectilinear
 from structgstream.data.timeline import Clock
+from structgstream.data.undistortion import rectilinear
 from structgstream.data.video_index import scan_videos
 from structgstream.data.video_pictures import pictures_at
 from structgstream.errors import StructGStreamError

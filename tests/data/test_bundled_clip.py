@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-from structgstream.data.json_videos import bundled_clip, bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip, bundled_clip_path
 
 
 def test_the_bundled_clip_is_a_capture() -> None:

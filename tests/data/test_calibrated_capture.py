@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from structgstream.data.json_videos import bundled_clip
+from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.open import open_capture
 from structgstream.data.undistortion import UndistortedSource, Undistortion

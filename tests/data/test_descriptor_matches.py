@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from structgstream.data import pair_matches as descriptor_matches
-from structgstream.data.pair_matches import mutual_matches
+from structgstream.data import matching as descriptor_matches
+from structgstream.data.matching import mutual_matches
 
 Descriptors = NDArray[np.float32]
 Seen = NDArray[np.bool_]

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from structgstream.data.picture_headers import StatedOptics, read_exif
+from structgstream.data.images import StatedOptics, read_exif
 from structgstream.errors import CaptureError, MissingExtraError
 
 FOCAL, FILM, RESOLUTION, UNIT, ACROSS, DOWN = 0x920A, 0xA405, 0xA20E, 0xA210, 0xA002, 0xA003

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from structgstream.data import json_videos as clip
-from structgstream.data.dataset_layouts import open_n3dv
-from structgstream.data.json_videos import bundled_clip
+from structgstream.data import dataset_layouts as clip
+from structgstream.data.dataset_layouts import bundled_clip, open_n3dv
 from structgstream.errors import CalibrationError
 from tests.support.captures import (
     all_numbers,

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from structgstream import cameras
-from structgstream.data.matching import Features
-from structgstream.data.pair_matches import KEYPOINT_SIDE, MatchConfig, PairMatcher
+from structgstream.data.matching import KEYPOINT_SIDE, Features, MatchConfig, PairMatcher
 from tests.support.filmed import noise_texture
 
 SIDE, SHIFT = 256, 17

@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from structgstream.data.picture_headers import picture_size
+from structgstream.data.images import picture_size
 from structgstream.errors import CaptureError
 
 

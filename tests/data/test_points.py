@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from structgstream import cameras
-from structgstream.data.json_videos import bundled_clip
+from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.data.matching import inside, project
 from structgstream.data.plane_sweep import DEFAULT_LEVELS, SweepConfig
 from structgstream.data.points import InitialPoints, PointsConfig, _has_neighbors, initial_points

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from structgstream.cameras import CameraRig
-from structgstream.data.json_videos import open_json_videos
+from structgstream.data.dataset_layouts import open_json_videos
 from structgstream.data.wrappers import Prefetch
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MultiViewFrame

@@ -20,8 +20,8 @@ from structgstream.data.prepared import (
     read_prepared,
     write_prepared,
 )
-from structgstream.data.rectilinear import rectilinear
 from structgstream.data.timeline import Clock
+from structgstream.data.undistortion import rectilinear
 from structgstream.data.wrappers import apart_seconds
 from structgstream.errors import CalibrationError, CaptureError, StorageError
 from tests.support.captures import (

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from structgstream.data.lenses import Fisheye, Pinhole
-from structgstream.data.rectilinear import WIDEST_DEGREES, rectilinear, shows
+from structgstream.data.undistortion import WIDEST_DEGREES, rectilinear, shows
 from structgstream.errors import CalibrationError, ConfigError
 from tests.support.lens_cameras import MILD, WIDE, filmed
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from structgstream.data.dataset_layouts import open_panoptic
+from structgstream.data.dataset_layouts import open_json_videos, open_panoptic
 from structgstream.data.images import ImageSource
-from structgstream.data.json_videos import open_json_videos
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import (
     SourceWrapper,

@@ -4,13 +4,14 @@
 import numpy as np
 import pytest
 
-from structgstream.evaluation.affine import (
+from structgstream.evaluation.metrics import (
+    PSNR_OF_EQUALS,
     ChannelFit,
     channel_fit,
+    psnr,
     psnr_affine,
     psnr_camera_color,
 )
-from structgstream.evaluation.metrics import PSNR_OF_EQUALS, psnr
 
 PLANTED = np.array([[0.8, 0.1, 0.0, 0.05], [0.05, 0.7, 0.1, 0.02], [0.0, -0.05, 0.9, 0.1]])
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from structgstream.errors import StorageError
-from structgstream.evaluation.byte_count import REST, Parts, Row, groups_of
-from structgstream.evaluation.byte_plot import field_colors, write_byte_plot
+from structgstream.evaluation.byte_count import REST, Parts, Row, field_colors, groups_of, write_byte_plot
 from structgstream.figure import COLORS, OTHER
 from tests.support.drawn import coloured, pixels_of
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from structgstream.data.json_videos import bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.data.open import open_capture
 from structgstream.errors import CaptureError
 from structgstream.evaluation.recording import capture_of, stored_capture

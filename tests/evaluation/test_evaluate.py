@@ -19,9 +19,9 @@ from structgstream.evaluation.evaluate import compared_frames, evaluate
 from structgstream.evaluation.facts import numbers_of
 from structgstream.evaluation.lpips import ENVIRONMENT
 from structgstream.evaluation.metrics import PSNR_OF_EQUALS
+from structgstream.evaluation.optional_metrics import FlowField
 from structgstream.evaluation.recording import to_device
 from structgstream.evaluation.report import as_json
-from structgstream.evaluation.temporal import FlowField
 from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import reference_backend

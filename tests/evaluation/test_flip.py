@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from flip_evaluator import evaluate
 
-from structgstream.data.json_videos import bundled_clip
+from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.errors import MissingExtraError
 from structgstream.evaluation.flip import PIXELS_PER_DEGREE, features_of, flip_map, flip_of
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from structgstream.errors import MissingExtraError
-from structgstream.evaluation.temporal import dis_flow
+from structgstream.evaluation.optional_metrics import dis_flow
 
 
 def textured(height: int = 96, width: int = 128) -> np.ndarray:

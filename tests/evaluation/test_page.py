@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from structgstream.evaluation.page import write_page
-from structgstream.evaluation.worst import Crop, Window
+from structgstream.evaluation.worst import Crop, Window, write_page
 from tests.support.drawn import pixels_of
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from structgstream import recorder as module
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.mirror import MirroredStore
@@ -13,8 +14,7 @@ from structgstream.codec.segments.sink import SegmentsSink
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.sinks import MemorySink
 from structgstream.errors import StorageError
-from structgstream.evaluation import preview as module
-from structgstream.evaluation.preview import PREVIEW, PreviewSink, preview
+from structgstream.recorder import PREVIEW, PreviewSink, preview
 from tests.support.pictures import decoded_picture
 from tests.support.rigs import random_scene
 from tests.support.streams import compact_header, moved, write_stream

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from structgstream.errors import CaptureError
-from structgstream.evaluation.metrics import PSNR_OF_EQUALS
-from structgstream.evaluation.scoring import counting, score
+from structgstream.evaluation.metrics import PSNR_OF_EQUALS, counting, score
 from structgstream.kernels.backend import reference_backend
 
 

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from structgstream.evaluation.temporal import FlowField, difference_of_change, dis_flow, flicker, warping_error
+from structgstream.evaluation.optional_metrics import FlowField, difference_of_change, dis_flow, flicker, warping_error
 from structgstream.flow import inside
 
 WIDTH, HEIGHT, FOCAL, DISTANCE = 96, 64, 80.0, 4.0

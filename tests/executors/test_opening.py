@@ -7,8 +7,9 @@ from typing import Any
 import pytest
 
 from structgstream.errors import ConfigError, MissingExtraError
-from structgstream.executors import opening, ray_cluster
-from structgstream.executors.opening import ExecutorName, ExecutorOptions, open_executor
+from structgstream.executors import executor as opening
+from structgstream.executors import ray_cluster
+from structgstream.executors.executor import ExecutorName, ExecutorOptions, open_executor
 from structgstream.executors.ray_cluster import RayOptions
 from structgstream.executors.task import Task, WorkerSlot
 from tests.support.sleepers import all_endings
@@ -21,13 +22,12 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
     class Engine:
         def __init__(self, *arguments: Any) -> None:
-            given.extend(arguments or ["inline"])
+            given.extend(arguments)
 
         def stop(self) -> None:
             pass
 
-    for name in ("InlineEngine", "LocalEngine"):
-        monkeypatch.setattr(opening, name, Engine)
+    monkeypatch.setattr(opening, "LocalEngine", Engine)
     monkeypatch.setattr(ray_cluster, "RayEngine", Engine)
     return given
 
@@ -52,11 +52,6 @@ def test_local_has_a_place_for_each_core_or_gpu_or_as_asked(opened: list[Any]) -
     assert three == (WorkerSlot(2, 0), WorkerSlot(2, 1), WorkerSlot(2, 0))
 
 
-def test_inline_has_none(opened: list[Any]) -> None:
-    open_and_close(ExecutorOptions("inline", workers=3), cores=4)
-    assert opened == ["inline"]
-
-
 def test_a_cluster_of_this_machine_has_its_share_and_one_that_is_joined_one_thread(opened: list[Any]) -> None:
     open_and_close(ExecutorOptions("ray", workers=2), cores=8)
     open_and_close(ExecutorOptions("ray", workers=2, address="head:1"), cores=8)
@@ -64,7 +59,7 @@ def test_a_cluster_of_this_machine_has_its_share_and_one_that_is_joined_one_thre
     assert opened == [RayOptions(None, 2, 4), RayOptions("head:1", 2, 1), RayOptions("head:1", 2, 3)]
 
 
-@pytest.mark.parametrize("name", ["inline", "local", "ray"])
+@pytest.mark.parametrize("name", ["local", "ray"])
 @pytest.mark.parametrize(
     ("workers", "threads", "said"),
     [(0, None, "workers must be 1 or more, got 0"), (1, -2, "threads must be 1 or more, got -2")],
@@ -81,7 +76,6 @@ def test_without_ray_the_others_run(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingExtraError, match="cluster"):
         open_executor(ExecutorOptions("ray"), cores=1)
-    for name in ("inline", "local"):
-        with open_executor(ExecutorOptions(name), cores=1) as executor:
-            executor.submit(Task("task", ("true",)))
-            assert all_endings(executor)["task"].done
+    with open_executor(ExecutorOptions("local"), cores=1) as executor:
+        executor.submit(Task("task", ("true",)))
+        assert all_endings(executor)["task"].done

@@ -14,8 +14,7 @@ import pytest
 
 from structgstream.errors import ConfigError, MissingExtraError
 from structgstream.executors.executor import TaskQueue
-from structgstream.executors.ray_cluster import RayEngine, RayOptions
-from structgstream.executors.ray_worker import CommandKilled, run_task
+from structgstream.executors.ray_cluster import CommandKilled, RayEngine, RayOptions, run_task
 from structgstream.executors.task import Task
 from tests.support.sleepers import all_endings
 

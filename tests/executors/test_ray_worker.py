@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from structgstream.executors import ray_worker
+from structgstream.executors import ray_cluster as ray_worker
 from structgstream.executors.local import CommandProcess
-from structgstream.executors.ray_worker import CommandKilled, run_task
+from structgstream.executors.ray_cluster import CommandKilled, run_task
 from structgstream.executors.task import Task, TaskResult
 
 

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from structgstream.exporters.baked_gaussians import BakedGaussians
+from structgstream.exporters.bake import BakedGaussians
 from structgstream.geometry import quaternion_matrices
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.harmonics import Y0

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from structgstream.errors import StreamError
-from structgstream.exporters.baked_gaussians import BakedGaussians
+from structgstream.exporters.bake import BakedGaussians
 from structgstream.exporters.formats import Format, FrameOptions
 from structgstream.exporters.glb import glb_bytes
 from structgstream.exporters.write import open_output

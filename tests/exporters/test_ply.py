@@ -11,7 +11,7 @@ import torch
 from plyfile import PlyData
 from torch import Tensor
 
-from structgstream.exporters.baked_gaussians import BakedGaussians
+from structgstream.exporters.bake import BakedGaussians
 from structgstream.exporters.formats import FrameOptions
 from structgstream.exporters.ply import ply_bytes
 from structgstream.exporters.write import write_gaussians

@@ -10,8 +10,7 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from structgstream.errors import CaptureError
-from structgstream.exporters.ply import ply_bytes
-from structgstream.exporters.ply_reader import find_sequence, read_ply
+from structgstream.exporters.ply import find_sequence, ply_bytes, read_ply
 from tests.support.plain import some
 
 

@@ -8,8 +8,10 @@ from pathlib import Path
 import pytest
 
 from structgstream.errors import ConfigError
-from structgstream.exporters.formats import Format, FrameOptions, PageFormat
-from structgstream.exporters.request import (
+from structgstream.exporters.formats import (
+    Format,
+    FrameOptions,
+    PageFormat,
     check_page,
     choose_frames,
     destination,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from structgstream.exporters.sog import codebook, vector_palette
+from structgstream.exporters.web import codebook, vector_palette
 from structgstream.exporters.write import write_gaussians
 from structgstream.geometry import quaternion_matrices
 from structgstream.scene.order import morton_order

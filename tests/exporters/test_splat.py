@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from structgstream.errors import ConfigError
-from structgstream.exporters.baked_gaussians import BakedGaussians
-from structgstream.exporters.splat import splat_bytes
+from structgstream.exporters.bake import BakedGaussians
+from structgstream.exporters.web import splat_bytes
 from structgstream.exporters.write import write_gaussians
 from structgstream.geometry import quaternion_matrices
 from structgstream.scene.harmonics import Y0

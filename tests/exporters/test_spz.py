@@ -14,9 +14,9 @@ import pytest
 import torch
 
 from structgstream.errors import ConfigError
-from structgstream.exporters.baked_gaussians import BakedGaussians
+from structgstream.exporters.bake import BakedGaussians
 from structgstream.exporters.formats import FrameOptions, SpzVersion
-from structgstream.exporters.spz import fractional_bits, spz_bytes
+from structgstream.exporters.web import fractional_bits, spz_bytes
 from structgstream.exporters.write import write_gaussians
 from tests.support.plain import RIG, picture, psnr, some
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from structgstream.cameras import CameraRig
 from structgstream.groups.base import GroupBase
-from structgstream.groups.border import draw_border, moving_at_border
+from structgstream.groups.seam_blend import draw_border, moving_at_border
 from structgstream.scene.scene import Scene
 from tests.support.backends import quickest_backend
 from tests.support.clip_groups import made

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.atomic_files import partial_path
+from structgstream.atomic_files import GrowingFile, name_finished, partial_path
 from structgstream.errors import StorageError
-from structgstream.groups.growing_file import GrowingFile, name_finished
 from tests.support.killed import folders_of_the_killed
 
 

@@ -7,8 +7,8 @@ import torch
 
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import open_stream
-from structgstream.groups.blending import Border
 from structgstream.groups.join import join_segments
+from structgstream.groups.seam_blend import Border
 from structgstream.scene.scene import Scene
 from tests.support.backends import quickest_backend
 from tests.support.clip_groups import FRAMES, LENGTH, made

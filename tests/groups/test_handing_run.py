@@ -12,12 +12,10 @@ from hypothesis import strategies as st
 from structgstream.errors import ConfigError, TaskError
 from structgstream.executors.task import PYTHON, Task
 from structgstream.groups import join
-from structgstream.groups.base import GroupBase
-from structgstream.groups.blending import Border
+from structgstream.groups.base import GroupBase, open_for
 from structgstream.groups.blending_run import MAX_GROUPS, BlendedRun, main, runs_of
 from structgstream.groups.join import PURPOSE, join_segments
-from structgstream.groups.pictures import open_for
-from structgstream.groups.seam_blend import OWN_FRAMES
+from structgstream.groups.seam_blend import OWN_FRAMES, Border
 from structgstream.groups.track_pass import track_capture
 from structgstream.owned_folders import own_folder
 from tests.support.backends import quickest_backend

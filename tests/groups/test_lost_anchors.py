@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import torch
 
-from structgstream.groups.lost_anchors import LostAnchorConfig, relocate_lost_anchors
+from structgstream.groups.first_frame import LostAnchorConfig, relocate_lost_anchors
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig, SpawnRules

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from structgstream.errors import ConfigError, OutOfMemoryError
-from structgstream.groups import method
+from structgstream.groups import unit as method
 from structgstream.groups.first_frame import GroupStartConfig
-from structgstream.groups.method import (
+from structgstream.groups.unit import (
     CATCH_UP_FRAMES,
     GroupEntry,
     GroupMethod,

@@ -9,7 +9,7 @@ from torch import Tensor
 from structgstream import cameras
 from structgstream.cameras import CameraRig
 from structgstream.groups.base import GroupBase
-from structgstream.groups.border import draw_border, visible_mixtures
+from structgstream.groups.seam_blend import draw_border, visible_mixtures
 from structgstream.scene.scene import Scene
 from tests.support.backends import quickest_backend
 from tests.support.clip_groups import made

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from structgstream.errors import CaptureError
-from structgstream.groups.base import GroupBase
-from structgstream.groups.pictures import fingerprint, open_for
+from structgstream.groups.base import GroupBase, fingerprint, open_for
 from tests.support.clip_groups import CAPTURE, made
 
 

@@ -12,9 +12,8 @@ from structgstream.atomic_files import partial_path
 from structgstream.codec.container import byte_source
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError, StorageError
-from structgstream.groups import segment_sink
-from structgstream.groups.segment_file import inspect_segment, open_segment
-from structgstream.groups.segment_sink import GroupSoFar, SegmentSink, resume_segment
+from structgstream.groups import segment_file as segment_sink
+from structgstream.groups.segment_file import GroupSoFar, SegmentSink, inspect_segment, open_segment, resume_segment
 from tests.support.killed import folders_of_the_killed
 from tests.support.properties import examples
 from tests.support.small_segments import END, FIRST, FROM_FRAME_0, IDENTITY, base, encoded, write
@@ -174,7 +173,7 @@ def test_a_nearly_full_disk_keeps_the_packets_before(tmp_path: Path, monkeypatch
 def so_far(count: int) -> GroupSoFar:
     with_records = []
     for packet in encoded()[0][:count]:
-        kind = segment_sink._TYPES[packet.kind]
+        kind = segment_sink.RECORD_TYPES[packet.kind]
         with_records.append(segment_sink.packed(kind, packet.payload))
     return GroupSoFar(base(), FIRST, with_records)
 

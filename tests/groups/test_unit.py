@@ -8,13 +8,11 @@ from pathlib import Path
 import pytest
 
 from structgstream.api import reconstruct
-from structgstream.atomic_files import partial_path
+from structgstream.atomic_files import GrowingFile, partial_path
 from structgstream.errors import CaptureError, ConfigError, OutOfMemoryError, StorageError, StreamError
-from structgstream.groups import method
+from structgstream.groups import unit as method
 from structgstream.groups.base import GroupBase
-from structgstream.groups.growing_file import GrowingFile
-from structgstream.groups.segment_file import inspect_segment, open_segment
-from structgstream.groups.segment_sink import GroupSoFar
+from structgstream.groups.segment_file import GroupSoFar, inspect_segment, open_segment
 from structgstream.scene.state import state_of
 from tests.support.backends import quickest_backend
 from tests.support.clip_groups import CAPTURE, LENGTH, fit, made, task

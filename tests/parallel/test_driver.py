@@ -11,11 +11,11 @@ import pytest
 
 from structgstream.errors import ConfigError, StorageError, TaskError
 from structgstream.executors.executor import TaskQueue
-from structgstream.executors.inline import InlineEngine
 from structgstream.executors.task import PYTHON, Task, TaskResult
 from structgstream.parallel.driver import Job, Status, _Drive, drive
 from structgstream.parallel.exchange import SharedFolder
 from structgstream.parallel.parts import Parts, group_name
+from tests.support.inline_engine import InlineEngine
 from tests.support.stand_ins import job, sha256, workers
 
 GROUPS = [(0, 4), (4, 8), (8, 12)]
@@ -48,12 +48,6 @@ def test_notes_say_what_each_task_took(undisturbed: Path) -> None:
     assert notes["track"].frames == 12
     assert [notes[group_name(*group)].frames for group in GROUPS] == [4, 4, 4]
     assert all(note.seconds > 0 and note.bytes > 0 and note.attempts == 1 for note in notes.values())
-
-
-def test_inline_gives_the_same_bytes(undisturbed: Path, tmp_path: Path) -> None:
-    given = job(tmp_path, program=(PYTHON, "-m", "tests.support.stand_in"))
-    run(given, Parts(tmp_path / "parts"), TaskQueue(InlineEngine()))
-    assert sha256(tmp_path / "out.sgs") == sha256(undisturbed / "out.sgs")
 
 
 class ElsewhereEngine(InlineEngine):

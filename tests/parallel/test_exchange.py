@@ -8,8 +8,7 @@ import pytest
 from structgstream.executors.task import Task
 from structgstream.parallel import object_folder
 from structgstream.parallel.driver import drive
-from structgstream.parallel.exchange import ObjectStore, SharedFolder
-from structgstream.parallel.object_folder import ObjectFolder
+from structgstream.parallel.exchange import ObjectFolder, ObjectStore, SharedFolder
 from structgstream.parallel.parts import Parts
 from tests.support import stand_in
 from tests.support.flaky_store import flaky_store

@@ -9,13 +9,13 @@ import pytest
 
 from structgstream.errors import StorageError
 from structgstream.owned_folders import MARKER, Owner
-from structgstream.parallel import object_folder
-from structgstream.parallel.object_folder import TRIES, ObjectFolder
+from structgstream.parallel import exchange
+from structgstream.parallel.exchange import TRIES, ObjectFolder
 
 
 @pytest.fixture
 def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ObjectFolder:
-    monkeypatch.setattr(object_folder, "FIRST_DELAY_SECONDS", 0.0)
+    monkeypatch.setattr(exchange, "FIRST_DELAY_SECONDS", 0.0)
     return ObjectFolder(f"file://{tmp_path / 'store'}")
 
 

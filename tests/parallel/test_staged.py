@@ -11,17 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.parallel import object_folder, staged
-from structgstream.parallel.exchange import ObjectStore
-from structgstream.parallel.object_folder import ObjectFolder
+from structgstream.parallel import exchange as staged
+from structgstream.parallel.driver import Unit
+from structgstream.parallel.exchange import ObjectFolder, ObjectStore, Staging
 from structgstream.parallel.parts import Parts
-from structgstream.parallel.staged import Staging
-from structgstream.parallel.unit import Unit
 
 
 @pytest.fixture(autouse=True)
 def quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(object_folder, "FIRST_DELAY_SECONDS", 0.0)
+    monkeypatch.setattr(staged, "FIRST_DELAY_SECONDS", 0.0)
     monkeypatch.setattr(staged, "POLL_SECONDS", 0.01)
     monkeypatch.setenv(staged.SCRATCH, str(tmp_path / "scratch"))
 
@@ -152,7 +150,7 @@ def test_a_command_that_is_killed_ends_this_process_the_same_way(store: ObjectFo
     words = ["--name", "task", "--grows", "t.partial", "--", "sh", "-c"]
     script = 'printf abc > "$0/t.partial"; kill -9 $$'
     done = subprocess.run(
-        [sys.executable, "-m", "structgstream.parallel.staged", *words, script, staged.HERE],
+        [sys.executable, "-m", "structgstream.parallel.exchange", *words, script, staged.HERE],
         env={**os.environ, staged.STORE: store.url, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         check=False,
     )

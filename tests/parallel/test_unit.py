@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 
 from structgstream.atomic_files import partial_path
-from structgstream.cli.fit_group import FitGroup
-from structgstream.cli.join import Join
+from structgstream.cli.groups import FitGroup, Join, Track
 from structgstream.cli.options import parse_options
-from structgstream.cli.track import Track
 from structgstream.errors import StreamError
 from structgstream.executors.task import PYTHON
 from structgstream.groups.track_file import TrackHead, TrackStart, TrackWriter, open_track
+from structgstream.parallel.driver import Unit, cut_track, starts_in
 from structgstream.parallel.parts import Parts
-from structgstream.parallel.unit import Unit, cut_track, starts_in
 
 HEAD = TrackHead("ab", "cd", 0.01, 500, 4, {"scale": 0.5})
 

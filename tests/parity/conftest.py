@@ -33,7 +33,7 @@ def emulation(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Kerne
     if compiler is None:
         pytest.skip("no C++ compiler to build the emulation with")
     built = tmp_path_factory.mktemp("cuda") / "emulation.so"
-    flags = ["-std=c++17", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
+    flags = ["-std=c++17", "-O2", "-Wall", "-Wextra", "-Werror", "-Wno-psabi", "-shared", "-fPIC"]
     subprocess.run([compiler, *flags, "-o", built, *sorted(SOURCES.glob("emulate_*.cpp"))], check=True)
     library = ctypes.CDLL(str(built))
     return lambda order: KernelLibrary(library, "cpu", lambda device: order)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from structgstream.cameras import CameraRig
-from structgstream.data.json_videos import bundled_clip
+from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.data.open import open_capture
 from structgstream.data.wrappers import resized
 from structgstream.errors import CalibrationError

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from structgstream.cameras import Camera
-from structgstream.data.arrays import Floats
 from structgstream.data.matching import project
-from structgstream.pose_check.resection import Resection, explained, resect
+from structgstream.geometry import Floats
 from structgstream.pose_check.tracks import Tracks
+from structgstream.pose_check.verdicts import Resection, explained, resect
 from tests.support.rigs import look_at
 
 NOISE = 0.3  # pixels

@@ -6,8 +6,7 @@ from itertools import combinations
 
 import numpy as np
 
-from structgstream.data.matching import Pair
-from structgstream.data.pair_matches import PairError
+from structgstream.data.matching import Pair, PairError
 from structgstream.pose_check.tracks import Tracks
 from structgstream.pose_check.verdicts import Suspects, find_suspects, track_outlier
 from tests.support.evidence_made import wide_ring

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from structgstream.cameras import Camera
-from structgstream.data.matching import project
-from structgstream.data.pair_matches import pair_error
+from structgstream.data.matching import pair_error, project
 from structgstream.pose_check import tracks as evidence
 from structgstream.pose_check.tracks import Evidence, Tracks, build_tracks, gather, pair_errors
 from tests.support.evidence_made import evidence_of, scattered, turned, wide_ring

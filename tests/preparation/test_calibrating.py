@@ -13,11 +13,10 @@ from structgstream.data.calibration import Calibration, PosedCamera
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
-from structgstream.preparation.camera_steps import check_enough, check_used, chosen_method
 from structgstream.preparation.footage import Footage, find_footage
-from structgstream.preparation.given_calibration import given_cameras
 from structgstream.preparation.options import PrepareOptions
-from structgstream.preparation.solvers import check_complete, packed, summary, unpacked
+from structgstream.preparation.prepare import check_enough, check_used, chosen_method
+from structgstream.preparation.solvers import check_complete, given_cameras, packed, summary, unpacked
 from structgstream.preparation.steps import Stored
 from tests.support.captures import write_video
 from tests.support.filmed import ring

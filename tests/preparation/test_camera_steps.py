@@ -12,10 +12,10 @@ from structgstream.data.calibration import Calibration
 from structgstream.data.timeline import Clock
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.solved import SolvedCalibration
-from structgstream.preparation.camera_steps import CameraSteps, chosen_method
 from structgstream.preparation.clocks import TIMESTAMPS, Clocks
 from structgstream.preparation.options import Distance, PrepareOptions
 from structgstream.preparation.output_folder import SOURCE
+from structgstream.preparation.prepare import CameraSteps, chosen_method
 from structgstream.preparation.steps import FOLDER, Job, Silent, Steps
 from tests.support.footage_made import still_room
 from tests.support.rooms import write_room

@@ -14,11 +14,10 @@ from structgstream.data.prepared import PreparedCapture, prepared_entries, read_
 from structgstream.data.timeline import Clock
 from structgstream.errors import ConfigError, StorageError
 from structgstream.preparation.calibration.solved import SolvedCalibration
-from structgstream.preparation.camera_steps import chosen_method
-from structgstream.preparation.capture_steps import POINTS, CaptureSteps, assembled, held_out_of
 from structgstream.preparation.footage import Footage, find_footage
-from structgstream.preparation.given_calibration import given_cameras
 from structgstream.preparation.options import PrepareOptions
+from structgstream.preparation.prepare import POINTS, CaptureSteps, assembled, chosen_method, held_out_of
+from structgstream.preparation.solvers import given_cameras
 from structgstream.preparation.steps import FOLDER, Job, Silent, Steps
 from tests.support.rooms import write_room
 

@@ -10,9 +10,9 @@ import pytest
 
 from structgstream.data.lenses import LensCamera, Pinhole, RadialTangential
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
-from structgstream.data.rectilinear import rectilinear
+from structgstream.data.undistortion import rectilinear
 from structgstream.errors import CalibrationError
-from structgstream.preparation.given_calibration import find_calibration, require_calibration
+from structgstream.preparation.solvers import find_calibration, require_calibration
 from tests.support.calibrations import WRITERS, truths, write_anipose, write_transforms
 from tests.support.captures import small_rig, write_immersive, write_text_model
 

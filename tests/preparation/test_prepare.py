@@ -11,9 +11,8 @@ import torch
 from structgstream.data.open import open_capture
 from structgstream.data.prepared import read_prepared
 from structgstream.errors import CalibrationError, CaptureError, ConfigError
-from structgstream.preparation.capture_steps import CaptureSteps
 from structgstream.preparation.options import Distance, PrepareOptions
-from structgstream.preparation.prepare import prepare_capture
+from structgstream.preparation.prepare import CaptureSteps, prepare_capture
 from tests.support.captures import write_picture, write_videos
 from tests.support.planes import room_frame
 from tests.support.rooms import write_room
@@ -88,7 +87,7 @@ def test_an_interrupted_preparation_goes_on(tmp_path: Path, monkeypatch: pytest.
     write_room(tmp_path / "videos", cameras=4)
     monkeypatch.setattr(CaptureSteps, "check", lambda self, content: ())
     with monkeypatch.context() as patched:
-        patched.setattr("structgstream.preparation.capture_steps.initial_points", interrupt)
+        patched.setattr("structgstream.preparation.prepare.initial_points", interrupt)
         with pytest.raises(KeyboardInterrupt):
             prepare_capture(tmp_path / "videos", tmp_path / "out", options=OPTIONS)
     assert len(open_capture(tmp_path / "out")) == 2

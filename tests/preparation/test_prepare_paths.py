@@ -12,11 +12,10 @@ import pytest
 from structgstream.data.prepared import PreparedCapture, read_prepared
 from structgstream.data.timeline import Clock
 from structgstream.errors import CalibrationError, CaptureError
-from structgstream.preparation.capture_steps import CaptureSteps
 from structgstream.preparation.clocks import first_clocks
 from structgstream.preparation.footage import find_footage
 from structgstream.preparation.options import Distance, PrepareOptions
-from structgstream.preparation.prepare import Preparation, prepare_capture
+from structgstream.preparation.prepare import CaptureSteps, Preparation, prepare_capture
 from structgstream.preparation.solvers import matched_pictures
 from tests.support.calibration_errors import calibration_errors
 from tests.support.captures import write_video, write_videos

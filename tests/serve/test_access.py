@@ -8,8 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from starlette.requests import Request
 
-from structgstream.serve.access import MAX_PARAMETERS, Authorizer, Query, Refused, parsed_query, query_of
-from structgstream.serve.tokens import EVERY_STREAM, Access, TokenKeys
+from structgstream.serve.access import (
+    EVERY_STREAM,
+    MAX_PARAMETERS,
+    Access,
+    Authorizer,
+    Query,
+    Refused,
+    TokenKeys,
+    parsed_query,
+    query_of,
+)
 from tests.support.properties import examples
 
 KEYS = TokenKeys((b"k" * 32,))

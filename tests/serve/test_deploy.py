@@ -21,9 +21,9 @@ import yaml
 from structgstream.cli.app import TERMINATED
 from structgstream.cli.options import parse_known_options
 from structgstream.cli.reconstruct import Reconstruct
+from structgstream.serve.access import TokenKeys
 from structgstream.serve.app import ServerSettings
 from structgstream.serve.listening import LOOPBACK_NAMES
-from structgstream.serve.tokens import TokenKeys
 from tests.support.segment_folders import GrowingFolder
 from tests.support.serving import Served, hosted
 from tests.support.streams import small_stream

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.codec.segments.manifest import history_name, init_name, part_name, segment_name
-from structgstream.serve.files import hash_in_name, is_plain_path, is_stream_name, open_below
+from structgstream.serve.streams import hash_in_name, is_plain_path, is_stream_name, open_below
 from tests.support.properties import examples
 
 

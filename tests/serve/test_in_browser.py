@@ -26,16 +26,15 @@ from numpy.typing import NDArray
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.sinks import FileSink, resume_segments
-from structgstream.data.json_videos import bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.data.open import open_capture
 from structgstream.evaluation.evaluate import rendered
 from structgstream.exporters.write import write_gaussians
 from structgstream.kernels.backend import reference_backend
 from structgstream.notebook import Player
 from structgstream.sequence_import import import_sequence
-from structgstream.serve.pages import bundle_path, linked_page
+from structgstream.serve.pages import StreamFile, bundle_path, linked_page, write_page, write_site
 from structgstream.serve.play import Truth
-from structgstream.serve.stream_file import StreamFile, write_page, write_site
 from tests.support.chromium import Browser, Tab, opened_browser
 from tests.support.pictures import decoded_picture
 from tests.support.plain import some

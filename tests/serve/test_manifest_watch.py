@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.serve.files import OpenedFile, open_below
 from structgstream.serve.manifest_watch import BrokenManifest, ManifestWatch, snapshot
+from structgstream.serve.streams import OpenedFile, open_below
 from tests.support.segment_folders import GrowingFolder
 from tests.support.streams import small_stream
 
@@ -131,7 +131,7 @@ def test_a_manifest_that_goes_and_comes_back(tmp_path: Path) -> None:
         (tmp_path / "manifest.json").write_bytes(b"{}")
         seconds = 2.0
         for _ in range(2):
-            with pytest.raises(BrokenManifest, match="its format is not"):
+            with pytest.raises(BrokenManifest, match="has no 'format'"):
                 await watch.current()
         growing.write()
         seconds = 3.0

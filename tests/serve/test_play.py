@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from structgstream.data.json_videos import bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.data.open import open_capture
-from structgstream.serve.pages import bundle
+from structgstream.serve.pages import StreamFile, bundle
 from structgstream.serve.play import Truth
-from structgstream.serve.stream_file import StreamFile
 from tests.support.pictures import decoded_picture
 from tests.support.serving import Served, served
 from tests.support.streams import small_stream

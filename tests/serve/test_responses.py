@@ -9,7 +9,6 @@ import pytest
 from starlette.requests import Request
 from starlette.types import Message
 
-from structgstream.serve.files import open_below
 from structgstream.serve.responses import (
     PIECE_BYTES,
     UnsatisfiableRange,
@@ -17,6 +16,7 @@ from structgstream.serve.responses import (
     file_response,
     requested_range,
 )
+from structgstream.serve.streams import open_below
 
 SIZE = 1000
 

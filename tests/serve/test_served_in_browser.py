@@ -12,8 +12,8 @@ import pytest
 from structgstream.codec.segments.quality_list import ListedQuality, write_list
 from structgstream.codec.sinks import MemorySink
 from structgstream.evaluation.pictures import png_bytes
+from structgstream.serve.access import EVERY_STREAM, TokenKeys
 from structgstream.serve.app import ServerSettings
-from structgstream.serve.tokens import EVERY_STREAM, TokenKeys
 from tests.support.chromium import Browser, Tab, opened_browser
 from tests.support.rigs import random_scene
 from tests.support.segment_folders import GrowingFolder

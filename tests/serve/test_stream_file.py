@@ -8,8 +8,7 @@ import pytest
 from structgstream.codec.container.records import FOOTER, FOOTER_MAGIC
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.errors import StorageError, StreamError
-from structgstream.serve.pages import bundle, single_page
-from structgstream.serve.stream_file import StreamFile, check_has_header, write_page, write_site
+from structgstream.serve.pages import StreamFile, bundle, check_has_header, single_page, write_page, write_site
 from tests.support.streams import small_stream
 
 STREAM = small_stream()

@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.errors import ConfigError
-from structgstream.serve import tokens
+from structgstream.serve import access as tokens
+from structgstream.serve.access import EVERY_STREAM, Access, TokenKeys, read_keys
 from structgstream.serve.app import ServerSettings
-from structgstream.serve.tokens import EVERY_STREAM, Access, TokenKeys, read_keys
 from tests.support.segment_folders import GrowingFolder
 from tests.support.serving import Served, hosted
 from tests.support.streams import small_stream

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from structgstream.data.points import PointsConfig
-from structgstream.session import initialization
-from structgstream.session.initialization import frame_seed, initial_points_of
+from structgstream.session import loop
+from structgstream.session.loop import frame_seed, initial_points_of
 from structgstream.similarity import Similarity
 from tests.support.memory_captures import MemoryCapture
 from tests.support.worlds import moving_world
@@ -33,7 +33,7 @@ def test_points_of_the_capture_are_taken_and_normalised(monkeypatch: pytest.Monk
         asked.append(seed)
         return type("Points", (), {"positions": np.ones((4, 3))})
 
-    monkeypatch.setattr(initialization, "initial_points", found)
+    monkeypatch.setattr(loop, "initial_points", found)
     given = np.array([[0.0, 0.1, 0.0], [1.0, 0.1, -1.0]])
     options = {"config": PointsConfig(), "seed": 5, "similarity": SIMILARITY}
     points = initial_points_of(source(given), WORLD.frames[0], **options)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.codec.packets import PacketKind
-from structgstream.session.key_frames import MIN_FRAMES, KeyFrames
+from structgstream.session.periods import MIN_FRAMES, KeyFrames
 
 
 def keys_of(keys: KeyFrames, times: list[float], *, first: int = 0) -> list[int]:

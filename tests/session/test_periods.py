@@ -5,8 +5,7 @@ import pytest
 
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError
-from structgstream.session.key_frames import KeyFrames
-from structgstream.session.periods import PeriodConfig, PeriodPlan
+from structgstream.session.periods import KeyFrames, PeriodConfig, PeriodPlan
 
 FPS, KEY_EVERY = 25.0, 5
 

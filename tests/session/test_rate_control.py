@@ -7,7 +7,7 @@ import pytest
 
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError
-from structgstream.session.key_frames import MIN_FRAMES, KeyFrames
+from structgstream.session.periods import MIN_FRAMES, KeyFrames
 from structgstream.session.rate_control import LEAST, MOST, RateConfig, RateController, with_rate_control
 from structgstream.training.online.config import OnlineConfig
 

@@ -5,10 +5,10 @@ import pytest
 
 from structgstream.cameras import CameraRig
 from structgstream.errors import ConfigError
+from structgstream.session.loop import check_resumable
 from structgstream.session.pipeline import StreamFacts
 from structgstream.session.presets import TINY, to_json
 from structgstream.session.rate_control import RateConfig
-from structgstream.session.resuming import check_resumable
 from structgstream.similarity import Similarity
 from tests.support.rigs import arc_rig
 from tests.support.streams import header_for, small_scene
@@ -50,12 +50,12 @@ def test_every_fact_of_a_camera_counts() -> None:
         ({"viewmat": viewmat}, "viewmat"),
         ({"K": RIG[LAST].K * 1.0 + 1e-9 * (RIG[LAST].K > 0)}, "K"),
         ({"near": 2.0 * RIG[LAST].near}, "near"),
-        ({"width": RIG[LAST].width + 1}, "size"),
+        ({"width": RIG[LAST].width + 1}, "width"),
     ):
         assert f"another part of it: cameras.{LAST}.{name} differ" in refused(rig=changed(**facts))
     turned = CameraRig({name: RIG[name] for name in [*RIG][::-1]}, RIG.held_out)
     assert "another part of it: order of cameras differ" in refused(rig=turned)
-    assert f"cameras.{LAST}.held out" in refused(rig=CameraRig(dict(RIG.cameras), frozenset({LAST})))
+    assert f"cameras.{LAST}.held_out" in refused(rig=CameraRig(dict(RIG.cameras), frozenset({LAST})))
 
 
 def test_another_method_is_named() -> None:
@@ -66,6 +66,6 @@ def test_many_differences_are_cut_short() -> None:
     cameras = {name: replace(RIG[name], near=0.5, width=7) for name in RIG}
     message = refused(rig=CameraRig(cameras, RIG.held_out))
     assert (
-        "cameras.cam00.near, cameras.cam00.size, cameras.cam01.near, cameras.cam01.size, cameras.cam02.near differ"
+        "cameras.cam00.near, cameras.cam00.width, cameras.cam01.near, cameras.cam01.width, cameras.cam02.near differ"
         in (message)
     )

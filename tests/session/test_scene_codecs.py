@@ -10,7 +10,7 @@ from structgstream.codec.packets import StreamHeader
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import state_of
-from structgstream.session.initialization import frame_seed
+from structgstream.session.loop import frame_seed
 from structgstream.session.pipeline import FrameTask, StreamFacts
 from structgstream.session.presets import TINY, StreamConfig, to_json
 from structgstream.session.scene_codecs import scene_codec

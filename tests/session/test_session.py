@@ -20,8 +20,7 @@ from structgstream.kernels.backend import reference_backend
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
 from structgstream.session import struct_gstream as method
 from structgstream.session.frame_report import FrameReport
-from structgstream.session.initialization import frame_seed
-from structgstream.session.loop import Session
+from structgstream.session.loop import Session, frame_seed
 from structgstream.session.presets import StreamConfig
 from structgstream.session.struct_gstream import stream_pipeline
 from structgstream.training.result import FitResult

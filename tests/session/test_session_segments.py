@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.codec.segments.retention import SegmentsOptions
+from structgstream.codec.segments.sink import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest, write_archive
 from structgstream.codec.sinks import resume_segments

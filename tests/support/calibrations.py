@@ -10,8 +10,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from structgstream.data.arrays import Floats
 from structgstream.data.calibration import PosedCamera
+from structgstream.geometry import Floats
 from tests.support.captures import HEIGHT, WIDTH, small_rig
 
 POINTS = np.random.default_rng(3).uniform(-0.6, 0.6, (30, 3))

@@ -7,9 +7,8 @@ from functools import cache
 from pathlib import Path
 
 from structgstream.api import reconstruct
-from structgstream.groups.base import GroupBase
+from structgstream.groups.base import GroupBase, open_for
 from structgstream.groups.first_frame import GroupStartConfig
-from structgstream.groups.pictures import open_for
 from structgstream.groups.track_pass import TrackOptions, track_capture
 from structgstream.groups.tracking import TrackConfig
 from structgstream.groups.unit import SegmentTask, fit_segment

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from structgstream.cameras import Camera
-from structgstream.data.arrays import Floats
 from structgstream.data.matching import inside, project
+from structgstream.geometry import Floats
 from structgstream.pose_check.tracks import Evidence
 from tests.support.takes import ring
 

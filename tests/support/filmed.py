@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
 from structgstream.cameras import Camera
-from structgstream.data.arrays import Floats
 from structgstream.data.lenses import Lens, LensCamera, Pinhole, RadialTangential
+from structgstream.geometry import Floats
 from structgstream.preparation.calibration.board import Board
 from tests.support.rigs import look_at
 

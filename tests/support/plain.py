@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import Camera
-from structgstream.exporters.baked_gaussians import BakedGaussians
+from structgstream.exporters.bake import BakedGaussians
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.render import render
 from tests.support.rigs import arc_rig

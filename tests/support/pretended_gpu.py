@@ -7,7 +7,7 @@ check that its tensors lie together, as on a GPU: only numbers ``[]`` and indice
 """
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
 from functools import partial
@@ -66,12 +66,12 @@ class _Elsewhere(Tensor):
         return _Elsewhere(self.values_here.new_tensor(data, **options))
 
     def tolist(self) -> Any:
-        return self.values_here.tolist()
+        return self.detach().cpu().tolist()
 
     def numpy(self, *, force: bool = False) -> Any:
         if not force:
             raise TypeError("a tensor on another device has no numpy array; copy it first")
-        return self.values_here.numpy(force=True)
+        return self.detach().cpu().numpy(force=True)
 
     def data_ptr(self) -> int:
         raise RuntimeError("a kernel of the processor was given a tensor on another device")
@@ -115,17 +115,38 @@ def _here(value: Any) -> Any:
 
 
 class _PretendedDevice(TorchDispatchMode):
+    def __init__(self, see: Callable[[Any, Any, Any, Any], None] | None) -> None:
+        super().__init__()
+        self._see = see
+
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        return _run(func, args, kwargs or {})
+        found = _run(func, args, kwargs or {})
+        if self._see is not None:
+            self._see(func, args, kwargs or {}, found)
+        return found
+
+
+def lies_there(value: Any) -> bool:
+    """Whether this is a tensor on ``DEVICE``."""
+    return isinstance(value, _Elsewhere)
+
+
+def values_of(value: Any) -> Any:
+    """What a kernel of the device reads and writes: the memory of a tensor there; any other value as it is."""
+    return _here(value)
 
 
 @contextmanager
-def pretended_device() -> Iterator[None]:
-    """``DEVICE`` holds tensors within, in this thread and in those that begin within."""
+def pretended_device(see: Callable[[Any, Any, Any, Any], None] | None = None) -> Iterator[None]:
+    """``DEVICE`` holds tensors within, in this thread and in those that begin within.
+
+    Args:
+        see: gets every operation: the function, its arguments, its options and its result.
+    """
     run, tensor = threading.Thread.run, torch.tensor
 
     def run_on_device(self: threading.Thread) -> None:
-        with _PretendedDevice():
+        with _PretendedDevice(see):
             run(self)
 
     def tensor_on_device(data: Any, *, device: Any = None, **options: Any) -> Tensor:
@@ -134,7 +155,7 @@ def pretended_device() -> Iterator[None]:
 
     threading.Thread.run, torch.tensor = run_on_device, tensor_on_device  # type: ignore[method-assign, assignment]
     try:
-        with _PretendedDevice():
+        with _PretendedDevice(see):
             yield
     finally:
         threading.Thread.run, torch.tensor = run, tensor  # type: ignore[method-assign, assignment]

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from structgstream.data.points import initial_points
-from structgstream.preparation import capture_steps
-from structgstream.preparation.report import page
+from structgstream.preparation import prepare as capture_steps
+from structgstream.preparation import report as page
 from tests.support.small_presets import FEW_POINTS
 
 

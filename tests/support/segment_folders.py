@@ -18,7 +18,7 @@ from structgstream.codec.segments.manifest import (
     manifest_to_json,
     sha256_of,
 )
-from structgstream.codec.segments.next_manifest import part_of, segment_of
+from structgstream.codec.segments.recovery import part_of, segment_of
 from structgstream.codec.segments.store import FolderStore
 
 _KINDS = {RecordType.KEY: PacketKind.KEY, RecordType.DELTA: PacketKind.DELTA}

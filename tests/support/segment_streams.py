@@ -7,8 +7,7 @@ from pathlib import Path
 
 from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
-from structgstream.codec.segments.retention import SegmentsOptions
-from structgstream.codec.segments.sink import Clocks, SegmentsSink
+from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsSink
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.codec.sinks import MemorySink, StoredSegments, resume_segments
 from tests.support.streams import header_for, moved, small_scene

@@ -14,7 +14,7 @@ import uvicorn
 
 from structgstream.serve import app, play
 from structgstream.serve.listening import bound, server
-from structgstream.serve.stream_file import StreamFile
+from structgstream.serve.pages import StreamFile
 
 
 @dataclass(frozen=True)

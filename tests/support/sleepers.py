@@ -3,7 +3,7 @@
 
 from pathlib import Path
 
-from structgstream.executors.executor import Executor
+from structgstream.executors.executor import TaskQueue
 from structgstream.executors.task import PYTHON, Task, TaskResult
 
 PATIENCE_SECONDS = 60.0
@@ -20,7 +20,7 @@ def module(name: str, *arguments: str) -> Task:
     return Task(name, (PYTHON, "-m", *arguments))
 
 
-def all_endings(executor: Executor) -> dict[str, TaskResult]:
+def all_endings(executor: TaskQueue) -> dict[str, TaskResult]:
     """What came of all tasks that can run."""
     endings = {}
     while True:

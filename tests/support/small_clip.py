@@ -5,7 +5,7 @@ import json
 import shutil
 from pathlib import Path
 
-from structgstream.data.json_videos import bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip_path
 from tests.support.shared_folder import made_once
 
 CAMERAS = ("cam00", "cam01", "cam02", "cam03", "cam04", "cam05")

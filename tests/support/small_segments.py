@@ -11,8 +11,7 @@ from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.header import unpack_header
 from structgstream.codec.packets import Packet, PacketKind, parse_packet
 from structgstream.groups.base import GroupBase
-from structgstream.groups.segment_file import SegmentIdentity
-from structgstream.groups.segment_sink import SegmentSink
+from structgstream.groups.segment_file import SegmentIdentity, SegmentSink
 from structgstream.scene.scene import Scene
 from tests.support.streams import header_for, moved, small_scene, small_stream
 

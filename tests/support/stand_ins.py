@@ -7,8 +7,7 @@ from pathlib import Path
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.local import LocalEngine
 from structgstream.executors.task import PYTHON, WorkerSlot
-from structgstream.parallel.driver import Job
-from structgstream.parallel.unit import Unit
+from structgstream.parallel.driver import Job, Unit
 from tests.support import stand_in
 
 PROGRAM = (PYTHON, "-I", "-S", stand_in.__file__)

@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig
-from structgstream.data.arrays import Floats
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.timeline import Clock
 from structgstream.frames import MultiViewFrame
+from structgstream.geometry import Floats
 from tests.support.rigs import look_at
 
 WIDTH, HEIGHT = 160, 120

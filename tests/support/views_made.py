@@ -7,9 +7,9 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Pair
+from structgstream.geometry import Floats
 from structgstream.preparation.calibration.keypoints import Keypoints
 
 Matches = dict[Pair, NDArray[np.uint32]]

@@ -8,7 +8,7 @@ from pathlib import Path
 import av
 import pytest
 
-from structgstream.data.json_videos import bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.data.live.rig_file import read_rig
 from tests.support.sender_modules import mpeg_ts, sender, sent_stream
 

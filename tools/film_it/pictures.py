@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from structgstream.data.calibration import rotation_matrix
-from structgstream.data.json_videos import bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.preparation.prepare import check_folder
 
 TURNED, DEGREES = "cam04", 0.6

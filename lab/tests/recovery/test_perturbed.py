@@ -6,7 +6,7 @@ import pytest
 
 from lab.recovery.perturbed import main
 from structgstream.data.calibration_files.tools import MULTICAL
-from structgstream.data.json_videos import bundled_clip, bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip, bundled_clip_path
 
 
 def test_every_camera_of_the_file_is_as_far_off_as_asked(tmp_path: Path) -> None:

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from lab.recovery.placement import exactly_placed, own_errors
-from structgstream.data.alignment import Alignment
-from structgstream.data.calibration import rotation_matrix
+from structgstream.data.calibration import Alignment, rotation_matrix
 from structgstream.data.lenses import LensCamera
 from tests.support.repetitive import ring
 

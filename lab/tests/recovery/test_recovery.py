@@ -9,7 +9,7 @@ from lab.recovery.recovery import camera_errors, clock_errors, plain, summary
 from lab.rigs.filming import Filming
 from lab.rigs.optics import filmed_camera
 from lab.rigs.rig import base, poses, turned
-from structgstream.data.alignment import Alignment
+from structgstream.data.calibration import Alignment
 from structgstream.data.lenses import LensCamera
 from structgstream.data.timeline import Clock
 

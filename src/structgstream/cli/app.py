@@ -10,7 +10,7 @@ import importlib
 import os
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import ModuleType
 
@@ -38,6 +38,19 @@ COMMANDS = {
     "inspect": "show the content of a stream file",
     "doctor": "show available back-ends and packages, and how to install missing ones",
 }
+SHARED = {
+    "archive": "conversion.archive",
+    "board": "prepare.board",
+    "export": "conversion.export",
+    "fit-group": "groups.fit_group",
+    "import": "conversion.import_files",
+    "join": "groups.join",
+    "plan": "parallel.plan",
+    "play": "serve.play",
+    "token": "serve.token",
+    "track": "groups.track",
+}
+"""Module and function of the commands that share a module; each of the others is ``main`` of the module of its name."""
 ENTRY_POINTS = "structgstream.commands"
 """Entry-point group for other distributions' commands: packages with ``COMMANDS`` and a module with ``main`` each."""
 DONE, PROBLEM, USAGE, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
@@ -100,46 +113,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The reader of our output has exited (`| head`). Python would raise again while it closes stdout.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return PROBLEM
-    except StructGStreamError as error:
-        if debug:
-            traceback.print_exc()
-        _print_error(f"structgstream: {error}")
-        return PROBLEM
-    except OSError as error:
-        if debug:
-            traceback.print_exc()
-        _print_error(f"structgstream: {_file_error(error)}")
-        return PROBLEM
-    except MemoryError as error:
-        if debug:
-            traceback.print_exc()
-        detail = f" ({error})" if str(error) else ""
-        _print_error(
-            f"structgstream: not enough memory{detail}; close other programs, or use smaller pictures (--scale 0.5)."
-        )
-        return PROBLEM
     except Exception as error:
         if debug:
             traceback.print_exc()
-        _print_error(f"structgstream: {_unexpected_error(error)}")
+        _print_error(f"structgstream: {_sentence(error)}")
         return PROBLEM
     return DONE
 
 
-def _unexpected_error(error: Exception) -> str:
+def _sentence(error: Exception) -> str:
+    """What an error says to the user: one of this package, of the operating system, or an unexpected one."""
+    if isinstance(error, StructGStreamError):
+        return str(error)
+    if isinstance(error, PermissionError) and error.filename is not None:
+        return f"no permission for {error.filename}; change its permissions or its owner, or use another place."
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        where = "" if error.filename is None else f" of {error.filename}"
+        return f"the disk{where} is full ({error.strerror}); make room, and run the command again."
+    if isinstance(error, MemoryError):
+        detail = f" ({error})" if str(error) else ""
+        return f"not enough memory{detail}; close other programs, or use smaller pictures (--scale 0.5)."
     return (
         f"unexpected error, {type(error).__name__}: {error}. Run the command again with --debug and report the output."
     )
-
-
-def _file_error(error: OSError) -> str:
-    """The message of an error of the operating system: missing permissions, a full disk."""
-    if isinstance(error, PermissionError) and error.filename is not None:
-        return f"no permission for {error.filename}; change its permissions or its owner, or use another place."
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        where = "" if error.filename is None else f" of {error.filename}"
-        return f"the disk{where} is full ({error.strerror}); make room, and run the command again."
-    return _unexpected_error(error)
 
 
 def overview() -> str:
@@ -175,7 +171,14 @@ def _run(command: str, arguments: list[str]) -> None:
         near = difflib.get_close_matches(command, packages, n=1)
         hint = f" Did you mean {near[0]!r}?" if near else ""
         raise UsageError(f"there is no command {command!r}.{hint} Commands: {', '.join(packages)}.")
-    importlib.import_module(f"{packages[command]}.{command.replace('-', '_')}").main(arguments)
+    entry_of(command, packages[command])(arguments)
+
+
+def entry_of(command: str, package: str = "structgstream.cli") -> Callable[[list[str]], None]:
+    """The function of a command of a package of commands."""
+    own = SHARED.get(command) if package == "structgstream.cli" else None
+    module, function = own.split(".") if own else (command.replace("-", "_"), "main")
+    return getattr(importlib.import_module(f"{package}.{module}"), function)
 
 
 def _packages() -> list[ModuleType]:

@@ -51,7 +51,7 @@ def main(arguments: list[str]) -> None:
     check_ending(options.output, command="demo", folder=True)
     if options.output.exists() and not options.output.is_dir():
         raise UsageError(f"--output is a folder, and {options.output} is a file.")
-    from structgstream.data.json_videos import bundled_clip_path
+    from structgstream.data.dataset_layouts import bundled_clip_path
     from structgstream.data.open import open_capture
     from structgstream.kernels.backend import select_backend
     from structgstream.recorder import check_output
@@ -108,7 +108,7 @@ def _look_at(stream: Path, source: "FrameSource", backend: "Backend") -> tuple["
     from structgstream.codec.reader import open_stream
     from structgstream.evaluation.evaluate import compared_frames
     from structgstream.evaluation.pictures import side_by_side
-    from structgstream.serve.stream_file import StreamFile, write_page
+    from structgstream.serve.pages import StreamFile, write_page
 
     folder, camera = stream.parent, source.rig.testing[0]
     reader = open_stream(stream)

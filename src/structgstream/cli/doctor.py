@@ -92,9 +92,7 @@ def _version(module: str, distribution: str) -> str | None:
 
 
 def _table(names: tuple[str, ...], rows: list[tuple[str, ...]]) -> Table:
-    table = compact_table()
-    for name in names:
-        table.add_column(name)
+    table = compact_table(*names, left=names)
     for row in rows:
         table.add_row(*literal_cells(*row))
     return table

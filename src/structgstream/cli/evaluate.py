@@ -102,12 +102,11 @@ def run_evaluation(
 ) -> "Report":
     """Evaluates with a progress display, and writes the report into ``folder`` (None: nowhere)."""
     from structgstream.evaluation.evaluate import Compared, evaluate
-    from structgstream.evaluation.page import write_page
     from structgstream.evaluation.pictures import contact_sheet, spread_indices
     from structgstream.evaluation.plots import write_plots
     from structgstream.evaluation.report import as_json, write_json
     from structgstream.evaluation.run_log import read_log
-    from structgstream.evaluation.worst import WorstPictures
+    from structgstream.evaluation.worst import WorstPictures, write_page
 
     frames = len(reader.packets)
     wanted = set(spread_indices(frames, SHEET_COLUMNS)) if frames else set()

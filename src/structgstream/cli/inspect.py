@@ -1,22 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``structgstream inspect``."""
+"""``structgstream inspect``: what a stream file holds, or what was understood of a capture."""
 
 import json
-from collections.abc import Mapping, Sequence
+import logging
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
+from rich.table import Table
 
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import Flag, JsonPath, StreamFile, check_ending, parse_options, write_json_output
-from structgstream.cli.progress import print_lines
-from structgstream.cli.stream_tables import bit_rate_text, facts_table, header_table, packet_table, period_table
+from structgstream.cli.progress import change, frames_text, human_bytes, print_lines
+from structgstream.cli.tables import SHOWN_FRAMES, compact_table, literal_cells, name_value_table
 
 if TYPE_CHECKING:
-    from structgstream.cameras import CameraRig
     from structgstream.codec.reader import StreamReader
+    from structgstream.data.source import FrameSource
+    from structgstream.data.video_index import VideoTrack
     from structgstream.evaluation.byte_count import Row
 
 CHANGES = ("grown", "removed", "spawned", "pruned")
@@ -90,8 +96,6 @@ def main(arguments: list[str]) -> None:
 
 
 def _print_capture(options: Inspect) -> None:
-    from structgstream.cli.capture_table import capture_tables, describe_capture
-
     if options.plot is not None or options.config or options.all_packets:
         raise UsageError("--plot, --config and --all-packets are of streams; of a capture only --json can be given.")
     content = describe_capture(options.stream)
@@ -108,13 +112,10 @@ def draw_byte_plot(path: Path, reader: "StreamReader", rows: "Sequence[Row]", *,
     """
     if not rows:
         raise UsageError("the stream has no whole frame, so there is nothing to draw.")
-    from structgstream.evaluation.byte_count import parts_of
-    from structgstream.evaluation.byte_plot import write_byte_plot
+    from structgstream.evaluation.byte_count import parts_of, write_byte_plot
 
-    frames = "1 frame" if len(rows) == 1 else f"{len(rows)} frames"
-    write_byte_plot(
-        path, rows, parts_of(reader, rows), title=f"{name}: {frames}, {bit_rate_text(rows, reader.header.fps)}"
-    )
+    title = f"{name}: {frames_text(len(rows))}, {bit_rate_text(rows, reader.header.fps)}"
+    write_byte_plot(path, rows, parts_of(reader, rows), title=title)
 
 
 def describe_stream(
@@ -144,25 +145,11 @@ def describe_stream(
             "dynamic": sorted(header.dynamic),
             "fields": periods[0]["fields"],
             "distance_input": header.distance_input,
-            "cameras": _cameras(header.rig),
+            "cameras": header.rig.plain(),
             "config": dict(header.config),
             "metadata": dict(header.metadata),
         },
         "packets": [_packet(row, log.get(row.index, {})) for row in rows],
-    }
-
-
-def _cameras(rig: "CameraRig") -> dict[str, dict[str, Any]]:
-    return {
-        name: {
-            "width": camera.width,
-            "height": camera.height,
-            "K": camera.K.tolist(),
-            "viewmat": camera.viewmat.tolist(),
-            "near": camera.near,
-            "held_out": name in rig.held_out,
-        }
-        for name, camera in rig.cameras.items()
     }
 
 
@@ -205,3 +192,259 @@ def describe_period(
             for name, tensor in part.items()
         },
     }
+
+
+SMALL_BYTES = 100_000  # if all packets are smaller, sizes are printed in bytes
+SHORT = {"anchor_positions": "positions", "covariance_mlp": "cov. mlp", "the rest": "rest"}  # 80 characters a line
+
+
+def facts_table(header: Mapping[str, Any], rows: "Sequence[Row]", *, packets: Sequence[Mapping[str, Any]]) -> Table:
+    """Facts of the stream: source, length, size, rate, added and removed items, whether it is complete."""
+    cameras = header["cameras"]
+    held_out = [name for name, camera in cameras.items() if camera["held_out"]]
+    sizes = sorted({f"{camera['width']}x{camera['height']}" for camera in cameras.values()})
+    table = name_value_table()
+    for name, value in header["metadata"].items():
+        table.add_row(*literal_cells(name, str(value)))
+    table.add_row("codec", header["codec"])
+    table.add_row("frames", f"{len(rows)} at {header['fps']:g} a second, {len(rows) / header['fps']:.2f} s")
+    table.add_row(
+        *literal_cells("cameras", f"{len(cameras)} of {', '.join(sizes)}; held out: {', '.join(held_out) or 'none'}")
+    )
+    headers = "header" if len(header["periods"]) < 2 else f"{len(header['periods'])} headers"
+    table.add_row("size", f"{human_bytes(header['total_bytes'])}, {headers} {human_bytes(header['header_bytes'])}")
+    if rows:
+        table.add_row("rate", bit_rate_text(rows, header["fps"]))
+    table.add_row("dynamic", ", ".join(header["dynamic"]) or "-")
+    changes = [packet["changes"] for packet in packets if packet["changes"]]
+    if changes:
+        grown, removed, spawned, pruned = (
+            sum(one.get(name, 0) for one in changes) for name in ("grown", "removed", "spawned", "pruned")
+        )
+        anchors, free = change(grown, removed) or " (none)", change(spawned, pruned) or " (none)"
+        table.add_row("came, went", f"anchors{anchors}, free Gaussians{free}, says the log")
+    acts = Counter[str]()
+    for packet in packets:
+        acts.update(packet["counts"])
+    if acts:
+        table.add_row("acts", ", ".join(f"{name} {count:,}" for name, count in acts.items()))
+    state = "damaged" if header["damage"] else "not finished"
+    table.add_row(
+        "state",
+        "complete: its run ended or was stopped in order" if header["complete"] else f"{state}: {header['cut_reason']}",
+    )
+    return table
+
+
+def bit_rate_text(rows: "Sequence[Row]", fps: float) -> str:
+    """The mean rate of at least one packet, as text."""
+    mean = sum(row.bytes for row in rows) / len(rows)
+    return f"{8e-6 * mean * fps:.2f} Mbit/s without the header"
+
+
+def period_table(periods: Sequence[Mapping[str, Any]]) -> Table | None:
+    """A row per period; None for a stream of one."""
+    if len(periods) < 2:
+        return None
+    titles = ("period", "frame", "frames", "seconds", "anchors", "header", "packets", "begins")
+    table = compact_table(*titles, left=("begins",), title="periods")
+    for one in periods:
+        anchors = one["fields"]["anchor_positions"]["shape"][0] if "anchor_positions" in one["fields"] else ""
+        table.add_row(
+            str(one["period"]),
+            str(one["first_frame"]),
+            str(one["frames"]),
+            f"{one['seconds']:.2f}",
+            f"{anchors:,}" if anchors != "" else "-",
+            human_bytes(one["header_bytes"]),
+            human_bytes(one["packet_bytes"]),
+            *literal_cells(one["begins"] or "-"),
+        )
+    return table
+
+
+def header_table(header: Mapping[str, Any]) -> Table:
+    """The fields of an init record, largest first."""
+    title = f"header of period {header['period']}" if header["period"] else "header"
+    table = compact_table("field", "shape", "bytes", "share", "bits a value", left=("field",), title=title)
+    whole = header["header_bytes"]
+    rest = whole
+    for name, field in sorted(header["fields"].items(), key=lambda item: -item[1]["bytes"]):
+        size, values = field["bytes"], math.prod(field["shape"])
+        shape = " x ".join(f"{length}" for length in field["shape"])
+        bits = f"{8 * size / values:.2f}" if values else "-"
+        table.add_row(name.replace("_", " "), shape, f"{size:,}", f"{size / whole:.1%}", bits)
+        rest -= size
+    table.add_row("the rest", "", f"{rest:,}", f"{rest / whole:.1%}", "")
+    return table
+
+
+def packet_table(rows: "Sequence[Row]", *, every: bool) -> Table:
+    """A row per packet, or for :data:`SHOWN_FRAMES` of them, and the means below; largest field first."""
+    from structgstream.evaluation.byte_count import FIRST, groups_of, occurring_fields
+
+    names = occurring_fields(row.sizes for row in rows)
+    small = max((row.bytes for row in rows), default=0) < SMALL_BYTES
+    step = 1 if every else max(-(-len(rows) // SHOWN_FRAMES), 1)
+
+    def cells(whole: float, sizes: Mapping[str, float]) -> list[str]:
+        numbers = [whole, *(sizes.get(name, 0) for name in names)]
+        return [f"{number:,.0f}" if small else f"{number / 1000:,.1f}" for number in numbers]
+
+    lines = [[str(row.index), row.kind, *cells(row.bytes, row.sizes)] for row in rows[::step]]
+    groups = groups_of(rows)
+    means = [
+        ["mean", name.split()[0], *cells(groups[name].bytes, groups[name].sizes)] for name in groups if name != FIRST
+    ]
+    table = compact_table()
+    table.padding = 0
+    table.title = "packets, bytes" if small else "packets, kB"
+    if step > 1:
+        table.title += f"; 1 in {step} is listed (--all-packets: every one)"
+    titles = [SHORT.get(name, name.replace("_", " ")) for name in names]
+    for title in ("frame", "kind", "all", *titles):
+        # One word per line, so that titles do not break inside words.
+        table.add_column(title.replace(" ", "\n"), justify="left" if title == "kind" else "right", no_wrap=True)
+    for line in lines:
+        table.add_row(*line)
+    table.add_section()
+    for line in means:
+        table.add_row(*line)
+    return table
+
+
+def describe_capture(path: Path) -> dict[str, Any]:
+    """The capture at ``path`` as plain values: ``layout``, ``fps``, ``frames``, ``held_out``, ``cameras``, ``remarks``.
+
+    ``remarks`` are the warnings of its reader: what is left out, and why. A folder without calibration is described as
+    the footage that ``prepare`` would read.
+
+    Raises:
+        CaptureError: it cannot be opened.
+    """
+    from structgstream.data.open import Uncalibrated, layout_of, open_capture
+    from structgstream.preparation.footage import NoFootage
+
+    with _warnings() as remarks:
+        try:
+            source = open_capture(path)
+        except Uncalibrated as error:
+            try:
+                return _describe_footage(path, remarks)
+            except NoFootage:
+                raise error from None
+        cameras = {name: _camera(source, name) for name in source.rig}
+    return {
+        "layout": layout_of(path),
+        "fps": source.fps,
+        "frames": len(source),
+        "held_out": sorted(source.rig.held_out),
+        "points": None if source.points is None else len(source.points),
+        "cameras": cameras,
+        "remarks": remarks,
+    }
+
+
+def _describe_footage(path: Path, remarks: list[str]) -> dict[str, Any]:
+    from structgstream.preparation.footage import find_footage
+
+    footage = find_footage(path)
+    cameras: dict[str, Any] = {}
+    for name in footage.cameras:
+        stamps, track = footage.stamps(name), footage.tracks.get(name)
+        colors, turned = ("-", "no") if track is None else (track.colors, _turned(track))
+        cameras[name] = {
+            "size": footage.size(name),
+            "lens": "-",
+            "frames": len(stamps),
+            "colors": colors,
+            "turned": turned,
+        }
+        cameras[name] |= {"first_seconds": float(stamps[0]), "last_seconds": float(stamps[-1])}
+    remark = f"There is no calibration: structgstream prepare {path} -o CAPTURE makes a capture of these files."
+    return {
+        "layout": "videos or pictures without calibration",
+        "fps": footage.fps,
+        "frames": min(camera["frames"] for camera in cameras.values()),
+        "held_out": [],
+        "points": None,
+        "cameras": cameras,
+        "remarks": [*remarks, remark],
+    }
+
+
+def capture_tables(name: str, content: dict[str, Any]) -> tuple[Table, ...]:
+    """The facts, a row per camera, and the remarks."""
+    facts = name_value_table()
+    facts.add_row(*literal_cells("capture", name))
+    facts.add_row(*literal_cells("layout", content["layout"]))
+    seconds = content["frames"] / content["fps"]
+    facts.add_row("frames", f"{content['frames']} at {content['fps']:g} a second, {seconds:.2f} s")
+    facts.add_row(*literal_cells("held out", ", ".join(content["held_out"]) or "none"))
+    colors = {own["colors"] for own in content["cameras"].values()}
+    if len(colors) == 1:
+        facts.add_row(*literal_cells("colours", *colors))
+    facts.add_row("points", "none" if content["points"] is None else f"{content['points']:,}")
+    titles = ["camera", "size", "lens", "frames", "from s", "to s", "turned", *["colours"] * (len(colors) > 1)]
+    cameras = compact_table(*titles, left=("camera", "lens", "colours"), title="cameras")
+    for camera, own in content["cameras"].items():
+        times = ["-" if own[key] is None else f"{own[key]:.3f}" for key in ("first_seconds", "last_seconds")]
+        size = "x".join(map(str, own["size"]))
+        cells = (camera, size, own["lens"], str(own["frames"]), *times, own["turned"])
+        cameras.add_row(*literal_cells(*cells, *([own["colors"]] if len(colors) > 1 else [])))
+    remarks = name_value_table()
+    for remark in content["remarks"]:
+        remarks.add_row(*literal_cells("note", remark))
+    return facts, cameras, remarks
+
+
+def _camera(source: "FrameSource", name: str) -> dict[str, Any]:
+    from structgstream.data.images import ImageSource
+    from structgstream.data.undistortion import UndistortedSource
+    from structgstream.data.video import VideoSource
+    from structgstream.data.wrappers import SourceWrapper
+
+    lens, stored = "pinhole", source
+    while isinstance(stored, SourceWrapper):
+        if isinstance(stored, UndistortedSource):
+            lens = type(stored.filmed[name].lens).__name__
+        stored = stored.source
+    camera = stored.rig[name]
+    found: dict[str, Any] = {"size": (camera.width, camera.height), "lens": lens, "frames": len(stored)}
+    found |= {"first_seconds": None, "last_seconds": None, "colors": "-", "turned": "no"}
+    if isinstance(stored, VideoSource):
+        track, stamps = stored.tracks[name], [stamp for stamp in stored.stamps[name] if stamp is not None]
+        times = [(stamp - track.origin) * track.tick_seconds for stamp in (stamps[0], stamps[-1])]
+        found |= {"frames": len(stamps), "first_seconds": times[0], "last_seconds": times[1], "colors": track.colors}
+        found["turned"] = _turned(track)
+    elif isinstance(stored, ImageSource):
+        places = [place for place, file in enumerate(stored.files[name]) if file is not None]
+        found |= {"frames": len(places)}
+        found |= {"first_seconds": places[0] / stored.fps, "last_seconds": places[-1] / stored.fps}
+        found["colors"] = next(file.suffix for file in stored.files[name] if file is not None)
+        turn = stored.turns.get(name, 1)
+        found["turned"] = "no" if turn == 1 else f"EXIF {turn}"
+    return found
+
+
+def _turned(track: "VideoTrack") -> str:
+    return f"{90 * track.quarter_turns} degrees" if track.quarter_turns else "no"
+
+
+@contextmanager
+def _warnings() -> Iterator[list[str]]:
+    """Warnings of the readers, as text, which are not printed meanwhile."""
+    found: list[str] = []
+
+    class Collector(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            found.append(record.getMessage())
+
+    handler, logger = Collector(logging.WARNING), logging.getLogger("structgstream")
+    propagates, logger.propagate = logger.propagate, False
+    logger.addHandler(handler)
+    try:
+        yield found
+    finally:
+        logger.removeHandler(handler)
+        logger.propagate = propagates

@@ -4,24 +4,33 @@
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import tyro
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.live import Live
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
 
 from structgstream.cli.app import UsageError, usage_errors
 from structgstream.cli.options import CaptureOptions, Flag
-from structgstream.cli.progress import Display, display
+from structgstream.cli.progress import Display, Lines, display, human_bytes, summary
 
 if TYPE_CHECKING:
     from structgstream.data.denoising import DenoisingConfig
     from structgstream.data.live.source import LiveSource
     from structgstream.data.source import FrameStream
     from structgstream.run_metrics import RunMetrics
+    from structgstream.session.frame_report import FrameReport
+    from structgstream.training.result import Step
 
 
 class Stoppable(Protocol):
@@ -116,7 +125,6 @@ def stop_of(source: "FrameStream") -> Callable[[], object]:
 @contextmanager
 def monitored(source: "FrameStream", metrics: "RunMetrics | None", *, done: int) -> Iterator[Display]:
     """Shows a run and writes its metrics; Ctrl-C ends a live one after the frame being fitted."""
-    from structgstream.cli.dashboard import live_display
     from structgstream.data.live.source import LiveSource
     from structgstream.data.source import frame_count
 
@@ -149,3 +157,180 @@ def stop_on_interrupt(source: Stoppable) -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+REFRESH = 4  # a second
+GAP = "  "
+Values = Callable[[], Mapping[str, Any]]
+
+
+def live_display(values: Values, *, frames: int | None, done: int = 0, console: Console | None = None) -> Display:
+    """A dashboard when ``console`` (default: standard output) is a terminal, else a line a frame.
+
+    Args:
+        values: of ``RunMetrics``.
+        frames: number of frames of the stream when it is finished; None where that is unknown.
+        done: how many of them are stored already.
+        console: where to write.
+    """
+    console = Console() if console is None else console
+    if console.is_terminal:
+        return Dashboard(values, frames, done, console=console)
+    return LiveLines(values, frames, done, console=console)
+
+
+class LiveLines(Lines):
+    """Plain lines, each with what the cameras and queues do."""
+
+    def __init__(self, values: Values, frames: int | None, done: int, *, console: Console) -> None:
+        super().__init__(frames, done, console=console)
+        self._values = values
+
+    def frame(self, report: "FrameReport", *, quality: str | None = None) -> None:
+        """Prints the frame's line."""
+        self._current = report.index + 1
+        self._print(f"{summary(report, self._frames, quality=quality)}  {state_line(self._values())}")
+
+
+class Dashboard:
+    """Cameras, queues, stages and the last frame, drawn again a few times a second."""
+
+    def __init__(self, values: Values, frames: int | None, done: int = 0, *, console: Console) -> None:
+        self._values, self._frames, self._console = values, frames, console
+        self._step = self._last = ""
+        self._next, self._ended = done + 1, False  # counted from 1, as the lines of frames are
+        self._live = Live(
+            console=console, refresh_per_second=REFRESH, get_renderable=self._drawn, vertical_overflow="crop"
+        )
+
+    def __enter__(self) -> "Dashboard":
+        self._live.start()
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._ended = True
+        self._live.stop()
+
+    def step(self, step: "Step") -> None:
+        """Notes the iteration."""
+        self._step = f"frame {self._next}  iteration {step.iteration}/{step.iterations}  loss {step.loss:.4f}"
+
+    def frame(self, report: "FrameReport", *, quality: str | None = None) -> None:
+        """Notes the frame."""
+        self._step, self._last = "", summary(report, self._frames, quality=quality)
+        self._next = report.index + 2
+
+    def _drawn(self) -> Panel:
+        values = self._values()
+        # What is cut off on a terminal of few lines is the end: cameras, of which the first line counts those present.
+        parts: list[RenderableType] = [Flow(state_parts(values))]
+        parts += [Flow(stages, style="dim")] if (stages := stage_parts(values)) else []
+        parts += [Text()]
+        parts += [Flow(self._last.split("  "))] if self._last else []
+        doing = self._step or ("" if self._ended else self._between(values))
+        parts += [Text(doing, style="dim")] if doing else []
+        if values.get("qualities"):
+            parts += [Text(), qualities_table(values["qualities"])]
+        if values.get("live") is not None:
+            parts += [Text(), cameras_table(values["live"]["cameras"])]
+        title = f"{values['stream']}  {values['state']}  {_duration(values['running_seconds'])}"
+        # A terminal shows Ctrl-C as ^C, which must not begin another line: the panel would be drawn one line too low.
+        width = max(self._console.width - len("^C"), 1)
+        return Panel(Group(*parts), title=title, title_align="left", width=width)
+
+    def _between(self, values: Mapping[str, Any]) -> str:
+        """What is done between two iterations, which may be most of a frame's time."""
+        live = values.get("live")
+        if live is not None and not any(camera["present"] for camera in live["cameras"].values()):
+            return "waits for cameras"
+        return f"frame {self._next}  takes pictures and prepares them"
+
+
+class Flow:
+    """Short texts one after the other, as many in a line as fit; none is broken that fits into one."""
+
+    def __init__(self, texts: Iterable[str], *, style: str = "") -> None:
+        self._texts, self._style = [text.strip() for text in texts if text.strip()], style
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        lines: list[str] = []
+        for text in self._texts:
+            longer = f"{lines[-1]}{GAP}{text}" if lines else ""
+            if longer and cell_len(longer) <= options.max_width:
+                lines[-1] = longer
+            else:
+                lines.append(text)
+        yield Text("\n".join(lines), style=self._style)
+
+
+def state_line(values: Mapping[str, Any]) -> str:
+    """Rates, queues, room and delay in one line."""
+    return GAP.join(state_parts(values))
+
+
+def state_parts(values: Mapping[str, Any]) -> list[str]:
+    """Rates, queues, room and delay."""
+    live = values.get("live")
+    parts = []
+    if live is not None:
+        present = sum(camera["present"] for camera in live["cameras"].values())
+        parts += [
+            f"{present}/{len(live['cameras'])} cameras",
+            f"in {_number(values['frames_in_per_second'])}/s out {_number(values['frames_out_per_second'], 2)}/s",
+            f"skipped {live['skipped_sets']:,}",
+        ]
+        if live["delay_seconds"] is not None:
+            parts.append(f"pictures {live['delay_seconds']:.2f} s old")
+    if values["bits_per_second"] is not None:
+        parts.append(f"{values['bits_per_second'] / 1e3:,.1f} kbit/s")
+    if values["disk_free_bytes"] is not None:
+        parts.append(f"disk {human_bytes(values['disk_free_bytes'])} free")
+    if values["resident_bytes"] is not None:
+        parts.append(f"memory {human_bytes(values['resident_bytes'])}")
+    return parts
+
+
+def stage_parts(values: Mapping[str, Any]) -> list[str]:
+    """Seconds by stage of the last frames' mean, the longest first."""
+    stages = sorted(values["seconds_by_stage"].items(), key=lambda item: -item[1])
+    return [f"{name} {seconds:.2f} s" for name, seconds in stages if name != "total"][:8]
+
+
+def qualities_table(qualities: Mapping[str, Mapping[str, Any]]) -> Table:
+    """A row a quality: its frames, its rate and bytes, decibels on training views, and seconds a frame."""
+    table = Table(box=None, pad_edge=False)
+    for title in ("quality", "frames", "kbit/s", "bytes", "train dB", "s a frame"):
+        table.add_column(title, justify="left" if title == "quality" else "right")
+    for name, own in qualities.items():
+        bits = own["bits_per_second"]
+        table.add_row(
+            Text(name),
+            "-" if own["frames"] is None else f"{own['frames']:,}",
+            "-" if bits is None else f"{bits / 1e3:,.1f}",
+            human_bytes(own["bytes"]),
+            _number(own["train_psnr"], 2),
+            _number(own["seconds_by_stage"].get("total"), 2),
+        )
+    return table
+
+
+def cameras_table(cameras: Mapping[str, Mapping[str, Any]]) -> Table:
+    """A row a camera: whether it sends, its pictures, and what went wrong how often."""
+    table = Table(box=None, pad_edge=False)
+    for title in ("camera", "", "pictures", "queue", "faults"):
+        table.add_column(title, justify="right" if title in ("pictures", "queue") else "left")
+    for name, camera in cameras.items():
+        faults = Flow(f"{kind} {count:,}" for kind, count in camera["faults"].items())
+        state = Text("sends", style="green") if camera["present"] else Text("absent", style="red")
+        table.add_row(Text(name), state, f"{camera['decoded']:,}", str(camera["queued"]), faults)
+    return table
+
+
+def _number(value: float | None, digits: int = 1) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _duration(seconds: float) -> str:
+    return time.strftime("%H:%M:%S", time.gmtime(seconds % 86400)) + (
+        f" + {int(seconds // 86400)} d" if seconds >= 86400 else ""
+    )

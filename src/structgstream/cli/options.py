@@ -80,6 +80,16 @@ def check_ending(output: Path | None, *endings: str, command: str, option: str =
         raise UsageError(f"{command} writes no {ending}, got {option} {output}; it writes {written}.")
 
 
+def check_new(output: Path, *, overwrite: bool) -> None:
+    """Check that a file does not exist, or may be replaced.
+
+    Raises:
+        UsageError: it exists.
+    """
+    if output.exists() and not overwrite:
+        raise UsageError(f"{output} exists; replace it with --overwrite, or choose another name.")
+
+
 def checked_paths(options: Options) -> Options:
     """Options, also those in groups, with ``~`` in paths expanded as a shell does it.
 

@@ -1,31 +1,41 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``structgstream parallel``."""
+"""``structgstream parallel`` and ``plan``."""
 
-from dataclasses import dataclass, field, replace
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
+from rich.live import Live
+from rich.text import Text
 
 from structgstream.cli.app import Interrupted, UsageError, usage_errors
 from structgstream.cli.options import (
+    STANDARD_OUTPUT,
     CaptureOptions,
     Device,
     Flag,
     Folder,
+    JsonPath,
     check_ending,
     open_selected_capture,
     parse_known_options,
     resolve_config,
+    write_json_output,
 )
-from structgstream.cli.parallel_display import ParallelDisplay
 from structgstream.cli.progress import human_bytes, print_lines
-from structgstream.executors.opening import ExecutorName, ExecutorOptions
+from structgstream.cli.tables import compact_table, literal_cells
+from structgstream.executors.executor import ExecutorName, ExecutorOptions
 
 if TYPE_CHECKING:
+    from structgstream.data.source import FrameSource
     from structgstream.executors.executor import TaskQueue
-    from structgstream.parallel.driver import Job
+    from structgstream.parallel.cost import Estimate, Measured, Work
+    from structgstream.parallel.driver import Job, State, Status
     from structgstream.parallel.exchange import ObjectStore
     from structgstream.parallel.parts import Parts
     from structgstream.session.presets import StreamConfig
@@ -36,8 +46,7 @@ class WorkerOptions:
     """Options that say what runs the groups."""
 
     executor: ExecutorName = "local"
-    """local: processes of this machine; inline: this process, one group after the other; ray: a Ray cluster, which
-    needs the extra cluster (docs/cluster.md)."""
+    """local: processes of this machine; ray: a Ray cluster, which needs the extra cluster (docs/cluster.md)."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Groups at a time. Default: one a GPU, or one a core. A cluster that is joined has its own number."""
     threads: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
@@ -112,8 +121,7 @@ def main(arguments: list[str]) -> None:
     if options.groups is not None and options.groups < 1:
         raise UsageError(f"--groups counts frames, from 1; got {options.groups}.")
     from structgstream.owned_folders import Owner
-    from structgstream.parallel.exchange import ObjectStore
-    from structgstream.parallel.object_folder import ObjectFolder
+    from structgstream.parallel.exchange import ObjectFolder, ObjectStore
     from structgstream.parallel.parts import PURPOSE, Parts
 
     parts, console = Parts(parts_folder(options.output)), Console()
@@ -169,7 +177,7 @@ def open_tasks(options: ExecutorOptions, device: Device) -> "TaskQueue":
         MissingExtraError: a package is missing.
     """
     from structgstream.evaluation.environment import usable_cores
-    from structgstream.executors.opening import open_executor
+    from structgstream.executors.executor import open_executor
 
     return open_executor(options, cores=usable_cores(), gpus=gpus_of(device))
 
@@ -192,13 +200,11 @@ def join_arguments(options: WorkerOptions, device: Device) -> tuple[str, ...]:
         return ()
     cores = usable_cores()
     slots = allocate_slots(workers=options.workers, cores=cores, threads=options.threads)
-    threads = 1 if options.executor == "inline" else min(cores, sum(slot.threads for slot in slots))
-    return ("--workers", str(threads))
+    return ("--workers", str(min(cores, sum(slot.threads for slot in slots))))
 
 
 def _job(options: Parallel, rest: list[str]) -> "Job":
-    from structgstream.parallel.driver import Job
-    from structgstream.parallel.unit import Unit
+    from structgstream.parallel.driver import Job, Unit
 
     capture = options.capture
     header = [*_option("preset", options.preset), *_option("quality", options.quality), *_option("seed", options.seed)]
@@ -236,3 +242,246 @@ def _drive(job: "Job", parts: "Parts", executor: "TaskQueue", exchange: "ObjectS
             drive(job, parts, executor, exchange=exchange, listener=display.show)
         except KeyboardInterrupt:
             raise Interrupted(f"Complete frames are in {parts.folder}; continue with the same command.") from None
+
+
+STYLES = {
+    "waiting for the track": ("·", "dim"),
+    "ready": ("○", ""),
+    "running": ("◐", "cyan"),
+    "done": ("●", "green"),
+    "failed": ("✗", "red"),
+}
+WORST_FIRST = ("failed", "running", "ready", "waiting for the track", "done")
+OTHERS = ("running", "ready", "waiting for the track", "failed")
+ROWS = 6
+SHOWN = 8
+FramesOf = Callable[[int, int], int]
+"""Number of fitted frames of a running group."""
+
+
+def cells(states: Sequence["State"], *, width: int) -> Text:
+    """A sign per group; of many groups, one for several, which shows the least advanced state."""
+    share = max(1, -(-len(states) // (width * ROWS)))
+    text = Text()
+    for start in range(0, len(states), share):
+        several = states[start : start + share]
+        state = next(name for name in WORST_FIRST if name in several)
+        sign, style = STYLES[state]
+        text.append(sign, style)
+        if (start // share + 1) % width == 0:
+            text.append("\n")
+    return text
+
+
+def counted(status: "Status") -> str:
+    """The status as text."""
+    if not status.groups:
+        return {"header": "frame 0", "track": "tracking begins"}.get(status.stage, status.stage)
+    counts = Counter(str(state) for state in status.states)
+    frames = sum(end - first for (first, end), state in zip(status.groups, status.states) if state == "done")
+    parts = [f"{counts['done']} of {len(status.groups)} groups done ({frames} of {status.groups[-1][1]} frames)"]
+    parts += [f"{counts[name]} {name}" for name in OTHERS if counts[name]]
+    return ", ".join(["joining", *parts[:1]] if status.stage == "join" else parts)
+
+
+class ParallelDisplay:
+    """Shows the status: all groups, redrawn on a terminal, else lines.
+
+    Args:
+        console: where to write.
+        frames_of: number of fitted frames of a group.
+    """
+
+    def __init__(self, console: Console, frames_of: FramesOf) -> None:
+        self._console, self._frames_of = console, frames_of
+        self._begun = time.monotonic()
+        self._live = Live(Text(), console=console, refresh_per_second=2)
+        self._printed = ""
+
+    def __enter__(self) -> "ParallelDisplay":
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        if self._console.is_terminal:
+            self._live.stop()
+
+    def show(self, status: "Status") -> None:
+        """Redraws the groups on a terminal; elsewhere prints a line if it has changed."""
+        if self._console.is_terminal:
+            self._live.update(self._picture(status))
+            return
+        done = sum(state == "done" for state in status.states)
+        line = f"{status.stage}: {done} of {len(status.groups)} groups done" if status.groups else status.stage
+        line += f", failed: {', '.join(status.failed)}" if status.failed else ""
+        if line != self._printed:
+            print_lines(self._console, line)
+            self._console.file.flush()
+            self._printed = line
+
+    def _picture(self, status: "Status") -> Text:
+        width = max(10, min(self._console.width - 2, 100))
+        seconds = time.monotonic() - self._begun
+        text = Text(f"{counted(status)}, {seconds / 60:.0f} min {seconds % 60:.0f} s\n")
+        text.append_text(cells(status.states, width=width))
+        running = [group for group, state in zip(status.groups, status.states) if state == "running"]
+        for first, end in running[:SHOWN]:
+            text.append(f"\n  frames {first}:{end}  {self._frames_of(first, end)} of {end - first}")
+        if len(running) > SHOWN:
+            text.append(f"\n  and {len(running) - SHOWN} more")
+        return text
+
+
+PROBE_FRAMES = 11
+PROBE_GROUP = 6
+ASSUMED = (
+    "Assumed: later frames are like the measured ones; workers do not slow each other down (shared cores, disks and "
+    "memory do); every process starts as fast; the tracking pass takes one worker; joining is as fast as in the "
+    "measured run, which more cores would make faster; nothing fails."
+)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How long a capture would take on so many workers, how many a wanted finish needs, and how large the stream is.
+
+    Measured first: frame 0 and ten frames in two groups, on one worker of this machine (in FOLDER; the same
+    command measures only once); or an existing run of parallel. Everything else follows from a model whose assumptions
+    are printed.
+
+    Example: structgstream plan basketball -o probe --machines 1 8 64 --finish-hours 2
+
+    Example: structgstream plan basketball --run ball.sgs.parts --machines 8 --frames 108000
+    """
+
+    scene: tyro.conf.Positional[Folder]
+    """The capture."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER", help_behavior_hint="")] = None
+    """Folder of the probe."""
+    run: Annotated[Path | None, tyro.conf.arg(metavar="OUT.parts", help_behavior_hint="")] = None
+    """Parts of a finished run to take the measurements from; no probe is made."""
+    machines: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N [N ...]", help_behavior_hint="")] = (1, 8, 64)
+    """Numbers of machines to plan for, each like this one."""
+    workers: int = 1
+    """Workers that run side by side on each machine; each is taken to be as fast as the measured one alone."""
+    finish_hours: Annotated[float | None, tyro.conf.arg(metavar="H", help_behavior_hint="")] = None
+    """Say how many workers end within H hours."""
+    groups: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    """Frames of a group. Default: one key interval."""
+    length: Annotated[int | None, tyro.conf.arg(metavar="FRAMES", help_behavior_hint="")] = None
+    """Plan for so many frames instead of the capture's."""
+    preset: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
+    """compact (default), fine, fast, or tiny; fields of the configuration are options as of reconstruct."""
+    device: Device = "auto"
+    """Compute back-end of the probe."""
+    json: JsonPath = None
+    """Write all numbers to this file; - is standard output."""
+    capture: CaptureOptions = field(default_factory=CaptureOptions)
+
+
+def plan(arguments: list[str]) -> None:
+    """Measures, computes, prints."""
+    options, rest = parse_known_options(Plan, "plan", arguments=arguments)
+    if (options.run is None) == (options.output is None):
+        raise UsageError("give either -o FOLDER for a probe, or --run OUT.parts of an existing run.")
+    check_ending(options.json, ".json", command="plan", option="--json")
+    config, _ = resolve_config(options.preset, rest, command="plan", seed=None)
+    from structgstream.parallel.cost import Work, measured_in
+
+    source = open_selected_capture(options.scene, options.capture)
+    interval = max(1, round(config.key_interval_seconds * source.fps))
+    with usage_errors():
+        work = Work(options.length or len(source), options.groups or interval, interval)
+        if options.workers < 1 or min(options.machines, default=0) < 1:
+            raise UsageError("--machines and --workers count from 1.")
+    if options.run is None and str(options.json) == STANDARD_OUTPUT:
+        raise UsageError("--json - needs --run: a probe prints to standard output what it does.")
+    console = Console(stderr=str(options.json) == STANDARD_OUTPUT)
+    folder = options.run if options.run is not None else _probe(options, rest, console)
+    _report(options, work, source, measured_in(folder), console)
+
+
+def _probe(options: Plan, rest: list[str], console: Console) -> Path:
+    """Two groups on one worker, unless they are there."""
+    from structgstream.cli.app import main as command
+
+    assert options.output is not None
+    options.output.mkdir(parents=True, exist_ok=True)
+    stream = options.output / "probe.sgs"
+    capture = options.capture
+    probe = ["parallel", str(options.scene), "-o", str(stream), "--frames", str(PROBE_FRAMES)]
+    probe += ["--groups", str(PROBE_GROUP), "--allow-unaligned", "--workers", "1", "--device", options.device]
+    probe += [] if options.preset is None else ["--preset", options.preset]
+    probe += [] if capture.held_out is None else ["--held-out", *capture.held_out]
+    probe += ["--scale", str(capture.scale), "--start", str(capture.start), "--every", str(capture.every)]
+    probe += [] if capture.near is None else ["--near", str(capture.near)]
+    console.print(f"Probe: frame 0 and {PROBE_FRAMES - 1} frames, on one worker.", highlight=False)
+    if status := command([*probe, *rest]):
+        raise SystemExit(status)  # It has said why.
+    return parts_folder(stream)
+
+
+def _report(options: Plan, work: "Work", source: "FrameSource", found: "Measured", console: Console) -> None:
+    from structgstream.parallel.cost import estimate, sequential_seconds, serial_seconds, stream_bytes, workers_for
+
+    costs = found.costs
+    estimates = [(count, estimate(costs, work, count * options.workers)) for count in options.machines]
+    alone, serial, size = sequential_seconds(costs, work), serial_seconds(costs, work), stream_bytes(costs, work)
+    seconds = work.frames / source.fps
+    print_lines(
+        console,
+        f"{source.name}: {work.frames} frames ({seconds:.1f} s of film) in {len(work.groups)} groups of {work.group}.",
+        f"Measured on one worker: frame 0 {costs.header_seconds:.1f} s, tracking {costs.track_seconds:.2f} s a frame, "
+        f"a group {costs.process_seconds + costs.first_seconds:.1f} s and {costs.frame_seconds:.2f} s a frame "
+        f"({found.groups} groups), memory {human_bytes(costs.worker_bytes)}.",
+        f"One frame after the other: {_time(alone)}. Stream: {human_bytes(size)}, {size * 8e-6 / seconds:.2f} Mbit/s.",
+    )
+    _table(console, estimates)
+    print_lines(console, _serial(costs.header_seconds, serial, alone, work.frames))
+    wanted = None
+    if options.finish_hours is not None:
+        wanted = workers_for(costs, work, options.finish_hours * 3600)
+        least = _time(estimate(costs, work, len(work.groups) + 1).seconds)
+        ends = f"{wanted.workers} workers ({_time(wanted.seconds)})" if wanted else f"not possible; least {least}"
+        print_lines(console, f"Within {options.finish_hours:g} h: {ends}.")
+    rate = 1 / costs.frame_seconds
+    print_lines(console, _live(rate, source.fps), ASSUMED)
+    if options.json is not None:
+        facts: dict[str, Any] = {"work": asdict(work), "measured": asdict(found), "bytes": size, "live_fps": rate}
+        facts |= {"sequential_seconds": alone, "serial_seconds": serial}
+        facts["estimates"] = [{"machines": count, **asdict(each)} for count, each in estimates]
+        facts["wanted"] = None if wanted is None else asdict(wanted)
+        write_json_output(options.json, facts)
+
+
+def _live(rate: float, fps: float) -> str:
+    if rate >= fps:
+        return f"Live: {rate:.1f} frames a second here, enough for {fps:g}."
+    return (
+        f"Live, where each frame needs the one before, workers do not help: {rate:.2f} frames a second here, "
+        f"{fps / rate:.1f} times too slow for {fps:g}."
+    )
+
+
+def _serial(header: float, serial: float, alone: float, frames: int) -> str:
+    growing = serial - header
+    return (
+        f"Serial whatever the workers: {_time(serial)}, of which frame 0 {_time(header)} once, and tracking and "
+        f"joining {_time(growing)}, which grow with the film ({_time(1000 * growing / frames)} for 1000 frames); so "
+        f"never more than {alone / serial:.1f} times faster."
+    )
+
+
+def _table(console: Console, estimates: list[tuple[int, "Estimate"]]) -> None:
+    table = compact_table("machines", "workers", "time", "after tracking", "times faster", "efficiency")
+    for count, each in estimates:
+        cells = (str(count), str(each.workers), _time(each.seconds), _time(each.tail_seconds))
+        table.add_row(*literal_cells(*cells, f"{each.speedup:.2f}", f"{100 * each.efficiency:.0f} %"))
+    console.print(table)
+
+
+def _time(seconds: float) -> str:
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

@@ -3,9 +3,8 @@
 
 import math
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
-from types import TracebackType
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING, Protocol
 
 from rich.console import Console, Group
@@ -35,6 +34,20 @@ def print_lines(console: Console, *lines: str) -> None:
     """Prints lines without rich's markup, colours and line breaks, so that paths can be copied and parsed."""
     for line in lines:
         console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
+
+
+def frames_text(count: int) -> str:
+    """A number of frames as text."""
+    return "1 frame" if count == 1 else f"{count} frames"
+
+
+@contextmanager
+def frame_bar(title: str, total: int) -> Iterator[Callable[[], None]]:
+    """A bar of ``total`` frames on standard error while the block runs; call what it gives after each frame."""
+    columns = [TextColumn(title), BarColumn(bar_width=32), MofNCompleteColumn(), TimeRemainingColumn()]
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("frames", total=total)
+        yield lambda: bar.advance(task)
 
 
 MAX_NAMES = 5
@@ -131,9 +144,7 @@ class Lines:
     def __enter__(self) -> "Lines":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         return None
 
     def step(self, step: "Step") -> None:
@@ -179,9 +190,7 @@ class Bars:
         self._live.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self._progress.update(self._one, visible=False)
         self._live.stop()
 
@@ -228,9 +237,7 @@ class StepDisplay(AbstractContextManager["StepDisplay"]):
         self._bar.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self._bar.stop()
 
     def begin(self, step: str, *, skipped: bool) -> None:

@@ -14,7 +14,7 @@ import tyro
 from structgstream.cli.app import UsageError
 
 if TYPE_CHECKING:
-    from structgstream.codec.segments.retention import SegmentsOptions
+    from structgstream.codec.segments.sink import SegmentsOptions
     from structgstream.codec.segments.store import Store
     from structgstream.recorder import Storage
     from structgstream.scene.scene import Scene
@@ -79,7 +79,7 @@ class SegmentOptions:
         """
         from structgstream.codec.segments.manifest import MANIFEST
         from structgstream.codec.segments.quality_list import read_list
-        from structgstream.codec.segments.retention import SegmentsOptions
+        from structgstream.codec.segments.sink import SegmentsOptions
         from structgstream.recorder import segments_folder
 
         listed = read_list(output)
@@ -119,7 +119,7 @@ class SegmentOptions:
                 replace another stream.
             MissingExtraError: a package is missing that the URL needs.
         """
-        from structgstream.codec.segments.retention import SegmentsOptions
+        from structgstream.codec.segments.sink import SegmentsOptions
         from structgstream.recorder import check_output, segments_folder
 
         options = SegmentsOptions(self.window, self.keep)
@@ -149,7 +149,7 @@ class SegmentOptions:
                 if left := mirror.finish(wait_seconds=FINISH_SECONDS):
                     report(
                         f"{left} files of {output} are not yet in {remote.name}; the next run with --resume, or any "
-                        "program that copies folders, brings them there."
+                        "program that copies folders, copies them."
                     )
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numbers as tables for a terminal."""
 
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 from rich.box import SIMPLE_HEAD
@@ -18,16 +19,16 @@ SHOWN_FRAMES = 24  # of a longer stream evenly spaced frames are shown
 BASIC = ("PSNR", "colour", "SSIM", "changed", "still")
 """Titles of the first columns of every table of scores; colour is PSNR after frame 0's colour fit."""
 
-FURTHER = (  # title, key, digits
-    ("MS-SSIM", "ms_ssim", 4),
-    ("FLIP", "flip", 4),
-    ("LPIPS", "lpips_alex", 4),
-    ("VGG", "lpips_vgg", 4),
-    ("E_warp", "e_warp", 5),
-    ("tFLIP", "temporal_flip", 4),
-    ("tLPIPS", "t_lpips", 5),
-    ("flicker", "flicker", 2),
-    ("truth", "truth_flicker", 2),
+FURTHER = (  # title, key, factor, digits
+    ("MS-SSIM", "ms_ssim", 1, 4),
+    ("FLIP", "flip", 1, 4),
+    ("LPIPS", "lpips_alex", 1, 4),
+    ("VGG", "lpips_vgg", 1, 4),
+    ("E_warp", "e_warp", 1, 5),
+    ("tFLIP", "temporal_flip", 1, 4),
+    ("tLPIPS", "t_lpips", 1, 5),
+    ("flicker", "flicker", 1, 2),
+    ("truth", "truth_flicker", 1, 2),
 )
 
 AT_OTHER_SIZES = (  # title, key, factor, digits
@@ -43,9 +44,10 @@ AT_OTHER_SIZES = (  # title, key, factor, digits
 
 def report_tables(report: "Report", *, title: str) -> Group:
     """Scores by frame and by camera, and the facts of the file."""
-    parts = [_frames(report, title), _cameras(report), _other_sizes(report)]
+    known = [column for column in AT_OTHER_SIZES if getattr(report.mean, column[1]) is not None]
+    parts = [_frames(report, title), _cameras(report), _by_camera(report, known)]
     if report.stream["metrics"] == "all":
-        parts.append(_further(report))
+        parts.append(_by_camera(report, FURTHER))
     if report.stream["not_available"]:
         parts.append(_not_available(report))
     parts.append(_facts(report))
@@ -65,9 +67,20 @@ def literal_cells(*cells: str) -> tuple[Text, ...]:
     return tuple(Text(printable(cell)) for cell in cells)
 
 
-def compact_table() -> Table:
-    """A table whose ten columns of numbers fit into 80 characters."""
-    return Table(box=SIMPLE_HEAD, header_style="bold", title_justify="left", padding=(0, 1, 0, 0), show_edge=False)
+def compact_table(*titles: str, left: Collection[str] = (), title: str | Text | None = None) -> Table:
+    """A table with columns of these titles, of which ten columns of numbers fit into 80 characters.
+
+    Args:
+        titles: of the columns.
+        left: titles of those that are not of numbers.
+        title: of the table.
+    """
+    table = Table(
+        title=title, box=SIMPLE_HEAD, header_style="bold", title_justify="left", padding=(0, 1, 0, 0), show_edge=False
+    )
+    for name in titles:
+        table.add_column(name, justify="left" if name in left else "right")
+    return table
 
 
 def _frames(report: "Report", title: str) -> Table:
@@ -94,33 +107,16 @@ def _frames(report: "Report", title: str) -> Table:
 
 
 def _cameras(report: "Report") -> Table:
-    table = compact_table()
-    for name in ("camera", "", *BASIC, "affine"):
-        table.add_column(name, justify="left" if name in ("camera", "") else "right")
+    table = compact_table("camera", "", *BASIC, "affine", left=("camera", ""))
     for name, scores in report.cameras.items():
         affine = f"{scores.psnr_affine:.2f}"
         table.add_row(*literal_cells(name, report.stream["cameras"][name]), *_scores(scores), affine)
     return table
 
 
-def _further(report: "Report") -> Table:
-    """The scores of ``FURTHER`` by camera, and their mean."""
-    table = compact_table()
-    for name in ("camera", *(title for title, _, _ in FURTHER)):
-        table.add_column(name, justify="left" if name == "camera" else "right")
-    for name, scores in (*report.cameras.items(), ("mean", report.mean)):
-        values = [getattr(scores, key) for _, key, _ in FURTHER]
-        cells = ["-" if v is None else f"{v:.{digits}f}" for v, (_, _, digits) in zip(values, FURTHER, strict=True)]
-        table.add_row(*literal_cells(name), *cells)
-    return table
-
-
-def _other_sizes(report: "Report") -> Table:
-    """The scores of ``AT_OTHER_SIZES`` by camera, and their mean, without columns in which there is nothing."""
-    columns = [column for column in AT_OTHER_SIZES if getattr(report.mean, column[1]) is not None]
-    table = compact_table()
-    for name in ("camera", *(title for title, *_ in columns)):
-        table.add_column(name, justify="left" if name == "camera" else "right")
+def _by_camera(report: "Report", columns: Sequence[tuple[str, str, int, int]]) -> Table:
+    """The scores of ``columns`` by camera, and their mean."""
+    table = compact_table("camera", *(title for title, *_ in columns), left=("camera",))
     for name, scores in (*report.cameras.items(), ("mean", report.mean)):
         values = [(getattr(scores, key), factor, digits) for _, key, factor, digits in columns]
         cells = ["-" if v is None else f"{factor * v:.{digits}f}" for v, factor, digits in values]

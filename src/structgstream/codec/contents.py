@@ -12,13 +12,16 @@ from typing import overload
 from structgstream.codec.container.blocks import field_sizes, iterate_blocks
 from structgstream.codec.container.byte_source import ByteSlice, ByteSource
 from structgstream.codec.container.damage import Damage, PacketSearch, Standing
-from structgstream.codec.container.index import Index, Period, indexed_frames, period_at
 from structgstream.codec.container.records import (
     FRAME,
     PACKET_KINDS,
     RECORD,
+    Index,
+    Period,
     Record,
     RecordType,
+    indexed_frames,
+    period_at,
     read_head,
     read_record,
     scan_records,
@@ -26,7 +29,6 @@ from structgstream.codec.container.records import (
 from structgstream.codec.header import unpack_header
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet
 from structgstream.errors import StreamError
-from structgstream.similarity import Similarity
 
 LOST = 2**64 - 1
 """Offset of a packet that is lost."""
@@ -189,32 +191,12 @@ class PeriodTable:
 def differences(first: StreamHeader, later: StreamHeader) -> Sequence[str]:
     """What may not change from period to period and differs."""
     found = {
-        "cameras": _cameras(first) != _cameras(later),
-        "similarity": _plain(first.similarity) != _plain(later.similarity),
+        "cameras": [*first.rig.plain().items()] != [*later.rig.plain().items()],
+        "similarity": first.similarity != later.similarity,
         "frames a second": first.fps != later.fps,
         "codec": first.codec != later.codec,
     }
     return [name for name, differs in found.items() if differs]
-
-
-def _plain(similarity: Similarity) -> tuple[float, ...]:
-    return (*similarity.center, similarity.scale)
-
-
-def _cameras(header: StreamHeader) -> list[tuple[object, ...]]:
-    rig = header.rig
-    return [
-        (
-            name,
-            rig[name].viewmat.tolist(),
-            rig[name].K.tolist(),
-            rig[name].width,
-            rig[name].height,
-            rig[name].near,
-            name in rig.held_out,
-        )
-        for name in rig
-    ]
 
 
 @dataclass(frozen=True)

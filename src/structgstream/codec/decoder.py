@@ -14,7 +14,7 @@ from torch import Tensor
 from structgstream.codec.container.blocks import coded_payloads, unpack_raw_blocks
 from structgstream.codec.container.records import FRAME
 from structgstream.codec.entropy.adaptive import AdaptiveCoder, AdaptiveDecoder
-from structgstream.codec.entropy.models import Models
+from structgstream.codec.entropy.decisions import Models
 from structgstream.codec.fields.packet_fields import (
     CODABLE,
     FREE_FIELDS,

@@ -5,7 +5,7 @@ Note [Closed loop]
 ~~~~~~~~~~~~~~~~~~
 Prediction is closed-loop: :meth:`SceneEncoder.encode` decodes the bytes it has just made and returns the
 reconstruction, from which the trainer starts the next frame. It equals the decoder's scene bit for bit; otherwise
-trainer and viewers would drift apart.
+trainer and viewers would diverge.
 """
 
 import math

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading a stream: header, packets, scenes; complete files and files truncated anywhere.
 
-Note [Nothing is kept]
-~~~~~~~~~~~~~~~~~~~~~~
+Note [Nothing is cached]
+~~~~~~~~~~~~~~~~~~~~~~~~
 Streams can be long, so a reader keeps only two headers, eight bytes per packet and the scene rendered last. Everything
 else is read on demand: the facts of a packet from the heads of its record and fields, a scene from its record, whose
 checksum is verified then. With the ``raw`` codec packets are independent, so random access costs one packet.
@@ -11,7 +11,6 @@ checksum is verified then. With the ``raw`` codec packets are independent, so ra
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +18,15 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera
 from structgstream.codec.container.byte_source import ByteSource, FileBytes
 from structgstream.codec.container.damage import Damage
-from structgstream.codec.container.index import Period, read_index
-from structgstream.codec.container.records import PREFIX, RecordType, check_prefix, incomplete_reason, read_record
+from structgstream.codec.container.records import (
+    PREFIX,
+    Period,
+    RecordType,
+    check_prefix,
+    incomplete_reason,
+    read_index,
+    read_record,
+)
 from structgstream.codec.contents import PacketInfo, Packets, PeriodTable, Scan, contents_by_index, first_run
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
@@ -66,7 +72,7 @@ NOTHING = -2  # index of the last decoded frame if there is none: no frame follo
 
 
 class StreamReader:
-    """A stream in memory or in a file; nearly constant memory (Note [Nothing is kept]).
+    """A stream in memory or in a file; nearly constant memory (Note [Nothing is cached]).
 
     Opening verifies every record's checksum, one record at a time. After a damaged record reading continues at the next
     whole packet: :meth:`scene` decodes every frame of :attr:`runs`, while :attr:`packets`, the length and
@@ -190,9 +196,7 @@ class StreamReader:
     def __enter__(self) -> "StreamReader":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -220,7 +224,7 @@ class StreamReader:
         return scene
 
     def render(self, index: int, camera: Camera | str, *, backend: BackendName | Backend = "auto") -> NDArray[np.uint8]:
-        """Renders one frame: ``[H, W, 3]`` 8-bit sRGB. The scene is kept for further pictures of the same frame.
+        """Renders one frame: ``[H, W, 3]`` 8-bit sRGB. The scene is stored for further pictures of the same frame.
 
         Args:
             index: the frame.
@@ -243,7 +247,7 @@ class StreamReader:
 
     def _missing(self, index: int) -> StreamError:
         if any(index in frames for frames in self._gone):
-            return StreamError(f"Frame {index} of {self._name} has left the window of frames that are kept.")
+            return StreamError(f"Frame {index} of {self._name} has left the window of the stream.")
         for damage in self.damage:
             if index in damage.frames:
                 return StreamError(

@@ -9,22 +9,28 @@ from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
-from structgstream.atomic_files import sync_folder
+from structgstream.atomic_files import lock_file, sync_folder
 from structgstream.codec.container.byte_source import ByteSlice, ByteSource, FileBytes, check_room, free_bytes
 from structgstream.codec.container.damage import readable_part
-from structgstream.codec.container.index import INDEX_ENTRY, Period, pack_index, period_at
-from structgstream.codec.container.records import RECORD_TYPES, RecordType, packed, prefix
+from structgstream.codec.container.records import (
+    INDEX_ENTRY,
+    RECORD_TYPES,
+    Period,
+    RecordType,
+    pack_index,
+    packed,
+    period_at,
+    prefix,
+)
 from structgstream.codec.contents import LOST, PacketInfo, PacketInfos
 from structgstream.codec.header import pack_header
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.segments.recovery import find
-from structgstream.codec.segments.retention import SegmentsOptions
-from structgstream.codec.segments.sink import Clocks, SegmentsSink
+from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsSink
 from structgstream.codec.segments.store import Store
 from structgstream.codec.segments.stored_bytes import StoredBytes
 from structgstream.errors import StorageError
-from structgstream.file_locks import lock_file
 from structgstream.scene.scene import Scene
 
 
@@ -163,7 +169,7 @@ class FileSink:
         Raises:
             StorageError: another sink writes to the file now.
         """
-        with suppress(OSError), self.path.open("rb+") as file:  # What cannot be opened is told by open().
+        with suppress(OSError), self.path.open("rb+") as file:  # open() reports what cannot be opened.
             self._lock(file)
 
     def open(self, header: StreamHeader) -> int:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Captures: readers of common layouts with one protocol, resizing, prefetching."""
 
-from structgstream.data.json_videos import bundled_clip
+from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.data.open import open_capture
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import Prefetch

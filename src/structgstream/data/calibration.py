@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibrated cameras: what calibration files contain (:class:`Calibration`), and rigs made of them.
+"""Calibrated cameras: what calibration files contain (:class:`Calibration`), rigs made of them, and the similarity
+transform between two estimates of one rig.
 
 Errors name the camera and the file.
 """
@@ -14,29 +15,23 @@ from numpy.typing import ArrayLike, NDArray
 from torch import from_numpy
 
 from structgstream.cameras import Camera, CameraRig
-from structgstream.data.lenses import Lens, Pinhole
+from structgstream.data.lenses import Lens, LensCamera, Pinhole
 from structgstream.data.text_files import BROKEN, Unreadable, number, reason
 from structgstream.errors import CalibrationError, CaptureError
+from structgstream.geometry import Floats
 from structgstream.similarity import rig_radius
 
 
 @dataclass(frozen=True)
 class PosedCamera:
-    """One camera of a calibration, or one picture that a camera took.
+    """One camera of a calibration, or one picture that a camera took."""
 
-    Args:
-        name: the camera's, or a path of which its name is a part (``cam00/000017.png``).
-        viewmat: ``[4, 4]`` float64, world to camera, OpenCV axes.
-        K: ``[3, 3]`` float64, pixels, the top-left pixel's centre at (0.5, 0.5).
-        size: width and height, pixels, that ``K`` is for; None if the file does not state it: that of the pictures.
-        lens: its distortion.
-    """
-
-    name: str
-    viewmat: NDArray[np.float64]
-    K: NDArray[np.float64]
+    name: str  # the camera's, or a path of which its name is a part (``cam00/000017.png``)
+    viewmat: NDArray[np.float64]  # ``[4, 4]`` float64, world to camera, OpenCV axes
+    K: NDArray[np.float64]  # ``[3, 3]`` float64, pixels, the top-left pixel's centre at (0.5, 0.5)
     size: tuple[int, int] | None
-    lens: Lens = field(default_factory=Pinhole)
+    """Width and height, pixels, that ``K`` is for; None if the file does not state it: that of the pictures."""
+    lens: Lens = field(default_factory=Pinhole)  # its distortion
 
     @property
     def center(self) -> NDArray[np.float64]:
@@ -46,24 +41,16 @@ class PosedCamera:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Cameras of one capture.
+    """Cameras of one capture."""
 
-    Args:
-        where: the file or folder that they come from, for messages.
-        cameras: as :class:`PosedCamera`; several of one camera must agree.
-        points: ``[P, 3]`` points of the scene, or None.
-        held_out: names of cameras that are held out in published results.
-        unposed: names of cameras without a pose.
-        turned_by_exif: whether it is for pictures turned by their EXIF orientation, as OpenCV reads them; None
-            where that depends on how it was made.
-    """
-
-    where: Path
-    cameras: tuple[PosedCamera, ...]
-    points: NDArray[np.float64] | None = None
-    held_out: Sequence[str] = ()
-    unposed: Sequence[str] = ()
+    where: Path  # the file or folder that they come from, for messages
+    cameras: tuple[PosedCamera, ...]  # as :class:`PosedCamera`; several of one camera must agree
+    points: NDArray[np.float64] | None = None  # ``[P, 3]`` points of the scene, or None
+    held_out: Sequence[str] = ()  # names of cameras that are held out in published results
+    unposed: Sequence[str] = ()  # names of cameras without a pose
     turned_by_exif: bool | None = None
+    """Whether it is for pictures turned by their EXIF orientation, as OpenCV reads them; None where that depends on how
+    it was made."""
 
 
 def rigid(rotation: ArrayLike, translation: ArrayLike) -> NDArray[np.float64]:
@@ -189,3 +176,49 @@ def listed(names: Collection[str], limit: int = 5) -> str:
     shown = ", ".join(repr(name) for name in list(names)[:limit])
     rest = f" and {len(names) - limit} more" if len(names) > limit else ""
     return f"camera{'s' if len(names) > 1 else ''} {shown}{rest}"
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """``aligned = scale * rotation @ point + translation``."""
+
+    scale: float  # positive
+    rotation: Floats  # ``[3, 3]``
+    translation: Floats  # ``[3]``
+
+    def points(self, points: Floats) -> Floats:
+        """Points ``[..., 3]``, aligned."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def camera(self, camera: Camera) -> Camera:
+        """A camera that sees the aligned points where ``camera`` sees the points."""
+        viewmat = camera.viewmat.clone()
+        turned = camera.viewmat[:3, :3] @ from_numpy(self.rotation.T.copy())
+        viewmat[:3, :3] = turned
+        viewmat[:3, 3] = self.scale * camera.viewmat[:3, 3] - turned @ from_numpy(self.translation)
+        return replace(camera, viewmat=viewmat, near=camera.near * self.scale)
+
+    def filmed(self, filmed: LensCamera) -> LensCamera:
+        """:meth:`camera` of a camera with a lens."""
+        return LensCamera(self.camera(filmed.camera), filmed.lens)
+
+
+def alignment(theirs: Mapping[str, Floats], ours: Mapping[str, Floats]) -> Alignment:
+    """The similarity from ``theirs`` to ``ours``, world-to-camera matrices ``[4, 4]`` of the same names.
+
+    The rotation is that of the cameras' axes, since positions alone do not give it when cameras stand in a line; scale
+    and translation are least squares of the positions (Umeyama, PAMI 1991). Cameras that all stand at one place leave
+    the scale at 1.
+    """
+    turns = sum(ours[name][:3, :3].T @ theirs[name][:3, :3] for name in theirs)
+    u, _, vh = np.linalg.svd(turns)
+    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vh)]) @ vh
+    from_, to = (np.array([_center(poses[name]) for name in theirs]) for poses in (theirs, ours))
+    turned = (from_ - from_.mean(0)) @ rotation.T
+    spread = float((turned**2).sum())
+    scale = float((turned * (to - to.mean(0))).sum() / spread) if spread > 0 else 1.0
+    return Alignment(scale, rotation, to.mean(0) - scale * rotation @ from_.mean(0))
+
+
+def _center(viewmat: Floats) -> Floats:
+    return -viewmat[:3, :3].T @ viewmat[:3, 3]

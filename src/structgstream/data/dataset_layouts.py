@@ -19,6 +19,11 @@ then two depth bounds. Rows belong to the existing videos in sorted order; the f
 held out, as in published results. Published loaders add a COLMAP model, in ``sparse``, ``colmap/sparse`` or
 ``colmap_0/sparse``: its points are used, transformed to the poses of the file.
 
+``cameras.json`` and a video per camera, in OpenCV axes, in two dialects. The package's own, as of the bundled clip:
+``{"width", "height", "fps", "frames", "near", "held_out": [names], "cameras": {name: {"K": 3x3, "viewmat": 4x4 world to
+camera}}}`` with ``name.mp4``. Of shared intrinsics: ``{"w", "h", "fl_x", "fl_y", "cx", "cy", "cams": [4x4 camera to
+world, ...]}`` with ``cam00.mp4``, ``cam01.mp4``, ... in the order of ``cams``; camera 0 is held out.
+
 Note [Order of rows]
 ~~~~~~~~~~~~~~~~~~~~
 Meet Room's rows follow the numbers of ``cam_2`` and ``cam_10``; LLFF sorts names as text, ``cam_10`` first. Where the
@@ -28,7 +33,8 @@ two differ the pictures decide: the order in which more pairs of neighbours agre
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
+from importlib.resources import files
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -36,26 +42,29 @@ import torch
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig
-from structgstream.data.alignment import aligned_points
 from structgstream.data.calibration import (
     Calibration,
     PosedCamera,
+    alignment,
     calibrated_camera,
     calibrated_rig,
+    check_names,
     intrinsics,
     rigid,
     rotation_matrix,
 )
-from structgstream.data.calibration_files.reading import calibration_of, read_array, readable
+from structgstream.data.calibration_files.reading import calibration_of, positive, read_array, readable
 from structgstream.data.camera_files import pictures_in, roots_of, videos_in
 from structgstream.data.colmap import find_model, read_model
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, common_pictures
 from structgstream.data.lenses import LensCamera, fisheye_lens, from_integer_centers
-from structgstream.data.pair_matches import PairMatcher, confirmed_share
+from structgstream.data.matching import PairMatcher, confirmed_share
 from structgstream.data.posed_capture import of_pictures, of_videos, open_posed
 from structgstream.data.source import FrameSource
-from structgstream.data.text_files import NamedFiles, mapping, number, path_parts, pixels, read_json
+from structgstream.data.text_files import NamedFiles, mapping, number, path_parts, pixels, read_json, whole
 from structgstream.data.timeline import natural
+from structgstream.data.video import VideoSource, synchronised
+from structgstream.data.video_index import scan_videos
 from structgstream.data.wrappers import resized
 from structgstream.errors import CalibrationError, CaptureError
 
@@ -289,3 +298,126 @@ def _n3dv_camera(name: str, pose: NDArray[np.float64], where: Path) -> PosedCame
     with readable(where, "3x5 poses with height, width and focal length"):
         size = pixels((width, height))
     return PosedCamera(name, rigid(rotation, -rotation @ center), intrinsics(focal, focal, width / 2, height / 2), size)
+
+
+CAMERAS_FILE = "cameras.json"
+
+
+def recognizes_json_videos(path: Path) -> bool:
+    """Whether the folder has this layout."""
+    return (path / CAMERAS_FILE).is_file()
+
+
+def open_json_videos(path: Path) -> VideoSource:
+    """The capture at ``path``.
+
+    Raises:
+        CaptureError: ``cameras.json`` or a video cannot be read, or they do not belong together.
+        CalibrationError: broken numbers.
+    """
+    file = path / CAMERAS_FILE
+    rig, fps, stated_frames = read_cameras(file)
+    videos = next(filter(None, map(videos_in, roots_of(path))), {})
+    check_names(list(rig), sorted(videos, key=natural), calibration=file, pictures=path)
+    source = synchronised(scan_videos({name: videos[name] for name in rig}), rig, where=path, fps=fps)
+    if len(source) < stated_frames:
+        raise CaptureError(
+            f"The videos of {path} share {len(source)} frames, {CAMERAS_FILE} states {stated_frames}; "
+            "copy the capture again or correct the number."
+        )
+    return source
+
+
+def read_cameras(file: Path) -> tuple[CameraRig, float | None, int]:
+    """The rig of a ``cameras.json``, its frames a second (None if not stated) and the number of frames.
+
+    Raises:
+        CalibrationError: the file cannot be read, or has broken numbers.
+    """
+    with readable(file, "width, height and cameras with K and viewmat, or w, h, fl_x, fl_y, cx, cy and cams"):
+        content = mapping(read_json(file))
+        rig = _own_rig(content, file) if "cameras" in content else _shared_intrinsics_rig(content, file)
+        return rig, positive(content, "fps") if "fps" in content else None, whole(content.get("frames", 1))
+
+
+def _own_rig(content: dict[str, Any], file: Path) -> CameraRig:
+    width, height = pixels((content["width"], content["height"]))
+    cameras = {
+        name: calibrated_camera(name, viewmat=entry["viewmat"], K=entry["K"], width=width, height=height, where=file)
+        for name, entry in mapping(content["cameras"]).items()
+    }
+    near = positive(content, "near") if "near" in content else None
+    return calibrated_rig(cameras, content.get("held_out", ()), where=file, near=near)
+
+
+def _shared_intrinsics_rig(content: dict[str, Any], file: Path) -> CameraRig:
+    K = [[content["fl_x"], 0, content["cx"]], [0, content["fl_y"], content["cy"]], [0, 0, 1]]
+    width, height = pixels((content["w"], content["h"]))
+    cameras: dict[str, Camera] = {}
+    for index, pose in enumerate(content["cams"]):
+        name = f"cam{index:02d}"
+        with readable(f"Camera {name!r} of {file}", "a pose of 4x4 numbers that can be inverted"):
+            viewmat = np.linalg.inv(np.array(pose, dtype=np.float64).reshape(4, 4))
+        cameras[name] = calibrated_camera(name, viewmat=viewmat, K=K, width=width, height=height, where=file)
+    return calibrated_rig(cameras, ("cam00",), where=file)
+
+
+def bundled_clip_path() -> Path:
+    """The folder of the bundled clip.
+
+    Raises:
+        CaptureError: the installation lacks the clip.
+    """
+    folder = Path(str(files("structgstream.data") / "clip"))
+    if not recognizes_json_videos(folder):
+        raise CaptureError("The bundled clip is missing from the installation; reinstall structgstream.")
+    return folder
+
+
+def bundled_clip() -> FrameSource:
+    """The bundled clip, as a capture."""
+    return open_json_videos(bundled_clip_path())
+
+
+MIN_COMMON = 3
+MAX_OFF = 0.03
+"""Largest residual of a camera position after alignment, as a share of the rig's extent."""
+
+
+def aligned_points(model: Calibration, rig: CameraRig) -> NDArray[np.float64] | None:
+    """The points ``[P, 3]`` of ``model`` in the coordinates of ``rig``, by the similarity that aligns its cameras.
+
+    None, with a warning, if too few cameras match by name or their positions do not agree.
+    """
+    if model.points is None:
+        return None
+    found = _common(model, rig)
+    if len(found) < MIN_COMMON:
+        log.warning(
+            "%s has %d cameras of the rig by name; its points are not used. Its pictures need the cameras' names.",
+            model.where, len(found),
+        )  # fmt: skip
+        return None
+    fitted = alignment(
+        {name: posed.viewmat for name, posed in found.items()}, {name: rig[name].viewmat.numpy() for name in found}
+    )
+    theirs = np.array([posed.center for posed in found.values()])
+    ours = np.array([rig[name].center.numpy() for name in found])
+    off = np.linalg.norm(fitted.points(theirs) - ours, axis=1).max() / np.linalg.norm(np.ptp(ours, axis=0))
+    if not off <= MAX_OFF:
+        log.warning(
+            "The cameras of %s lie up to %.0f %% of the rig's extent away from the rig's; its points are not used.",
+            model.where, 100 * off,
+        )  # fmt: skip
+        return None
+    return fitted.points(model.points)
+
+
+def _common(model: Calibration, rig: CameraRig) -> dict[str, PosedCamera]:
+    """A pose of the model for each camera of the rig whose name is a part of a picture's."""
+    found: dict[str, PosedCamera] = {}
+    for posed in model.cameras:
+        parts = PurePosixPath(posed.name).with_suffix("").parts
+        if (name := next((part for part in parts if part in rig.cameras), None)) is not None:
+            found.setdefault(name, posed)
+    return found

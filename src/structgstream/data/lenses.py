@@ -20,8 +20,8 @@ from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike
 
 from structgstream.cameras import Camera
-from structgstream.data.arrays import Floats
 from structgstream.data.text_files import Unreadable, number
+from structgstream.geometry import Floats
 
 NEWTON_STEPS = 50
 CLOSE_ENOUGH = 1e-10

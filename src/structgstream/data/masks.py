@@ -38,17 +38,11 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class CameraMasks:
-    """The mask files of one camera.
+    """The mask files of one camera."""
 
-    Args:
-        size: width and height of its stored pictures.
-        always: for all frames, or None.
-        frames: by frame number, for one.
-    """
-
-    size: tuple[int, int]
-    always: Path | None
-    frames: Mapping[int, Path]
+    size: tuple[int, int]  # width and height of its stored pictures
+    always: Path | None  # for all frames, or None
+    frames: Mapping[int, Path]  # by frame number, for one
 
 
 @dataclass(frozen=True)

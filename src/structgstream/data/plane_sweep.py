@@ -17,9 +17,9 @@ import torch
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
-from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv, reduced_mask
 from structgstream.data.matching import back_project, inside, project
+from structgstream.geometry import Floats
 from structgstream.kernels.backend import processor_backend
 
 
@@ -48,30 +48,19 @@ FloatImage = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class SweepConfig:
-    """Sampling and acceptance thresholds of the plane sweep.
+    """Sampling and acceptance thresholds of the plane sweep."""
 
-    Args:
-        width: width the pictures are reduced to, pixels.
-        planes: fewest and most planes; between them, one per pixel of disparity.
-        window: side of the correlation window, reduced pixels.
-        noise: grey-level noise (full scale 1) added to the variances, so that textureless windows correlate with none.
-        min_score: least correlation of an accepted pixel.
-        min_margin: least difference between the score of the best plane and that of any non-adjacent one.
-        agreement: largest difference to another view's depth, in planes and as a share of depth; the looser one
-            applies.
-        views: number of other views that must agree.
-        level_planes: also sweep horizontal planes, for floors and tables seen at a slant.
-    """
-
-    width: int = 240
-    planes: tuple[int, int] = (48, 128)
-    window: int = 5
+    width: int = 240  # width the pictures are reduced to, pixels
+    planes: tuple[int, int] = (48, 128)  # fewest and most planes; between them, one per pixel of disparity
+    window: int = 5  # side of the correlation window, reduced pixels
     noise: float = 0.008
-    min_score: float = 0.6
-    min_margin: float = 0.04
+    """Grey-level noise (full scale 1) added to the variances, so that textureless windows correlate with none."""
+    min_score: float = 0.6  # least correlation of an accepted pixel
+    min_margin: float = 0.04  # least difference between the score of the best plane and that of any non-adjacent one
     agreement: tuple[float, float] = (1.0, 0.01)
-    views: int = 2
-    level_planes: bool = False
+    """Largest difference to another view's depth, in planes and as a share of depth; the looser one applies."""
+    views: int = 2  # number of other views that must agree
+    level_planes: bool = False  # also sweep horizontal planes, for floors and tables seen at a slant
 
 
 # Small windows for texture and outlines, then large ones, on pictures reduced until their noise averages out, for
@@ -84,34 +73,22 @@ DEFAULT_LEVELS = (
 
 @dataclass(frozen=True)
 class SweepBounds:
-    """The range of depths that one camera sweeps.
+    """The range of depths that one camera sweeps."""
 
-    Args:
-        depth_range: nearest and farthest depth along z.
-        up: unit normal ``[3]`` of the level planes (floor, table) in the world; None sweeps no level planes.
-        heights: lowest and highest level plane, along ``up``.
-    """
-
-    depth_range: tuple[float, float]
+    depth_range: tuple[float, float]  # nearest and farthest depth along z
     up: Floats | None = None
-    heights: tuple[float, float] = (0.0, 0.0)
+    """Unit normal ``[3]`` of the level planes (floor, table) in the world; None sweeps no level planes."""
+    heights: tuple[float, float] = (0.0, 0.0)  # lowest and highest level plane, along ``up``
 
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Depth map of one camera at reduced resolution.
+    """Depth map of one camera at reduced resolution."""
 
-    Args:
-        camera: the camera at the size of the map.
-        inverse_depth: ``[H, W]`` float64, 1 / z.
-        step: distance of two planes in inverse depth.
-        believed: ``[H, W]`` mask of the pixels with a high score and a sufficient margin.
-    """
-
-    camera: Camera
-    inverse_depth: Floats
-    step: float
-    believed: NDArray[np.bool_]
+    camera: Camera  # the camera at the size of the map
+    inverse_depth: Floats  # ``[H, W]`` float64, 1 / z
+    step: float  # distance of two planes in inverse depth
+    believed: NDArray[np.bool_]  # ``[H, W]`` mask of the pixels with a high score and a sufficient margin
 
 
 @dataclass(frozen=True)
@@ -205,9 +182,6 @@ def sweep_points(
 
     A later level adds points only where earlier ones have none nearby, because large windows extend surfaces over
     outlines.
-
-    Raises:
-        MissingExtraError: cv2 is not installed.
     """
     cv2 = opencv()
     names = [name for name in cameras if neighbours[name]]

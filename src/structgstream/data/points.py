@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig, enlargement
-from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv, reduced_mask
 from structgstream.data.matching import (
     Features,
@@ -34,6 +33,7 @@ from structgstream.data.matching import (
 )
 from structgstream.data.plane_sweep import DEFAULT_LEVELS, SweepBounds, SweepConfig, sweep_points
 from structgstream.frames import MultiViewFrame
+from structgstream.geometry import Floats
 
 _log = logging.getLogger(__name__)
 
@@ -76,17 +76,11 @@ class PointsConfig:
 
 @dataclass(frozen=True)
 class InitialPoints:
-    """Points to start the first frame from.
+    """Points to start the first frame from."""
 
-    Args:
-        positions: ``[P, 3]`` float64, in the capture's units.
-        colors: ``[P, 3]`` uint8 sRGB.
-        counts: number of points from ``"sift"``, ``"sweep"`` and ``"random"``.
-    """
-
-    positions: Floats
-    colors: NDArray[np.uint8]
-    counts: Mapping[str, int]
+    positions: Floats  # ``[P, 3]`` float64, in the capture's units
+    colors: NDArray[np.uint8]  # ``[P, 3]`` uint8 sRGB
+    counts: Mapping[str, int]  # number of points from ``"sift"``, ``"sweep"`` and ``"random"``
 
     @property
     def random(self) -> bool:
@@ -102,9 +96,6 @@ def initial_points(
     Absent cameras and pixels that do not count give no points.
 
     The result does not depend on the number of threads; ``seed`` is used for random points only.
-
-    Raises:
-        MissingExtraError: cv2 is not installed.
     """
     cameras = {name: rig[name] for name in frame.showing(rig.training)}
     images, masks = {name: frame.images[name] for name in cameras}, frame.masks

@@ -41,14 +41,19 @@ from structgstream.data.camera_files import (
     unread_files,
     videos_in,
 )
-from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, common_pictures
+from structgstream.data.images import (
+    PICTURE_SUFFIXES,
+    ImageSource,
+    check_one_series,
+    common_pictures,
+    picture_size,
+    read_exif,
+)
 from structgstream.data.lenses import LensCamera
-from structgstream.data.picture_headers import check_one_series, picture_size, read_exif
-from structgstream.data.rectilinear import rectilinear
 from structgstream.data.source import FrameSource
 from structgstream.data.text_files import path_parts
 from structgstream.data.timeline import natural
-from structgstream.data.undistortion import undistort
+from structgstream.data.undistortion import rectilinear, undistort
 from structgstream.data.video import VideoSource, synchronised
 from structgstream.data.video_index import VIDEO_SUFFIXES, scan_videos
 from structgstream.errors import CalibrationError, CaptureError
@@ -76,7 +81,7 @@ def open_posed(
     Args:
         path: the folder with pictures or videos.
         calibration: its cameras.
-        target: chooses the pinhole to undistort a camera to, see :func:`~structgstream.data.rectilinear.rectilinear`.
+        target: chooses the pinhole to undistort a camera to, see :func:`~structgstream.data.undistortion.rectilinear`.
         complete: whether every video must be calibrated; else the others are left out with a warning.
         fps: frames a second of pictures; None for :data:`PICTURE_FPS`. Videos state theirs.
 
@@ -211,11 +216,7 @@ def orientations(calibration: Calibration, firsts: Mapping[str, Path]) -> dict[s
 
 
 def _orientation(file: Path, posed: PosedCamera, calibration: Calibration) -> int:
-    """The EXIF orientation by which a camera's pictures are turned: that of the pictures that were calibrated.
-
-    Raises:
-        CalibrationError: neither the calibration nor the size of the pictures decides.
-    """
+    """The EXIF orientation by which a camera's pictures are turned: that of the pictures that were calibrated."""
     orientation = read_exif(file).orientation
     if orientation == 1:
         return 1
@@ -260,9 +261,6 @@ def _poses(calibration: Calibration, cameras: Collection[str]) -> dict[str, Pose
 
     Where no name is the same, a calibrated camera's may be one of the words of a file's (``take2_cam1``), or both may
     have the same numbers (``cam_1`` and ``Camera01``), provided that every file finds its own.
-
-    Raises:
-        CalibrationError: pictures of one camera have different poses.
     """
     names = [*(posed.name for posed in calibration.cameras), *calibration.unposed]
     parts = [_parts(name) for name in names]
@@ -327,11 +325,7 @@ def _still(calibration: Calibration, names: Sequence[str | None]) -> dict[str, P
 def _check(
     poses: Mapping[str, PosedCamera], pictured: Collection[str], *, calibration: Calibration, root: Path
 ) -> None:
-    """Pictures and calibration belong together.
-
-    Raises:
-        CalibrationError: they do not.
-    """
+    """Pictures and calibration belong together."""
     if poses:
         check_names(poses, sorted(pictured, key=natural), calibration=calibration.where, pictures=root)
         used = {posed.name for posed in poses.values()}

@@ -7,8 +7,8 @@ calibrated again without touching what was filmed.
 
 import json
 import logging
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -21,9 +21,8 @@ from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import calibrated_camera, calibrated_rig
 from structgstream.data.calibration_files.reading import positive, read_array, readable
 from structgstream.data.camera_files import by_stem, files_of
-from structgstream.data.images import PICTURE_SUFFIXES, ImageSource
+from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, picture_size
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
-from structgstream.data.picture_headers import picture_size
 from structgstream.data.source import FrameSource
 from structgstream.data.text_files import Unreadable, mapping, number, pixels, read_json
 from structgstream.data.timeline import Clock, common_slots, natural, picture_slots
@@ -43,40 +42,29 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PreparedCamera:
-    """A camera of a prepared capture.
+    """A camera of a prepared capture."""
 
-    Args:
-        files: its video, or the folder of its pictures, relative to the capture.
-        filmed: pose, intrinsics, size and lens of the pictures as they are stored.
-        pinhole: what they are undistorted to; its pose is that of ``filmed``.
-        clock: from the stamps of the file to the time that all cameras share.
-    """
-
-    files: str
-    filmed: LensCamera
-    pinhole: Camera
-    clock: Clock = Clock()
+    files: str  # its video, or the folder of its pictures, relative to the capture
+    filmed: LensCamera  # pose, intrinsics, size and lens of the pictures as they are stored
+    pinhole: Camera  # what they are undistorted to; its pose is that of ``filmed``
+    clock: Clock = Clock()  # from the stamps of the file to the time that all cameras share
 
 
 @dataclass(frozen=True)
 class PreparedCapture:
-    """The content of ``capture.json``.
+    """The content of ``capture.json``."""
 
-    Args:
-        cameras: by name.
-        fps: frames a second of the common timeline.
-        near: near plane, in the capture's units.
-        unit: of poses and points; ``arbitrary`` where no length was given.
-        held_out: names of the held-out cameras.
-        points: file of points ``[P, 3]`` (``.npy``) relative to the capture, or None.
-    """
+    cameras: Mapping[str, PreparedCamera]  # by name
+    fps: float  # frames a second of the common timeline
+    near: float  # near plane, in the capture's units
+    unit: Unit = "arbitrary"  # of poses and points; ``arbitrary`` where no length was given
+    held_out: frozenset[str] = field(default_factory=frozenset)  # names of the held-out cameras
+    points: str | None = None  # file of points ``[P, 3]`` (``.npy``) relative to the capture, or None
 
-    cameras: Mapping[str, PreparedCamera]
-    fps: float
-    near: float
-    unit: Unit = "arbitrary"
-    held_out: frozenset[str] = field(default_factory=frozenset)
-    points: str | None = None
+    def only(self, names: Collection[str]) -> "PreparedCapture":
+        """These cameras, in the order of the capture, without points."""
+        cameras = {name: camera for name, camera in self.cameras.items() if name in names}
+        return replace(self, cameras=cameras, held_out=self.held_out.intersection(names), points=None)
 
 
 def recognizes_prepared(path: Path) -> bool:
@@ -146,8 +134,7 @@ def open_prepared(path: Path) -> FrameSource:
         CalibrationError: ``capture.json`` is broken, or of pictures of another size.
     """
     capture = read_prepared(path)
-    filmed = {name: camera.filmed for name, camera in capture.cameras.items()}
-    rig = _rig({name: own.camera for name, own in filmed.items()}, capture, path)
+    rig = filmed_rig(path, capture)
     files = {name: path / camera.files for name, camera in capture.cameras.items()}
     if missing := [f"{file} of camera {name!r}" for name, file in files.items() if not file.exists()]:
         raise CaptureError(f"{missing[0]} is missing; restore it, or prepare the capture again.")
@@ -158,9 +145,23 @@ def open_prepared(path: Path) -> FrameSource:
     else:
         clocks = {name: camera.clock for name, camera in capture.cameras.items()}
         source = synchronised(scan_videos(files), rig, where=path, fps=capture.fps, points=points, clocks=clocks)
-    pinholes = prepared_rig(path, capture)
-    undistorted = UndistortedSource(source, pinholes, filmed)
-    return source if all(undistorted.is_unchanged(name) for name in rig) else undistorted
+    return undistorted(source, path, capture)
+
+
+def undistorted(source: FrameSource, path: Path, capture: PreparedCapture) -> FrameSource:
+    """Pictures of :func:`filmed_rig` for the pinholes of the capture; the source itself if that changes nothing."""
+    filmed = {name: camera.filmed for name, camera in capture.cameras.items()}
+    made = UndistortedSource(source, prepared_rig(path, capture), filmed)
+    return source if all(made.is_unchanged(name) for name in filmed) else made
+
+
+def filmed_rig(path: Path, capture: PreparedCapture) -> CameraRig:
+    """The rig of the pictures before undistortion.
+
+    Raises:
+        CalibrationError: a camera to hold out is not there.
+    """
+    return _rig({name: camera.filmed.camera for name, camera in capture.cameras.items()}, capture, path)
 
 
 def prepared_rig(path: Path, capture: PreparedCapture) -> CameraRig:
@@ -226,7 +227,8 @@ def _of_folders(
 
 
 def _rig(cameras: Mapping[str, Camera], capture: PreparedCapture, path: Path) -> CameraRig:
-    return calibrated_rig(cameras, capture.held_out, where=path / FILE, near=capture.near)
+    where = file if (file := path / FILE).is_file() else path
+    return calibrated_rig(cameras, capture.held_out, where=where, near=capture.near)
 
 
 def _read_points(path: Path, capture: PreparedCapture) -> NDArray[np.float64] | None:

@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.errors import CaptureError
 from structgstream.frames import MIN_CAMERAS
+from structgstream.geometry import Floats
 
 log = logging.getLogger(__name__)
 
@@ -242,19 +242,12 @@ DUPLICATE = 0.5
 
 @dataclass(frozen=True)
 class Placed:
-    """A camera's frames on the common timeline.
+    """A camera's frames on the common timeline."""
 
-    Args:
-        slots: ``[n]`` int64, ascending: the instants that have a frame.
-        frames: ``[n]`` int64, the frame of each, counted in the video.
-        errors: ``[n]``, time of the frame minus the instant, in periods.
-        repeated: slots that two frames of one instant compete for, which regular videos do not have.
-    """
-
-    slots: NDArray[np.int64]
-    frames: NDArray[np.int64]
-    errors: Floats
-    repeated: tuple[int, ...]
+    slots: NDArray[np.int64]  # ``[n]`` int64, ascending: the instants that have a frame
+    frames: NDArray[np.int64]  # ``[n]`` int64, the frame of each, counted in the video
+    errors: Floats  # ``[n]``, time of the frame minus the instant, in periods
+    repeated: tuple[int, ...]  # slots that two frames of one instant compete for, which regular videos do not have
 
 
 def place(positions: Floats) -> Placed:

@@ -20,9 +20,8 @@ import numpy as np
 
 from structgstream.data.calibration import Calibration, PosedCamera, intrinsics
 from structgstream.data.calibration_files.reading import calibration_of, positive, readable
-from structgstream.data.images import PICTURE_SUFFIXES
+from structgstream.data.images import PICTURE_SUFFIXES, picture_size
 from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential
-from structgstream.data.picture_headers import picture_size
 from structgstream.data.posed_capture import of_pictures, open_posed
 from structgstream.data.source import FrameSource
 from structgstream.data.text_files import NamedFiles, Unreadable, mapping, number, path_parts, pixels, read_json
@@ -136,11 +135,7 @@ def _camera(name: str, frame: dict[str, Any], picture: Path, where: Path) -> Pos
 
 
 def _lens(name: str, frame: dict[str, Any], where: Path) -> Lens:
-    """The lens of a picture, whose model may be one of COLMAP's names.
-
-    Raises:
-        CalibrationError: the lens model is unknown.
-    """
+    """The lens of a picture, whose model may be one of COLMAP's names."""
     model = "OPENCV_FISHEYE" if frame.get("is_fisheye") else str(frame.get("camera_model") or "OPENCV").upper()
     k1, k2, k3, k4, p1, p2 = (number(frame.get(key) or 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     if model in FISHEYES:

@@ -27,26 +27,18 @@ class VideoSource:
     """A :class:`~structgstream.data.source.FrameSource` over one video per camera, made by :func:`synchronised`.
 
     Pictures are converted to the size that ``rig`` states.
-
-    Args:
-        name: the capture's name.
-        rig: its cameras.
-        fps: frames a second.
-        tracks: camera name to its video.
-        stamps: camera name to the time stamp, in ticks of its video, of its picture in each frame; None where it has
-            none.
-        points: ``[P, 3]`` points that came with the capture, or None.
-        apart_seconds: camera name to how long after its instant its picture of each frame was taken, ``[N]`` by its own
-            time stamps; NaN where it has none.
     """
 
-    name: str
-    rig: CameraRig
-    fps: float
-    tracks: Mapping[str, VideoTrack]
+    name: str  # the capture's name
+    rig: CameraRig  # its cameras
+    fps: float  # frames a second
+    tracks: Mapping[str, VideoTrack]  # camera name to its video
     stamps: Mapping[str, tuple[int | None, ...]]
-    points: NDArray[np.float64] | None = None
+    """Camera name to the time stamp, in ticks of its video, of its picture in each frame; None where it has none."""
+    points: NDArray[np.float64] | None = None  # ``[P, 3]`` points that came with the capture, or None
     apart_seconds: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    """Camera name to how long after its instant its picture of each frame was taken, ``[N]`` by its own time stamps;
+    NaN where it has none."""
     _reported: set[str] = field(default_factory=set, init=False, repr=False, compare=False)
 
     def __len__(self) -> int:

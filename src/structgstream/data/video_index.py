@@ -41,33 +41,19 @@ TURNS = {(1, 0, 0, 1): 0, (0, -1, 1, 0): 1, (-1, 0, 0, -1): 2, (0, 1, -1, 0): 3}
 
 @dataclass(frozen=True)
 class VideoTrack:
-    """The index of a video file.
+    """The index of a video file."""
 
-    Args:
-        path: the file.
-        stamps: presentation time of every frame, ascending, in ticks.
-        tick_seconds: length of a tick.
-        width: width of the picture as it is shown, pixels.
-        height: height of the picture as it is shown, pixels.
-        quarter_turns: counterclockwise quarter turns of the stored picture to the shown one, 0 to 3.
-        keyframes: presentation times, ascending, in ticks, of the frames that decode alone.
-        colors: what the file states of its colours, in words.
-        origin: ticks of time 0. AVI states no presentation times; its first frame is at 0.
-        container: FFmpeg's name of the container.
-        start: presentation time, in ticks, of the first picture, which may be one that does not decode.
-    """
-
-    path: Path
-    stamps: tuple[int, ...]
-    tick_seconds: float
-    width: int
-    height: int
-    quarter_turns: int = 0
-    keyframes: tuple[int, ...] = ()
-    colors: str = ""
-    origin: int = 0
-    container: str = ""
-    start: int = 0
+    path: Path  # the file
+    stamps: tuple[int, ...]  # presentation time of every frame, ascending, in ticks
+    tick_seconds: float  # length of a tick
+    width: int  # width of the picture as it is shown, pixels
+    height: int  # height of the picture as it is shown, pixels
+    quarter_turns: int = 0  # counterclockwise quarter turns of the stored picture to the shown one, 0 to 3
+    keyframes: tuple[int, ...] = ()  # presentation times, ascending, in ticks, of the frames that decode alone
+    colors: str = ""  # what the file states of its colours, in words
+    origin: int = 0  # ticks of time 0. AVI states no presentation times; its first frame is at 0
+    container: str = ""  # FFmpeg's name of the container
+    start: int = 0  # presentation time, in ticks, of the first picture, which may be one that does not decode
 
     @property
     def seconds(self) -> NDArray[np.float64]:
@@ -246,11 +232,7 @@ def _first_frame(packet: "Packet") -> "VideoFrame | None":
 
 
 def _quarter_turns(path: Path, stream: "VideoStream", frame: "VideoFrame | None") -> int:
-    """How the stored picture must be turned to be shown.
-
-    Raises:
-        CaptureError: it is mirrored, turned by another angle, or two fields.
-    """
+    """How the stored picture must be turned to be shown."""
     if stream.codec_context.field_order > PROGRESSIVE or (frame is not None and frame.interlaced_frame):
         raise CaptureError(
             f"The video {path} is interlaced: its lines are of two instants; set the camera to a progressive mode "

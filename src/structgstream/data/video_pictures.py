@@ -92,23 +92,14 @@ def _decoded(track: VideoTrack, wanted: Sequence[int], on_damage: Damage) -> Gen
 
 @dataclass
 class _Run:
-    """Decodes a file from a key frame on, or from its beginning, up to the first damage.
+    """Decodes a file from a key frame on, or from its beginning, up to the first damage."""
 
-    Args:
-        track: the video.
-        begin: time stamp of a key frame; None for the beginning.
-        expected: number of the next frame in the video's order.
-        met: whether the first frame came.
-        landed_late: whether the seek landed after the key frame, as it may without an index (MPEG-TS).
-        reason: why it ended.
-    """
-
-    track: VideoTrack
-    begin: int | None
-    expected: int = 0
-    met: bool = False
-    landed_late: bool = False
-    reason: str = "a frame is missing or broken"
+    track: VideoTrack  # the video
+    begin: int | None  # time stamp of a key frame; None for the beginning
+    expected: int = 0  # number of the next frame in the video's order
+    met: bool = False  # whether the first frame came
+    landed_late: bool = False  # whether the seek landed after the key frame, as it may without an index (MPEG-TS)
+    reason: str = "a frame is missing or broken"  # why it ended
 
     @property
     def lost(self) -> int:
@@ -168,11 +159,7 @@ def _key_before(track: VideoTrack, stamp: int) -> int | None:
 
 
 def _shown(frame: "VideoFrame", reformatter: "VideoReformatter", track: VideoTrack, size: tuple[int, int]) -> Picture:
-    """The picture as it is shown, at ``size``.
-
-    Raises:
-        CaptureError: it has another size than the video's first ones, so the calibration cannot be of both.
-    """
+    """The picture as it is shown, at ``size``."""
     turned = track.quarter_turns % 2
     width, height = (frame.height, frame.width) if turned else (frame.width, frame.height)
     if (width, height) != (track.width, track.height):

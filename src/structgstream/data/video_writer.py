@@ -30,7 +30,6 @@ class VideoWriter(AbstractContextManager["VideoWriter"]):
         crf: constant rate factor of x264; 18 is hard to tell from the source.
 
     Raises:
-        MissingExtraError: PyAV is not installed.
         StorageError: the file cannot be written, or this PyAV has no H.264 encoder.
     """
 
@@ -100,9 +99,6 @@ def bt709_frame(picture: NDArray[np.uint8], *, pixels: str = "yuv420p") -> Any:
 
     Args:
         pixels: FFmpeg's name of the pixel format.
-
-    Raises:
-        MissingExtraError: PyAV is not installed.
     """
     frame = load_av().VideoFrame.from_ndarray(picture, format="rgb24")
     frame = frame.reformat(

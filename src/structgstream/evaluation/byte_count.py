@@ -1,11 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Accounting of a stream's bytes by packet, field, kind of packet and header."""
+"""A stream's bytes by packet, field, kind of packet and header, and a plot of them."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
 
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import StreamReader
+from structgstream.figure import COLORS, INK, OTHER, figure_of, save_figure, without_frame
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
 
 REST = "the rest"
 """Bytes that belong to no field: heads of records, checksums, and the header's JSON."""
@@ -100,3 +110,114 @@ def parts_of(reader: StreamReader, rows: Sequence[Row]) -> Parts:
         if name != FIRST or group.bytes > NOTHING * reader.header_bytes:
             parts[name] = dict(group.sizes)
     return parts
+
+
+SMALL = 0.01  # fields below this share of every part are combined
+TALLEST_KEY = 3.0  # times the largest delta packet; a larger key packet is drawn cut, with its size above it
+MAX_GAPS = 150  # bars of more packets than this touch
+MAX_SIZE_LABELS = 25  # sizes are not written for more cut packets than this
+LABELLED_SHARE = 0.06  # smaller shares of a part are not labelled
+
+
+def write_byte_plot(path: Path, rows: Sequence[Row], parts: Parts, *, title: str) -> None:
+    """Bars over the frames, stacked by field, above the composition of each part of the stream.
+
+    Args:
+        path: the picture; its suffix is a format that matplotlib writes.
+        rows: all packets of the stream, at least one.
+        parts: bytes by field of its parts; the last ones determine the order of the fields.
+        title: a line above.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+        StorageError: the file cannot be written.
+    """
+    colours = field_colors(parts)
+    across = 0.34 * len(parts) + 0.3
+    figure = figure_of(10.0, 4.4 + across)
+    top, bottom = figure.subplots(2, 1, height_ratios=(3.6, across))
+    keys = _packets(top, rows, colours)
+    top.set_title(title, fontsize=11, fontweight="bold", color=INK, loc="left", pad=10)
+    _shares(bottom, parts, colours)
+    figure.legend(handles=[*_named(colours), keys], fontsize=8, frameon=False, loc="outside right upper")
+    save_figure(figure, path)
+
+
+def field_colors(parts: Parts) -> dict[str, str]:
+    """A colour for each field above :data:`SMALL`, assigned from the last part to the first, by size in each part."""
+    colours: dict[str, str] = {}
+    for sizes in reversed(parts.values()):
+        whole = sum(sizes.values())
+        for field, size in sorted(sizes.items(), key=lambda item: -item[1]):
+            if field != REST and size >= SMALL * whole and field not in colours and len(colours) < len(COLORS):
+                colours[field] = COLORS[len(colours)]
+    return {**colours, REST: OTHER}
+
+
+def _packets(axis: "Axes", rows: Sequence[Row], colours: Mapping[str, str]) -> "Artist":
+    """Draws the packets; returns the mark of key packets, for a legend."""
+    index = np.array([row.index for row in rows])
+    total = np.array([row.bytes for row in rows]) / 1000
+    key = np.array([row.kind == "key" for row in rows])
+    top = float(total.max())
+    if key.any() and not key.all() and top > TALLEST_KEY * total[~key].max():
+        top = 1.3 * float(total[~key].max())
+    cut = total > top
+    shown = np.minimum(total, top)
+    base: NDArray[np.float64] = np.zeros(len(rows))
+    # Bars that touch have an edge of their own colour, because otherwise white lines are visible between them.
+    width, edge = (0.85, 0.0) if len(rows) <= MAX_GAPS else (1.0, 0.3)
+    for field, colour in colours.items():
+        share = np.array([row.sizes.get(field, 0) / row.bytes for row in rows])
+        height = shown - base if field == REST else shown * share
+        axis.bar(index, height, bottom=base, width=width, color=colour, edgecolor=colour, linewidth=edge)
+        base = base + height
+    axis.hlines([0.93 * top] * int(cut.sum()), index[cut] - 0.6, index[cut] + 0.6, color="white", linewidth=2.5)
+    for number, size in zip(index[cut], total[cut]):
+        if cut.sum() <= MAX_SIZE_LABELS:
+            axis.annotate(
+                f"{size:,.0f}", (number, 1.04 * top), xytext=(6, 0), textcoords="offset points",
+                fontsize=8, color=INK, va="center",
+            )  # fmt: skip
+    (keys,) = axis.plot(
+        index[key], shown[key] + 0.04 * top, "v", color=INK, markersize=5.5,
+        label="key packet, cut (kB)" if cut.any() else "key packet",
+    )  # fmt: skip
+    axis.set_ylim(0, 1.1 * top)
+    axis.set_xlim(index[0] - 0.7, index[-1] + 0.7)
+    axis.locator_params(axis="x", integer=True)
+    axis.set_ylabel("kB a packet", fontsize=9)
+    axis.set_xlabel("frame", fontsize=9)
+    without_frame(axis)
+    return keys
+
+
+def _shares(axis: "Axes", parts: Parts, colours: Mapping[str, str]) -> None:
+    """A horizontal bar for each part, all of equal length."""
+    for row, sizes in enumerate(parts.values()):
+        whole, base = sum(sizes.values()), 0.0
+        for field, colour in colours.items():
+            share = 1.0 - base if field == REST else sizes.get(field, 0.0) / whole
+            axis.barh(row, share, left=base, height=0.72, color=colour)
+            if share >= LABELLED_SHARE:
+                ink = INK if _bright(colour) else "white"
+                axis.text(base + share / 2, row, f"{share:.0%}", fontsize=8, color=ink, ha="center", va="center")
+            base += share
+    labels = [f"{name}\n{sum(sizes.values()) / 1000:,.1f} kB" for name, sizes in parts.items()]
+    axis.set_yticks(range(len(parts)), labels)
+    axis.invert_yaxis()
+    axis.set_xlim(0, 1)
+    axis.set_xticks([])
+    axis.spines[:].set_visible(False)
+    axis.tick_params(labelsize=8, length=0)
+
+
+def _named(colours: Mapping[str, str]) -> "list[Artist]":
+    from matplotlib.patches import Patch
+
+    return [Patch(color=colour, label=field.replace("_", " ")) for field, colour in colours.items()]
+
+
+def _bright(colour: str) -> bool:
+    red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
+    return 0.299 * red + 0.587 * green + 0.114 * blue > 140

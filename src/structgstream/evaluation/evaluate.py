@@ -16,7 +16,6 @@ from structgstream.codec.packets import PacketKind
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import select_cameras
 from structgstream.errors import CaptureError
-from structgstream.evaluation.affine import ChannelFit, channel_fit
 from structgstream.evaluation.environment import environment
 from structgstream.evaluation.facts import (
     check_same_frames,
@@ -27,7 +26,7 @@ from structgstream.evaluation.facts import (
     training_facts,
 )
 from structgstream.evaluation.ghosts import Ghosts, GhostSearch
-from structgstream.evaluation.metrics import blackened, both
+from structgstream.evaluation.metrics import ChannelFit, Mask, Picture, blackened, both, channel_fit, counting, score
 from structgstream.evaluation.optional_metrics import (
     OF_WHOLE_PICTURES,
     ComparedFrame,
@@ -38,9 +37,7 @@ from structgstream.evaluation.optional_metrics import (
 )
 from structgstream.evaluation.recording import Drawable, Recording, to_device
 from structgstream.evaluation.report import FrameScores, Report, Scores, drawing_facts, mean_scores, psnr_trend
-from structgstream.evaluation.scoring import Mask, Picture, counting, score
 from structgstream.evaluation.sizes import StoredSize, half_scores, halved, stored_size
-from structgstream.evaluation.temporal import Flow
 from structgstream.evaluation.worst import worst_facts
 from structgstream.kernels.backend import Backend
 from structgstream.memory import PeakMeter
@@ -86,7 +83,6 @@ def evaluate(
     log: Mapping[int, Mapping[str, Any]] | None = None,
     observer: Observer | None = None,
     metrics: MetricSelection = "all",
-    flow: Flow | None = None,
     lpips_weights: Path | None = None,
     stored: FrameSource | None = None,
 ) -> Report:
@@ -100,7 +96,6 @@ def evaluate(
         log: the trainer's log by frame number (``run_log.read_log``).
         observer: called with frame number and comparison for every picture.
         metrics: "basic" leaves out the metrics that take longer than rendering: MS-SSIM, FLIP, LPIPS, temporal ones.
-        flow: exact flow to the frame before, if the capture has it; None estimates it.
         lpips_weights: folder or file with the weights of LPIPS (``lpips.py``, Note [Weights]).
         stored: the same frames at the capture's own, larger size (``capture.stored_capture``); None to leave out these
             scores.
@@ -118,7 +113,7 @@ def evaluate(
     optional_metrics = None
     if metrics == "all":
         optional_metrics = load_optional_metrics(
-            views.items(), frames=len(recording.packets), device=backend.device, flow=flow, lpips_weights=lpips_weights
+            views.items(), frames=len(recording.packets), device=backend.device, lpips_weights=lpips_weights
         )
     size = len(recording.packets)
     selected = select_cameras(source, names)

@@ -3,23 +3,11 @@
 
 Note [Ghosts]
 ~~~~~~~~~~~~~
-The truth alone determines where a ghost may be. Its *background* is the median, pixel by pixel, of at most 15 pictures
-that are spread over ten seconds. A pixel is *occupied* while the truth differs from the background by more than 20
-levels, and *disoccluded* if
-
-- a pixel within 1.9 % of the picture's longer side was occupied in an earlier frame of the last two seconds (at least
-  12 frames),
-- no pixel within 0.9 % of that side is occupied now, and
-- the truth is within 8 levels of the background.
-
-A disoccluded pixel is a *ghost* if the rendering differs from the truth by more than 8 levels and was not wrong before.
-If the pixel was visible before it was occupied, the rendering must also differ from the rendering of that time by more
-than 8 levels. Otherwise, for example behind an object of the first frame, the error must contain at least a quarter of
-the colour of the object that was there. Ghosts into which no square of 0.8 % of the side fits are left out, because
-they are slightly displaced outlines. A ghost counts in every frame in which it is visible.
-
-Differences of pictures are means over the channels and 3x3 pixels. Pictures whose longer side has 1280 pixels or more
-are reduced first, by a whole factor and by area mean, to 640 to 1279, so that size does not change the score.
+The truth alone determines where a ghost may be: pixels that an object *occupied*, in difference to the median of the
+pictures, and that are *disoccluded* now. Such a pixel is a *ghost* if the rendering is wrong there and was not wrong
+before; where nothing was visible before, the error must contain a part of the object's colour. ``docs/evaluation.md``
+has the definition with its numbers. Ghosts into which no small square fits are left out, because they are slightly
+displaced outlines. Large pictures are reduced first, so that size does not change the score.
 """
 
 from collections.abc import Iterator, Mapping
@@ -30,11 +18,17 @@ from numpy.typing import NDArray
 
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import every_nth_frame, section
-from structgstream.evaluation.metrics import blackened, decibels, differing, dilate, mean_of_squares, squared_errors
+from structgstream.evaluation.metrics import (
+    Mask,
+    Picture,
+    blackened,
+    decibels,
+    differing,
+    dilate,
+    mean_of_squares,
+    squared_errors,
+)
 from structgstream.evaluation.sizes import block_mask, block_means
-
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 OCCUPIED, RESTORED, WRONG = 20, 8, 8  # levels of 255; noise of cameras and compression is 2 to 4 after the 3x3 mean
 REACH, MARGIN = 12 / 640, 6 / 640  # shares of the longer side: soft edges, and shadows next to moving objects

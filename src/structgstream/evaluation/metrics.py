@@ -1,14 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""PSNR, SSIM and MS-SSIM of a rendering against the camera's picture, and the masks of the pixels that they count.
+"""Scores of a picture: PSNR, SSIM and MS-SSIM against the camera's picture, over the pixels that masks count.
 
-All metrics compare 8-bit pictures: a rendering is clamped and rounded first, as it is displayed.
-Definitions, and how they relate to those of other projects: ``docs/evaluation.md``.
+All metrics compare 8-bit pictures: a rendering is clamped and rounded first, as it is displayed. Definitions, and how
+they relate to those of other projects: ``docs/evaluation.md``.
 
 In typical captures nine of ten pixels are static, so a mean over all pixels hides the quality of moving parts. Masks of
 changed pixels are computed from the camera's pictures, never from renderings.
+
+A held-out camera's exposure and white balance are unknown in training, so a part of its error is unrelated to the
+scene. The best affine colour transform, fitted to the scored picture itself, bounds that part. It uses the ground
+truth, so it is never the main result; reports label it ``psnr_affine``.
+
+Note [Colour of a camera]
+~~~~~~~~~~~~~~~~~~~~~~~~~
+A camera's colour response is constant over time. So ``psnr_camera_color`` fits a gain and a bias per channel to the
+camera's first frame, as training does for its cameras (``scene/color.py``), and uses them for all later frames, as if
+the camera had been colour-calibrated once. Changing light and local colour errors still count; a fit per frame, or one
+that mixes channels, would hide them.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,28 +29,32 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d
 
 from structgstream.cameras import enlargement
+from structgstream.errors import CaptureError
+from structgstream.evaluation.report import Scores
 from structgstream.kernels.backend import Backend
 
+Picture = NDArray[np.uint8]
+"""``[H, W, 3]`` sRGB."""
+Mask = NDArray[np.bool_]
+"""``[H, W]``."""
 THRESHOLD = 0.1  # of full scale
 SMOOTHED = 1  # half width, pixels, of a 3x3 mean against noise, which does not depend on the picture's size
 REACH_PIXELS = 3  # of the dilation, which includes edges; multiplied by the picture's enlargement
 
 
-def blackened(picture: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
+def blackened(picture: Picture, mask: Mask | None) -> Picture:
     """``picture`` ``[H, W, 3]``, black where the mask ``[H, W]`` is False; unchanged without a mask."""
     return picture if mask is None else np.where(mask[..., None], picture, np.uint8(0))
 
 
-def both(mask: NDArray[np.bool_] | None, other: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+def both(mask: Mask | None, other: Mask | None) -> Mask | None:
     """Pixels of both masks; None for all."""
     if mask is None or other is None:
         return other if mask is None else mask
     return mask & other
 
 
-def changed_pixels(
-    truth: NDArray[np.uint8], first: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
-) -> NDArray[np.bool_]:
+def changed_pixels(truth: Picture, first: Picture, mask: Mask | None = None) -> Mask:
     """Dilated mask ``[H, W]`` of the pixels that changed since the camera's first picture.
 
     The absolute difference of the two pictures ``[H, W, 3]``, averaged over channels and 3x3 pixels, is thresholded at
@@ -52,7 +68,7 @@ def changed_pixels(
     return dilate(differing(truth, first, THRESHOLD * 255), reach)
 
 
-def differing(one: NDArray[np.uint8], other: NDArray[np.uint8], levels: float) -> NDArray[np.bool_]:
+def differing(one: Picture, other: Picture, levels: float) -> Mask:
     """Mask ``[H, W]`` of the pixels where two pictures ``[H, W, 3]`` differ by more than ``levels`` of 255.
 
     The absolute difference is averaged over channels and 3x3 pixels.
@@ -68,12 +84,12 @@ def differing(one: NDArray[np.uint8], other: NDArray[np.uint8], levels: float) -
     return total > levels * (3 * size**2)
 
 
-def dilate(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
+def dilate(mask: Mask, pixels: int) -> Mask:
     """``mask`` ``[H, W]`` dilated by a square that reaches ``pixels`` to each side."""
     return _dilate_down(_dilate_down(mask, pixels).T, pixels).T
 
 
-def _dilate_down(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
+def _dilate_down(mask: Mask, pixels: int) -> Mask:
     result = mask.copy()
     for step in range(1, pixels + 1):
         result[step:] |= mask[:-step]
@@ -88,7 +104,7 @@ SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)  # exponents of MS-SSIM, fines
 SMALLEST_OF_SCALES = (WINDOW - 1) * 2 ** (len(SCALES) - 1) + 1  # pixels: the window fits five times halved pictures
 
 
-def squared_errors(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArray[np.int32]:
+def squared_errors(picture: Picture, truth: Picture) -> NDArray[np.int32]:
     """Squared difference of two 8-bit pictures ``[H, W, 3]``, summed over channels, ``[H, W]``, exactly."""
     squares = np.square(np.subtract(picture, truth, dtype=np.int16), dtype=np.int32)
     return squares[..., 0] + squares[..., 1] + squares[..., 2]  # many times faster than a sum over so short an axis
@@ -104,13 +120,13 @@ def decibels(error: float) -> float:
     return -10.0 * math.log10(error) if error > 0.0 else PSNR_OF_EQUALS
 
 
-def psnr(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:
+def psnr(picture: Picture, truth: Picture) -> float:
     """Peak signal-to-noise ratio of two 8-bit pictures ``[H, W, 3]``, dB, over all pixels and channels."""
     errors = squared_errors(picture, truth)
     return decibels(mean_of_squares(int(errors.sum(dtype=np.int64)), errors.size))
 
 
-def ssim_map(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Tensor:
+def ssim_map(picture: Picture, truth: Picture) -> Tensor:
     """Structural similarity of every pixel and channel, ``[3, H, W]`` (Wang et al., 2004).
 
     Gaussian window of 11 pixels, sigma 1.5; K1 = 0.01, K2 = 0.03, weighted (biased) moments, zeros beyond the
@@ -120,7 +136,7 @@ def ssim_map(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Tensor:
     return luminance * structure
 
 
-def _channels(*pictures: NDArray[np.uint8]) -> tuple[Tensor, ...]:
+def _channels(*pictures: Picture) -> tuple[Tensor, ...]:
     """8-bit pictures as ``[3, H, W]`` in [0, 1]."""
     return tuple(torch.from_numpy(np.ascontiguousarray(p)).permute(2, 0, 1) / 255.0 for p in pictures)
 
@@ -140,7 +156,7 @@ def _similarity(a: Tensor, b: Tensor, *, padding: int) -> tuple[Tensor, Tensor]:
     return luminance, (2 * covariance + C2) / (variances + C2)
 
 
-def ms_ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float | None:
+def ms_ssim(picture: Picture, truth: Picture) -> float | None:
     """Structural similarity over five scales (Wang et al., 2003), averaged over channels; None for small pictures.
 
     Windows and constants as in :func:`ssim_map`, without padding. Each scale averages 2x2 pixels of the one before; an
@@ -160,7 +176,7 @@ def ms_ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float | Non
     return float(product.mean())
 
 
-def masked_ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8], mask: NDArray[np.bool_]) -> float:
+def masked_ssim(picture: Picture, truth: Picture, mask: Mask) -> float:
     """Mean of :func:`ssim_map` over the pixels of ``mask`` ``[H, W]``, of pictures that are black in the others.
 
     A pixel outside the mask is therefore treated as one beyond the border.
@@ -168,7 +184,7 @@ def masked_ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8], mask: NDAr
     return float(ssim_map(picture, truth)[:, torch.from_numpy(mask)].mean())
 
 
-def ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8], backend: Backend) -> float:
+def ssim(picture: Picture, truth: Picture, backend: Backend) -> float:
     """Mean of :func:`ssim_map` over pixels and channels, as Gaussian splatting papers report it.
 
     On real pictures all back-ends agree within 1e-5; the C++ one is the nearest to float64.
@@ -177,3 +193,144 @@ def ssim(picture: NDArray[np.uint8], truth: NDArray[np.uint8], backend: Backend)
     image, target = (torch.from_numpy(np.ascontiguousarray(p)).to(device) for p in (picture, truth))
     with torch.no_grad():
         return float(backend.l1_ssim(image / 255.0, target)[1])
+
+
+CHUNK = 256  # pixels whose products of bytes can be added exactly in float32
+
+
+def psnr_affine(picture: Picture, truth: Picture) -> float:
+    """PSNR of ``picture`` after its best affine change of colour towards ``truth``, dB."""
+    planes = _planes(picture, truth)
+    pixels = truth.size // 3
+    difference = _apply_matrix(planes[:4], _fit_matrix(planes))[:, :pixels] - planes[4:].flatten(1)[:, :pixels]
+    return decibels(float(difference.square_().sum(dtype=torch.float64)) / (255.0**2 * truth.size))
+
+
+@dataclass(frozen=True)
+class ChannelFit:
+    """A camera's colour response, ``gain * rendering + bias`` per channel (Note [Colour of a camera]).
+
+    Args:
+        gains: gain of red, green and blue.
+        biases: bias of red, green and blue, full scale 1.
+    """
+
+    gains: tuple[float, float, float]
+    biases: tuple[float, float, float]
+
+
+def channel_fit(picture: Picture, truth: Picture) -> ChannelFit:
+    """The gain and bias of each channel that minimize the squared error of ``picture`` against ``truth``.
+
+    Both are ``[H, W, 3]`` uint8. A constant channel gets gain 1, because it does not determine one.
+    """
+    pairs = [_fit_line(picture[..., channel], truth[..., channel]) for channel in range(3)]
+    (r, g, b), biases = zip(*pairs, strict=True)
+    return ChannelFit((r, g, b), biases)
+
+
+def _fit_line(values: Picture, targets: Picture) -> tuple[float, float]:
+    x, y = values.astype(np.float64), targets.astype(np.float64)
+    mean_x, mean_y = float(x.mean()), float(y.mean())
+    x -= mean_x
+    variance = float(np.square(x).sum())
+    gain = float((x * (y - mean_y)).sum()) / variance if variance > 0.0 else 1.0
+    return gain, (mean_y - gain * mean_x) / 255.0
+
+
+def psnr_camera_color(picture: Picture, truth: Picture, fit: ChannelFit) -> float:
+    """PSNR, dB, of ``picture`` corrected by ``fit`` and clamped, not rounded."""
+    levels = np.arange(256, dtype=np.float64)
+    total = 0.0
+    for channel, (gain, bias) in enumerate(zip(fit.gains, fit.biases, strict=True)):
+        table = np.clip(gain * levels + 255.0 * bias, 0.0, 255.0).astype(np.float32)
+        difference = table[picture[..., channel]] - truth[..., channel]
+        total += float(np.square(difference).sum(dtype=np.float64))
+    return decibels(total / (255.0**2 * truth.size))
+
+
+def _planes(*pictures: Picture) -> Tensor:
+    """A plane of ones, then the channels of the pictures: ``[1 + 3 n, chunks, CHUNK]`` float32, zero-padded.
+
+    Computed with torch, because the spinning threads of NumPy's BLAS slowed the next rendering by half (2 cores).
+    """
+    pixels = pictures[0].size // 3
+    planes = np.zeros((1 + 3 * len(pictures), -(-pixels // CHUNK) * CHUNK), np.float32)
+    planes[0, :pixels] = 1.0
+    for i, picture in enumerate(pictures):
+        for channel in range(3):
+            planes[1 + 3 * i + channel, :pixels] = picture[..., channel].ravel()
+    return torch.from_numpy(planes).reshape(len(planes), -1, CHUNK)
+
+
+def _fit_matrix(planes: Tensor) -> NDArray[np.float64]:
+    # The normal equations are 4x4, so the fit costs one pass over the pixels.
+    products = (planes.transpose(0, 1) @ planes.permute(1, 2, 0)).sum(0, dtype=torch.float64)  # [7, 7]
+    scale = torch.tensor([1.0] + 6 * [255.0], dtype=torch.float64)
+    products = (products / (scale[:, None] * scale)).numpy()
+    solution = np.linalg.lstsq(products[:4, :4], products[:4, 4:], rcond=None)[0].T
+    return np.roll(solution, -1, axis=1).astype(np.float64)  # the ones come last in the matrix
+
+
+def _apply_matrix(planes: Tensor, matrix: NDArray[np.float64]) -> Tensor:
+    """The first four planes through a 3x4 matrix, ``[3, pixels]``, 0 to 255, clamped."""
+    scaled = torch.from_numpy(np.roll(matrix * [1.0, 1.0, 1.0, 255.0], 1, axis=1)).float()
+    return (scaled @ planes.flatten(1)).clamp_(0.0, 255.0)
+
+
+def score(
+    picture: Picture,
+    truth: Picture,
+    first: Picture,
+    *,
+    backend: Backend,
+    seconds: float = 0.0,
+    color: ChannelFit | None = None,
+    mask: Mask | None = None,
+    first_mask: Mask | None = None,
+) -> Scores:
+    """The scores of a rendering against ``truth``.
+
+    Args:
+        picture: the rendering.
+        truth: the camera's picture.
+        first: the camera's picture of frame 0.
+        backend: computes SSIM.
+        seconds: duration of the rendering.
+        color: the camera's colour response, fitted to frame 0; None to leave out that score.
+        mask: ``[H, W]`` bool, the pixels that count; None for all. Pictures are black in the others.
+        first_mask: mask of ``first``.
+
+    Raises:
+        CaptureError: the pictures have different sizes.
+    """
+    for other, what in ((truth, "truth"), (first, "truth of frame 0")):
+        if picture.shape != other.shape:
+            raise CaptureError(
+                f"A rendering of {picture.shape[1]}x{picture.shape[0]} pixels cannot be scored against a {what} of "
+                f"{other.shape[1]}x{other.shape[0]}; open the capture at the scale of the reconstruction."
+            )
+    errors, changed = squared_errors(picture, truth), changed_pixels(truth, first, both(mask, first_mask))
+    ssim_score = ssim(picture, truth, backend) if mask is None else masked_ssim(picture, truth, mask)
+    if mask is not None:
+        errors, changed = errors[mask], changed[mask]
+        picture, truth = counting(mask, picture, truth)
+    total, moving = int(errors.sum(dtype=np.int64)), int(np.count_nonzero(changed))
+    in_changed = int(np.sum(errors, where=changed, dtype=np.int64))
+    return Scores(
+        psnr=decibels(mean_of_squares(total, errors.size)),
+        ssim=ssim_score,
+        psnr_affine=psnr_affine(picture, truth),
+        psnr_changed=decibels(mean_of_squares(in_changed, moving)) if moving else None,
+        psnr_still=decibels(mean_of_squares(total - in_changed, errors.size - moving))
+        if moving < errors.size
+        else None,
+        changed_share=moving / errors.size,
+        render_seconds=seconds,
+        psnr_camera_color=None if color is None else psnr_camera_color(picture, truth, color),
+    )
+
+
+def counting(mask: Mask | None, *pictures: Picture) -> tuple[Picture, ...]:
+    """The pixels of each picture ``[H, W, 3]`` that count, as a picture ``[P, 1, 3]``; unchanged without a mask."""
+    return pictures if mask is None else tuple(picture[mask][:, None] for picture in pictures)

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Metrics with requirements: an optional package, weights, or the previous frame.
 
-If a requirement is missing, the metric is None, and the reason and its remedy are reported once.
+If a requirement is missing, the metric is None, and the reason and its remedy are reported once. Temporal metrics
+compare consecutive frames of one camera by the optical flow between them; synthetic captures may provide exact flow:
+any :data:`Flow`.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -17,12 +19,78 @@ from structgstream.cameras import Camera
 from structgstream.errors import MissingExtraError
 from structgstream.evaluation.flip import FlipFeatures, features_of, flip_of, opencv
 from structgstream.evaluation.lpips import ALEX, TRUNKS, VGG, Features, Lpips, how_to_get, load_lpips, weights_file
-from structgstream.evaluation.metrics import SMALLEST_OF_SCALES, both, changed_pixels, ms_ssim
-from structgstream.evaluation.temporal import Flow, FlowField, difference_of_change, dis_flow, flicker, warping_error
-from structgstream.flow import sampled
+from structgstream.evaluation.metrics import SMALLEST_OF_SCALES, Mask, Picture, both, changed_pixels, ms_ssim
+from structgstream.flow import consistency_mask, dis_search, sampled
 
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
+
+@dataclass(frozen=True)
+class FlowField:
+    """Backward flow of one frame.
+
+    Args:
+        offsets: ``[H, W, 2]`` float32, x and y in pixels: pixel ``p`` was at ``p + offsets[p]`` in the frame before.
+        seen: ``[H, W]`` mask of the pixels that were not occluded in the frame before.
+    """
+
+    offsets: NDArray[np.float32]
+    seen: Mask
+
+
+Flow = Callable[[Picture, Picture, str, int], FlowField]
+"""From truth of the previous frame, truth of this frame, camera name and frame number to this frame's flow field."""
+
+
+def dis_flow() -> Flow:
+    """Flow by dense inverse search in both directions; consistent pixels (``flow.consistency_mask``) count as seen.
+
+    Raises:
+        MissingExtraError: OpenCV is not installed.
+    """
+    search = dis_search("eval")
+
+    def field(before: Picture, now: Picture, camera: str, index: int) -> FlowField:
+        backward = search(now, before)
+        return FlowField(backward, consistency_mask(backward, search(before, now)))
+
+    return field
+
+
+def warping_error(now: Picture, before: Picture, field: FlowField) -> float | None:
+    """E_warp of one pair: the mean squared difference of a rendering and the warped previous rendering.
+
+    ``before`` is warped by the truth's backward flow; the mean is over channels and over the pixels that were not
+    occluded. Pictures are ``[H, W, 3]`` uint8, full scale 1. None if all pixels were occluded.
+
+    Source: Lai et al., 2018, whose sum over channels is a mean here.
+    """
+    if not field.seen.any():
+        return None
+    carried = sampled(before.astype(np.float32), field.offsets)
+    squares = np.square(carried - now)[field.seen]
+    return float(squares.mean(dtype=np.float64)) / 255.0**2
+
+
+def difference_of_change(rendered: float, true: float) -> float:
+    """Difference between the frame-to-frame change of rendering and truth, both by the same picture distance.
+
+    With LPIPS this is tLP (Chu et al., 2020): ``|LPIPS(r_t, r_{t-1}) - LPIPS(g_t, g_{t-1})|``.
+    """
+    return abs(rendered - true)
+
+
+def flicker(now: Picture, before: Picture, still: Mask) -> float | None:
+    """Mean absolute difference of two consecutive pictures over the static pixels ``still`` ``[H, W]``, in levels of
+    1/255.
+
+    None without static pixels.
+    """
+    count = int(np.count_nonzero(still))
+    if not count:
+        return None
+    difference = np.abs(np.subtract(now, before, dtype=np.int16)).sum(2, dtype=np.int32)
+    return int(np.sum(difference, where=still, dtype=np.int64)) / (3 * count)
+
+
 MetricSelection = Literal["all", "basic"]
 """All metrics, or only the cheap ones of two pictures: PSNR and its variants, and SSIM."""
 
@@ -68,7 +136,6 @@ def load_optional_metrics(
     *,
     frames: int,
     device: torch.device,
-    flow: Flow | None = None,
     lpips_weights: Path | None = None,
 ) -> OptionalMetrics:
     """The metrics that are available here for these cameras (by name) and this number of frames.
@@ -77,7 +144,6 @@ def load_optional_metrics(
         cameras: the scored cameras; a metric that needs larger pictures than one of them has is left out.
         frames: number of frames; temporal metrics need two.
         device: device that computes LPIPS.
-        flow: exact flow; None estimates it.
         lpips_weights: folder or file with the trunks' weights (``lpips.py``, Note [Weights]).
 
     Raises:
@@ -90,11 +156,11 @@ def load_optional_metrics(
         measure = features_of
     except MissingExtraError as error:
         missing |= dict.fromkeys(("flip", "temporal_flip"), str(error))
-    if flow is None:
-        try:
-            flow = dis_flow()
-        except MissingExtraError as error:
-            missing["e_warp"] = str(error)
+    flow = None
+    try:
+        flow = dis_flow()
+    except MissingExtraError as error:
+        missing["e_warp"] = str(error)
     sides = {name: min(camera.width, camera.height) for name, camera in cameras}
     found: dict[str, Lpips] = {}
     weights: dict[str, str] = {}

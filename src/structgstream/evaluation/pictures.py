@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from structgstream.atomic_files import atomic_write
 from structgstream.errors import MissingExtraError
+from structgstream.evaluation.metrics import Picture
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 RGB, FILTER_UP = 2, 2
 
 
-def png_bytes(picture: NDArray[np.uint8]) -> bytes:
+def png_bytes(picture: Picture) -> bytes:
     """``picture`` ``[H, W, 3]`` as a PNG file: 8-bit sRGB, every row as its difference from the one above."""
     height, width, _ = picture.shape
     rows = picture.reshape(height, width * 3)
@@ -35,7 +35,7 @@ def png_bytes(picture: NDArray[np.uint8]) -> bytes:
     return SIGNATURE + b"".join(_chunk(kind, body) for kind, body in parts)
 
 
-def write_png(path: Path, picture: NDArray[np.uint8]) -> None:
+def write_png(path: Path, picture: Picture) -> None:
     """Writes ``picture`` ``[H, W, 3]`` atomically; creates the folder if it is missing.
 
     Raises:
@@ -48,7 +48,6 @@ def _chunk(kind: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
 
-Picture = NDArray[np.uint8]
 DIFFERENCE_GAIN = 4
 GAP, MARGIN, LABEL = 4, 12, 26  # pixels
 LARGEST_TILE = 400  # pixels across

@@ -14,37 +14,11 @@ from structgstream.atomic_files import atomic_write
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores of one picture, or their mean over several.
+    """Scores of one picture, or their mean over several, as ``docs/evaluation.md`` defines them.
 
-    Args:
-        psnr: dB, the main result.
-        ssim: see ``metrics.ssim``.
-        psnr_affine: dB after the best affine change of colour towards the truth (``affine.py``).
-        psnr_camera_color: dB after a gain and a bias per channel, fitted to the camera's first frame (``affine.py``,
-            Note [Colour of a camera]); None without a fit.
-        psnr_changed: dB over the pixels that changed since the camera's first picture; None without any.
-        psnr_still: dB over the other, static pixels; None without any.
-        changed_share: share of the pixels that changed.
-        render_seconds: wall-clock time of the rendering, the picture in main memory.
-        ms_ssim: see ``metrics.ms_ssim``. This and the following scores are None if not requested or not available;
-            ``stream["not_available"]`` has the reason.
-        flip: mean LDR-FLIP (``flip.py``).
-        lpips_alex: LPIPS with AlexNet (``lpips.py``).
-        lpips_vgg: LPIPS with VGG16.
-        e_warp: squared warping error (``temporal.py``). This and the following scores compare consecutive frames, so
-            they are None in frame 0.
-        temporal_flip: difference between the change from the previous frame by FLIP, of rendering and truth.
-        t_lpips: the same by LPIPS with AlexNet.
-        flicker: mean absolute change of the rendering where the truth did not change, in levels of 1/255.
-        truth_flicker: that of the truth: the camera's noise.
-        psnr_half: dB of a rendering at half size (``sizes.py``); None for pictures of one row or column.
-        ssim_half: SSIM of it.
-        psnr_stored: dB of a rendering at the size of the stored pictures, if those are larger than the stream's; None
-            otherwise, and in frames that are not scored at this size.
-        ssim_stored: SSIM of it.
-        disoccluded_share: share of disoccluded pixels (``ghosts.py``, Note [Ghosts]).
-        ghost_share: share of ghosts among the disoccluded pixels. This and the next are None without any of them.
-        psnr_disoccluded: dB over these pixels.
+    Those without pixels, without a fit of the camera's colour (``psnr_camera_color``), not requested or not available
+    are None; ``stream["not_available"]`` has the reason. ``e_warp``, ``temporal_flip``, ``t_lpips``, ``flicker`` and
+    ``truth_flicker`` compare consecutive frames, so they are None in frame 0.
     """
 
     psnr: float

@@ -6,20 +6,25 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import select_cameras
 from structgstream.errors import CaptureError
-from structgstream.evaluation.metrics import blackened, decibels, masked_ssim, mean_of_squares, squared_errors, ssim
+from structgstream.evaluation.metrics import (
+    Mask,
+    Picture,
+    blackened,
+    decibels,
+    masked_ssim,
+    mean_of_squares,
+    squared_errors,
+    ssim,
+)
 from structgstream.evaluation.pictures import spread_indices
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.scene.render import Drawable, render, to_8bit_image
-
-Picture = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 STORED_FRAMES, STORED_SHARE = 5, 4
 """At most five frames, and at most one in four, are scored at the stored size: twice the size has four times the

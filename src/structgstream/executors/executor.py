@@ -1,59 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The protocol of executors, which callers use, the protocol of engines, and the task queue between them."""
+"""The task queue, the protocol of the engines that run its tasks, and the engines by name."""
 
 from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
-from types import TracebackType
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol
 
 from structgstream.errors import ConfigError
-from structgstream.executors.task import Task, TaskResult
-
-
-class Executor(Protocol):
-    """Runs each task as soon as its dependencies are done. The end of a ``with`` block stops running tasks."""
-
-    def submit(self, task: Task, *, after: Iterable[str] = (), gpus: int = 0) -> None:
-        """Adds a task, which is started in :meth:`wait`.
-
-        Args:
-            task: a task with a unique name.
-            after: names of tasks that must succeed first; they may be submitted later.
-            gpus: number of GPUs that it needs, 0 or 1.
-
-        Raises:
-            ConfigError: the name is taken, or there is no GPU.
-        """
-        ...
-
-    def finished(self, name: str) -> None:
-        """Marks a task as done that was not submitted, for the tasks that depend on it."""
-        ...
-
-    def wait(self, seconds: float) -> Sequence[TaskResult]:
-        """Starts tasks that are ready, waits up to ``seconds`` for a task to end, and returns the results."""
-        ...
-
-    @property
-    def running(self) -> Sequence[str]:
-        """Names of the tasks that the engine runs."""
-        ...
-
-    @property
-    def waiting(self) -> Sequence[str]:
-        """Names of the tasks that have not started; if none is running, they depend on a failed task."""
-        ...
-
-    def close(self) -> None:
-        """Stops running tasks."""
-        ...
-
-    def __enter__(self) -> "Executor": ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
+from structgstream.executors.local import LocalEngine
+from structgstream.executors.task import Task, TaskResult, allocate_slots
 
 
 class Engine(Protocol):
@@ -95,7 +50,7 @@ class Engine(Protocol):
 
 
 class TaskQueue:
-    """An :class:`Executor` on top of an engine: resolves dependencies, orders tasks and restarts killed ones.
+    """Runs each task on an engine as soon as its dependencies are done, and restarts killed ones.
 
     Tasks are started in the order in which they become ready; among equals, those submitted earlier first.
     """
@@ -113,23 +68,30 @@ class TaskQueue:
     def __enter__(self) -> "TaskQueue":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self.close()
 
     @property
     def running(self) -> Sequence[str]:
-        """See :meth:`Executor.running`."""
+        """Names of the tasks that the engine runs."""
         return tuple(self._running)
 
     @property
     def waiting(self) -> Sequence[str]:
-        """See :meth:`Executor.waiting`."""
+        """Names of the tasks that have not started; if none is running, they depend on a failed task."""
         return tuple(name for name in self._tasks if name not in self._running)
 
     def submit(self, task: Task, *, after: Iterable[str] = (), gpus: int = 0) -> None:
-        """See :meth:`Executor.submit`."""
+        """Adds a task, which is started in :meth:`wait`.
+
+        Args:
+            task: a task with a unique name.
+            after: names of tasks that must succeed first; they may be submitted later.
+            gpus: number of GPUs that it needs, 0 or 1.
+
+        Raises:
+            ConfigError: the name is taken, or there is no GPU.
+        """
         if task.name in self._tasks or task.name in self._done:
             raise ConfigError(f"There are two tasks with the name {task.name!r}.")
         self.engine.check(gpus)
@@ -143,7 +105,7 @@ class TaskQueue:
             self._followers.setdefault(name, []).append(task.name)
 
     def finished(self, name: str) -> None:
-        """See :meth:`Executor.finished`."""
+        """Marks a task as done that was not submitted, for the tasks that depend on it."""
         self._done.add(name)
         for follower in self._followers.pop(name, ()):
             missing = self._missing[follower]
@@ -153,7 +115,7 @@ class TaskQueue:
                 self._ready.append(follower)
 
     def wait(self, seconds: float) -> Sequence[TaskResult]:
-        """See :meth:`Executor.wait`."""
+        """Starts tasks that are ready, waits up to ``seconds`` for a task to end, and returns the results."""
         self._begin()
         if not self._running:
             return ()
@@ -173,7 +135,7 @@ class TaskQueue:
         return results
 
     def close(self) -> None:
-        """See :meth:`Executor.close`."""
+        """Stops running tasks, as the end of a ``with`` block does."""
         self.engine.stop()
         self._running.clear()
 
@@ -190,3 +152,45 @@ class TaskQueue:
             self._running.add(name)
             self.engine.start(task, gpus=gpus, attempt=self._attempts[name])
         self._ready.extendleft(reversed(passed))
+
+
+ExecutorName = Literal["local", "ray"]
+
+
+@dataclass(frozen=True)
+class ExecutorOptions:
+    """Options of an executor.
+
+    Args:
+        name: ``local``: processes of this machine; ``ray``: a Ray cluster.
+        workers: number of concurrent tasks; None for one per GPU, or one per core. An existing cluster has its own
+            number.
+        threads: threads of each worker; None for its share of the cores, and 1 on a cluster.
+        address: address of the Ray cluster; None starts one on this machine.
+    """
+
+    name: ExecutorName = "local"
+    workers: int | None = None
+    threads: int | None = None
+    address: str | None = None
+
+
+def open_executor(options: ExecutorOptions, *, cores: int, gpus: int = 0) -> TaskQueue:
+    """The executor; use it as a context manager.
+
+    Args:
+        options: options of the executor.
+        cores: number of cores of this machine that may be used.
+        gpus: number of GPUs of this machine that may be used.
+
+    Raises:
+        ConfigError: there is less than one worker or thread, or the cluster cannot be joined.
+        MissingExtraError: a package is missing.
+    """
+    slots = allocate_slots(workers=options.workers, cores=cores, gpus=gpus, threads=options.threads)
+    if options.name == "local":
+        return TaskQueue(LocalEngine(slots))
+    from structgstream.executors.ray_cluster import RayEngine, RayOptions
+
+    threads = options.threads or (1 if options.address else slots[0].threads)
+    return TaskQueue(RayEngine(RayOptions(options.address, len(slots), threads)))

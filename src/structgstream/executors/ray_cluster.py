@@ -9,13 +9,14 @@ import os
 import secrets
 import tempfile
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from structgstream.errors import ConfigError, MissingExtraError
-from structgstream.executors.ray_worker import CommandKilled, run_task
+from structgstream.executors.local import CommandProcess, waited_for
 from structgstream.executors.task import Task, TaskResult, thread_environment
 
 OLDEST = (2, 52)
@@ -185,3 +186,31 @@ def _join(ray: Any, options: RayOptions, folder: Path) -> None:
             f"The Ray cluster at {options.address} cannot be joined ({reason}); is its head running, and is the token "
             "the one that it was started with?"
         ) from error
+
+
+POLL_SECONDS = 1.0
+
+
+class CommandKilled(Exception):
+    """A signal ended a command; Ray restarts the task."""
+
+
+def run_task(task: Task, environment: Mapping[str, str]) -> TaskResult:
+    """Runs the command in a process of this machine, which is killed when this process ends.
+
+    Raises:
+        CommandKilled: a signal ended it; the message has the signal and the command's output.
+    """
+    process = CommandProcess(task, environment=environment)
+    try:
+        # Ray cancels a task by raising an exception between two Python instructions, so a wait must be short.
+        while not waited_for([process], POLL_SECONDS):
+            pass
+    except BaseException:
+        process.stop()
+        raise
+    result = process.ended()
+    assert result is not None, "the process has ended"
+    if result.killed:
+        raise CommandKilled(f"{task.name} was ended by signal {-result.status}. {result.output}")
+    return result

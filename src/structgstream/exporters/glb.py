@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from structgstream.exporters.baked_gaussians import BakedGaussians
+from structgstream.exporters.bake import BakedGaussians
 from structgstream.exporters.formats import FrameOptions
 from structgstream.scene.harmonics import Y0
 

@@ -19,8 +19,7 @@ from structgstream.codec.container.records import PREFIX, read_record
 from structgstream.codec.header import unpack_header
 from structgstream.codec.packets import StreamHeader
 from structgstream.executors.task import PYTHON, Task
-from structgstream.groups.blending import Border, GroupBlender
-from structgstream.groups.seam_blend import OWN_FRAMES
+from structgstream.groups.seam_blend import OWN_FRAMES, Border, GroupBlender
 from structgstream.groups.segment_file import open_segment
 from structgstream.kernels.backend import BackendName, select_backend
 

@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import BinaryIO
 
 from structgstream.atomic_files import atomic_file
-from structgstream.codec.container.index import pack_index
+from structgstream.codec.container.records import pack_index
 from structgstream.codec.reader import open_stream
 from structgstream.errors import ConfigError, StreamError, TaskError
 from structgstream.executors.executor import TaskQueue
 from structgstream.executors.local import LocalEngine
 from structgstream.executors.task import allocate_slots
-from structgstream.groups.blending import Border, GroupBlender
 from structgstream.groups.blending_run import BlendedRun, header_of, run_task, runs_of
+from structgstream.groups.seam_blend import Border, GroupBlender
 from structgstream.groups.segment_file import Segment, open_segment
 from structgstream.kernels.backend import Backend
 from structgstream.owned_folders import own_folder, remove_own

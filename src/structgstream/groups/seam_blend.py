@@ -7,26 +7,41 @@ Two groups that were fitted independently show the same surface with different e
 at the border. Therefore static anchors start with their values of the frame before: the group's own values plus a
 difference. Anchors of two fits next to each other show neither well, so whole neighbourhoods are blended. The
 differences fade to zero in equal steps in the frames after the border. They are also halved in each frame in which the
-anchor or most of its neighbours change, because motion hides the step. Differences are quantization indices
-(Note [Bins]), hence exact. Most are 1 or 2, so each value is rounded by a threshold of its own; otherwise all of them
-would vanish in the same frame.
+anchor or most of its neighbours change, because motion hides the step. Differences are quantization indices (Note
+[Bins]), hence exact. Most are 1 or 2, so each value is rounded by a threshold of its own; otherwise all of them would
+vanish in the same frame.
 
-A mixture of the two fits may show what neither fit shows (``border``); anchors there are not blended (``withdraw``).
-
-Free Gaussians of two groups cannot be paired, so a group starts with its own. The exposure
-(``training/online/exposure.py``), which each group fits independently, changes from that of the frame before in equal
-steps, because a jump would be visible everywhere.
+On an untextured moving body, or where one fit has a free Gaussian and the other has anchors, a mixture of the two fits
+may show what neither shows, although no change is detected there; renderings of both fits find anchors that move, and
+such mixtures, which are not blended (``withdraw``). Free Gaussians of two groups cannot be paired, so a group starts
+with its own. The exposure (``training/online/exposure.py``), which each group fits independently, changes from that of
+the frame before in equal steps, because a jump would be visible everywhere.
 """
 
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import chain
 
 import torch
 from torch import Tensor
 
+from structgstream.cameras import CameraRig, enlargement
+from structgstream.codec.container.records import PACKET_KINDS, RECORD_TYPES, packed, read_record
+from structgstream.codec.decoder import SceneDecoder
+from structgstream.codec.encoder import SceneEncoder
+from structgstream.codec.packets import Packet, StreamHeader, parse_packet
+from structgstream.groups.segment_file import Segment
+from structgstream.kernels.backend import Backend
+from structgstream.scene.render import render, to_8bit_image
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import FieldName, fields_of, scene_of, state_of
+from structgstream.scene.state import FieldName, fields_of, on_device, scene_of, state_of
 from structgstream.training.neighbours import nearest
-from structgstream.training.online.select import changed_primitives
+from structgstream.training.online.config import MotionConfig
+from structgstream.training.online.measure import accumulate, measure, primitive_of, sum_by_primitive
+from structgstream.training.online.preprocess import detect_changes
+from structgstream.training.online.select import changed_primitives, select_dynamic
+from structgstream.training.views import View, area_mean
 
 NEIGHBOURS = 65
 """Size of a neighbourhood that is blended as a whole, the anchor included."""
@@ -140,3 +155,227 @@ def _thresholds(values: Tensor) -> Tensor:
 
 def _bins(values: Tensor, step: float) -> Tensor:
     return (values.double() / step).round().long()
+
+
+CAMERAS = 9
+"""Training cameras, at equal distances in the rig, for which the frames around a border are drawn."""
+
+
+def border_cameras(rig: CameraRig) -> tuple[str, ...]:
+    """Names of the cameras for which the frames around a border are drawn."""
+    return rig.training[:: max(1, len(rig.training) // CAMERAS)]
+
+
+@dataclass(frozen=True)
+class BorderPictures:
+    """Renderings of the two frames at a border; at 640 x 360 they take 50 MB.
+
+    Args:
+        before: rendering ``[H, W, 3]`` of the last frame of the group before, by name of the :func:`border_cameras`.
+        first: rendering ``[H, W, 3]`` of the first frame of the group, by the same names.
+    """
+
+    before: Mapping[str, Tensor]
+    first: Mapping[str, Tensor]
+
+
+def draw_border(before: Scene, first: Scene, rig: CameraRig, backend: Backend) -> BorderPictures:
+    """Draws the last frame of a group and the first one of the next."""
+    names = border_cameras(rig)
+    with torch.no_grad():
+        then, now = ({name: render(scene, rig[name], backend).image for name in names} for scene in (before, first))
+    return BorderPictures(then, now)
+
+
+def moving_at_border(
+    before: Scene,
+    first: Scene,
+    pictures: BorderPictures,
+    rig: CameraRig,
+    backend: Backend,
+    *,
+    earlier: Scene | None = None,
+    second: Scene | None = None,
+) -> Tensor | None:
+    """Mask ``[M]`` of the anchors of ``first`` that move; None if everything changes, as at a cut.
+
+    An anchor moves if the selection of an online frame finds it between the renderings of ``before`` and ``first``,
+    or if it changed from ``earlier`` to ``before`` or from ``first`` to ``second``. The second test is needed because
+    slow motion, and fast motion of an untextured surface, change the pictures by less than the two fits differ.
+
+    Args:
+        before: the last frame of the group before.
+        first: the first frame of the group.
+        pictures: renderings of these two frames.
+        rig: in the units of the scene.
+        backend: the compute back-end.
+        earlier: the last but one frame of the group before; None if that group has one frame only.
+        second: the second frame of the group; None if it has one frame only.
+    """
+    config = MotionConfig(enabled=True, picture_scale=0.5)
+    views, earlier_views = (_as_views(drawn, rig, backend) for drawn in (pictures.first, pictures.before))
+    changes = detect_changes(views, earlier_views, config=config, backend=backend)
+    measured = measure(first, views, changes, config=config, backend=backend)
+    found = select_dynamic(first, measured, config=config, backend=backend)
+    if found.scene_cut:
+        return None
+    moving = found.anchors
+    for older, newer in ((earlier, before), (first, second)):
+        if older is not None and newer is not None:
+            moving = moving | changed_primitives(older, newer)[: len(moving)]
+    return moving
+
+
+def _as_views(drawn: Mapping[str, Tensor], rig: CameraRig, backend: Backend) -> list[View]:
+    """Renderings as if they were pictures of their cameras."""
+    pictures = ((name, torch.from_numpy(to_8bit_image(image)).to(backend.device)) for name, image in drawn.items())
+    return [View(row, rig[name], picture) for row, (name, picture) in enumerate(pictures)]
+
+
+TOLERANCE = 3.0 / 255.0
+"""A pixel may be so far outside the range of the two fits. A smaller tolerance adds flicker without a gain
+(lab/notes/groups-measured.md)."""
+MIN_EXCESS = 1.0 / 255.0
+"""An anchor is a visible mixture if the mean distance beyond the tolerance, over the pixels it covers, reaches this."""
+MIN_PIXELS = 0.5
+"""Anchors that cover fewer pixels of the reduced pictures do not count."""
+_SCALE = 0.5  # relative to pictures of the reference size
+
+
+def visible_mixtures(mixed: Scene, pictures: BorderPictures, rig: CameraRig, backend: Backend) -> Tensor:
+    """Mask ``[M]`` of the anchors of ``mixed`` that cover pixels that differ from both frames of the border.
+
+    A pixel may have any colour between those of the two.
+
+    Args:
+        mixed: the group's first frame, blended.
+        pictures: renderings of the last frame of the group before and of the group's own first frame.
+        rig: in the units of the scene.
+        backend: the compute back-end.
+    """
+    folded, count = mixed.with_folded_appearance(), len(mixed.anchors)
+    sums = torch.zeros(count, 2).to(mixed.anchors.positions)
+    with torch.no_grad():
+        for name in pictures.first:
+            camera = rig[name]
+            small = camera.scaled(_SCALE / enlargement(camera.width, camera.height))
+            shown = render(mixed, camera, backend).image
+            excess = _excess(shown, pictures.before[name], pictures.first[name])
+            excess = area_mean(excess[None, None], (small.height, small.width))
+            gaussians = folded.gaussians(small, backend)
+            maps = torch.stack([torch.ones_like(excess[0, 0]), excess[0, 0]], dim=-1)
+            of_gaussians = accumulate(gaussians, small, maps, backend)
+            sums += sum_by_primitive(of_gaussians, primitive_of(gaussians, folded), folded)[:count]
+    covered = sums[:, 0]
+    return (covered > MIN_PIXELS) & (sums[:, 1] > MIN_EXCESS * covered)
+
+
+def _excess(mixed: Tensor, before: Tensor, first: Tensor) -> Tensor:
+    """Distance ``[H, W]`` of each pixel of ``mixed`` ``[H, W, 3]`` beyond the tolerance, mean over channels."""
+    then, own, shown = (image.clamp(0.0, 1.0) for image in (before, first, mixed))
+    allowed = shown.clamp(torch.minimum(then, own), torch.maximum(then, own))
+    return ((shown - allowed).abs().mean(-1) - TOLERANCE).clamp(min=0.0)
+
+
+WITHDRAWING_ROUNDS = 3
+"""Largest number of rounds. Withdrawing an anchor changes the mixture around it, which is then tested again."""
+
+
+@dataclass(frozen=True)
+class Border:
+    """Result of the seam blend at the beginning of a group.
+
+    Args:
+        frame: the group's first frame.
+        blended: number of anchors that start with the values of the frame before.
+        withdrawn: number of anchors that do not, because the mixture would be visible.
+    """
+
+    frame: int
+    blended: int
+    withdrawn: int
+
+
+class GroupBlender:
+    """Blends the groups of a stream, which must be given in order; at most four scenes are in memory.
+
+    Args:
+        header: of the stream.
+        backend: the compute back-end that renders the frames around borders.
+        on_border: called for each border, in order.
+    """
+
+    def __init__(
+        self, header: StreamHeader, backend: Backend, *, on_border: Callable[[Border], None] | None = None
+    ) -> None:
+        self._header = header
+        self._backend = backend
+        self._rig = header.similarity.rig(header.rig)
+        self._shown: deque[Scene] = deque(maxlen=2)
+        self._on_border = on_border or (lambda border: None)
+
+    def follow(self, segment: Segment) -> None:
+        """Start after a group whose last two frames are not blended: the first group, or one of at least
+        :data:`~structgstream.groups.seam_blend.OWN_FRAMES` frames.
+
+        Raises:
+            StreamError: a packet is damaged.
+        """
+        self._shown.extend(scene for _, scene in self._decoded(segment))
+
+    def records(self, segment: Segment) -> Iterator[bytes]:
+        """The records of the packets of ``segment``, blended; those of the first group are unchanged.
+
+        Raises:
+            StreamError: a packet is damaged.
+        """
+        if not self._shown:
+            for number, (_, scene) in enumerate(self._decoded(segment)):
+                self._shown.append(scene)
+                yield segment.record(number)
+            return
+        frames = self._decoded(segment)
+        begun = [next(frames)] + [frame for frame in (next(frames, None),) if frame is not None]
+        seam_blend = self._begin(begun[0][0].index, [scene for _, scene in begun])
+        encoder = SceneEncoder(self._header)
+        for packet, scene in chain(begun, frames):
+            shown = scene if seam_blend is None else seam_blend.scene(scene)
+            made = encoder.encode(shown, index=packet.index, pts_seconds=packet.pts_seconds, kind=packet.kind)
+            self._shown.append(made.reconstruction)
+            yield packed(RECORD_TYPES[packet.kind], made.packet.payload)
+
+    def _begin(self, frame: int, begun: list[Scene]) -> SeamBlend | None:
+        """The seam blend of a group, from its first one or two frames; None if everything changes."""
+        device = self._backend.device
+        *earlier, before = (on_device(scene, device) for scene in self._shown)
+        first, *second = (on_device(scene, device) for scene in begun)
+        pictures = draw_border(before, first, self._rig, self._backend)
+        moving = moving_at_border(
+            before,
+            first,
+            pictures,
+            self._rig,
+            self._backend,
+            earlier=earlier[0] if earlier else None,
+            second=second[0] if second else None,
+        )
+        if moving is None:
+            self._on_border(Border(frame, 0, 0))
+            return None
+        seam_blend, withdrawn = SeamBlend(self._shown[-1], begun[0], moving.cpu(), steps=self._header.steps), 0
+        for _ in range(WITHDRAWING_ROUNDS):
+            mixed = on_device(seam_blend.first, device)
+            more = seam_blend.withdraw(visible_mixtures(mixed, pictures, self._rig, self._backend).cpu())
+            if not more:
+                break
+            withdrawn += more
+        self._on_border(Border(frame, seam_blend.blended, withdrawn))
+        return seam_blend
+
+    def _decoded(self, segment: Segment) -> Iterator[tuple[Packet, Scene]]:
+        decoder = SceneDecoder(self._header)
+        for number in range(len(segment.entries)):
+            record = read_record(segment.record(number), 0)
+            assert record is not None, "verified when the segment was opened"
+            packet = parse_packet(record.payload, PACKET_KINDS[record.type])
+            yield packet, decoder.decode(packet)

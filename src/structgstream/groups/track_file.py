@@ -21,11 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.atomic_files import partial_path
+from structgstream.atomic_files import GrowingFile, partial_path
 from structgstream.codec.container.byte_source import ByteSource, FileBytes
 from structgstream.codec.container.records import RECORD, packed, read_head, read_record
 from structgstream.errors import StreamError
-from structgstream.groups.growing_file import GrowingFile
 
 SIGNATURE = b"\x89SGT\r\n\x1a\n"
 MAJOR, MINOR = 1, 0

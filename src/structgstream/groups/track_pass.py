@@ -13,16 +13,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from structgstream.atomic_files import partial_path
+from structgstream.atomic_files import name_finished, partial_path
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import read_ahead
 from structgstream.errors import ConfigError, StreamError
-from structgstream.groups.base import GroupBase
+from structgstream.groups.base import GroupBase, fingerprint
 from structgstream.groups.boundaries import Groups, equal_groups, groups_path, quiet_groups, write_groups
-from structgstream.groups.growing_file import name_finished
-from structgstream.groups.pictures import fingerprint
-from structgstream.groups.segment_file import Segment
-from structgstream.groups.segment_sink import GroupSoFar
+from structgstream.groups.segment_file import GroupSoFar, Segment
 from structgstream.groups.track_file import TrackFile, TrackHead, TrackStart, TrackWriter, open_track
 from structgstream.groups.tracking import TrackConfig, Tracked, Tracker, TrackPictures, track_frame
 from structgstream.kernels.backend import Backend

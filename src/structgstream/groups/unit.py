@@ -1,30 +1,204 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The unit of work: fits one group of frames from header and track into a segment; can be repeated at any time."""
+"""The unit of work: fits one group of frames from header and track into a segment; can be repeated at any time.
+
+The first frame of a group is fitted from frame 0 and the track, the others as in any stream.
+"""
 
 import hashlib
+import logging
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
+import torch
+from torch import Tensor
+
 from structgstream.atomic_files import partial_path
+from structgstream.cameras import CameraRig
 from structgstream.data.denoising import denoised
 from structgstream.data.source import FrameSource
 from structgstream.errors import ConfigError, StorageError
-from structgstream.frames import MultiViewFrame
-from structgstream.groups.base import GroupBase
-from structgstream.groups.first_frame import GroupStartConfig
-from structgstream.groups.method import GroupEntry, GroupMethod
-from structgstream.groups.pictures import fingerprint, open_for
-from structgstream.groups.segment_file import Segment, SegmentIdentity
-from structgstream.groups.segment_sink import GroupSoFar, SegmentSink, resume_segment
+from structgstream.frames import MIN_CAMERAS, MultiViewFrame
+from structgstream.groups.base import GroupBase, fingerprint, open_for
+from structgstream.groups.first_frame import GroupStartConfig, fit_group_start
+from structgstream.groups.segment_file import GroupSoFar, Segment, SegmentIdentity, SegmentSink, resume_segment
 from structgstream.groups.track_file import TrackStart, open_track
 from structgstream.groups.track_pass import dense
 from structgstream.kernels.backend import Backend
 from structgstream.recorder import LogExtras, Run, record
 from structgstream.scene.scene import Scene
-from structgstream.session.pipeline import Pipeline
-from structgstream.session.struct_gstream import FrameZeroContext, stream_pipeline
-from structgstream.training.result import StepListener
+from structgstream.scene.state import on_device
+from structgstream.session.pipeline import FrameTask, Past, Pipeline
+from structgstream.session.presets import StreamConfig
+from structgstream.session.rate_control import with_rate_control
+from structgstream.session.struct_gstream import FrameZeroContext, StructGStream, stream_pipeline
+from structgstream.training.online.config import OnlineConfig
+from structgstream.training.online.fit import held
+from structgstream.training.online.preprocess import FramePictures, preprocess
+from structgstream.training.online.split import with_displacements
+from structgstream.training.result import FitResult, StepListener
+
+CATCH_UP_FRAMES = 6
+"""Number of frames, from a group's first one, that also spawn what the frames before the group would have spawned."""
+_log = logging.getLogger(__name__)
+_OUT_OF_MEMORY = (MemoryError, torch.OutOfMemoryError)
+
+
+@dataclass(frozen=True)
+class GroupEntry:
+    """Start of a group.
+
+    Args:
+        frame: its first frame, after frame 0.
+        displacements: ``[M + F, 3]`` displacements of frame 0's primitives (Note [Primitives]) since frame 0.
+        velocities: ``[M + F, 3]`` displacements since the frame before.
+        first_pictures: returns the pictures of frame 0.
+    """
+
+    frame: int
+    displacements: Tensor
+    velocities: Tensor
+    first_pictures: Callable[[], MultiViewFrame]
+
+
+@dataclass
+class GroupMethod:
+    """The method of a group's frames. The state before its first frame is frame 0.
+
+    If memory runs out it lowers its budget once and fits the frame again.
+
+    Args:
+        config: configuration of the stream.
+        start: configuration of the first frame's fit.
+        entry: start of the group; None for the group of frame 0, which is fitted as any stream.
+        lowered: whether the budget has been lowered.
+    """
+
+    config: StreamConfig
+    start: GroupStartConfig
+    entry: GroupEntry | None
+    lowered: bool = False
+    _first: MultiViewFrame | None = field(default=None, repr=False)
+
+    @property
+    def _usual(self) -> StructGStream:
+        return StructGStream(self.config)
+
+    def _config_at(self, frame: int) -> StreamConfig:
+        """The configuration of a frame; that of :func:`catching_up` in the group's first :data:`CATCH_UP_FRAMES`."""
+        first = None if self.entry is None else self.entry.frame
+        return self.config if first is None or frame >= first + CATCH_UP_FRAMES else catching_up(self.config)
+
+    @property
+    def needs_before(self) -> bool:
+        """See ``StructGStream.needs_before``."""
+        return self._usual.needs_before
+
+    @property
+    def needs_older(self) -> bool:
+        """See ``StructGStream.needs_older``."""
+        return self._usual.needs_older
+
+    def observe(
+        self, frame: MultiViewFrame, before: MultiViewFrame | None, *, rig: CameraRig, backend: Backend
+    ) -> FramePictures:
+        """The training pictures and their changes, which in the group's first frame are those since frame 0."""
+        if self.entry is None or frame.index != self.entry.frame:
+            return self._usual.observe(frame, before, rig=rig, backend=backend)
+        online = self.config.online
+        without_flow = replace(online.scene_flow, enabled=False)
+        first = self.entry.first_pictures()
+        return preprocess(frame, rig, before=first, motion=online.motion, start=without_flow, backend=backend)
+
+    def first(self, task: FrameTask) -> FitResult[Scene]:
+        """Not supported: frame 0 is that of the header.
+
+        Raises:
+            ConfigError: always.
+        """
+        raise ConfigError("A group needs a header with frame 0; give one with --init.")
+
+    def prepare(self, state: Scene, task: Callable[[], FrameTask]) -> FrameZeroContext:
+        """See ``StructGStream.prepare``."""
+        return self._usual.prepare(state, task)
+
+    def next(self, past: Past[Scene, FrameZeroContext], task: FrameTask) -> FitResult[Scene]:
+        """Fit a frame of the group."""
+        try:
+            return self._fit(past, task)
+        except _OUT_OF_MEMORY:
+            if self.lowered:
+                raise
+            self.lowered, self.start = True, lowered_start(self.start)
+            self.config = replace(self.config, online=lowered_budget(self.config.online))
+            _log.warning(
+                "Frame %d: not enough memory. From here on flow is estimated in half of the views, and a quarter of "
+                "the Gaussians may be spawned; results differ slightly.",
+                task.frame.index,
+            )
+        found = self._fit(past, task)
+        return replace(found, counts={**found.counts, "lowered budgets": 1})
+
+    def _fit(self, past: Past[Scene, FrameZeroContext], task: FrameTask) -> FitResult[Scene]:
+        entry = self.entry
+        if entry is not None and task.frame.index == entry.frame:
+            return self._begin(entry, past, task)
+        if entry is not None and task.frame.index == entry.frame + 1:
+            past = replace(past, older=_older(past.state, entry.velocities), seconds=None)
+        return StructGStream(self._config_at(task.frame.index)).next(past, task)
+
+    def _begin(self, entry: GroupEntry, past: Past[Scene, FrameZeroContext], task: FrameTask) -> FitResult[Scene]:
+        pictures, device = task.pictures, task.backend.device
+        if len(pictures.views) < MIN_CAMERAS:
+            return held(with_displacements(on_device(past.state, device), entry.displacements.to(device)))
+        return fit_group_start(
+            on_device(past.state, device),
+            entry.displacements.to(device),
+            pictures.views,
+            pictures.changes or [None] * len(pictures.views),
+            frame_index=task.frame.index,
+            config=with_rate_control(self._config_at(task.frame.index).online, task.pressure),
+            start=self.start,
+            backend=task.backend,
+            seed=task.seed,
+            steps=task.steps,
+            floor=past.memory.floor,
+            light=past.memory.light,
+            on_step=task.on_step,
+        )
+
+
+def catching_up(config: StreamConfig) -> StreamConfig:
+    """``config`` for a group's first frames, which lack what earlier frames would have spawned.
+
+    Thin content in small clusters is spawned although there are many of them (``ThinSpawnConfig.overflow``).
+    """
+    spawn = config.online.spawn
+    thin = replace(spawn.thin, overflow="small-clusters")
+    return replace(config, online=replace(config.online, spawn=replace(spawn, thin=thin)))
+
+
+def lowered_budget(online: OnlineConfig) -> OnlineConfig:
+    """``online`` with less memory: flow in half of the views, a quarter of the spawned Gaussians."""
+    return replace(
+        online,
+        scene_flow=replace(online.scene_flow, views=max(2, online.scene_flow.views // 2)),
+        spawn=replace(online.spawn, most=online.spawn.most // 4),
+    )
+
+
+def lowered_start(start: GroupStartConfig) -> GroupStartConfig:
+    """``start`` with a quarter of the spawned Gaussians."""
+    return replace(start, births=start.births // 4)
+
+
+def _older(state: Scene, velocities: Tensor) -> Scene:
+    """The scene one frame before ``state``, the group's first: anchors moved back by their velocities."""
+    anchors = state.anchors
+    positions = anchors.positions - velocities[: len(anchors)].to(anchors.positions)
+    return replace(state.without_free(), anchors=replace(anchors, positions=positions))
+
 
 MIN_PIXELS = 0.5
 """A primitive whose tracked displacement is at most this, in pixels of a median camera, counts as not displaced."""

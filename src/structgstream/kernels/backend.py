@@ -73,8 +73,8 @@ class Backend:
         device: device of its tensors.
         functions: function of each operation by name, with the signature of the oracle.
         recorder: creates a recorder of iterations (``kernels.cuda_graph``); None if operations are queued one by one.
-        iterations: runs those of a frame in which only anchors and free Gaussians are trained (``kernels.cpu_fit``);
-            None: they are run in torch.
+        iterations: runs those of a frame in which only anchors and free Gaussians are trained (``kernels.cpu_fit``,
+            ``kernels.cuda_fit``); None: they are run in torch.
     """
 
     name: str
@@ -84,9 +84,9 @@ class Backend:
     iterations: Callable[[FitFrame], Callable[[int, int], None]] | None = None
 
     rasterize = Operation(reference_raster.rasterize)  # cuda: gsplat
-    projected_radii = Operation(reference_raster.projected_radii)  # cuda: gsplat, which draws a picture
-    blending_weights = Operation(reference_raster.blending_weights)  # cuda: gradients of gsplat's picture
-    picture_and_weights = Operation(reference_raster.picture_and_weights)  # cuda: gsplat
+    projected_radii = Operation(reference_raster.projected_radii)  # cuda: own kernels, or a picture of gsplat
+    blending_weights = Operation(reference_raster.blending_weights)  # cuda: own kernels, or gsplat's gradients
+    picture_and_weights = Operation(reference_raster.picture_and_weights)  # cuda: own kernels, or gsplat
     generate_structured = Operation(reference_anchors.generate_structured)  # cuda: own kernels
     l1_ssim = Operation(reference_losses.l1_ssim)  # cuda: own kernels
     volume = Operation(reference_losses.volume)
@@ -151,7 +151,7 @@ def cuda_backend() -> Backend:
     Raises:
         BackendError: no GPU, or gsplat is not installed or does not load.
     """
-    from structgstream.kernels import cuda, cuda_anchors, cuda_library
+    from structgstream.kernels import cuda, cuda_anchors, cuda_fit, cuda_library, cuda_picture
 
     reason = cuda.cuda_reason()
     if reason is not None:
@@ -175,9 +175,12 @@ def cuda_backend() -> Backend:
     )
     if library is None:
         return backend
-    return backend.with_functions(
+    return replace(backend, iterations=partial(cuda_fit.iterations, library)).with_functions(
         generate_structured=partial(cuda_anchors.generate_structured, library),
         l1_ssim=partial(cuda.l1_ssim, library),
+        projected_radii=partial(cuda_picture.projected_radii, library),
+        blending_weights=partial(cuda_picture.blending_weights, library),
+        picture_and_weights=partial(cuda_picture.picture_and_weights, library),
         sweep=partial(cuda.sweep, library),
     )
 

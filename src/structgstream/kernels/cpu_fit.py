@@ -58,14 +58,8 @@ def _leaf(leaf: FitLeaf | None) -> _Leaf:
     return _Leaf(*addresses(*tensors), leaf.values.numel(), before, step)
 
 
-def iterations(frame: FitFrame) -> Callable[[int, int], None]:
-    """The function that does iterations ``first`` to ``last`` (not included) of ``frame``: each once, in their order.
-
-    Leaves, pictures and results are written in place. Results do not depend on the number of threads.
-
-    Raises:
-        OutOfMemoryError: there is no memory for what an iteration needs, here or in the function.
-    """
+def native_frame(frame: FitFrame) -> tuple[ctypes.Structure, list[Any]]:
+    """``struct sgs_fit_frame`` of ``frame``, and what must live as long as it is used."""
     alive: list[Any] = [frame]
 
     def lasting(tensor: Tensor | None) -> Tensor | None:
@@ -113,6 +107,18 @@ def iterations(frame: FitFrame) -> Callable[[int, int], None]:
         *(prices.l1, prices.ssim, prices.volume, prices.smoothness, prices.rate, prices.pixel, prices.slack),
         *(*plan.betas, plan.eps),
     )
+    return native, [*alive, native]
+
+
+def iterations(frame: FitFrame) -> Callable[[int, int], None]:
+    """The function that does iterations ``first`` to ``last`` (not included) of ``frame``: each once, in their order.
+
+    Leaves, pictures and results are written in place. Results do not depend on the number of threads.
+
+    Raises:
+        OutOfMemoryError: there is no memory for what an iteration needs, here or in the function.
+    """
+    native, alive = native_frame(frame)
     library = native_library()
     fit = library.sgs_fit_new(ctypes.byref(native))
     if not fit:

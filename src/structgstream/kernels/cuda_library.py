@@ -27,6 +27,11 @@ CUDA_PROTOTYPES: Mapping[str, tuple[str, str]] = {
     "sgs_cuda_l1_ssim": ("i", "pppiippppppp"),
     "sgs_cuda_l1_ssim_backward": ("i", "pppiipppppppp"),
     "sgs_cuda_error": ("s", "i"),
+    "sgs_cuda_radii": ("i", "lppppppiifppp"),
+    "sgs_cuda_picture": ("i", "lpppppppiifpppippppp"),
+    "sgs_cuda_fit_new": ("i", "plpp"),
+    "sgs_cuda_fit_run": ("i", "pii"),
+    "sgs_cuda_fit_free": ("v", "p"),
     "sgs_cuda_anchor_inputs": ("i", "ppppppiiiipppiifpppp"),
     "sgs_cuda_anchor_inputs_backward": ("i", "piiipppp"),
     "sgs_cuda_anchor_outputs": ("i", "ppppiipppppppppppp"),
@@ -40,6 +45,8 @@ CUDA_PROTOTYPES: Mapping[str, tuple[str, str]] = {
 }
 """For each function of csrc/cuda: result type, argument types in order (``native.TYPES``)."""
 FLAGS = ("-O3", "-std=c++17", "-shared", "-Xcompiler", "-fPIC", "--threads", "0")
+SHARED_HEADERS = ("include", "cpu")
+"""Folders beside that of the sources; they have the headers of the C interface of the CPU kernels."""
 _OPERATIONS = "L1, SSIM, anchors, sweeps and tile lists"
 _LAST_LINES = 5  # of a failing compiler's output that an error quotes
 
@@ -126,7 +133,8 @@ def compiled(architecture: str, *, nvcc: Path, sources: Path, cache: Path) -> Pa
     virtual = architecture.replace("sm_", "compute_")
     flags = [*FLAGS, "-gencode", f"arch={virtual},code={architecture}"]
     state = hashlib.sha256("\n".join([_output([str(nvcc), "--version"]), *flags]).encode())
-    for path in sorted([*units, *sources.glob("*.h")]):
+    shared = [path for folder in SHARED_HEADERS for path in sources.parent.joinpath(folder).glob("*.h")]
+    for path in sorted([*units, *sources.glob("*.h"), *shared]):
         state.update(path.name.encode() + b"\0" + path.read_bytes())
     library = cache / f"{architecture}-{state.hexdigest()[:32]}.so"
     if library.is_file():

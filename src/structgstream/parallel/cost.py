@@ -19,8 +19,8 @@ from typing import Any
 from structgstream.errors import ConfigError
 from structgstream.evaluation.run_log import read_log
 from structgstream.groups.boundaries import read_groups
+from structgstream.parallel.driver import HEADER, JOIN, TRACK
 from structgstream.parallel.parts import CompletedTask, Parts, group_name
-from structgstream.parallel.unit import HEADER, JOIN, TRACK
 
 
 @dataclass(frozen=True)

@@ -1,20 +1,109 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drives a parallel run: header, track, each group as soon as the track has its start, and the join."""
+"""The commands of a parallel run as tasks, and its driver: header, track, each group as soon as the track has its
+start, and the join.
+"""
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+import tempfile
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 
-from structgstream.atomic_files import atomic_write
-from structgstream.errors import StorageError, TaskError
-from structgstream.executors.executor import Executor, TaskQueue
+from structgstream.atomic_files import atomic_write, partial_path
+from structgstream.errors import StorageError, StreamError, TaskError
+from structgstream.executors.executor import TaskQueue
 from structgstream.executors.local import LocalEngine
-from structgstream.executors.task import Task, TaskResult, WorkerSlot
+from structgstream.executors.task import PYTHON, Task, TaskResult, WorkerSlot, thread_environment
 from structgstream.groups.boundaries import Groups, groups_path, read_groups
 from structgstream.parallel.exchange import SharedFolder
 from structgstream.parallel.parts import Parts, group_name, key_of, sha256_of
-from structgstream.parallel.unit import HEADER, JOIN, TRACK, Unit
+
+HEADER, TRACK, JOIN = "header", "track", "join"
+PROGRAM = (PYTHON, "-m", "structgstream")
+
+
+def starts_in(track: Path) -> Collection[int]:
+    """The starts in a file of ``structgstream track``; none before its head is written."""
+    from structgstream.groups.track_file import open_track
+
+    try:
+        return open_track(track).starts
+    except StreamError:
+        return ()
+
+
+def cut_track(track: Path, first: int) -> bytes:
+    """An unfinished track with the one start that a group needs.
+
+    Raises:
+        StreamError: there is none, or it is damaged.
+    """
+    from structgstream.groups.track_file import TrackWriter, open_track
+
+    found = open_track(track)
+    start = found.start(first)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "start"
+        writer = TrackWriter(path, found.head)
+        writer.write(start)
+        writer.close()
+        return partial_path(path).read_bytes()
+
+
+@dataclass(frozen=True)
+class Unit:
+    """Options of the commands.
+
+    Args:
+        capture: folder of the capture.
+        frames: number of frames; None for all.
+        header: further arguments of ``reconstruct`` for frame 0: preset, scale, held-out cameras.
+        track: further arguments of ``track``: length of groups.
+        track_threads: threads of the tracking pass, which all groups wait for; None for those of its worker slot.
+        device: further arguments of all commands: the back-end.
+        join: further arguments of ``join``: number of processes.
+        program: runs the commands.
+        starts: the frames at which a group may start, of a track that is finished or growing.
+        cut: extracts from a track what one group needs.
+    """
+
+    capture: str
+    frames: int | None = None
+    header: tuple[str, ...] = ()
+    track: tuple[str, ...] = ()
+    track_threads: int | None = None
+    device: tuple[str, ...] = ()
+    join: tuple[str, ...] = ()
+    program: tuple[str, ...] = PROGRAM
+    starts: Callable[[Path], Collection[int]] = field(default=starts_in, compare=False)
+    cut: Callable[[Path, int], bytes] = field(default=cut_track, compare=False)
+
+    def header_task(self, parts: Parts) -> Task:
+        """Fits frame 0, which all groups share."""
+        argv = (*self.program, "reconstruct", self.capture, "-o", str(parts.header), "--frames", "1", "--resume")
+        return Task(HEADER, (*argv, *self.header, *self.device), str(parts.header), parts.log(HEADER))
+
+    def track_task(self, parts: Parts) -> Task:
+        """The tracking pass."""
+        argv = (*self.program, "track", self.capture, "--init", str(parts.header), "-o", str(parts.track))
+        count = () if self.frames is None else ("--frames", str(self.frames))
+        command = (*argv, *count, *self.track, *self.device)
+        variables = {} if self.track_threads is None else thread_environment(self.track_threads)
+        return Task(TRACK, command, str(parts.track), parts.log(TRACK), variables)
+
+    def group_task(self, parts: Parts, first: int, end: int) -> Task:
+        """Fits a group to a segment."""
+        name, segment = group_name(first, end), str(parts.segment(first, end))
+        argv = (*self.program, "fit-group", self.capture, "--init", str(parts.header), "--track", str(parts.track))
+        command = (*argv, "--frames", f"{first}:{end}", "-o", segment, *self.device)
+        return Task(name, command, segment, parts.log(name))
+
+    def join_task(self, parts: Parts, groups: Groups, output: Path) -> Task:
+        """Joins all segments to the stream."""
+        segments = [str(parts.segment(first, end)) for first, end in groups]
+        command = (*self.program, "join", *segments, "-o", str(output), "--overwrite", *self.device, *self.join)
+        return Task(JOIN, command, str(output), parts.log(JOIN))
+
 
 POLL_SECONDS = 0.5
 MESSAGE_LINES = 6  # of the output of a failed task
@@ -83,7 +172,7 @@ class Job:
 def drive(
     job: Job,
     parts: Parts,
-    executor: Executor,
+    executor: TaskQueue,
     *,
     exchange: SharedFolder | None = None,
     listener: Listener | None = None,
@@ -110,7 +199,7 @@ def drive(
 class _Drive:
     """The state of :func:`drive`."""
 
-    def __init__(self, job: Job, parts: Parts, executor: Executor, exchange: SharedFolder, listener: Listener) -> None:
+    def __init__(self, job: Job, parts: Parts, executor: TaskQueue, exchange: SharedFolder, listener: Listener) -> None:
         self._job, self._unit, self._parts, self._executor = job, job.unit, parts, executor
         self._exchange, self._listener = exchange, listener
         self._status = Status(HEADER)

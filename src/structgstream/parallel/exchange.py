@@ -1,23 +1,166 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Transfer of parts between the driver and the machines of the tasks: a shared folder, or an object store."""
+"""Transfer of parts between the driver and the machines of the tasks: a shared folder, or an object store.
 
+With an object store the command of a task runs in this module as a program. It copies inputs (``--needs``) into a
+folder of its machine, and outputs to the store: a growing file (``--grows``) repeatedly while the command runs, results
+(``--gives``) when it succeeded. The folder remains when the command is killed, so that the next attempt of the same run
+on this machine continues there; a run that was started again (``--run``) has another folder, and removes the earlier
+one.
+"""
+
+import argparse
+import hashlib
+import os
+import random
+import re
+import subprocess
+import sys
+import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from structgstream.atomic_files import atomic_write, partial_path
-from structgstream.errors import StorageError
+from structgstream.errors import StorageError, StructGStreamError
 from structgstream.evaluation.run_log import log_path
-from structgstream.executors.task import PYTHON, Task
+from structgstream.executors.task import PYTHON, Task, argv_of
 from structgstream.groups.boundaries import groups_path
-from structgstream.owned_folders import MARKER, Owner
-from structgstream.parallel.object_folder import ObjectFolder
+from structgstream.owned_folders import MARKER, Owner, own_folder, owner_of, parse_owner, remove_own
 from structgstream.parallel.parts import PART_NAMES, Parts
-from structgstream.parallel.staged import HERE, STORE
-from structgstream.parallel.unit import CutsTrack
+from structgstream.remote_folders import open_url, reason_of, shown_address
 
-STAGED = (PYTHON, "-m", "structgstream.parallel.staged")
+T = TypeVar("T")
+TRIES = 8
+FIRST_DELAY_SECONDS = 0.1
+LONGEST_DELAY_SECONDS = 10.0
+
+
+class ObjectFolder:
+    """Objects by name, with the bytes of the files that they are copies of.
+
+    A request that fails is made again, :data:`TRIES` times in all, with growing, varied pauses.
+
+    Args:
+        url: of the folder, as fsspec takes it. Addresses and credentials come from the environment, as the scheme's
+            package reads them (``AWS_ENDPOINT_URL``, ``AWS_ACCESS_KEY_ID``, ...).
+
+    Raises:
+        MissingExtraError: fsspec, or the package for this scheme, is not installed.
+        StorageError: the URL is not understood.
+    """
+
+    def __init__(self, url: str) -> None:
+        self.url = url.rstrip("/")
+        self.name = shown_address(self.url)
+        """For messages."""
+        self._files, self._root = open_url(self.url)
+
+    def write(self, name: str, data: bytes) -> None:
+        """Writes or replaces an object.
+
+        Raises:
+            StorageError: it cannot be written.
+        """
+
+        def put() -> None:
+            if self._files.protocol in ("file", ("file", "local")):
+                self._files.makedirs(str(Path(f"{self._root}/{name}").parent), exist_ok=True)
+            self._files.pipe_file(f"{self._root}/{name}", data)
+
+        self._tried(put, f"write {name}")
+
+    def read(self, name: str) -> bytes | None:
+        """The content of an object; None if there is none.
+
+        Raises:
+            StorageError: it cannot be read.
+        """
+
+        def get() -> bytes | None:
+            try:
+                return self._files.cat_file(f"{self._root}/{name}")
+            except FileNotFoundError:
+                return None
+
+        return self._tried(get, f"read {name}")
+
+    def size(self, name: str) -> int | None:
+        """The bytes of an object; None if there is none.
+
+        Raises:
+            StorageError: the store cannot be asked.
+        """
+
+        def found() -> int | None:
+            try:
+                return int(self._files.info(f"{self._root}/{name}")["size"])
+            except FileNotFoundError:
+                return None
+
+        return self._tried(found, f"look for {name}")
+
+    def owner(self) -> Owner | None:
+        """Whose the folder is; None if there is nothing in it.
+
+        Raises:
+            StorageError: it holds objects and no marker, or cannot be listed.
+        """
+        names = self._all()
+        if not names:
+            return None
+        data = self.read(MARKER) if MARKER in names else None
+        found = None if data is None else parse_owner(data)
+        if found is None:
+            raise StorageError(
+                f"{self.name} holds objects and no marker of structgstream ({MARKER}), so they may be somebody else's; "
+                "nothing there was changed. Choose a --store that is empty."
+            )
+        return found
+
+    def remove(self, names: re.Pattern[str]) -> None:
+        """Removes the objects of a marked folder whose names match in full; others stay.
+
+        Raises:
+            StorageError: the folder is not marked, or they cannot be removed.
+        """
+        if self.owner() is None:
+            return
+
+        def removed() -> None:
+            if found := [f"{self._root}/{name}" for name in self._all() if names.fullmatch(name)]:
+                self._files.rm(found)
+
+        self._tried(removed, "remove what is")
+
+    def _all(self) -> list[str]:
+        """Names of all objects, also of those in folders."""
+
+        def listed() -> list[str]:
+            self._files.invalidate_cache()
+            try:
+                return [str(path).removeprefix(f"{self._root}/") for path in self._files.find(self._root)]
+            except FileNotFoundError:
+                return []
+
+        return self._tried(listed, "list the content of")
+
+    def _tried(self, action: Callable[[], T], what: str) -> T:
+        delay = FIRST_DELAY_SECONDS
+        for attempt in range(TRIES):
+            try:
+                return action()
+            except Exception as error:  # Each file system has its own.
+                if attempt + 1 == TRIES:
+                    raise StorageError(f"Cannot {what} in {self.name} ({reason_of(error, self.url)}).") from error
+            time.sleep(delay * random.uniform(0.5, 1.5))  # so that two processes do not fail in step
+            delay = min(2 * delay, LONGEST_DELAY_SECONDS)
+        raise AssertionError("unreachable")
+
+
+STAGED = (PYTHON, "-m", "structgstream.parallel.exchange")
 POLL_SECONDS = 1.0
 
 
@@ -52,7 +195,7 @@ class ObjectStore(SharedFolder):
         cut: extracts from a track what one group needs.
     """
 
-    def __init__(self, store: ObjectFolder, parts: Parts, *, cut: CutsTrack) -> None:
+    def __init__(self, store: ObjectFolder, parts: Parts, *, cut: Callable[[Path, int], bytes]) -> None:
         self._store, self._parts, self._cut = store, parts, cut
         self._asked = 0.0
         self._fetched_bytes: int | None = None  # of the growing track
@@ -136,3 +279,128 @@ class ObjectStore(SharedFolder):
         outer = (*STAGED, "--name", task.name, "--run", self._parts.run, *files, "--")
         environment = {**task.environment, STORE: self._store.url}
         return replace(task, command=(*outer, *inner), environment=environment)
+
+
+HERE = "{here}"
+"""In an argument of the command: the folder of this machine."""
+STORE = "STRUCTGSTREAM_STORE"
+"""The variable with the URL of the store. It may hold credentials, and every user of a machine sees command lines."""
+SCRATCH = "STRUCTGSTREAM_SCRATCH"
+"""The variable that names a folder for files of this machine; without it, that of temporary files."""
+PURPOSE = "scratch files of a task"
+ANY = re.compile(f"(?!{re.escape(MARKER)}$).*", re.DOTALL)
+GROWTH = 1.1
+"""Minimum factor by which a growing file is longer when it is stored again."""
+SIGNALLED = 128
+"""Statuses from this on are those of a signal."""
+
+
+class Staging:
+    """The files of a task on this machine and in the store."""
+
+    def __init__(self, store: ObjectFolder, folder: Path) -> None:
+        self.store, self.folder = store, folder
+        self._sizes: dict[str, int] = {}
+
+    def fetch(self, name: str, *, replace: bool = False) -> None:
+        """Copies a file from the store if it is there and missing here; with ``replace`` even if it is here."""
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if (replace or not path.exists()) and (data := self.store.read(name)) is not None:
+            atomic_write(path, data)
+
+    def put(self, name: str) -> None:
+        """Copies a file to the store if it exists."""
+        path = self.folder / name
+        if path.exists():
+            self.store.write(name, path.read_bytes())
+
+    def put_growing(self, name: str, *, ended: bool) -> None:
+        """Replaces a file in the store when it has grown by the factor :data:`GROWTH`, or the command has ended.
+
+        It is stored as a whole, so that the store has a prefix of one attempt, even if another attempt writes, too. The
+        factor bounds the bytes sent to a multiple of the file.
+        """
+        path = self.folder / name
+        size, stored = path.stat().st_size if path.exists() else 0, self._sizes.get(name, 0)
+        if size < stored or size > stored * (1 if ended else GROWTH):
+            self.put(name)
+            self._sizes[name] = size
+
+
+def run(options: argparse.Namespace) -> int:
+    """Fetches inputs, runs the command and stores outputs; returns its status."""
+    staging = Staging(ObjectFolder(options.store), scratch_folder(options))
+    for name in options.needs:
+        staging.fetch(name, replace=True)
+    for name in options.gives:
+        staging.fetch(name)
+    if not all((staging.folder / name).exists() for name in options.gives):
+        for name in options.grows:
+            staging.fetch(name)
+    process = subprocess.Popen(
+        argv_of(tuple(argument.replace(HERE, str(staging.folder)) for argument in options.command))
+    )
+    status = None
+    while status is None:
+        with suppress(subprocess.TimeoutExpired):
+            status = process.wait(POLL_SECONDS)
+        for name in options.grows:
+            staging.put_growing(name, ended=status is not None)
+    if status == 0:
+        for name in options.gives:
+            staging.put(name)
+    if 0 <= status < SIGNALLED:  # A command that failed by itself would fail again.
+        remove_own(staging.folder, PURPOSE, ANY, whole=True)
+    if status < 0:  # As the command ended, so that the task counts as killed.
+        os.kill(os.getpid(), -status)
+    return status
+
+
+def scratch_folder(options: argparse.Namespace) -> Path:
+    """The marked folder of a task on this machine; those of earlier runs of the task are removed.
+
+    Raises:
+        StorageError: it is somebody else's, or cannot be made.
+    """
+    above = Path(os.environ.get(SCRATCH) or tempfile.gettempdir())
+    # Names of tasks are unique within a run only.
+    task = hashlib.sha256(f"{options.store}\n{options.name}".encode()).hexdigest()[:16]
+    folder = above / f"structgstream-{task}-{options.run}"
+    for earlier in above.glob(f"structgstream-{task}-*"):
+        if earlier != folder and (owner := owner_of(earlier)) is not None and owner.purpose == PURPOSE:
+            remove_own(earlier, PURPOSE, ANY, whole=True)
+    own_folder(folder, PURPOSE)
+    return folder
+
+
+def parsed(arguments: Sequence[str]) -> argparse.Namespace:
+    """The command line, and the store's URL from :data:`STORE`; what follows ``--`` is the command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--name", required=True, help="of the task")
+    parser.add_argument("--run", default="", help="random name of the run")
+    for flag, text in (
+        ("needs", "file to fetch"),
+        ("gives", "file to store when the command has ended well, and to fetch before if it is there"),
+        ("grows", "file to store while it grows, and to fetch before if not all that is given is there"),
+    ):
+        parser.add_argument(f"--{flag}", action="append", default=[], metavar="NAME", help=text)
+    parser.add_argument("command", nargs="+")
+    options = parser.parse_args(arguments)
+    options.store = os.environ.get(STORE)
+    if not options.store:
+        parser.error(f"the variable {STORE} has no URL of a store")
+    return options
+
+
+def main() -> int:
+    """Runs; an error of the store is one sentence."""
+    try:
+        return run(parsed(sys.argv[1:]))
+    except StructGStreamError as error:
+        print(f"structgstream: {error}", file=sys.stderr, flush=True)
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

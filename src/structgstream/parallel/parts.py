@@ -15,10 +15,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from structgstream.atomic_files import atomic_write
+from structgstream.atomic_files import atomic_write, lock_file, open_lockable
 from structgstream.errors import ConfigError, StorageError
 from structgstream.executors.task import TaskResult
-from structgstream.file_locks import lock_file, open_lockable
 from structgstream.owned_folders import Owner, check_owned, own_folder, remove_own
 
 PLAN = "plan.json"

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.calibration import listed
-from structgstream.data.pair_matches import PAIR_SHARE, PairError, PairMatcher, neighbor_errors
+from structgstream.data.matching import PAIR_SHARE, PairError, PairMatcher, neighbor_errors
 from structgstream.errors import CalibrationError
 from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.findings import Finding, explain, readings_of
@@ -34,21 +34,13 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PoseCheck:
-    """Result of the pose check.
+    """Result of the pose check."""
 
-    Args:
-        matches: number of good matches.
-        share_violating: share of these that violate the poses; nan without matches.
-        off: cameras that are off; empty where all is right.
-        unmatched: cameras without a match to any other that was tried.
-        findings: what is off, in sentences.
-    """
-
-    matches: int
-    share_violating: float
-    off: tuple[str, ...] = ()
-    unmatched: tuple[str, ...] = ()
-    findings: tuple[Finding, ...] = ()
+    matches: int  # number of good matches
+    share_violating: float  # share of these that violate the poses; nan without matches
+    off: tuple[str, ...] = ()  # cameras that are off; empty where all is right
+    unmatched: tuple[str, ...] = ()  # cameras without a match to any other that was tried
+    findings: tuple[Finding, ...] = ()  # what is off, in sentences
 
     @property
     def conclusive(self) -> bool:
@@ -59,11 +51,7 @@ class PoseCheck:
 def examine_poses(
     frame: MultiViewFrame, cameras: Mapping[str, Camera], *, matcher: PairMatcher | None = None
 ) -> tuple[Evidence, Verdict]:
-    """Matches of one instant's pictures, and which cameras are off by them.
-
-    Raises:
-        MissingExtraError: cv2 or scipy is not installed.
-    """
+    """Matches of one instant's pictures, and which cameras are off by them."""
     evidence = gather(frame, cameras, matcher=matcher)
     verdict = judge(evidence, cameras)
     matches = sum(map(len, evidence.matches.values()))
@@ -81,7 +69,6 @@ def check_poses(frame: MultiViewFrame, rig: CameraRig) -> PoseCheck:
 
     Raises:
         CalibrationError: most cameras are off, and most good matches violate the epipolar geometry of the poses.
-        MissingExtraError: cv2 or scipy is not installed.
     """
     cameras = {name: rig[name] for name in frame.showing(rig.training)}
     matcher = PairMatcher(frame.images, masks=frame.masks)

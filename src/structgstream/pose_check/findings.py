@@ -12,12 +12,10 @@ import numpy as np
 import torch
 
 from structgstream.cameras import Camera
-from structgstream.data.matching import Pair
-from structgstream.data.pair_matches import pair_error
+from structgstream.data.matching import Pair, pair_error
 from structgstream.data.timeline import natural
-from structgstream.pose_check.resection import explained
 from structgstream.pose_check.tracks import Evidence, pixel_scale
-from structgstream.pose_check.verdicts import Verdict
+from structgstream.pose_check.verdicts import Verdict, explained
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")  # the worst first

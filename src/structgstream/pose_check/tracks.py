@@ -9,10 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
-from structgstream.data.arrays import Floats
-from structgstream.data.matching import Pair, epipolar_errors, fundamental_matrix, project, rays
-from structgstream.data.pair_matches import PairError, PairMatcher, neighbor_pairs, pair_error
+from structgstream.data.matching import (
+    Pair,
+    PairError,
+    PairMatcher,
+    epipolar_errors,
+    fundamental_matrix,
+    neighbor_pairs,
+    pair_error,
+    project,
+    rays,
+)
 from structgstream.frames import MultiViewFrame
+from structgstream.geometry import Floats
 
 ALL_PAIRS = 32  # cameras; with more, only neighbours by the given poses are matched
 NEIGHBOURS = 8
@@ -20,17 +29,12 @@ NEIGHBOURS = 8
 
 @dataclass(frozen=True)
 class Evidence:
-    """Keypoints and matches of one instant.
+    """Keypoints and matches of one instant."""
 
-    Args:
-        images: name of a camera to its picture ``[H, W, 3]``.
-        keypoints: name of a camera to pixels ``[S, 2]``.
-        matches: pair of cameras to numbers of keypoints ``[M, 2]``; empty where they see too little in common.
-    """
-
-    images: Mapping[str, NDArray[np.uint8]]
-    keypoints: Mapping[str, Floats]
+    images: Mapping[str, NDArray[np.uint8]]  # name of a camera to its picture ``[H, W, 3]``
+    keypoints: Mapping[str, Floats]  # name of a camera to pixels ``[S, 2]``
     matches: Mapping[Pair, NDArray[np.intp]]
+    """Pair of cameras to numbers of keypoints ``[M, 2]``; empty where they see too little in common."""
 
     def pixels(self, pair: Pair) -> tuple[Floats, Floats]:
         """Matched pixels ``[M, 2]`` in both pictures."""
@@ -57,9 +61,6 @@ def gather(
         cameras: as given.
         matcher: of the same pictures, where some pairs were matched before.
         readings: other poses of the same cameras.
-
-    Raises:
-        MissingExtraError: cv2 is not installed.
     """
     names = [name for name in cameras if name in frame.images]
     if len(names) <= ALL_PAIRS:
@@ -92,23 +93,14 @@ def pixel_scale(width: float) -> float:
 
 @dataclass(frozen=True)
 class Tracks:
-    """Observations of points.
+    """Observations of points."""
 
-    Args:
-        names: of the cameras; observations number them in this order.
-        points: ``[P, 3]``, triangulated from cameras that are not off.
-        point: ``[M]`` number of the point of each observation.
-        camera: ``[M]`` number of its camera.
-        pixels: ``[M, 2]`` its keypoint.
-        residuals: ``[M]`` its distance to the projected point, pixels.
-    """
-
-    names: tuple[str, ...]
-    points: Floats
-    point: NDArray[np.intp]
-    camera: NDArray[np.intp]
-    pixels: Floats
-    residuals: Floats
+    names: tuple[str, ...]  # of the cameras; observations number them in this order
+    points: Floats  # ``[P, 3]``, triangulated from cameras that are not off
+    point: NDArray[np.intp]  # ``[M]`` number of the point of each observation
+    camera: NDArray[np.intp]  # ``[M]`` number of its camera
+    pixels: Floats  # ``[M, 2]`` its keypoint
+    residuals: Floats  # ``[M]`` its distance to the projected point, pixels
 
     def of(self, name: str) -> NDArray[np.bool_]:
         """Mask ``[M]`` of a camera's observations."""

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The clocks of all cameras of a take, as a step of the preparation finds and stores them."""
+"""The clocks of all cameras of a take, and pictures of the same instants by them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
 
 from structgstream.data.lenses import LensCamera
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
 from structgstream.preparation.footage import Footage
-from structgstream.preparation.instants import (
-    shared_seconds,
-)
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.steps import Stored
 from structgstream.preparation.synchronization import Method, synchronize
@@ -22,19 +23,12 @@ SURE_PERIODS = 0.5
 
 @dataclass(frozen=True)
 class Clocks:
-    """The clocks of all cameras.
+    """The clocks of all cameras."""
 
-    Args:
-        clocks: by camera.
-        method: how they were found, see ``preparation.synchronization``.
-        summary: the method and its warnings, for users.
-        sure: whether pictures of one moment can be chosen by them.
-    """
-
-    clocks: Mapping[str, Clock]
-    method: str
-    summary: str
-    sure: bool = True
+    clocks: Mapping[str, Clock]  # by camera
+    method: str  # how they were found, see ``preparation.synchronization``
+    summary: str  # the method and its warnings, for users
+    sure: bool = True  # whether pictures of one moment can be chosen by them
 
 
 def synchronized(
@@ -113,3 +107,86 @@ def unpacked_clocks(stored: Stored) -> Clocks:
     clocks = {name: Clock(**clock) for name, clock in values["clocks"].items()}
     summary = values["summary"] if "summary" in values else values["told"]  # the former name
     return Clocks(clocks, values["method"], summary, values["sure"])
+
+
+Picture = NDArray[np.uint8]
+STILL_PICTURES = 9
+
+
+@dataclass(frozen=True)
+class Shots(Sequence[Picture]):
+    """Pictures of one camera, decoded on access, so that a long take does not fill the memory."""
+
+    footage: Footage
+    camera: str
+    indices: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    @overload
+    def __getitem__(self, number: int) -> Picture: ...
+    @overload
+    def __getitem__(self, number: slice) -> "Shots": ...
+    def __getitem__(self, number: int | slice) -> "Picture | Shots":
+        if isinstance(number, slice):
+            return Shots(self.footage, self.camera, self.indices[number])
+        return next(self.footage.pictures(self.camera, [self.indices[number]]))
+
+
+def shared_seconds(footage: Footage, clocks: Mapping[str, Clock]) -> tuple[float, float]:
+    """First and last moment that all cameras filmed, in the time that they share.
+
+    Raises:
+        CaptureError: there is none.
+    """
+    spans = {}
+    for name in footage.cameras:
+        first, last = clocks.get(name, Clock()).common_seconds(footage.stamps(name)[[0, -1]])
+        spans[name] = first, last
+    late = max(spans, key=lambda name: spans[name][0])
+    early = min(spans, key=lambda name: spans[name][1])
+    first, last = spans[late][0], spans[early][1]
+    if first > last + 1e-6:
+        raise CaptureError(
+            f"The cameras of {footage.where} have no moment in common: {footage.path(early).name} of camera {early!r} "
+            f"ends {first - last:.3f} s before {footage.path(late).name} of camera {late!r} begins (lengths "
+            f"{_length(spans, early)} and {_length(spans, late)}); give longer videos, or leave one camera out with "
+            "--without."
+        )
+    return first, last
+
+
+def shots_of(footage: Footage, clocks: Mapping[str, Clock], seconds: Sequence[float]) -> dict[str, Shots]:
+    """Each camera's pictures nearest to these moments of the shared time."""
+    found = {}
+    for name in footage.cameras:
+        times = clocks.get(name, Clock()).common_seconds(footage.stamps(name))
+        indices = [int(np.abs(times - moment).argmin()) for moment in seconds]
+        found[name] = Shots(footage, name, tuple(indices))
+    return found
+
+
+def still_pictures(footage: Footage) -> dict[str, list[Picture]]:
+    """One picture of each camera without what moves: each value is the median over pictures spread over its take.
+
+    It is of no moment, so it needs no clocks; what stands longer than half of the take remains.
+    """
+    found = {}
+    for name in footage.cameras:
+        taken = len(footage.stamps(name))
+        count = min(STILL_PICTURES, taken - 1 + taken % 2)  # an odd one, whose median is a value that was filmed
+        indices = np.unique(np.linspace(0, taken - 1, count).round().astype(int))
+        stacked = np.stack(list(footage.pictures(name, indices.tolist())))
+        stacked.partition(count // 2, axis=0)
+        found[name] = [stacked[count // 2].copy()]
+    return found
+
+
+def spread_moments(first: float, last: float, count: int) -> list[float]:
+    """Moments from the first to the last, both included; fewer when the take has no length."""
+    return np.linspace(first, last, count).tolist() if last > first and count > 1 else [first]
+
+
+def _length(spans: Mapping[str, tuple[float, float]], name: str) -> str:
+    return f"{spans[name][1] - spans[name][0]:.3f} s"

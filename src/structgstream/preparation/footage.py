@@ -20,7 +20,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.audio import read_audio
 from structgstream.data.camera_files import (
     NO_CAMERAS,
     UNREAD,
@@ -31,13 +30,12 @@ from structgstream.data.camera_files import (
     name_of,
     other_roots,
 )
-from structgstream.data.images import PICTURE_SUFFIXES, read_picture, significant_bits
-from structgstream.data.picture_headers import check_one_series, picture_size
+from structgstream.data.images import PICTURE_SUFFIXES, check_one_series, picture_size, read_picture, significant_bits
 from structgstream.data.posed_capture import filmed_roots
 from structgstream.data.prepared import pictures_of
 from structgstream.data.timeline import natural, picture_slots
 from structgstream.data.video import measured_fps
-from structgstream.data.video_index import VIDEO_SUFFIXES, VideoTrack, open_video, scan_videos, video_stream
+from structgstream.data.video_index import VIDEO_SUFFIXES, VideoTrack, load_av, open_video, scan_videos, video_stream
 from structgstream.data.video_pictures import pictures_at
 from structgstream.errors import CaptureError
 
@@ -57,21 +55,14 @@ class NoFootage(CaptureError):
 
 @dataclass(frozen=True)
 class Footage:
-    """What the cameras filmed.
+    """What the cameras filmed."""
 
-    Args:
-        where: the folder it lies in, for messages.
-        files: name of a camera to its video, folder of pictures or picture, in natural order of the names.
-        tracks: of the cameras with videos.
-        stills: of the cameras with pictures, these in order.
-        picture_fps: frames a second of pictures.
-    """
-
-    where: Path
+    where: Path  # the folder it lies in, for messages
     files: Mapping[str, Path]
-    tracks: Mapping[str, VideoTrack]
-    stills: Mapping[str, tuple[Path, ...]]
-    picture_fps: float = PICTURE_FPS
+    """Name of a camera to its video, folder of pictures or picture, in natural order of the names."""
+    tracks: Mapping[str, VideoTrack]  # of the cameras with videos
+    stills: Mapping[str, tuple[Path, ...]]  # of the cameras with pictures, these in order
+    picture_fps: float = PICTURE_FPS  # frames a second of pictures
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -209,11 +200,7 @@ def find_footage(where: Path, *, picture_fps: float | None = None) -> Footage:
 
 
 def _of_size(picture: NDArray[np.uint8], size: tuple[int, int], name: str, file: Path) -> NDArray[np.uint8]:
-    """The picture itself.
-
-    Raises:
-        CaptureError: it has another size than the camera's first one.
-    """
+    """The picture itself."""
     height, width = picture.shape[:2]
     if (width, height) != size:
         raise CaptureError(
@@ -293,11 +280,7 @@ def _found(root: Path) -> dict[str, Path]:
 
 
 def _check_left(root: Path, found: Mapping[str, Path]) -> None:
-    """Warns of files and folders that are no camera, so that none is lost unnoticed.
-
-    Raises:
-        CaptureError: an empty folder among those of cameras.
-    """
+    """Warns of files and folders that are no camera, so that none is lost unnoticed."""
     taken = next(iter(found.values()))
     for entry in sorted(entry for entry in root.iterdir() if not is_hidden(entry)):
         if entry.is_file() and entry.suffix.lower() in FILMED and entry not in found.values():
@@ -317,3 +300,42 @@ def _check_left(root: Path, found: Mapping[str, Path]) -> None:
             "The folder %s is left out: it holds no %s, as %s does. If it is a camera, give all of one kind.",
             entry, "video" if taken.suffix.lower() in VIDEO_SUFFIXES else "picture", taken,
         )  # fmt: skip
+
+
+LONGEST_SECONDS = 7200.0
+
+
+def read_audio(path: Path, *, rate: int = 48_000) -> NDArray[np.float32] | None:
+    """Mono samples ``[N]`` in [-1, 1]; sample ``k`` sounds at ``k / rate`` seconds of the video's time stamps.
+
+    Where the sound starts later than time 0, silence precedes it. None when the file has no sound.
+
+    Raises:
+        CaptureError: the file cannot be read, or is longer than two hours.
+    """
+    av = load_av()
+    with open_video(path) as container:
+        if not container.streams.audio:
+            return None
+        stream = container.streams.audio[0]
+        resampler = av.AudioResampler(format="flt", layout="mono", rate=rate)
+        parts: list[NDArray[np.float32]] = []
+        start_seconds: float | None = None
+        try:
+            for frame in container.decode(stream):
+                if start_seconds is None:
+                    start_seconds = 0.0 if frame.time is None else float(frame.time)
+                parts += [resampled.to_ndarray()[0] for resampled in resampler.resample(frame)]
+            parts += [resampled.to_ndarray()[0] for resampled in resampler.resample(None)]
+        except av.error.FFmpegError as error:
+            raise CaptureError(
+                f"The sound of {path} cannot be decoded ({error.strerror}); copy the file again, or synchronise by "
+                "another method."
+            ) from None
+    if not parts or start_seconds is None:
+        return None
+    samples = np.concatenate(parts).astype(np.float32)
+    first = round(start_seconds * rate)
+    if len(samples) + first > LONGEST_SECONDS * rate:
+        raise CaptureError(f"{path} is longer than two hours; cut it to the take.")
+    return np.concatenate([np.zeros(first, np.float32), samples]) if first > 0 else samples[-first:]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from structgstream.data.rectilinear import check_field_of_view
+from structgstream.data.undistortion import check_field_of_view
 from structgstream.errors import ConfigError
 from structgstream.preparation.calibration.board import Board
 from structgstream.preparation.calibration.colmap import LensModel

@@ -12,9 +12,8 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from structgstream.atomic_files import give_name, partial_path, replacing
+from structgstream.atomic_files import give_name, lock_file, open_lockable, partial_path, replacing
 from structgstream.errors import CaptureError, StorageError
-from structgstream.file_locks import lock_file, open_lockable
 from structgstream.preparation.options import Link
 from structgstream.preparation.steps import FOLDER
 

@@ -4,23 +4,474 @@
 :func:`check_folder` is the last step for a capture of any layout.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import json
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from structgstream.data.calibration import Calibration
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.atomic_files import atomic_file
+from structgstream.cameras import CameraRig
+from structgstream.data.calibration import NEAR_IN_RIG_RADII, Calibration, listed
 from structgstream.data.camera_files import REPORT
-from structgstream.data.open import open_capture
-from structgstream.data.prepared import read_prepared, recognizes_prepared
+from structgstream.data.masks import FOLDER as MASKS
+from structgstream.data.open import best_surrounded, open_capture
+from structgstream.data.points import initial_points
+from structgstream.data.prepared import (
+    PreparedCamera,
+    PreparedCapture,
+    prepared_entries,
+    prepared_rig,
+    read_prepared,
+    recognizes_prepared,
+    write_prepared,
+)
+from structgstream.data.source import FrameSource
+from structgstream.data.timeline import Clock
+from structgstream.data.undistortion import rectilinear
+from structgstream.data.video import measured_fps
+from structgstream.data.wrappers import WithRig
+from structgstream.errors import CalibrationError, ConfigError
+from structgstream.frames import MIN_CAMERAS
 from structgstream.pose_check.findings import Finding
-from structgstream.preparation.camera_steps import CameraSteps, check_used, chosen_method
-from structgstream.preparation.capture_steps import CaptureSteps, assembled
-from structgstream.preparation.checking.check import Checked, check_capture
-from structgstream.preparation.footage import Footage
-from structgstream.preparation.options import PrepareOptions
-from structgstream.preparation.output_folder import lock_output
-from structgstream.preparation.report.page import write_report
-from structgstream.preparation.steps import Job, Listener, Silent, Steps
+from structgstream.preparation.calibration.solved import SolvedCalibration, with_distance
+from structgstream.preparation.checking.check import Checked, Examination, check_capture, examine_capture
+from structgstream.preparation.checking.overlap import nearest_depth, observed_depths
+from structgstream.preparation.clocks import (
+    TIMESTAMPS,
+    Clocks,
+    first_clocks,
+    packed_clocks,
+    synchronized,
+    unpacked_clocks,
+)
+from structgstream.preparation.footage import Footage, find_footage
+from structgstream.preparation.options import METHODS, PrepareOptions
+from structgstream.preparation.output_folder import link, lock_output, mark_output, remove_others, unlink
+from structgstream.preparation.report import write_report
+from structgstream.preparation.solvers import (
+    calibration_key,
+    check_complete,
+    describe_focals,
+    describe_turns,
+    find_calibration,
+    given_cameras,
+    packed,
+    refined,
+    require_calibration,
+    solve_cameras,
+    stated_focals,
+    summary,
+    unpacked,
+)
+from structgstream.preparation.steps import FOLDER, Job, Listener, Silent, Steps, Stored, fingerprint
+from structgstream.similarity import rig_radius
+
+MIN_SOLVED = 3  # cameras, for poses that can be checked
+
+
+class CameraSteps:
+    """The steps of one preparation up to a calibration in a unit.
+
+    Args:
+        job: what is prepared, and how.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self.videos, self.capture, self.options = job.videos, job.capture, job.options
+        self.steps = job.steps
+
+    def find(self) -> Footage:
+        self.steps.begin("find")
+        footage = find_footage(self.videos, picture_fps=self.options.fps)
+        self._check_names(self.options.without, footage, purpose="leave out")
+        footage = footage.only([name for name in footage.cameras if name not in self.options.without])
+        held_out, distance = self.options.held_out, self.options.distance
+        self._check_names(() if held_out == ("auto",) else held_out, footage, purpose="hold out")
+        self._check_names(
+            () if distance is None else (distance.first, distance.second), footage, purpose="measure from"
+        )
+        check_enough(footage)
+        self._check_trained(footage)
+        mark_output(self.capture, self.videos)
+        turns = describe_turns(footage)
+        self.steps.end("find", _described(footage) + (f"; {turns}" if turns else ""))
+        return footage
+
+    def _check_names(self, names: Collection[str], footage: Footage, *, purpose: str) -> None:
+        """Refuses cameras that are not there, before anything takes time."""
+        if unknown := [name for name in names if name not in footage.cameras]:
+            raise ConfigError(
+                f"{self.videos} has no {listed(unknown)} to {purpose}; its cameras are {', '.join(footage.cameras)}."
+            )
+
+    def _check_trained(self, footage: Footage) -> None:
+        """Refuses to hold out more cameras than can be spared, before anything takes time."""
+        held_out = set(self.options.held_out) - {"auto"}
+        if len(footage.cameras) - len(held_out) < MIN_CAMERAS:
+            raise ConfigError(
+                f"{self.videos} has {len(footage.cameras)} cameras, {len(held_out)} of them held out; a reconstruction "
+                f"needs {MIN_CAMERAS} or more to train on: hold out fewer."
+            )
+
+    def synchronize(self, footage: Footage, method: str | Calibration) -> Clocks:
+        """The clocks; by motion they may be unsure until the calibration is known."""
+
+        def find() -> Clocks:
+            if not isinstance(method, str):
+                return synchronized(footage, self.options, cameras=given_cameras(method, footage).cameras)
+            # Pictures of a board are matched by their time, so there clocks must be known first.
+            by_itself = method == "sfm" or self.options.board_videos is not None
+            return (first_clocks if by_itself else synchronized)(footage, self.options)
+
+        inputs = {
+            "files": fingerprint(footage.files),
+            "table": fingerprint({"table": table}) if (table := footage.where / TIMESTAMPS).is_file() else None,
+            "fps": footage.fps,
+            "how": self.options.synchronize,
+            "calibration": method if isinstance(method, str) else calibration_key(method),
+            "board": self.options.board_videos is not None,
+        }
+        return self._clocks("synchronize", inputs, find)
+
+    def synchronize_again(
+        self, footage: Footage, clocks: Clocks, method: str | Calibration, solved: SolvedCalibration
+    ) -> Clocks:
+        """By motion again when the calibration is known, which makes it exact.
+
+        Raises:
+            CaptureError: not even so.
+        """
+        if clocks.method != "motion" or not isinstance(method, str):
+            return clocks
+        return self._clocks(
+            "clocks",
+            {},
+            lambda: synchronized(footage, self.options, cameras=solved.cameras),
+            after=("scale",),
+        )
+
+    def _clocks(
+        self, step: str, inputs: Mapping[str, object], find: Callable[[], Clocks], after: tuple[str, ...] = ()
+    ) -> Clocks:
+        return self.steps.run(
+            step, inputs, find, pack=packed_clocks, unpack=unpacked_clocks, summary=lambda found: found.summary,
+            after=after,
+        )  # fmt: skip
+
+    def calibrate(self, footage: Footage, clocks: Clocks, method: str | Calibration) -> SolvedCalibration:
+        options = self.options
+        name = method if isinstance(method, str) else method.where.name
+        inputs = {
+            "method": method if isinstance(method, str) else calibration_key(method),
+            "board": asdict(options.board),
+            "lens": options.lens,
+            "intrinsics": options.intrinsics,
+            "board_videos": None if options.board_videos is None else fingerprint({"board": options.board_videos}),
+            "instants": options.instants,
+        }
+        focals = stated_focals(footage) if method == "sfm" else {}
+        if focals:
+            inputs["focals"] = focals
+        solved = self._solved(
+            "calibrate",
+            inputs,
+            lambda: (_first(method, footage, clocks, options, focals), describe_focals(focals, footage)),
+            describe=lambda found, detail: f"{name}: {summary(found)}" + (f"; {detail}" if detail else ""),
+            after="synchronize",
+        )
+        last = "calibrate"
+        if options.refine:
+            solved = self._solved(
+                last := "refine",
+                {},
+                lambda: refined(solved, footage, clocks, options),
+                describe=lambda found, detail: detail,
+                after="calibrate",
+            )
+        distance = options.distance
+
+        def scale() -> tuple[SolvedCalibration, str]:
+            if distance is None:
+                return solved, ""
+            return with_distance(solved, distance.first, distance.second, metres=distance.metres), ""
+
+        return self._solved(
+            "scale",
+            {"distance": None if distance is None else asdict(distance)},
+            scale,
+            describe=lambda found, _: "metres" if found.metres else "arbitrary units; --distance A B 3.2m gives metres",
+            after=last,
+        )
+
+    def _solved(
+        self,
+        step: str,
+        inputs: Mapping[str, object],
+        solve: Callable[[], tuple[SolvedCalibration, str]],
+        *,
+        describe: Callable[[SolvedCalibration, str], str],
+        after: str,
+    ) -> SolvedCalibration:
+        def pack(found: tuple[SolvedCalibration, str]) -> Stored:
+            stored = packed(found[0])
+            return Stored({**stored.values, "detail": found[1]}, stored.arrays)
+
+        found = self.steps.run(
+            step,
+            inputs,
+            solve,
+            pack=pack,
+            unpack=lambda stored: (unpacked(stored), str(stored.values.get("detail", stored.values.get("told", "")))),
+            summary=lambda found: describe(*found),
+            after=(after,),
+        )
+        return found[0]
+
+
+def chosen_method(footage: Footage, options: PrepareOptions) -> str | Calibration:
+    """``sfm``, ``board``, or the calibration to use.
+
+    Raises:
+        CalibrationError: the requested calibration is missing or broken.
+    """
+    if str(options.calibration) not in METHODS:
+        return require_calibration(Path(options.calibration))
+    if options.calibration != "auto":
+        return str(options.calibration)
+    if options.board_videos is not None:
+        return "board"
+    return find_calibration(footage.where) or "sfm"
+
+
+def check_used(method: str | Calibration, footage: Footage, options: PrepareOptions) -> None:
+    """
+    Raises:
+        ConfigError: an option has no effect, so that its user expects another capture.
+    """
+    if options.fps is not None and footage.tracks:
+        raise ConfigError(
+            f"The videos of {footage.where} state the time of each frame, and --fps is the rate of folders of "
+            "pictures; leave out --fps."
+        )
+    if options.board_videos is not None and method != "board":
+        raise ConfigError(
+            "Videos of a board (--board-videos) calibrate by --calibration board alone; choose that, or leave them out."
+        )
+    if options.intrinsics != "own" and method != "sfm":
+        raise ConfigError(
+            "Shared intrinsics (--intrinsics) are estimated by structure from motion alone; choose --calibration sfm, "
+            "or leave them out."
+        )
+    if options.lens is not None and isinstance(method, Calibration) and not options.refine:
+        raise ConfigError(
+            f"{method.where} states the lenses, so --lens {options.lens} has no effect; add --refine to adjust them to "
+            "the pictures, choose --calibration sfm, or leave out --lens."
+        )
+
+
+def check_enough(footage: Footage) -> None:
+    """
+    Raises:
+        CalibrationError: too few cameras for poses that can be checked.
+    """
+    if len(footage.cameras) < MIN_SOLVED:
+        raise CalibrationError(
+            f"{footage.where} has {listed(footage.cameras)} alone; a capture needs {MIN_SOLVED} or more, as two "
+            "cameras cannot confirm each other's calibration: film with more."
+        )
+
+
+def _first(
+    method: str | Calibration,
+    footage: Footage,
+    clocks: Clocks,
+    options: PrepareOptions,
+    focals: Mapping[str, float],
+) -> SolvedCalibration:
+    if isinstance(method, str):
+        return check_complete(solve_cameras(method, footage, clocks, options, focals=focals), footage)
+    return given_cameras(method, footage)
+
+
+def _described(footage: Footage) -> str:
+    sizes = sorted({footage.size(name) for name in footage.cameras})
+    shown = ", ".join(f"{width}x{height}" for width, height in sizes[:3])
+    lengths = [len(footage.stamps(name)) for name in footage.cameras]
+    frames = f"{min(lengths)}" if min(lengths) == max(lengths) else f"{min(lengths)} to {max(lengths)}"
+    kind = "videos" if footage.tracks else "folders of pictures"
+    return f"{len(footage.cameras)} {kind}, {shown}, {frames} frames, {footage.fps:g} a second"
+
+
+POINTS = "points.npy"
+NEAR_SHARE = 0.5  # of the depth of the nearest points: what comes closer later is still drawn
+
+
+class CaptureSteps:
+    """The steps of one preparation from a calibration on.
+
+    Args:
+        job: what is prepared, and how.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self.videos, self.capture, self.options = job.videos, job.capture, job.options
+        self.steps = job.steps
+        self.examination: Examination | None = None  # which two steps look at
+        self._opened: FrameSource | None = None
+
+    def link(self, footage: Footage, content: PreparedCapture) -> None:
+        self.steps.begin("link")
+        for number, (name, camera) in enumerate(content.cameras.items()):
+            self.steps.progress(number, len(content.cameras), name)
+            target = self.capture / camera.files
+            source = footage.path(name)
+            if not footage.tracks and source.is_file():
+                target = target / source.name
+            link(source, target, how=self.options.link)
+            if not footage.tracks:
+                remove_others(self.capture / camera.files, [file.name for file in footage.stills[name]])
+        self._link_masks()
+        write_prepared(self.capture, content)
+        how = {"hard": "hard link or copy", "symlink": "symlink", "copy": "copy"}[self.options.link]
+        self.steps.end("link", f"{len(content.cameras)} cameras by {how}")
+
+    def _link_masks(self) -> None:
+        """All masks but those of cameras that are left out; these are removed where an earlier run linked them."""
+        folder = self.videos / MASKS
+        for entry in sorted(folder.iterdir()) if folder.is_dir() else ():
+            target = self.capture / MASKS / entry.name
+            if (entry.name if entry.is_dir() else entry.stem) in self.options.without:
+                unlink(entry, target)
+            else:
+                link(entry, target, how=self.options.link)
+
+    def near(self, content: PreparedCapture) -> PreparedCapture:
+        """With the near plane from the points that pictures confirm."""
+        if self.options.near is not None:
+            return content
+
+        def measure() -> float | None:
+            self.examination = examine_capture(self._source(content))
+            return nearest_depth(observed_depths(self.examination.tracks, self.examination.cameras))
+
+        nearest = self.steps.run(
+            "near",
+            self._inputs(content),
+            measure,
+            pack=lambda found: Stored({"nearest": found}),
+            unpack=lambda stored: stored.values["nearest"],
+            summary=lambda found: "too few points: 0.12 rig radii" if found is None
+            else f"{NEAR_SHARE * found:.3g}, half of the depth of the nearest points",
+            after=("synchronize",),
+        )  # fmt: skip
+        content = content if nearest is None else replace(content, near=NEAR_SHARE * nearest)
+        write_prepared(self.capture, content)
+        return content
+
+    def points(self, content: PreparedCapture) -> PreparedCapture:
+        def estimate() -> NDArray[np.float64]:
+            source = self._source(content)
+            return initial_points(next(source.frames(0)), source.rig).positions
+
+        found = self.steps.run(
+            "points",
+            self._inputs(content),
+            estimate,
+            pack=lambda points: Stored({}, {"points": points}),
+            unpack=lambda stored: stored.arrays["points"],
+            summary=lambda points: f"{len(points):,} points of frame 0",
+            after=("synchronize",),
+        )  # fmt: skip
+        with atomic_file(self.capture / POINTS) as file:
+            np.save(file, found)
+        content = replace(content, points=POINTS)
+        write_prepared(self.capture, content)
+        return content
+
+    def check(self, content: PreparedCapture) -> tuple[Finding, ...]:
+        from structgstream.preparation.report import write_report
+
+        def look() -> tuple[Finding, ...]:
+            source = self._source(content)
+            checked = check_capture(source, unit=content.unit, listener=self.steps, examination=self.examination)
+            checked = replace(checked, report=replace(checked.report, steps=dict(self.steps.summaries)))
+            write_report(self.capture / REPORT, checked, listener=self.steps)
+            return checked.report.findings
+
+        if not (self.capture / REPORT / "index.html").is_file():
+            (self.capture / FOLDER / "check.json").unlink(missing_ok=True)
+        return self.steps.run(
+            "check",
+            self._inputs(content),
+            look,
+            pack=lambda findings: Stored({"findings": [asdict(finding) for finding in findings]}),
+            unpack=lambda stored: tuple(
+                Finding(found["severity"], found["sentence"], tuple(found["cameras"]))
+                for found in stored.values["findings"]
+            ),
+            summary=lambda findings: f"{len(findings)} finding{'s' * (len(findings) != 1)}; {REPORT}/index.html",
+            after=("points",),
+        )
+
+    def _inputs(self, content: PreparedCapture) -> dict[str, object]:
+        """All that frames depend on, but for what was filmed."""
+        inputs: dict[str, object] = {"content": json.dumps(prepared_entries(content))}
+        if (masks := self.capture / MASKS).is_dir():
+            inputs["masks"] = fingerprint({"masks": masks})
+        return inputs
+
+    def _source(self, content: PreparedCapture) -> FrameSource:
+        """The capture, opened once: indexing videos takes time, and its warnings should come once."""
+        if self._opened is None:
+            self._opened = open_capture(self.capture)
+        points = None
+        if content.points is not None:
+            points = np.asarray(np.load(self.capture / content.points, allow_pickle=False), np.float64)
+        return _Grown(self._opened, prepared_rig(self.capture, content), points)
+
+
+@dataclass(frozen=True)
+class _Grown(WithRig):
+    """An opened capture with the near plane and the points that were found since."""
+
+    found: NDArray[np.float64] | None
+
+    @property
+    def points(self) -> NDArray[np.float64] | None:
+        return self.found
+
+
+def held_out_of(options: PrepareOptions, rig: CameraRig) -> frozenset[str]:
+    """The cameras to hold out."""
+    return frozenset({best_surrounded(rig)} if options.held_out == ("auto",) else options.held_out)
+
+
+def assembled(
+    footage: Footage,
+    clocks: Mapping[str, Clock],
+    solved: SolvedCalibration,
+    options: PrepareOptions,
+) -> PreparedCapture:
+    """The content of ``capture.json`` with the usual near plane, without points.
+
+    Raises:
+        ConfigError: a field of view or size that cannot be.
+        CalibrationError: a lens that cannot be undistorted.
+    """
+    cameras = {}
+    for name in footage.cameras:
+        filmed = solved.cameras[name]
+        pinhole = rectilinear(filmed, degrees=options.field_of_view, size=options.size)
+        where = f"videos/{name}{footage.path(name).suffix.lower()}" if footage.tracks else f"pictures/{name}"
+        cameras[name] = PreparedCamera(where, filmed, pinhole, clocks.get(name, Clock()))
+    rig = CameraRig({name: camera.pinhole for name, camera in cameras.items()})
+    held_out = held_out_of(options, rig)
+    near = options.near or NEAR_IN_RIG_RADII * rig_radius(rig.with_held_out(held_out))
+    fps = measured_fps(footage.tracks, clocks) if footage.tracks else None
+    return PreparedCapture(cameras, fps or footage.fps, near, "metres" if solved.metres else "arbitrary", held_out)
 
 
 @dataclass(frozen=True)
@@ -57,7 +508,6 @@ def prepare_capture(
         CaptureError: the videos cannot be read, synchronised or calibrated, or ``capture`` holds something else.
         ConfigError: options that the cameras do not allow.
         StorageError: the capture cannot be written.
-        MissingExtraError: a package is missing that a step needs.
     """
     options = options or PrepareOptions()
     job = Job(videos, capture, options, Steps(capture, listener or Silent()))
@@ -97,7 +547,6 @@ def check_folder(path: Path, *, report: Path | None, listener: Listener | None =
 
     Raises:
         CaptureError: the capture cannot be opened or read.
-        MissingExtraError: a package is missing that the check or the report needs.
         StorageError: the report cannot be written.
     """
     listener = listener or Silent()

@@ -1,32 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Solves for the cameras with the pictures that each method needs, and packs the result for the cache of steps."""
+"""Cameras by the method that is chosen: solved from the pictures that it needs, or given by a file."""
 
 import shlex
 from collections.abc import Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from structgstream.data.calibration import listed
-from structgstream.data.lenses import LensCamera
-from structgstream.data.picture_headers import read_exif
-from structgstream.data.prepared import LENSES, camera_of, lens_model
+from structgstream.data.calibration import Calibration, PosedCamera, listed
+from structgstream.data.dataset_layouts import CAMERAS_FILE, MODELS_FILE, read_cameras, read_models
+from structgstream.data.found_calibrations import calibration_below, read_calibration
+from structgstream.data.images import read_exif
+from structgstream.data.lenses import LensCamera, Pinhole
+from structgstream.data.posed_capture import filmed_by, orientations
+from structgstream.data.prepared import FILE as PREPARED
+from structgstream.data.prepared import LENSES, camera_of, lens_model, read_prepared
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.calibration.board_solving import solve_board
 from structgstream.preparation.calibration.refinement import refine
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
 from structgstream.preparation.calibration.structure import solve_structure
-from structgstream.preparation.clocks import Clocks, synchronized
-from structgstream.preparation.footage import Footage, find_footage
-from structgstream.preparation.instants import (
+from structgstream.preparation.clocks import (
+    Clocks,
     Picture,
     Shots,
     shared_seconds,
     shots_of,
     spread_moments,
     still_pictures,
+    synchronized,
 )
+from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.steps import Stored
 
@@ -55,7 +61,6 @@ def solve_cameras(
     Raises:
         CalibrationError: the cameras see too little in common, or too little of the board.
         CaptureError: pictures cannot be read.
-        MissingExtraError: pycolmap or cv2 is not installed.
     """
     if method == "sfm":
         pictures = matched_pictures(footage, clocks, options)
@@ -152,7 +157,6 @@ def stated_focals(footage: Footage) -> dict[str, float]:
 
     Raises:
         CaptureError: a picture cannot be read.
-        MissingExtraError: Pillow is not installed.
     """
     stated = {name: read_exif(files[0]).focal_pixels for name, files in footage.stills.items()}
     return {name: focal for name, focal in stated.items() if focal is not None}
@@ -177,7 +181,6 @@ def describe_turns(footage: Footage) -> str:
 
     Raises:
         CaptureError: a picture cannot be read.
-        MissingExtraError: Pillow is not installed.
     """
     turned = [name for name, files in footage.stills.items() if read_exif(files[0]).orientation != 1]
     if not turned:
@@ -228,3 +231,92 @@ def unpacked(stored: Stored) -> SolvedCalibration:
     seen = Observations(arrays["point"], arrays["camera"], arrays["pixels"], arrays["instant"])
     missing = tuple(stored.values["missing"])
     return SolvedCalibration(cameras, arrays["points"], seen, missing, bool(stored.values["metres"]))
+
+
+def find_calibration(where: Path) -> Calibration | None:
+    """The calibration in a folder or one folder below, or that a file holds; None when there is none that is known.
+
+    Raises:
+        CalibrationError: it is broken, or a pickle.
+    """
+    folder, file = (where, None) if where.is_dir() else (where.parent, where)
+
+    def meant(name: str) -> bool:
+        return (folder / name).is_file() and file in (None, folder / name)
+
+    if meant(PREPARED):
+        return _of_prepared(folder)
+    if meant(CAMERAS_FILE):
+        return _of_cameras(folder / CAMERAS_FILE)
+    if meant(MODELS_FILE):
+        return read_models(folder / MODELS_FILE)
+    if (found := read_calibration(folder, file)) is not None or file is not None:
+        return found
+    below = calibration_below(folder)
+    return None if below is None else read_calibration(below)
+
+
+def require_calibration(where: Path) -> Calibration:
+    """As :func:`find_calibration`.
+
+    Raises:
+        CalibrationError: there is none, or it is broken.
+    """
+    if not where.exists():
+        raise CalibrationError(f"The calibration {where} does not exist; give a file or a folder of docs/captures.md.")
+    found = find_calibration(where)
+    if found is None:
+        raise CalibrationError(
+            f"{where} is no calibration that is known; expected a file of docs/captures.md (aniposelib, EasyMocap, "
+            "multical, Kalibr, CMU Panoptic, Qualisys, ZJU-MoCap, OpenCV, transforms.json, models.json, COLMAP)."
+        )
+    return found
+
+
+def _of_prepared(folder: Path) -> Calibration:
+    capture = read_prepared(folder)
+    cameras = []
+    for name, camera in capture.cameras.items():
+        filmed = camera.filmed.camera
+        size = (filmed.width, filmed.height)
+        cameras.append(PosedCamera(name, filmed.viewmat.numpy(), filmed.K.numpy(), size, camera.filmed.lens))
+    return Calibration(folder / PREPARED, tuple(cameras), held_out=sorted(capture.held_out), turned_by_exif=False)
+
+
+def _of_cameras(file: Path) -> Calibration:
+    rig, _, _ = read_cameras(file)
+    cameras = tuple(
+        PosedCamera(name, camera.viewmat.numpy(), camera.K.numpy(), (camera.width, camera.height), Pinhole())
+        for name, camera in rig.cameras.items()
+    )
+    return Calibration(file, cameras, held_out=rig.testing)
+
+
+def given_cameras(calibration: Calibration, footage: Footage) -> SolvedCalibration:
+    """The cameras of a given calibration, for these pictures.
+
+    Raises:
+        CalibrationError: it belongs to other cameras, to pictures of another size, or to pictures turned by their EXIF
+            orientation, while a prepared capture has them as they are stored.
+    """
+    turns = orientations(calibration, {name: files[0] for name, files in footage.stills.items()})
+    if turned := [name for name, turn in turns.items() if turn != 1]:
+        raise CalibrationError(
+            f"{calibration.where} is for pictures that are turned as their EXIF orientation says, and those of "
+            f"{listed(turned)} are stored otherwise; turn them without loss (exiftran -a, jpegtran), so that they are "
+            "stored upright, or give the folder with the calibration to reconstruct as it is."
+        )
+    sizes = {name: footage.size(name) for name in footage.cameras}
+    filmed = filmed_by(calibration, sizes, root=footage.where)
+    points = np.empty((0, 3)) if calibration.points is None else calibration.points
+    none = np.empty(0, np.intp)
+    return SolvedCalibration(filmed, points, Observations(none, none, np.empty((0, 2)), none))
+
+
+def calibration_key(calibration: Calibration) -> list[object]:
+    """Every value of a calibration that results depend on, as JSON can hold it; its files may be several."""
+    cameras = [
+        (camera.name, camera.viewmat.tolist(), camera.K.tolist(), camera.size, repr(camera.lens))
+        for camera in calibration.cameras
+    ]
+    return [str(calibration.where), cameras, None if calibration.points is None else calibration.points.tolist()]

@@ -176,16 +176,9 @@ def fingerprint(files: Mapping[str, Path]) -> list[tuple[str, str, int, int]]:
 
 @dataclass(frozen=True)
 class Job:
-    """One preparation.
+    """One preparation."""
 
-    Args:
-        videos: the folder of what was filmed.
-        capture: the folder to make.
-        options: of the preparation.
-        steps: runs them, or takes their results from the disk, and reports them.
-    """
-
-    videos: Path
-    capture: Path
-    options: PrepareOptions
-    steps: Steps
+    videos: Path  # the folder of what was filmed
+    capture: Path  # the folder to make
+    options: PrepareOptions  # of the preparation
+    steps: Steps  # runs them, or takes their results from the disk, and reports them

@@ -7,15 +7,26 @@ Each quality is a session of its own, equal to that of a run with a single quali
 is always advanced next, the coarsest first among equals. So all sessions receive the same frames (Note [Readers]), and
 they differ by at most one frame when the process is killed. After resuming, a quality that lacks a frame gets it before
 any other continues.
+
+Note [Shared work]
+~~~~~~~~~~~~~~~~~~
+Qualities differ in quantization steps and in the weight of the rate term. Neither affects the preprocessing of
+pictures, nor the fit of frame 0 (or of a period that begins from points), which is quantized only afterwards. So each
+of these is computed for the first quality that requests it, and the others receive the same values; their bytes equal
+those of separate runs. Qualities fit a frame one after the other, so only the latest results are cached.
 """
 
 import math
-from collections.abc import Callable, Generator, Mapping, Sequence
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Generator, Hashable, Mapping, Sequence
+from concurrent.futures import Future
 from contextlib import ExitStack, closing, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
+from structgstream.cameras import CameraRig
 from structgstream.codec.packets import PacketSink
 from structgstream.data.denoising import DenoisingConfig, denoised
 from structgstream.data.shared_frames import SharedFrames
@@ -23,18 +34,116 @@ from structgstream.data.source import FrameStream
 from structgstream.data.wrappers import read_ahead
 from structgstream.errors import StorageError
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry, read_log
+from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
-from structgstream.qualities.bit_rates import BitRates
-from structgstream.qualities.ladder import Quality, configured
-from structgstream.qualities.shared_work import SharedWork, shared_pipeline
+from structgstream.qualities.ladder import BitRates, Quality, configured
 from structgstream.recorder import Storage, log_reports
 from structgstream.run_metrics import RunMetrics
 from structgstream.scene.scene import Scene
 from structgstream.session.frame_report import FrameReport
 from structgstream.session.loop import Session
-from structgstream.session.pipeline import Pipeline, StoredStream
+from structgstream.session.pipeline import FrameTask, Past, Pipeline, StoredStream
 from structgstream.session.presets import StreamConfig
-from structgstream.training.result import StepListener
+from structgstream.session.struct_gstream import FrameZeroContext, StructGStream, stream_pipeline
+from structgstream.training.online.preprocess import FramePictures
+from structgstream.training.result import FitResult, StepListener
+
+Value = TypeVar("Value")
+PICTURES_KEPT = 3
+"""Results of the current frame, the next one, which may be read ahead, and the previous one, if a quality lacks it."""
+
+
+class Once(Generic[Value]):
+    """A cache that computes each value at its first request; concurrent requests wait for it. Thread-safe.
+
+    Args:
+        most: largest number of cached values.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._found: OrderedDict[Hashable, Future[Value]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def value(self, key: Hashable, make: Callable[[], Value]) -> tuple[Value, bool]:
+        """The value of ``key``, and whether it was computed now. All waiting requests receive an error of ``make``."""
+        with self._lock:
+            found = self._found.get(key)
+            mine = found is None
+            if found is None:
+                found = self._found[key] = Future()
+                while len(self._found) > self._most:
+                    self._found.popitem(last=False)
+        if mine:
+            try:
+                found.set_result(make())
+            except BaseException as error:
+                found.set_exception(error)
+                self._forget(key)
+        return found.result(), mine
+
+    def clear(self) -> None:
+        """Removes all values."""
+        with self._lock:
+            self._found.clear()
+
+    def _forget(self, key: Hashable) -> None:
+        with self._lock:
+            self._found.pop(key, None)
+
+
+@dataclass(frozen=True)
+class SharedWork:
+    """Shared results of the qualities of one run.
+
+    Args:
+        pictures: preprocessed pictures, by the numbers of a frame and of the frame before.
+        first: fits of first frames, by frame number.
+    """
+
+    pictures: Once[FramePictures] = field(default_factory=lambda: Once(PICTURES_KEPT))
+    first: Once[FitResult[Scene]] = field(default_factory=lambda: Once(1))
+
+
+@dataclass(frozen=True)
+class SharedMethod(StructGStream):
+    """The method of one of several qualities (Note [Shared work]).
+
+    Args:
+        shared: the shared results.
+    """
+
+    shared: SharedWork = field(default_factory=SharedWork)
+
+    def observe(
+        self, frame: MultiViewFrame, before: MultiViewFrame | None, *, rig: CameraRig, backend: Backend
+    ) -> FramePictures:
+        """See ``StructGStream``."""
+        key = frame.index, None if before is None else before.index
+        observe = super().observe
+        return self.shared.pictures.value(key, lambda: observe(frame, before, rig=rig, backend=backend))[0]
+
+    def first(self, task: FrameTask) -> FitResult[Scene]:
+        """See ``StructGStream``; only the quality that computed the fit reports its seconds."""
+        first = super().first
+        fit, mine = self.shared.first.value(task.frame.index, lambda: first(task))
+        return fit if mine else replace(fit, seconds={})
+
+    def next(self, past: Past[Scene, FrameZeroContext], task: FrameTask) -> FitResult[Scene]:
+        """See ``StructGStream``."""
+        if task.begins is None:  # All qualities have the previous frame, so no first frame is needed again.
+            self.shared.first.clear()
+        return super().next(past, task)
+
+
+def shared_pipeline(config: StreamConfig, shared: SharedWork) -> Pipeline[Scene, Any]:
+    """The pipeline of one of several qualities.
+
+    Raises:
+        ConfigError: see ``stream_pipeline``.
+    """
+    return replace(stream_pipeline(config), method=SharedMethod(config, shared=shared))
+
 
 FIGURES = ("kind", "bytes", "train_psnr", "total_seconds", "cpu_seconds", "anchors", "free", "begins")
 """Keys that a line of the joint log contains for each quality, copied from that quality's own log."""

@@ -1,16 +1,115 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parses the query of a request and checks its access token."""
+"""Access tokens, ``v1.EXPIRES.SIGNATURE.STREAM``, and the check of a request's query and token.
 
+Note [Tokens]
+~~~~~~~~~~~~~
+EXPIRES is in Unix seconds; STREAM is the name of a stream, or ``~`` for every stream and the metrics. SIGNATURE is the
+HMAC-SHA256 of both under the secret, in base64 without padding. Tokens are not stored: the secret is sufficient to
+check one. A token cannot be revoked, so it should expire soon; all tokens of a secret become invalid when the server
+is started without it. All characters can be used in a query and in a header without escapes.
+"""
+
+import base64
+import hashlib
+import hmac
 import re
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Final
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 from urllib.parse import parse_qsl
 
-from starlette.requests import Request
+from structgstream.errors import ConfigError
+from structgstream.serve.streams import is_stream_name
 
-from structgstream.serve.tokens import Access, TokenKeys
+if TYPE_CHECKING:
+    from starlette.requests import Request
+
+EVERY_STREAM: Final = "~"
+MIN_SECRET_BYTES: Final = 32
+MAX_SECRET_FILE_BYTES: Final = 64 * 1024
+MAX_TOKEN_BYTES: Final = 256
+
+_TOKEN = re.compile(r"v1\.([0-9]{1,12})\.([A-Za-z0-9_-]{43})\.([A-Za-z0-9._~-]{1,128})", re.ASCII)
+_CONTEXT = b"structgstream access token v1\0"
+
+
+class Access(Enum):
+    """The result of checking a token for a stream."""
+
+    GRANTED = "granted"
+    MISSING = "no token"
+    FORGED = "not a token of this server"
+    EXPIRED = "expired"
+    OTHER_STREAM = "for another stream"
+
+
+@dataclass(frozen=True)
+class TokenKeys:
+    """Secrets. The first one signs and all are accepted, so a secret can be replaced while its tokens are valid."""
+
+    secrets: tuple[bytes, ...]
+
+    def token(self, stream: str, *, expires_unix_seconds: int) -> str:
+        """A token for ``stream``, or for every stream with :data:`EVERY_STREAM`.
+
+        Raises:
+            ConfigError: no stream can have this name.
+        """
+        if stream != EVERY_STREAM and not is_stream_name(stream):
+            raise ConfigError(
+                f"{stream!r} is no name of a stream; expected letters, digits, dots, dashes and underscores."
+            )
+        return f"v1.{expires_unix_seconds}.{_signature(self.secrets[0], expires_unix_seconds, stream)}.{stream}"
+
+    def access(self, token: str | None, stream: str, *, unix_seconds: float) -> Access:
+        """Check ``token`` for a stream at a time; its other parts are parsed only if the signature is valid."""
+        if not token:
+            return Access.MISSING
+        found = _TOKEN.fullmatch(token) if len(token) <= MAX_TOKEN_BYTES else None
+        if found is None:
+            return Access.FORGED
+        expires, signature, name = int(found[1]), found[2].encode(), found[3]
+        # All secrets are tried, so that the time does not depend on which one signed.
+        right = [hmac.compare_digest(signature, _signature(key, expires, name).encode()) for key in self.secrets]
+        if not any(right):
+            return Access.FORGED
+        if unix_seconds >= expires:
+            return Access.EXPIRED
+        return Access.GRANTED if name in (stream, EVERY_STREAM) else Access.OTHER_STREAM
+
+
+def _signature(secret: bytes, expires: int, stream: str) -> str:
+    digest = hmac.digest(secret, _CONTEXT + f"{expires}\0{stream}".encode("ascii"), hashlib.sha256)
+    return base64.urlsafe_b64encode(digest).rstrip(b"=").decode()
+
+
+def read_keys(path: Path) -> TokenKeys:
+    """The secrets of a file, one a line.
+
+    Raises:
+        ConfigError: the file cannot be read, has no secret, or one that can be guessed.
+    """
+    advice = f"make one with: (umask 077; openssl rand -hex 32 > {path})"
+    try:
+        with path.open("rb") as file:
+            content = file.read(MAX_SECRET_FILE_BYTES + 1)
+    except OSError as error:
+        raise ConfigError(f"The secret file {path} cannot be read ({error.strerror}); {advice}.") from None
+    if len(content) > MAX_SECRET_FILE_BYTES:
+        raise ConfigError(f"The secret file {path} has over {MAX_SECRET_FILE_BYTES} bytes; expected a secret a line.")
+    secrets = tuple(line.strip() for line in content.splitlines() if line.strip())
+    if not secrets:
+        raise ConfigError(f"The secret file {path} is empty; {advice}.")
+    short = min(map(len, secrets))
+    if short < MIN_SECRET_BYTES:
+        raise ConfigError(
+            f"A secret in {path} has {short} characters, and at least {MIN_SECRET_BYTES} are needed; {advice}."
+        )
+    return TokenKeys(secrets)
+
 
 MAX_PARAMETERS: Final = 16
 _NUMBER = re.compile(r"[0-9]{1,16}", re.ASCII)
@@ -71,7 +170,7 @@ def parsed_query(raw: bytes, headers: Mapping[str, str]) -> Query:
     return Query(bearer[1] if bearer else values.get("token"), int(values["after"]) if "after" in values else None)
 
 
-def query_of(request: Request) -> Query:
+def query_of(request: "Request") -> Query:
     """The query of a request.
 
     Raises:
@@ -92,7 +191,7 @@ class Authorizer:
         self._keys = keys
         self._clock = clock
 
-    def access(self, request: Request, name: str) -> Access:
+    def access(self, request: "Request", name: str) -> Access:
         """Access of a request to the stream ``name``.
 
         Raises:
@@ -103,7 +202,7 @@ class Authorizer:
             return Access.GRANTED
         return self._keys.access(query.token, name, unix_seconds=self._clock())
 
-    def check(self, request: Request, name: str) -> None:
+    def check(self, request: "Request", name: str) -> None:
         """Check that a request has access to the stream ``name``.
 
         Raises:
@@ -113,7 +212,7 @@ class Authorizer:
         if access is not Access.GRANTED:
             raise refusal(access)
 
-    def page_query(self, request: Request) -> str:
+    def page_query(self, request: "Request") -> str:
         """The query that a page adds to the addresses it loads: the token of its own request, if one is needed."""
         token = query_of(request).token
         return f"?token={token}" if self._keys is not None and token else ""

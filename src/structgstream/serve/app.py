@@ -8,20 +8,7 @@ the files that a sink writes, previews and the metrics of the run. With keys eve
 ``/player.js`` needs a token. The token is checked before the stream is looked up, so that responses do not reveal which
 streams exist.
 
-==================================  ==========================================================
-``/``, ``/streams.json``            the streams that the token gives access to
-``/streams/NAME/``                  the player
-``/streams/NAME/manifest.json``     the manifest; ``?after=N`` waits for a newer one
-``/streams/NAME/FILE``              an immutable file of the segments
-``/streams/NAME/qualities.json``    the renditions of a stream
-``/streams/NAME/RENDITION/FILE``    manifest and files of one of them, as above
-``/streams/NAME/stream.sgs``        the bytes of a stream that is one file, which may grow
-``/streams/NAME/state``             of such a file: length, and whether it is complete
-``/streams/NAME/preview``           a picture
-``/metrics``, ``/health``           for the operator
-==================================  ==========================================================
-
-Connections, rates and slow clients are bounded by the reverse proxy in front of it (docs/serve.md).
+docs/serve.md lists the addresses. The reverse proxy in front bounds connections, rates and slow clients.
 """
 
 import asyncio
@@ -44,8 +31,7 @@ from starlette.routing import Route
 from structgstream.codec.container.records import footer_offset
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.quality_list import MAX_LIST_BYTES, QUALITIES
-from structgstream.serve.access import Authorizer, Refused, query_of, refusal
-from structgstream.serve.files import OpenedFile, hash_in_name, is_plain_path, is_stream_name
+from structgstream.serve.access import EVERY_STREAM, Access, Authorizer, Refused, TokenKeys, query_of, refusal
 from structgstream.serve.listening import LOOPBACK_NAMES
 from structgstream.serve.manifest_watch import BrokenManifest, Manifests, Snapshot
 from structgstream.serve.metrics import CONTENT_TYPE, CountRequests, Metrics, exposition, run_numbers, stream_families
@@ -55,8 +41,15 @@ from structgstream.serve.responses import (
     content_response,
     file_response,
 )
-from structgstream.serve.streams import Catalog, ServedStream, StreamKind
-from structgstream.serve.tokens import EVERY_STREAM, Access, TokenKeys
+from structgstream.serve.streams import (
+    Catalog,
+    OpenedFile,
+    ServedStream,
+    StreamKind,
+    hash_in_name,
+    is_plain_path,
+    is_stream_name,
+)
 
 YEAR_SECONDS: Final = 31536000
 MAX_RUN_BYTES: Final = 256 * 1024
@@ -387,7 +380,7 @@ async def _unrouted(request: Request, error: Exception) -> Response:
 
 
 async def _broken(request: Request, error: Exception) -> Response:
-    return PlainTextResponse(f"The stream's manifest.json is no manifest: {error}.", 502, NO_STORE_HEADERS)
+    return PlainTextResponse(f"The stream's manifest.json is no manifest: {error}", 502, NO_STORE_HEADERS)
 
 
 async def _unreadable(request: Request, error: Exception) -> Response:

@@ -9,25 +9,21 @@ trusted, because the file may be replaced again within the same tick.
 """
 
 import asyncio
-import json
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any, Final
+from dataclasses import dataclass, field
+from typing import Final
 
 from anyio import to_thread
 
-from structgstream.codec.segments.manifest import MANIFEST
-from structgstream.serve.files import FileStamp, OpenedFile
-from structgstream.serve.streams import ServedStream
+from structgstream.codec.segments.manifest import FORMAT, MANIFEST, MAX_MANIFEST_BYTES, Fields, parse_object
+from structgstream.errors import StreamError
+from structgstream.serve.streams import FileStamp, OpenedFile, ServedStream
 
 POLL_SECONDS: Final = 0.1
 TICK_NS: Final = 100_000_000
 """Minimum age of a trusted stat."""
-MAX_MANIFEST_BYTES: Final = 8 * 10**6
-MAX_SEQUENCE: Final = 2**53
-FORMAT: Final = "structgstream-segments"
 
 
 class BrokenManifest(Exception):
@@ -36,20 +32,19 @@ class BrokenManifest(Exception):
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A manifest: its bytes, and the content as JSON values."""
+    """A manifest: its bytes and its fields."""
 
     content: bytes
     sequence: int
     live: bool
-    values: dict[str, Any]
+    fields: Fields = field(compare=False)
 
     def edge(self, name: str) -> float | None:
         """A number of the newest frame; None if the manifest has none."""
-        edge = self.values.get("edge")
-        found = edge.get(name) if isinstance(edge, dict) else None
-        if isinstance(found, bool) or not isinstance(found, int | float) or not abs(found) < 2**63:
+        try:
+            return self.fields.fields("edge").number(name)
+        except StreamError:
             return None
-        return float(found)
 
 
 class ManifestWatch:
@@ -138,7 +133,7 @@ class ManifestWatch:
             if file.stamp == self._stamp:
                 return self._stamp, self._found
             if len(file) > MAX_MANIFEST_BYTES:
-                raise BrokenManifest(f"it has {len(file)} bytes, more than {MAX_MANIFEST_BYTES}")
+                raise BrokenManifest(f"{MANIFEST} has {len(file)} bytes; expected at most {MAX_MANIFEST_BYTES}.")
             content = file.read(0, len(file))
         sure = time.time_ns() - file.stamp.modified_ns > TICK_NS
         same = isinstance(self._found, Snapshot) and self._found.content == content
@@ -152,17 +147,12 @@ def snapshot(content: bytes) -> Snapshot:
         BrokenManifest: it is not a manifest.
     """
     try:
-        values = json.loads(content)
-    except (ValueError, RecursionError):
-        raise BrokenManifest("it is no JSON") from None
-    if not isinstance(values, dict) or values.get("format") != FORMAT:
-        raise BrokenManifest(f"its format is not {FORMAT}")
-    sequence, live = values.get("sequence"), values.get("live")
-    if isinstance(sequence, bool) or not isinstance(sequence, int) or not 0 <= sequence <= MAX_SEQUENCE:
-        raise BrokenManifest(f"its sequence is not a number from 0 to {MAX_SEQUENCE}")
-    if not isinstance(live, bool):
-        raise BrokenManifest("it does not state whether the stream is live")
-    return Snapshot(content, sequence, live, values)
+        fields = parse_object(content, MANIFEST, max_bytes=MAX_MANIFEST_BYTES)
+        if fields.text("format") != FORMAT:
+            fields.refuse(f"has another format than {FORMAT}")
+        return Snapshot(content, fields.whole("sequence", most=2**53 - 1), fields.flag("live"), fields)
+    except StreamError as error:
+        raise BrokenManifest(str(error)) from None
 
 
 class Manifests:

@@ -25,9 +25,8 @@ from structgstream.data.wrappers import select_cameras
 from structgstream.errors import CaptureError, StreamError
 from structgstream.frames import MultiViewFrame
 from structgstream.serve.listening import LOOPBACK_NAMES
-from structgstream.serve.pages import SERVED_POLICY, bundle, linked_page, policy
+from structgstream.serve.pages import SERVED_POLICY, StreamFile, bundle, linked_page, policy
 from structgstream.serve.responses import NO_STORE_HEADERS, file_response
-from structgstream.serve.stream_file import StreamFile
 
 JPEG_QUALITY = 95
 MAX_CACHED_BYTES = 64 * 10**6

@@ -11,22 +11,23 @@ from contextlib import suppress
 from functools import partial
 from typing import Generic
 
-from structgstream.codec.container.index import Period
-from structgstream.codec.container.records import MAX_PERIODS
+import torch
+
+from structgstream.cameras import CameraRig
+from structgstream.codec.container.records import MAX_PERIODS, Period
 from structgstream.codec.contents import PacketInfo
 from structgstream.codec.encoder import Encoded
 from structgstream.codec.header import check_picture_sizes
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
 from structgstream.data.denoising import denoised
+from structgstream.data.points import PointsConfig, initial_points
 from structgstream.data.source import FrameStream, frame_count, is_recording, retain_frames
-from structgstream.errors import StorageError
-from structgstream.frames import MultiViewFrame
+from structgstream.errors import CaptureError, ConfigError, StorageError
+from structgstream.frames import MIN_CAMERAS, MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.lookahead import Lookahead
 from structgstream.session.frame_report import FrameReport, metered
-from structgstream.session.initialization import check_enough_pictures, frame_seed, initial_points_of, shows_enough
-from structgstream.session.key_frames import KeyFrames
-from structgstream.session.periods import PeriodPlan
+from structgstream.session.periods import KeyFrames, PeriodPlan
 from structgstream.session.pipeline import (
     FrameCoder,
     FrameTask,
@@ -37,9 +38,9 @@ from structgstream.session.pipeline import (
     StoredStream,
     StreamFacts,
 )
+from structgstream.session.presets import completed
 from structgstream.session.rate_control import RateController
-from structgstream.session.resuming import check_resumable
-from structgstream.similarity import normalizing_similarity
+from structgstream.similarity import Similarity, normalizing_similarity
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.result import StepListener
 
@@ -306,3 +307,84 @@ class Session(Generic[State, Memory]):
         frame = next(self._source.frames(index))
         check_enough_pictures(frame, self._rig, self._source.name)
         return self._task(frame, self._pipeline.method.observe(frame, None, rig=self._rig, backend=self._backend))
+
+
+def frame_seed(seed: int, index: int) -> int:
+    """The seed of a frame, which depends only on its index, so that a frame can be repeated separately."""
+    return (seed * 1_000_003 + index) % 2**63
+
+
+def shows_enough(frame: MultiViewFrame, rig: CameraRig) -> bool:
+    """Whether a later frame can be fitted: at least two training cameras have pictures that are not blank."""
+    return len(frame.showing(rig.training)) >= MIN_CAMERAS
+
+
+def check_enough_pictures(frame: MultiViewFrame, rig: CameraRig, capture: str) -> None:
+    """Check that at least two training cameras have pictures, which in frame 0 must not be blank.
+
+    Raises:
+        CaptureError: they do not; the message names the cameras.
+    """
+    present = frame.present(rig.training) if frame.index else frame.showing(rig.training)
+    if len(present) < MIN_CAMERAS:
+        raise CaptureError(
+            f"Frame {frame.index} of {capture} has pictures of {', '.join(present) or 'none'} of its "
+            f"{len(rig.training)} training cameras; at least {MIN_CAMERAS} are needed. Restore them, or choose "
+            "frames before or after it (--start, --frames)."
+        )
+
+
+def initial_points_of(
+    source: FrameStream, frame: MultiViewFrame, *, config: PointsConfig, seed: int, similarity: Similarity
+) -> torch.Tensor:
+    """Normalised points ``[P, 3]`` of the capture, or estimated from ``frame``, after checking the poses.
+
+    A capture's points are those of its first frame; at the beginning of later periods they are estimated.
+    """
+    from structgstream.pose_check.check import check_poses
+
+    check_poses(frame, source.rig)
+    given = source.points if frame.index == 0 else None
+    if given is None:
+        given = initial_points(frame, source.rig, config=config, seed=seed).positions
+    return similarity.points(torch.from_numpy(given))
+
+
+def check_resumable(header: StreamHeader, facts: StreamFacts) -> None:
+    """Check that a stream was made with the same method, configuration and capture.
+
+    Raises:
+        ConfigError: it was not; the message names the differences.
+    """
+    if header.codec != facts.codec:
+        raise ConfigError(
+            f"The stream was made by another method or codec, {header.codec!r} instead of {facts.codec!r}. "
+            "Resume with the same, or start again with --overwrite."
+        )
+    differing = list(_differences(dict(completed(header.config)), dict(completed(facts.config))))
+    if differing:
+        raise ConfigError(
+            f"The stream was made with another configuration: {', '.join(differing[:5])} differ. "
+            "Resume with the same preset and options, or start again with --overwrite."
+        )
+    ours = _capture_facts(facts.rig, facts.fps, facts.metadata)
+    differing = list(_differences(_capture_facts(header.rig, header.fps, header.metadata), ours))
+    if differing:
+        raise ConfigError(
+            f"The stream was made from another capture or another part of it: {', '.join(differing[:5])} differ. "
+            "Resume with the same capture and options, or start again with --overwrite."
+        )
+
+
+def _capture_facts(rig: CameraRig, fps: float, metadata: Mapping[str, object]) -> dict[str, object]:
+    """The properties of a capture that must be equal to continue a stream, as plain values."""
+    return {"order of cameras": [*rig], "cameras": rig.plain(), "fps": fps, **metadata}
+
+
+def _differences(old: object, new: object, path: str = "") -> Iterator[str]:
+    """Paths at which two trees of plain JSON values differ."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in sorted({*old, *new}):
+            yield from _differences(old.get(key), new.get(key), f"{path}.{key}" if path else key)
+    elif old != new:
+        yield path

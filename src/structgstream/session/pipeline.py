@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import CameraRig
-from structgstream.codec.container.index import Period
+from structgstream.codec.container.records import Period
 from structgstream.codec.contents import PacketInfo
 from structgstream.codec.encoder import Encoded
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader

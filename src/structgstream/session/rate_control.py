@@ -20,7 +20,7 @@ its predicted size is that of a delta packet times the square root of its frame 
 Note [Media time]
 ~~~~~~~~~~~~~~~~~
 Rates are per media time, and a live run may skip pictures. The budget of a packet is then that of all frames of the
-media until the next packet, and key packets come sooner (``key_frames``). The place of a packet is its time in frames
+media until the next packet, and key packets come sooner (``periods``). The place of a packet is its time in frames
 of the media; without gaps it is the frame number. Future packets are expected to have the mean spacing of the packets
 in the window. A window has at least as many packets as the shortest group.
 """
@@ -34,7 +34,7 @@ from typing import ClassVar
 
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError
-from structgstream.session.key_frames import KeyFrames
+from structgstream.session.periods import KeyFrames
 from structgstream.training.online.config import OnlineConfig
 
 _log = logging.getLogger(__name__)

@@ -7,8 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.codec.container.index import FOOTER, FOOTER_MAGIC, INDEX_ENTRY, pack_index, read_index
-from structgstream.codec.container.records import Record, RecordType, packed, scan_records
+from structgstream.codec.container.records import (
+    FOOTER,
+    FOOTER_MAGIC,
+    INDEX_ENTRY,
+    Record,
+    RecordType,
+    pack_index,
+    packed,
+    read_index,
+    scan_records,
+)
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.errors import StreamError
 from tests.support.streams import same, small_stream

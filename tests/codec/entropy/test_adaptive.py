@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from structgstream.codec.entropy.adaptive import AdaptiveCoder, AdaptiveDecoder, AdaptiveEncoder
-from structgstream.codec.entropy.models import LARGEST_NUMBER, Models
+from structgstream.codec.entropy.decisions import LARGEST_NUMBER, Models
 from structgstream.errors import StreamError
 
 HISTORY = np.array([1, 0, 7, 3, 0, 0, 1, 2] * 6, np.uint8)

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.codec.entropy import reference_decisions as reference
+from structgstream.codec.entropy import decisions as reference
 from structgstream.codec.entropy.adaptive import code_activity, code_numbers, code_residuals
-from structgstream.codec.entropy.models import (
+from structgstream.codec.entropy.decisions import (
     ACTIVITY_CONTEXTS,
     BLOCK_CONTEXTS,
     NUMBER_NODES,

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from structgstream.codec.entropy.bits import fixed, pack_bits, signed_golomb
 from structgstream.codec.entropy.rans import encode
-from structgstream.codec.entropy.table_choice import choose_tables
 from structgstream.codec.entropy.tables import (
     TOTAL,
     FrequencyTables,
+    choose_tables,
     code_costs,
     decode_tables,
     geometric,

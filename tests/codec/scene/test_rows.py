@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.codec.entropy.adaptive import AdaptiveDecoder, AdaptiveEncoder
-from structgstream.codec.entropy.models import Models
+from structgstream.codec.entropy.decisions import Models
 from structgstream.codec.fields.rows import Change, code_change
 from structgstream.errors import StreamError
 from tests.support.properties import examples

@@ -66,7 +66,7 @@ def test_a_stream_is_written_to_s3_stopped_continued_and_archived(server: Emulat
 
 def test_an_outage_of_s3_costs_nothing(server: Emulator, tmp_path: Path) -> None:
     here, told = folder(tmp_path / "here"), []
-    mirror = MirroredStore(here, s3(server, "outage"), options=MirrorOptions(tell=told.append))
+    mirror = MirroredStore(here, s3(server, "outage"), options=MirrorOptions(report=told.append))
 
     def outage(frame: int) -> None:
         if frame == 2:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.codec.container.records import FRAME, PacketKind, RecordType, packed
-from structgstream.codec.segments.next_manifest import part_of, records_of, segment_of
+from structgstream.codec.segments.recovery import part_of, records_of, segment_of
 from structgstream.errors import StreamError
 from tests.support.properties import examples
 

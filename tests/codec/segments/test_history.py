@@ -4,7 +4,6 @@
 import pytest
 
 from structgstream.codec.packets import PacketKind
-from structgstream.codec.segments.history import paged, segments_from
 from structgstream.codec.segments.manifest import (
     Edge,
     HistoryEntry,
@@ -20,6 +19,7 @@ from structgstream.codec.segments.manifest import (
     segment_name,
     sha256_of,
 )
+from structgstream.codec.segments.stored_bytes import paged, segments_from
 from structgstream.errors import StreamError
 
 SHA = sha256_of(b"")

@@ -11,8 +11,7 @@ import pytest
 from structgstream.codec.segments.manifest import MANIFEST, manifest_from_json
 from structgstream.codec.segments.mirror import AnotherStreamError, MirroredStore, MirrorOptions
 from structgstream.codec.segments.recovery import stale_files
-from structgstream.codec.segments.retention import SegmentsOptions
-from structgstream.codec.segments.sink import SegmentsSink
+from structgstream.codec.segments.sink import SegmentsOptions, SegmentsSink
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest
 from structgstream.errors import StorageError
@@ -80,7 +79,7 @@ def test_the_writer_goes_on_while_the_other_store_cannot_be_reached(tmp_path: Pa
     here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
     told: list[str] = []
     remote.reachable.clear()
-    mirror = MirroredStore(here, remote, options=MirrorOptions(tell=told.append))
+    mirror = MirroredStore(here, remote, options=MirrorOptions(report=told.append))
     written(mirror, SENT)
     for _ in range(2):
         assert remote.refused.acquire(timeout=60)
@@ -130,7 +129,7 @@ def test_another_stream_that_is_found_after_an_outage_is_not_replaced(tmp_path: 
     written(first, packets(4))
     assert first.finish(wait_seconds=60) == 0
     before = contents(remote)
-    options = MirrorOptions(grace_seconds=0.0, tell=told.append)
+    options = MirrorOptions(grace_seconds=0.0, report=told.append)
     second = MirroredStore(folder(tmp_path / "second"), remote, options=options)
     written(second, SENT)
     assert second.finish(wait_seconds=1.0) > 0
@@ -203,7 +202,7 @@ def test_a_file_that_is_to_go_while_it_is_copied_goes_when_its_manifest_is_there
             assert done.wait(60)
 
     remote.before = before
-    mirror = MirroredStore(here, remote, options=MirrorOptions(tell=told.append))
+    mirror = MirroredStore(here, remote, options=MirrorOptions(report=told.append))
     mirror.copy_all()
     assert inside.wait(60)
     written(mirror, SENT, options=SegmentsOptions(grace_seconds=0.5))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from structgstream.codec.container.records import FRAME, RecordType, packed
 from structgstream.codec.segments.manifest import Edge, PeriodEntry, Window, manifest_from_json, manifest_to_json
-from structgstream.codec.segments.next_manifest import (
+from structgstream.codec.segments.recovery import (
     Draft,
     empty_manifest,
     next_segment,

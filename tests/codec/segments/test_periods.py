@@ -10,7 +10,7 @@ import pytest
 
 from structgstream.codec.container.records import MINOR_WITH_PERIODS, PREFIX
 from structgstream.codec.reader import StreamReader, open_stream
-from structgstream.codec.segments.retention import SegmentsOptions
+from structgstream.codec.segments.sink import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest, write_archive
 from structgstream.codec.sinks import resume_segments

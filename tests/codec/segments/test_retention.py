@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from structgstream.codec.segments.manifest import Manifest, PeriodEntry, SegmentEntry, segment_name
-from structgstream.codec.segments.next_manifest import empty_manifest
-from structgstream.codec.segments.retention import Retention, SegmentsOptions
+from structgstream.codec.segments.recovery import empty_manifest
+from structgstream.codec.segments.sink import Retention, SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
 from tests.support.segment_streams import folder, header
 

@@ -14,8 +14,7 @@ from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.segments.manifest import MANIFEST, Manifest
 from structgstream.codec.segments.recovery import find
-from structgstream.codec.segments.retention import SegmentsOptions
-from structgstream.codec.segments.sink import SegmentsSink
+from structgstream.codec.segments.sink import SegmentsOptions, SegmentsSink
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import StoredBytes, read_manifest, write_archive
 from structgstream.codec.sinks import resume_segments

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from structgstream.codec.container.records import PacketKind
 from structgstream.codec.segments.manifest import MANIFEST, manifest_to_json
-from structgstream.codec.segments.retention import SegmentsOptions
+from structgstream.codec.segments.sink import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import StoredBytes, is_segments, open_segments, read_manifest
 from structgstream.errors import StreamError

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.codec.segments.strict_json import MOST, Fields, parse_object
+from structgstream.codec.segments.manifest import MOST, Fields, parse_object
 from structgstream.errors import StreamError
 from tests.support.properties import examples
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from structgstream.data.calibration_files.opencv_storage import may_be_storage, read_storage
+from structgstream.data.calibration_files.reading import may_be_storage, read_storage
 from structgstream.data.text_files import Unreadable
 
 MATRIX = np.arange(6.0).reshape(2, 3)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from structgstream.data.calibration_files.plain_pickle import load_plain
+from structgstream.data.calibration_files.reading import load_plain
 from structgstream.errors import CalibrationError
 
 PLAIN = {

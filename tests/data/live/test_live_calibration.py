@@ -7,17 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from structgstream.data.json_videos import bundled_clip, bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip, bundled_clip_path
 from structgstream.data.lenses import LensCamera, RadialTangential
-from structgstream.data.live.calibration import (
+from structgstream.data.live.source import (
     LivePictures,
-    filmed_rig,
     filmed_sizes,
     read_calibration,
-    select_cameras,
     with_calibration,
 )
-from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
+from structgstream.data.prepared import PreparedCamera, PreparedCapture, filmed_rig, write_prepared
 from structgstream.data.undistortion import Undistortion
 from structgstream.frames import MultiViewFrame
 from tests.support.captures import small_rig
@@ -46,7 +44,7 @@ def test_a_prepared_capture_needs_its_file_alone(tmp_path: Path) -> None:
 
 def test_pictures_are_undistorted_as_those_of_the_capture(tmp_path: Path) -> None:
     capture = prepared(tmp_path)
-    filmed = filmed_rig(capture, tmp_path)
+    filmed = filmed_rig(tmp_path, capture)
     random = np.random.default_rng(0)
     images = {
         name: random.integers(0, 256, (size[1], size[0], 3)).astype(np.uint8)
@@ -76,9 +74,9 @@ def test_a_capture_of_another_layout_gives_its_rig() -> None:
     clip = bundled_clip()
     assert capture.held_out == clip.rig.held_out
     assert capture.near == pytest.approx(clip.rig["cam03"].near)
-    chosen = select_cameras(capture, ["cam02", "cam01", "cam05"])
+    chosen = capture.only(["cam02", "cam01", "cam05"])
     assert [*chosen.cameras] == ["cam01", "cam02", "cam05"]
     assert chosen.held_out == frozenset()
-    rig = filmed_rig(capture, bundled_clip_path())
+    rig = filmed_rig(bundled_clip_path(), capture)
     assert (rig["cam03"].K == clip.rig["cam03"].K).all()
     assert (rig["cam03"].viewmat == clip.rig["cam03"].viewmat).all()

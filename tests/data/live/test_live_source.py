@@ -18,8 +18,7 @@ from structgstream.data.denoising import DenoisingConfig
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.live import recorder as recording
 from structgstream.data.live import source as source_module
-from structgstream.data.live.calibration import read_calibration
-from structgstream.data.live.source import LiveOptions, LiveSource
+from structgstream.data.live.source import LiveOptions, LiveSource, read_calibration
 from structgstream.data.live.status import FaultLog
 from structgstream.data.live.synchronizer import LivePicture, PictureSet
 from structgstream.data.open import open_capture

@@ -10,8 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from structgstream.errors import ConfigError
-from structgstream.preparation.calibration.board import Board
-from structgstream.preparation.calibration.board_page import write_board_pdf
+from structgstream.preparation.calibration.board import Board, write_board_pdf
 
 BOARD = Board(7, 5, 0.035)
 POINTS_A_MM = 72 / 25.4

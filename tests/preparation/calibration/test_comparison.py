@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from structgstream.data.alignment import Alignment
-from structgstream.data.calibration import rotation_matrix
+from structgstream.data.calibration import Alignment, rotation_matrix
 from structgstream.data.lenses import Fisheye, LensCamera, RadialTangential
 from structgstream.errors import CalibrationError
 from tests.support.calibration_errors import calibration_errors, lens_difference

@@ -2,8 +2,7 @@
 import numpy as np
 import pytest
 
-from structgstream.data.alignment import Alignment
-from structgstream.data.calibration import rotation_matrix
+from structgstream.data.calibration import Alignment, rotation_matrix
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.solved import (
     Observations,

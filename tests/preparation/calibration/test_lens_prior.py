@@ -2,8 +2,7 @@
 import numpy as np
 import pytest
 
-from structgstream.preparation.calibration.lens_prior import usual_prior
-from structgstream.preparation.calibration.lens_terms import ACROSS, FOCAL, TERMS
+from structgstream.preparation.calibration.lens_terms import ACROSS, FOCAL, TERMS, usual_prior
 
 FREE = (FOCAL, ACROSS)
 LENSES = 40
@@ -36,7 +35,7 @@ def test_how_far_lenses_differ_is_estimated() -> None:
 
 
 def test_the_cost_has_the_gradient_and_the_curvature_that_are_added() -> None:
-    prior = usual_prior(np.array([0, 0, 1, -1] * 10), FREE, fisheye=False)
+    prior = usual_prior(np.array([0, 0, 1, 1] * 10), FREE, fisheye=False)
     own, size = rows(0.01, 0.004), 2 * LENSES
     A, gradient = np.zeros((size, size)), np.zeros(size)
     prior.add(A, gradient, own, start=0, free=FREE)
@@ -44,8 +43,6 @@ def test_the_cost_has_the_gradient_and_the_curvature_that_are_added() -> None:
     step[:, ACROSS] = np.random.default_rng(1).normal(size=LENSES) * 1e-3
     flat = step[:, list(FREE)].ravel()
     assert prior.cost(own + step) - prior.cost(own) == pytest.approx(gradient @ flat + flat @ A @ flat / 2)
-    assert not gradient[6:8].any()  # the fourth lens has no prior
-    assert not A[6:8].any()
 
 
 def test_terms_without_a_prior_cost_nothing() -> None:

@@ -9,15 +9,22 @@ import pytest
 
 from structgstream.data.lenses import LensCamera
 from structgstream.preparation.calibration.colmap import colmap_camera
-from structgstream.preparation.calibration.mapping import Freedom, Mapper, adjust, cameras_of, filtered, mapped, size_of
+from structgstream.preparation.calibration.mapping import (
+    Mapper,
+    adjust,
+    cameras_of,
+    filtered,
+    mapped,
+    size_of,
+    verified_pairs,
+    write_database,
+)
 from structgstream.preparation.calibration.triangulation import PosedGraph, posed_model
-from structgstream.preparation.calibration.view_graph import verified_pairs, write_database
 from tests.support.calibration_errors import calibration_errors
 from tests.support.filmed import ring
 from tests.support.views_made import cloud, keypoints_of, matches_of
 
 RIG = ring(5, radius=2.6, arc_degrees=80)
-NOTHING, FOCAL = Freedom(False, False, False), Freedom(True, False, False)
 
 
 def graph_of(rig: Mapping[str, LensCamera], *, noise: float = 0.1) -> PosedGraph:
@@ -27,13 +34,12 @@ def graph_of(rig: Mapping[str, LensCamera], *, noise: float = 0.1) -> PosedGraph
     return PosedGraph(keypoints, geometries)
 
 
-def zoomed(factor: float, *, center: float = 0.0) -> dict[str, LensCamera]:
-    """The rig with other focal lengths, and principal points moved to the right."""
+def zoomed(factor: float) -> dict[str, LensCamera]:
+    """The rig with other focal lengths."""
     found = {}
     for name, filmed in RIG.items():
         K = filmed.camera.K.clone()
         K[[0, 1], [0, 1]] *= factor
-        K[0, 2] += center
         found[name] = replace(filmed, camera=replace(filmed.camera, K=K))
     return found
 
@@ -44,35 +50,20 @@ def test_a_mapper_places_all_cameras(tmp_path: Path, mapper: Mapper) -> None:
     cameras = {name: colmap_camera(filmed, number) for number, (name, filmed) in enumerate(RIG.items(), 1)}
     database = tmp_path / "database.db"
     write_database(database, graph.keypoints, cameras, graph.geometries)
-    model = mapped(database, mapper=mapper, freedom=NOTHING, fixed=frozenset())
+    model = mapped(database, mapper=mapper)
     assert model is not None
     assert size_of(model)[0] == 5
-    adjust(model, freedom=NOTHING)
+    adjust(model)
     for error in calibration_errors(cameras_of(model), RIG).values():
         assert error.rotation_degrees < 0.05
         assert error.position_percent < 0.2
-        assert error.focal_percent == 0
+        assert abs(error.focal_percent) < 0.5
 
 
-def test_adjusting_finds_focal_lengths_only_where_they_are_free() -> None:
-    model = posed_model(graph_of(RIG), zoomed(1.03), pixels=20.0, slack_degrees=3.0)
-    adjust(model, freedom=FOCAL, fixed=frozenset({2}))
-    found = {name: float(camera.camera.K[0, 0]) for name, camera in cameras_of(model).items()}
-    assert {name for name, focal in found.items() if focal == pytest.approx(1.03 * 420, abs=1e-6)} == {"cam01"}
+def test_adjusting_finds_focal_lengths() -> None:
     free = posed_model(graph_of(RIG), zoomed(1.03), pixels=20.0, slack_degrees=3.0)
-    adjust(free, freedom=FOCAL)
+    adjust(free)
     assert all(float(camera.camera.K[0, 0]) == pytest.approx(420, abs=2) for camera in cameras_of(free).values())
-
-
-def test_principal_points_are_held_near_the_middle_and_the_model_is_as_before() -> None:
-    """The rig has them 3 and 2 pixels beside it; the pictures that hold them are gone afterwards."""
-    model = posed_model(graph_of(RIG), zoomed(1.0, center=15.0), pixels=20.0, slack_degrees=3.0)
-    before = sorted(model.reg_image_ids()), len(model.point3D_ids())
-    adjust(model, freedom=Freedom(True, True, False))
-    assert (sorted(model.reg_image_ids()), len(model.point3D_ids())) == before
-    for camera in cameras_of(model).values():
-        assert abs(float(camera.camera.K[0, 2]) - 240) < 8
-        assert abs(float(camera.camera.K[1, 2]) - 180) < 8
 
 
 def test_filtering_removes_what_is_far_off_or_seen_from_one_side() -> None:

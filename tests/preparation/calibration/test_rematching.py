@@ -20,7 +20,6 @@ ADJUST = partial(
     adjust_together,
     lens=range(COUNT),
     free=(FOCAL, ASPECT, ACROSS, DOWN),
-    fixed=np.zeros(COUNT, bool),
     limits=LIMITS,
 )
 

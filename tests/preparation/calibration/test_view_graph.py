@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from structgstream.data.matching import connected_groups
 from structgstream.preparation.calibration.colmap import colmap_camera, pycolmap_module
-from structgstream.preparation.calibration.view_graph import verified_pairs, write_database
+from structgstream.preparation.calibration.mapping import verified_pairs, write_database
 from tests.support.filmed import ring
 from tests.support.properties import examples
 from tests.support.views_made import cloud, keypoints_of, matches_of

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import json
 
-from structgstream.preparation.checking.findings import CameraCheck, CheckReport, Coverage, Finding, PairCheck
+from structgstream.preparation.checking.check import CameraCheck, CheckReport, Coverage, Finding, PairCheck
 
 
 def report(*errors: float | None) -> CheckReport:

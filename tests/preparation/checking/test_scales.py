@@ -6,7 +6,7 @@ import pytest
 
 from structgstream.data.matching import project
 from structgstream.pose_check.tracks import build_tracks
-from structgstream.preparation.checking.scales import nearest_depth, observed_depths, scale_findings
+from structgstream.preparation.checking.overlap import nearest_depth, observed_depths, scale_findings
 from tests.support.evidence_made import Cameras, evidence_of, scattered, turned, wide_ring
 
 WORLD = scattered(200)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from structgstream.cameras import CameraRig
-from structgstream.data.json_videos import bundled_clip
+from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.preparation.checking.times import SynchronizationCheck, check_synchronization, time_findings
 from tests.support.takes import MadeSource, ring
 

@@ -10,9 +10,8 @@ import pytest
 from matplotlib.colors import to_hex
 
 from structgstream.figure import COLORS
-from structgstream.preparation.checking.check import Examination, examine
-from structgstream.preparation.checking.findings import CameraCheck, CheckReport, Coverage, PairCheck
-from structgstream.preparation.report import pictures as charts
+from structgstream.preparation import report as charts
+from structgstream.preparation.checking.check import CameraCheck, CheckReport, Coverage, Examination, PairCheck, examine
 from tests.support.planes import room_frame, room_rig
 
 

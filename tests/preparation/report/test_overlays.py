@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from structgstream.pose_check.tracks import pair_errors
+from structgstream.preparation import report as overlays
 from structgstream.preparation.checking.check import Checked, check_capture, examine
-from structgstream.preparation.report import pictures as overlays
 from tests.support.evidence_made import turned
 from tests.support.memory_captures import MemoryCapture
 from tests.support.planes import HEIGHT, WIDTH, room_frame, room_rig

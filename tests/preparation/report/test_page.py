@@ -8,7 +8,7 @@ import pytest
 
 from structgstream.errors import StorageError
 from structgstream.preparation.checking.check import check_capture
-from structgstream.preparation.report.page import write_report
+from structgstream.preparation.report import write_report
 from tests.support.drawn import pixels_of
 from tests.support.memory_captures import MemoryCapture
 from tests.support.planes import room_frame, room_rig

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from structgstream.preparation.synchronization.correlation import Signal
-from structgstream.preparation.synchronization.lines import Line, fitted_line
+from structgstream.preparation.synchronization.correlation import Line, Signal, fitted_line
 
 FINE = 1 / 600
 LAG = 0.237

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.preparation.synchronization.phases import (
+from structgstream.preparation.synchronization.audio import (
     GRID_HERTZ,
     OTHER_SECONDS,
     REACH_SECONDS,

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
-from structgstream.preparation.synchronization.result import Synchronization, frame_residuals, synchronization
+from structgstream.preparation.synchronization.synchronize import Synchronization, frame_residuals, synchronization
 from tests.support.properties import examples
 
 STAMPS = np.arange(120) / 30

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from camera_lines import Line, Served, opened_lines
 from mpeg_ts import Loop, Muxer
 from rtsp import RtspCamera
-from structgstream.data.json_videos import bundled_clip, bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip, bundled_clip_path
 
 
 class Fault(StrEnum):

@@ -3,7 +3,7 @@
 
 from dataclasses import replace
 
-from structgstream.data.json_videos import bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.session.presets import COMPACT, StreamConfig
 from structgstream_studies.experiments.captures import CapturePart
 from tests.support.small_presets import FEW_POINTS, TINY_RIG

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
-from structgstream.data.json_videos import bundled_clip_path
+from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MultiViewFrame
 from structgstream_studies.experiments.captures import CapturePart, capture_facts, fingerprint

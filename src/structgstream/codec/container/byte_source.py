@@ -121,6 +121,6 @@ def check_room(free: int | None, *, largest: int, closing: int, where: str, fram
     needed = MARGIN_PACKETS * largest + closing
     if free is not None and free < needed:
         raise StorageError(
-            f"The disk of {where} is nearly full: {free} bytes are left, and {needed} are kept to finish the stream. "
+            f"The disk of {where} is nearly full: {free} bytes are left, and {needed} are needed to finish the stream. "
             f"It was closed after {frames} frames, all of which are safe; make room and continue with --resume."
         )

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 
 from structgstream.codec.container.blocks import LENGTH
 from structgstream.codec.container.byte_source import ByteSource
-from structgstream.codec.container.index import INDEX_ENTRY, indexed_frames
 from structgstream.codec.container.records import (
     CHECKSUM,
     FRAME,
+    INDEX_ENTRY,
     PREFIX,
     RECORD,
     Head,
@@ -19,6 +19,7 @@ from structgstream.codec.container.records import (
     RecordType,
     check_prefix,
     incomplete_reason,
+    indexed_frames,
     may_be_prefix,
     read_record,
     scan_records,

@@ -12,9 +12,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.entropy import reference_decisions as reference
+from structgstream.codec.entropy import decisions as reference
 from structgstream.codec.entropy.bits import Bins, Flags, Naturals
-from structgstream.codec.entropy.models import (
+from structgstream.codec.entropy.decisions import (
     ACTIVITY_CONTEXTS,
     BLOCK_CONTEXTS,
     LARGEST_NUMBER,
@@ -55,15 +55,7 @@ def code_activity(
     if not uses_native(native):
         reference.code_activity(arithmetic, models, history=history, sizes=sizes, active=active)
         return
-    state, blocks, rows = arithmetic.native(), models[0].native, models[1].native
-    result = native_library().sgs_code_activity(
-        *map(ctypes.byref, (state, blocks, rows)),
-        arithmetic.encodes,
-        len(active),
-        *map(_address, (history, sizes, active)),
-    )
-    arithmetic.take(state)
-    _check(result)
+    _code_native("sgs_code_activity", arithmetic, models, len(active), history, sizes, active)
 
 
 def code_residuals(
@@ -88,16 +80,7 @@ def code_residuals(
     arithmetic.reserve(residuals.size)
     if not uses_native(native):
         return reference.code_residuals(arithmetic, model, last=last, others=others, residuals=residuals)
-    state, its_model = arithmetic.native(), model.native
-    result = native_library().sgs_code_residuals(
-        *map(ctypes.byref, (state, its_model)),
-        arithmetic.encodes,
-        len(residuals),
-        residuals.shape[1],
-        *map(_address, (last, others, residuals)),
-    )
-    arithmetic.take(state)
-    return _check(result)
+    return _code_native("sgs_code_residuals", arithmetic, [model], *residuals.shape, last, others, residuals)
 
 
 def code_numbers(
@@ -122,31 +105,25 @@ def code_numbers(
     arithmetic.reserve(len(values))
     if not uses_native(native):
         return reference.code_numbers(arithmetic, model, contexts=contexts, values=values, flags=flags)
-    state, its_model = arithmetic.native(), model.native
-    result = native_library().sgs_code_numbers(
-        *map(ctypes.byref, (state, its_model)),
-        arithmetic.encodes,
-        len(values),
-        _address(contexts),
-        flags,
-        _address(values),
-    )
-    arithmetic.take(state)
-    return _check(result)
+    return _code_native("sgs_code_numbers", arithmetic, [model], len(values), contexts, flags, values)
 
 
-def _address(array: np.ndarray) -> int:
-    assert array.flags.c_contiguous
-    return array.ctypes.data
-
-
-def _check(result: int) -> bool:
-    """Whether the coded values are within bounds.
+def _code_native(name: str, arithmetic: ArithmeticState, models: Sequence[Model], *given: int | np.ndarray) -> bool:
+    """Calls a C++ coder with sizes and arrays; returns whether the coded values are within bounds.
 
     Raises:
         OutOfMemoryError: there is not enough memory.
         StreamError: a model has the wrong shape.
     """
+    state, arguments = arithmetic.native(), list[int]()
+    for value in given:
+        if isinstance(value, np.ndarray):
+            assert value.flags.c_contiguous
+            value = value.ctypes.data
+        arguments.append(value)
+    coder = getattr(native_library(), name)
+    result = coder(*map(ctypes.byref, (state, *(model.native for model in models))), arithmetic.encodes, *arguments)
+    arithmetic.take(state)
     if result == _NO_MEMORY:
         raise OutOfMemoryError("to code decisions")
     if result > _DAMAGED:

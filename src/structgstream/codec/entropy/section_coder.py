@@ -28,8 +28,7 @@ from structgstream.codec.entropy.bits import (
     varint,
 )
 from structgstream.codec.entropy.rans import decode, encode, section_bytes
-from structgstream.codec.entropy.table_choice import choose_tables
-from structgstream.codec.entropy.tables import FrequencyTables, decode_tables, geometric_family
+from structgstream.codec.entropy.tables import FrequencyTables, choose_tables, decode_tables, geometric_family
 from structgstream.errors import StreamError
 from structgstream.scene.state import FieldName
 

@@ -11,9 +11,8 @@ from torch import Tensor
 
 from structgstream.codec.entropy.adaptive import AdaptiveCoder
 from structgstream.codec.entropy.bits import Bins
-from structgstream.codec.fields.free_rows import FreeBins, code_free
 from structgstream.codec.fields.quantization import check_range, dequantize, quantize
-from structgstream.codec.fields.rows import Change, code_change
+from structgstream.codec.fields.rows import Change, FreeBins, code_change, code_free
 from structgstream.scene.state import FIELDS, FieldName, Granularity, fields_of
 
 

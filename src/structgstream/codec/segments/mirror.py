@@ -3,7 +3,7 @@
 
 The folder is what counts: a packet is written when it is durable there, and whoever writes never waits for the network.
 A thread copies what is new, with back-off when the other store cannot be reached; what waits is in the folder, also
-after the process was killed, and the next run copies it. Nothing is kept in memory but names.
+after the process was killed, and the next run copies it. Only names are in memory.
 
 Note [Order of copying]
 ~~~~~~~~~~~~~~~~~~~~~~~
@@ -47,12 +47,12 @@ class MirrorOptions:
 
     Args:
         grace_seconds: how long a file that has left the folder stays in the other store.
-        tell: is told of trouble and its end, each once, in a sentence.
+        report: gets a sentence when trouble begins and when it ends.
         elapsed: seconds that never jump.
     """
 
     grace_seconds: float = 120.0
-    tell: Callable[[str], object] = lambda text: None
+    report: Callable[[str], object] = lambda text: None
     elapsed: Callable[[], float] = time.monotonic
 
 
@@ -224,15 +224,15 @@ class MirroredStore:
             self._known = False
             if isinstance(error, AnotherStreamError):
                 if self._failures == 1:
-                    self._options.tell(f"{error} The stream goes on in {self._folder.name}.")
+                    self._options.report(f"{error} The stream goes on in {self._folder.name}.")
             elif self._failures == 2:  # A single failure is not reported.
-                self._options.tell(
+                self._options.report(
                     f"{self._remote.name} cannot be reached ({error}); the stream goes on in {self._folder.name}, and "
                     "is copied when it can be again."
                 )
             return min(_FIRST_WAIT_SECONDS * 2.0 ** (self._failures - 1), _LONGEST_WAIT_SECONDS)
         if self._failures >= 2:
-            self._options.tell(f"{self._remote.name} can be reached again, and is up to date.")
+            self._options.report(f"{self._remote.name} can be reached again, and is up to date.")
         self._failures = 0
         return 0.0
 

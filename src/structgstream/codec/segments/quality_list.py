@@ -8,9 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from structgstream.atomic_files import atomic_write
-from structgstream.codec.segments.manifest import MANIFEST
+from structgstream.codec.segments.manifest import MANIFEST, Fields, parse_object
 from structgstream.codec.segments.store import read_bounded
-from structgstream.codec.segments.strict_json import Fields, parse_object
 from structgstream.errors import StreamError
 
 QUALITIES = "qualities.json"

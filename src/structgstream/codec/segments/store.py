@@ -10,11 +10,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
-from structgstream.atomic_files import replacing
+from structgstream.atomic_files import lock_file, open_lockable, replacing
 from structgstream.codec.container.byte_source import free_bytes
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.errors import StorageError, StreamError
-from structgstream.file_locks import lock_file, open_lockable
 from structgstream.remote_folders import open_url, reason_of, shown_address
 
 MAX_FILE_BYTES = 2**32

@@ -13,8 +13,14 @@ from typing import Any
 import numpy as np
 
 from structgstream.data.calibration import PosedCamera, rigid
-from structgstream.data.calibration_files.opencv_storage import may_be_storage, read_storage
-from structgstream.data.calibration_files.reading import LARGEST_BYTES, CalibrationFormat, NoPose, common_folder
+from structgstream.data.calibration_files.reading import (
+    LARGEST_BYTES,
+    CalibrationFormat,
+    NoPose,
+    common_folder,
+    may_be_storage,
+    read_storage,
+)
 from structgstream.data.calibration_files.tools import EXTRINSICS, INTRINSICS, decompose_projection
 from structgstream.data.lenses import fisheye_lens, from_integer_centers, opencv_lens
 from structgstream.data.text_files import Unreadable, number, pixels, read_text, reason
@@ -155,11 +161,7 @@ def _own_pose(content: dict[str, Any]) -> bool:
 
 
 def _pose(content: dict[str, Any]) -> np.ndarray:
-    """World to camera, ``[4, 4]``.
-
-    Raises:
-        NoPose: there is none.
-    """
+    """World to camera, ``[4, 4]``."""
     for key in ("pose", "inverse pose"):
         if (matrix := _value(content, key)) is not None:
             viewmat = rigid(matrix[:3, :3], matrix[:3, 3])

@@ -16,14 +16,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from structgstream.data.calibration import PosedCamera, intrinsics, rigid
-from structgstream.data.calibration_files.opencv_storage import parsed_yaml, read_storage
-from structgstream.data.calibration_files.plain_pickle import load_plain
 from structgstream.data.calibration_files.reading import (
     LARGEST_BYTES,
     CalibrationFormat,
     NoPose,
     common_folder,
     json_files_with,
+    load_plain,
+    parsed_yaml,
+    read_storage,
     readable,
 )
 from structgstream.data.lenses import Lens, Pinhole, fisheye_lens, from_integer_centers, opencv_lens

@@ -26,17 +26,11 @@ SAME_RESET_SECONDS = 0.1
 
 @dataclass(frozen=True)
 class PictureTime:
-    """When a picture was taken.
+    """When a picture was taken."""
 
-    Args:
-        seconds: on the common clock; None if the picture must not be used.
-        fault: what was wrong with its time stamp, or None.
-        reset_seconds: by how much the camera's clock was reset, with :attr:`Fault.JUMP`.
-    """
-
-    seconds: float | None
-    fault: Fault | None = None
-    reset_seconds: float = 0.0
+    seconds: float | None  # on the common clock; None if the picture must not be used
+    fault: Fault | None = None  # what was wrong with its time stamp, or None
+    reset_seconds: float = 0.0  # by how much the camera's clock was reset, with :attr:`Fault.JUMP`
 
 
 class ClockResets:

@@ -23,7 +23,6 @@ from fractions import Fraction
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from structgstream.data.live.calibration import select_cameras
 from structgstream.data.live.status import FaultLog
 from structgstream.data.prepared import FILE, PreparedCapture, write_prepared
 from structgstream.data.timeline import Clock
@@ -115,7 +114,7 @@ class Recording:
                 for name, camera in self._calibration.cameras.items()
             }
             capture = replace(self._calibration, cameras=cameras, fps=self._fps, points=None)
-            write_prepared(folder, select_cameras(capture, [*known]) if known else capture)
+            write_prepared(folder, capture.only(known) if known else capture)
             return folder
 
     def add_frame(self, frame: MultiViewFrame, *, common_seconds: float) -> None:

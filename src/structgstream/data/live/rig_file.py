@@ -28,21 +28,15 @@ class TimeBase(StrEnum):
 
 @dataclass(frozen=True)
 class LiveCamera:
-    """How a camera is read.
-
-    Args:
-        url: whatever PyAV opens: ``rtsp://``, ``udp://``, ``http://``, ``rtp://``, an ``.sdp`` file, a device, a file.
-        offset_seconds: added to the times of its pictures.
-        format: the container or device driver, where the URL does not state it (``mpegts``, ``v4l2``); None to probe.
-        options: of FFmpeg's protocol and demuxer, by name.
-        follow: whether a file is still being written, so that reading waits at its end.
-    """
+    """How a camera is read."""
 
     url: str
-    offset_seconds: float = 0.0
+    """Whatever PyAV opens: ``rtsp://``, ``udp://``, ``http://``, ``rtp://``, an ``.sdp`` file, a device, a file."""
+    offset_seconds: float = 0.0  # added to the times of its pictures
     format: str | None = None
-    options: Mapping[str, str] = field(default_factory=dict)
-    follow: bool = False
+    """The container or device driver, where the URL does not state it (``mpegts``, ``v4l2``); None to probe."""
+    options: Mapping[str, str] = field(default_factory=dict)  # of FFmpeg's protocol and demuxer, by name
+    follow: bool = False  # whether a file is still being written, so that reading waits at its end
 
     @property
     def shown_url(self) -> str:
@@ -67,37 +61,23 @@ class LiveCamera:
 
 @dataclass(frozen=True)
 class LiveRig:
-    """The content of a rig file.
+    """The content of a rig file."""
 
-    Args:
-        name: of the stream.
-        calibration: folder of the capture that has the cameras' calibration.
-        cameras: by name, in the order of the file.
-        fps: maximum number of frames per second, stated in the header; None for that of the calibration.
-        clock: which clock states when a picture was taken.
-        tolerance_seconds: maximum distance of a picture of a set from its instant; None for half a frame period.
-        deadline_seconds: how long a set waits for pictures of cameras that are present.
-        queue_frames: maximum number of pictures of a camera that wait to be matched; the oldest are dropped.
-        stuck_seconds: a camera is absent when its picture has not changed for this time while others did.
-        silent_seconds: a camera without packets for this time is opened again.
-        start_seconds: how long frame 0 waits for all cameras.
-        end_seconds: the stream ends when no camera has sent for this time; None for never.
-        without: cameras of the calibration that are not used.
-    """
-
-    name: str
-    calibration: Path
-    cameras: Mapping[str, LiveCamera]
+    name: str  # of the stream
+    calibration: Path  # folder of the capture that has the cameras' calibration
+    cameras: Mapping[str, LiveCamera]  # by name, in the order of the file
     fps: float | None = None
-    clock: TimeBase = TimeBase.ARRIVAL
+    """Maximum number of frames per second, stated in the header; None for that of the calibration."""
+    clock: TimeBase = TimeBase.ARRIVAL  # which clock states when a picture was taken
     tolerance_seconds: float | None = None
-    deadline_seconds: float = 0.5
-    queue_frames: int = 32
-    stuck_seconds: float = 5.0
-    silent_seconds: float = 5.0
-    start_seconds: float = 30.0
-    end_seconds: float | None = None
-    without: tuple[str, ...] = ()
+    """Maximum distance of a picture of a set from its instant; None for half a frame period."""
+    deadline_seconds: float = 0.5  # how long a set waits for pictures of cameras that are present
+    queue_frames: int = 32  # maximum number of pictures of a camera that wait to be matched; the oldest are dropped
+    stuck_seconds: float = 5.0  # a camera is absent when its picture has not changed for this time while others did
+    silent_seconds: float = 5.0  # a camera without packets for this time is opened again
+    start_seconds: float = 30.0  # how long frame 0 waits for all cameras
+    end_seconds: float | None = None  # the stream ends when no camera has sent for this time; None for never
+    without: tuple[str, ...] = ()  # cameras of the calibration that are not used
 
 
 def read_rig(path: Path) -> LiveRig:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Live cameras as a stream of frames of unknown length."""
+"""Live cameras as a stream of frames of unknown length, with the calibration of a capture."""
 
 import logging
 import threading
@@ -15,29 +15,107 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
 from structgstream.data.denoising import DenoisingConfig, mean_of_still
-from structgstream.data.live.calibration import (
-    LivePictures,
-    filmed_rig,
-    filmed_sizes,
-    read_calibration,
-    select_cameras,
-    with_calibration,
-)
+from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.live.ingest import FrameBuffer, Ingest
 from structgstream.data.live.recorder import Recording
 from structgstream.data.live.resume_cache import ResumeCache, resume_folder
 from structgstream.data.live.rig_file import LiveRig, TimeBase, check_cameras, read_rig
 from structgstream.data.live.status import CameraStatus, Fault, FaultLog, LiveStatus
 from structgstream.data.live.synchronizer import PictureSet, SetTimes
+from structgstream.data.masks import FOLDER, with_masks
+from structgstream.data.open import open_capture, selected
+from structgstream.data.prepared import (
+    PreparedCamera,
+    PreparedCapture,
+    filmed_rig,
+    read_prepared,
+    recognizes_prepared,
+    undistorted,
+)
 from structgstream.data.source import FrameSource
+from structgstream.data.undistortion import UndistortedSource
 from structgstream.data.video_index import load_av
 from structgstream.data.video_pictures import srgb
+from structgstream.data.wrappers import SourceWrapper
 from structgstream.errors import CaptureError, StorageError
 from structgstream.frames import MIN_CAMERAS, MultiViewFrame
 
+
+@dataclass(frozen=True)
+class LivePictures:
+    """Pictures as cameras sent them, as a capture, so that the wrappers of captures apply to them."""
+
+    name: str  # of the stream
+    rig: CameraRig  # the cameras of the stored pictures
+    fps: float  # frames a second
+    arriving: Iterator[MultiViewFrame]  # frames in the order of their arrival
+    points: NDArray | None = None
+
+    def __len__(self) -> int:
+        """0: the number is unknown."""
+        return 0
+
+    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
+        return self.arriving
+
+
+def read_calibration(folder: Path) -> PreparedCapture:
+    """Lenses and pinholes of the cameras of a capture of any layout.
+
+    Raises:
+        CaptureError: it cannot be opened. A prepared capture needs its ``capture.json`` alone.
+    """
+    if recognizes_prepared(folder):
+        return read_prepared(folder)
+    source = open_capture(folder)
+    lenses = _lenses(source)
+    rig = source.rig
+    cameras = {
+        name: PreparedCamera(name, lenses.get(name, LensCamera(rig[name], Pinhole())), rig[name]) for name in rig
+    }
+    near = min(rig[name].near for name in rig)
+    return PreparedCapture(cameras, source.fps, near, "arbitrary", rig.held_out)
+
+
+def filmed_sizes(capture: PreparedCapture) -> dict[str, tuple[int, int]]:
+    """Width and height of each camera's pictures before undistortion, pixels."""
+    return {name: (own.filmed.camera.width, own.filmed.camera.height) for name, own in capture.cameras.items()}
+
+
+def with_calibration(
+    pictures: FrameSource,
+    capture: PreparedCapture,
+    folder: Path,
+    *,
+    held_out: tuple[str, ...] | None,
+    scale: float,
+    near: float | None,
+) -> FrameSource:
+    """Live pictures undistorted and masked as those of a prepared capture are.
+
+    Args:
+        pictures: those of ``prepared.filmed_rig``.
+        capture: the calibration, read in ``folder``; other arguments as of ``open_capture``.
+
+    Raises:
+        CaptureError: masks that do not fit.
+        ConfigError: an invalid option.
+    """
+    source = with_masks(undistorted(pictures, folder, capture), folder / FOLDER)
+    return selected(source, held_out=held_out, scale=scale, near=near)
+
+
+def _lenses(source: FrameSource) -> Mapping[str, LensCamera]:
+    while isinstance(source, SourceWrapper):
+        if isinstance(source, UndistortedSource):
+            return source.filmed
+        source = source.source
+    return {}
+
+
 log = logging.getLogger(__name__)
 
-Policy = POLL_SECONDS = 0.2
+POLL_SECONDS = 0.2
 HEARTBEAT_SECONDS = 5.0
 MAX_DENOISING_SECONDS = 5.0  # for the sets that frame 0 is averaged with
 MAX_CAPTURE_TIMES = 16  # of the last frames
@@ -45,25 +123,15 @@ MAX_CAPTURE_TIMES = 16  # of the last frames
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """Options of a live run.
+    """Options of a live run."""
 
-    Args:
-        frames: number of frames after which the stream ends; None for no end.
-        held_out: see ``open_capture``.
-        scale: see ``open_capture``.
-        near: see ``open_capture``.
-        record: folder for the cameras' packets; None for none.
-        resume: whether the stream is continued.
-        denoising: over how many sets frame 0 is averaged.
-    """
-
-    frames: int | None = None
-    held_out: tuple[str, ...] | None = None
-    scale: float = 1.0
-    near: float | None = None
-    record: Path | None = None
-    resume: bool = False
-    denoising: DenoisingConfig = field(default_factory=DenoisingConfig)
+    frames: int | None = None  # number of frames after which the stream ends; None for no end
+    held_out: tuple[str, ...] | None = None  # see ``open_capture``
+    scale: float = 1.0  # see ``open_capture``
+    near: float | None = None  # see ``open_capture``
+    record: Path | None = None  # folder for the cameras' packets; None for none
+    resume: bool = False  # whether the stream is continued
+    denoising: DenoisingConfig = field(default_factory=DenoisingConfig)  # over how many sets frame 0 is averaged
 
 
 class LiveSource:
@@ -95,13 +163,13 @@ class LiveSource:
         rig = read_rig(path)
         calibration = read_calibration(rig.calibration)
         check_cameras(rig, list(calibration.cameras), path)
-        self._calibration = select_cameras(calibration, list(rig.cameras))
+        self._calibration = calibration.only(rig.cameras)
         self._live: LiveRig = rig
         self._options, self._now = options, now
         self._unix_offset = unix() - now()
         self.name = rig.name
         self.fps = calibration.fps if rig.fps is None else rig.fps
-        self._filmed = filmed_rig(self._calibration, rig.calibration)
+        self._filmed = filmed_rig(rig.calibration, self._calibration)
         self.rig: CameraRig = self._calibrated(iter(())).rig
         self.points: NDArray[np.float64] | None = None
         self.faults = FaultLog(self.name, now=now)

@@ -76,39 +76,22 @@ class FaultLog:
 
 @dataclass(frozen=True)
 class CameraStatus:
-    """State of a camera.
+    """State of a camera."""
 
-    Args:
-        present: whether it sent a usable picture within the deadline.
-        decoded: number of decoded pictures.
-        queued: number of pictures that wait to be matched.
-        faults: number of occurrences by kind.
-    """
-
-    present: bool = False
-    decoded: int = 0
-    queued: int = 0
-    faults: Mapping[str, int] = field(default_factory=dict)
+    present: bool = False  # whether it sent a usable picture within the deadline
+    decoded: int = 0  # number of decoded pictures
+    queued: int = 0  # number of pictures that wait to be matched
+    faults: Mapping[str, int] = field(default_factory=dict)  # number of occurrences by kind
 
 
 @dataclass(frozen=True)
 class LiveStatus:
-    """State of a live run. Ages are of the frame delivered last, seconds from capture; None if unknown.
+    """State of a live run. Ages are of the frame delivered last, seconds from capture; None if unknown."""
 
-    Args:
-        cameras: by name.
-        sets: number of matched sets of pictures.
-        small_sets: of them, with too few training cameras for a frame.
-        skipped_sets: of them, replaced by a newer one before the trainer asked.
-        arrived_seconds: age when the last picture arrived.
-        matched_seconds: age when the set was complete.
-        delay_seconds: age when the frame was delivered.
-    """
-
-    cameras: Mapping[str, CameraStatus]
-    sets: int = 0
-    small_sets: int = 0
-    skipped_sets: int = 0
-    arrived_seconds: float | None = None
-    matched_seconds: float | None = None
-    delay_seconds: float | None = None
+    cameras: Mapping[str, CameraStatus]  # by name
+    sets: int = 0  # number of matched sets of pictures
+    small_sets: int = 0  # of them, with too few training cameras for a frame
+    skipped_sets: int = 0  # of them, replaced by a newer one before the trainer asked
+    arrived_seconds: float | None = None  # age when the last picture arrived
+    matched_seconds: float | None = None  # age when the set was complete
+    delay_seconds: float | None = None  # age when the frame was delivered

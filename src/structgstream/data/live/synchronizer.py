@@ -23,32 +23,20 @@ Count = Callable[[str, Fault, int], None]
 
 @dataclass(frozen=True)
 class LivePicture:
-    """A picture of a camera.
+    """A picture of a camera."""
 
-    Args:
-        seconds: when it was taken, on the common clock.
-        arrived: when it arrived, monotonic seconds.
-        content: a decoded frame of PyAV.
-    """
-
-    seconds: float
-    arrived: float
-    content: Any
+    seconds: float  # when it was taken, on the common clock
+    arrived: float  # when it arrived, monotonic seconds
+    content: Any  # a decoded frame of PyAV
 
 
 @dataclass(frozen=True)
 class PictureSet:
-    """Pictures of one instant.
+    """Pictures of one instant."""
 
-    Args:
-        seconds: the instant, on the common clock.
-        pictures: by camera, in the rig's order; cameras without one are missing.
-        matched: when the set was complete, monotonic seconds.
-    """
-
-    seconds: float
-    pictures: Mapping[str, LivePicture]
-    matched: float
+    seconds: float  # the instant, on the common clock
+    pictures: Mapping[str, LivePicture]  # by camera, in the rig's order; cameras without one are missing
+    matched: float  # when the set was complete, monotonic seconds
 
     @property
     def times(self) -> "SetTimes":

@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.data.lenses import Fisheye, LensCamera
+from structgstream.geometry import Floats
 from structgstream.preparation.calibration.bundle import BodyObservations, Bundle, Parameters, linearized, solved
-from structgstream.preparation.calibration.lens_prior import usual_prior
-from structgstream.preparation.calibration.lens_terms import row_of, with_row
+from structgstream.preparation.calibration.lens_terms import row_of, usual_prior, with_row
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
 
 _log = logging.getLogger(__name__)
@@ -25,15 +24,10 @@ NORMAL_MEDIAN = 1.1774  # of the length of a pair of standard normal numbers
 
 @dataclass(frozen=True)
 class Limits:
-    """Which observations stay.
+    """Which observations stay."""
 
-    Args:
-        pixels: largest reprojection error.
-        degrees: smallest angle between the rays of a point.
-    """
-
-    pixels: float
-    degrees: float = 1.5
+    pixels: float  # largest reprojection error
+    degrees: float = 1.5  # smallest angle between the rays of a point
 
     @classmethod
     def for_pictures(cls, longest_side: int) -> "Limits":
@@ -46,7 +40,6 @@ def adjust_together(
     *,
     lens: Sequence[int],
     free: Sequence[int],
-    fixed: NDArray[np.bool_],
     limits: Limits,
 ) -> SolvedCalibration:
     """``found`` with poses, points and the free terms of its lenses adjusted, without the observations that are off.
@@ -54,14 +47,13 @@ def adjust_together(
     Args:
         lens: number of the lens of each camera; cameras with shared intrinsics have one.
         free: the terms of ``lens_terms.py`` that are estimated.
-        fixed: by lens, whether it stays.
     """
-    bundle, parameters = _problem(found, np.asarray(lens, np.intp), tuple(free), fixed)
+    bundle, parameters = _problem(found, np.asarray(lens, np.intp), tuple(free))
     bundle, parameters = estimated(bundle, parameters)
     adjusted = _result(found, bundle, parameters)
     inliers = cleaned(adjusted, limits)
     _log_adjustment(adjusted, inliers, bundle)
-    again, parameters = _problem(inliers, bundle.lens, bundle.free, fixed)
+    again, parameters = _problem(inliers, bundle.lens, bundle.free)
     again = replace(again, prior=bundle.prior, noise=bundle.noise)
     return cleaned(_result(inliers, again, solved(again, parameters)), limits)
 
@@ -83,15 +75,11 @@ def chosen(found: SolvedCalibration, good: NDArray[np.bool_]) -> SolvedCalibrati
     return replace(found, points=found.points[inliers], observations=observations)
 
 
-def _problem(
-    found: SolvedCalibration, lens: NDArray[np.intp], free: tuple[int, ...], fixed: NDArray[np.bool_]
-) -> tuple[Bundle, Parameters]:
+def _problem(found: SolvedCalibration, lens: NDArray[np.intp], free: tuple[int, ...]) -> tuple[Bundle, Parameters]:
     cameras, seen = list(found.cameras.values()), found.observations
     observations = BodyObservations(seen.camera, seen.point, np.zeros((len(seen), 3)), seen.pixels)
     rotations = np.broadcast_to(np.eye(3), (len(found.points), 3, 3))
-    return posed_problem(
-        cameras, observations, (rotations, found.points), lens=lens, free=free, fixed=fixed, rotating=False
-    )
+    return posed_problem(cameras, observations, (rotations, found.points), lens=lens, free=free, rotating=False)
 
 
 def posed_problem(
@@ -101,7 +89,6 @@ def posed_problem(
     *,
     lens: NDArray[np.intp],
     free: tuple[int, ...],
-    fixed: NDArray[np.bool_],
     rotating: bool,
 ) -> tuple[Bundle, Parameters]:
     """The problem of cameras that see bodies, with the usual prior of their lenses.
@@ -109,16 +96,14 @@ def posed_problem(
     Args:
         bodies: rotations ``[B, 3, 3]`` and positions ``[B, 3]``.
     """
-    first = [int(np.flatnonzero(lens == number)[0]) for number in range(len(fixed))]
+    _, first = np.unique(lens, return_index=True)
     rows = np.stack([row_of(cameras[index]) for index in first])
     sizes = np.array([[filmed.camera.width, filmed.camera.height] for filmed in cameras], np.float64)
     fisheye = np.array([isinstance(filmed.lens, Fisheye) for filmed in cameras])
-    alike = np.full(len(fixed), -1, np.intp)
-    _, groups = np.unique(sizes[first][~fixed], axis=0, return_inverse=True)
-    alike[~fixed] = groups.ravel()
-    prior = usual_prior(alike, free, fisheye=bool(fisheye[first][~fixed].any()))
+    _, alike = np.unique(sizes[first], axis=0, return_inverse=True)
+    prior = usual_prior(alike.ravel(), free, fisheye=bool(fisheye.any()))
     views = np.stack([filmed.camera.viewmat.numpy() for filmed in cameras])
-    bundle = Bundle(observations, lens, sizes, fisheye, free, fixed, rotating, prior)
+    bundle = Bundle(observations, lens, sizes, fisheye, free, rotating, prior)
     return bundle, Parameters(views[:, :3, :3], views[:, :3, 3], rows, *bodies)
 
 

@@ -1,124 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cameras, lenses and their poses in metres from a ChArUco board that is shown around.
 
-Views of the board are a model of COLMAP's in which the board is the world and the rig moves before it. The cameras are
-the sensors of one rig, an instant is a frame of it: a picture's pose is the camera's in the rig times the rig's before
-the board. So the poses that still cameras share over all instants are shared in the adjustment, and the board's
-corners, which are known, fix its scale.
+The board is a body with one pose an instant, the cameras have one pose for all instants, and the board's corners, which
+are known, fix the scale.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera
 from structgstream.errors import CalibrationError
+from structgstream.geometry import Floats
 from structgstream.preparation.calibration.adjustment import cameras_in, estimated, posed_problem
 from structgstream.preparation.calibration.board import Board, Sighting, board_sightings
-from structgstream.preparation.calibration.bundle import BodyObservations, Parameters
+from structgstream.preparation.calibration.bundle import BodyObservations, Parameters, solved
 from structgstream.preparation.calibration.colmap import (
     LensModel,
     colmap_camera,
-    colmap_pose,
     filmed_camera,
     guessed_camera,
     pycolmap_module,
 )
 from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL
-from structgstream.preparation.calibration.mapping import Freedom, adjust
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
 
 Sightings = Mapping[str, Sequence[Sighting]]
-
-
-def board_model(
-    board: Board,
-    sightings: Sightings,
-    cameras: Mapping[str, Any],
-    sensors: Mapping[str, Floats],
-    rig_poses: Mapping[int, Floats],
-) -> Any:
-    """The model of all sightings.
-
-    Args:
-        cameras: of pycolmap, with the ids 1, 2, ... in the order of the names.
-        sensors: rig-to-camera matrices ``[4, 4]``; the first camera is the rig's reference, its matrix the identity.
-        rig_poses: instant to the board-to-rig matrix ``[4, 4]``.
-    """
-    pycolmap = pycolmap_module()
-    model = pycolmap.Reconstruction()
-    rig = pycolmap.Rig(rig_id=1)
-    for name, camera in cameras.items():
-        model.add_camera(camera)
-        if rig.num_sensors() == 0:
-            rig.add_ref_sensor(camera.sensor_id)
-        else:
-            rig.add_sensor(camera.sensor_id, colmap_pose(sensors[name]))
-    model.add_rig(rig)
-    black = np.zeros(3, np.uint8)
-    known = board.corners
-    corners = {index: model.add_point3D(known[index], pycolmap.Track(), black) for index in _repeated(sightings)}
-    images: list[tuple[int, str, Sighting]] = []
-    for instant, pose in rig_poses.items():
-        frame = pycolmap.Frame(frame_id=instant + 1, rig_id=1)
-        for name, own_sightings in sightings.items():
-            for sighting in (sighting for sighting in own_sightings if sighting.instant == instant):
-                images.append((len(images) + 1, name, sighting))
-                frame.add_data_id(pycolmap.data_t(cameras[name].sensor_id, len(images)))
-        frame.rig_from_world = colmap_pose(pose)
-        model.add_frame(frame)
-    for number, name, sighting in images:
-        image = pycolmap.Image(
-            name=f"{name}/{sighting.instant}",
-            camera_id=cameras[name].camera_id,
-            image_id=number,
-            frame_id=sighting.instant + 1,
-        )
-        seen = [(pixel, corners[corner]) for pixel, corner in _of_points(sighting, corners)]
-        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(pixel, point) for pixel, point in seen])
-        model.add_image(image)
-    for instant in rig_poses:
-        model.register_frame(instant + 1)
-    for number, _, sighting in images:
-        for index, (_, corner) in enumerate(_of_points(sighting, corners)):
-            model.point3D(corners[corner]).track.add_element(number, index)
-    return model
-
-
-def _repeated(sightings: Sightings) -> list[int]:
-    """The corners that have two observations or more: COLMAP adjusts no others."""
-    seen = [sighting.corners for own_sightings in sightings.values() for sighting in own_sightings]
-    corners, counts = np.unique(np.concatenate(seen), return_counts=True)
-    return [int(corner) for corner in corners[counts > 1]]
-
-
-def _of_points(sighting: Sighting, points: Mapping[int, int]) -> list[tuple[Floats, int]]:
-    pairs = zip(sighting.pixels, sighting.corners.tolist(), strict=True)
-    return [(pixel, corner) for pixel, corner in pairs if corner in points]
-
-
-def sensor_poses(model: Any, cameras: Mapping[str, Any]) -> dict[str, Floats]:
-    """Rig-to-camera matrices ``[4, 4]``."""
-    rig = model.rig(1)
-    return {
-        name: np.eye(4) if rig.is_ref_sensor(camera.sensor_id) else matrix(rig.sensor_from_rig(camera.sensor_id))
-        for name, camera in cameras.items()
-    }
-
-
-def rig_poses(model: Any) -> dict[int, Floats]:
-    """Board-to-rig matrices ``[4, 4]`` by instant."""
-    return {number - 1: matrix(model.frame(number).rig_from_world) for number in sorted(model.reg_frame_ids())}
-
-
-def matrix(pose: Any) -> Floats:
-    """A rigid motion of pycolmap as ``[4, 4]``."""
-    return np.vstack([np.array(pose.matrix()), [0.0, 0.0, 0.0, 1.0]])
 
 
 FIELDS_OF_VIEW: Mapping[LensModel, tuple[float, ...]] = {
@@ -131,6 +42,7 @@ FIELDS_OF_VIEW: Mapping[LensModel, tuple[float, ...]] = {
 MAX_SIGHTINGS_ALONE = 24
 POSE_PIXELS = 0.02  # of the longer side: coarse, since the lens is not known yet
 OUTLIER_PIXELS = 2.0
+ROUGH_STEPS = 12
 
 
 def solve_board(
@@ -138,18 +50,16 @@ def solve_board(
     board: Board,
     *,
     lens: LensModel = "opencv",
-    known: Mapping[str, LensCamera] | None = None,
 ) -> SolvedCalibration:
     """Poses, intrinsics and lenses from pictures of ``board`` at many instants.
 
     The lens of each camera is estimated from its own sightings, poses between cameras from the instants that they
     share, and all of them, with the board's pose at each instant, are then adjusted together, at last with what alike
-    lenses share (lens_prior.py, Note [Alike lenses]).
+    lenses share (lens_terms.py, Note [Alike lenses]).
 
     Args:
         pictures: camera name to pictures ``[H, W, 3]`` of the same instants for all cameras.
         lens: which distortion is estimated.
-        known: cameras whose intrinsics and lens are known and stay; their poses are not read.
 
     Returns:
         the calibration in metres, in the axes of the first camera; the points are the board's corners at each instant.
@@ -157,66 +67,47 @@ def solve_board(
     Raises:
         CalibrationError: a camera that does not show the board well enough, or at no instant at which it connects to
             the others; another board than given.
-        MissingExtraError: pycolmap or cv2 is not installed.
     """
     pycolmap_module()
     sightings = board_sightings(pictures, board)
-    known = known or {}
-    views = {}
-    for number, (name, shots) in enumerate(pictures.items(), 1):
-        size = shots[0].shape[1], shots[0].shape[0]
-        if name in known:
-            starts = [colmap_camera(known[name], number)]
-        else:
-            starts = [guessed_camera(lens, number, size, degrees) for degrees in FIELDS_OF_VIEW[lens]]
-        views[name] = _own_view(name, sightings[name], board, starts, fixed=name in known)
+    views = {name: _own_view(name, sightings[name], board, shots[0].shape, lens) for name, shots in pictures.items()}
     sensors = _connected_sensors(views)
     poses = _rig_poses(views, sensors, sightings)
-    cameras = {name: view.camera for name, view in views.items()}
-    fixed = frozenset(cameras[name].camera_id for name in known)
-    free = Freedom(*[len(known) < len(pictures)] * 3)
-    filmed = _filmed(cameras, sensors)
+    filmed = {name: _placed(view.filmed, sensors[name]) for name, view in views.items()}
     inliers: Sightings = {name: [s for s in sightings[name] if s.instant in view.poses] for name, view in views.items()}
     for _ in range(2):
-        model = board_model(board, inliers, cameras, sensors, poses)
-        adjust(model, freedom=free, fixed=fixed, constant_points=True)
-        cameras = {name: model.camera(camera.camera_id) for name, camera in cameras.items()}
-        sensors, poses = sensor_poses(model, cameras), rig_poses(model)
-        filmed = _filmed(cameras, sensors)
+        filmed, poses = adjust_board(board, inliers, filmed, poses, lens=lens, rough=True)
         inliers = _without_outliers(inliers, _solved(board, inliers, filmed, poses))
-    filmed, poses = adjust_board(board, inliers, filmed, poses, lens=lens, known=frozenset(known))
+    filmed, poses = adjust_board(board, inliers, filmed, poses, lens=lens)
     return _solved(board, inliers, filmed, poses)
 
 
 @dataclass(frozen=True)
 class _View:
-    """A camera as its own sightings give it: ``camera`` of pycolmap and board-to-camera matrices by instant."""
+    """A camera by its own sightings: its pose is the identity, and ``poses`` are board to camera by instant."""
 
-    camera: Any
+    filmed: LensCamera
     poses: Mapping[int, Floats]
 
 
 def _own_view(
-    name: str, own_sightings: Sequence[Sighting], board: Board, starts: Sequence[Any], *, fixed: bool
+    name: str, own_sightings: Sequence[Sighting], board: Board, shape: tuple[int, ...], lens: LensModel
 ) -> _View:
-    """Intrinsics from the best start, and a pose for each sighting that agrees with them."""
+    """Intrinsics from the field of view that fits best, and a pose for each sighting that agrees with them."""
     chosen = sorted(own_sightings, key=lambda sighting: (-len(sighting.corners), sighting.instant))[
         : 2 * MAX_SIGHTINGS_ALONE
     ]
     chosen = sorted(chosen, key=lambda sighting: sighting.instant)
     picks = np.linspace(0, len(chosen) - 1, min(len(chosen), MAX_SIGHTINGS_ALONE)).round().astype(int)
     sample = [chosen[index] for index in picks]
-    best: tuple[float, Any] | None = None
-    for camera in starts:
+    best: tuple[float, LensCamera] | None = None
+    for degrees in FIELDS_OF_VIEW[lens]:
+        camera = filmed_camera(guessed_camera(lens, 1, shape[1::-1], degrees), pycolmap_module().Rigid3d())
         poses = _poses(camera, sample, board)
         if len(poses) < max(3, len(sample) // 2):
             continue
-        if not fixed:
-            seen = {name: [sighting for sighting in sample if sighting.instant in poses]}
-            model = board_model(board, seen, {name: camera}, {name: np.eye(4)}, poses)
-            adjust(model, freedom=Freedom(), constant_points=True)
-            camera = model.camera(camera.camera_id)
-            model.update_point_3d_errors()
+        seen = {name: [sighting for sighting in sample if sighting.instant in poses]}
+        camera = adjust_board(board, seen, {name: camera}, poses, lens=lens, rough=True)[0][name]
         error = _misfit(camera, sample, board)
         if best is None or error < best[0]:
             best = error, camera
@@ -232,11 +123,11 @@ def _own_view(
 
 
 def _poses(
-    camera: Any, own_sightings: Sequence[Sighting], board: Board, *, share: float = POSE_PIXELS
+    filmed: LensCamera, own_sightings: Sequence[Sighting], board: Board, *, share: float = POSE_PIXELS
 ) -> dict[int, Floats]:
     """Board-to-camera matrices by instant, of the sightings of which most corners agree."""
     pycolmap = pycolmap_module()
-    options = pycolmap.AbsolutePoseEstimationOptions()
+    camera, options = colmap_camera(filmed, 1), pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = max(2.0, share * max(camera.width, camera.height))
     options.ransac.random_seed = 0
     found = {}
@@ -245,21 +136,20 @@ def _poses(
             sighting.pixels, board.corners[sighting.corners], camera, options
         )
         if result is not None and result["num_inliers"] >= 0.7 * len(sighting.corners):
-            found[sighting.instant] = matrix(result["cam_from_world"])
+            found[sighting.instant] = np.vstack([np.array(result["cam_from_world"].matrix()), [0.0, 0.0, 0.0, 1.0]])
     return found
 
 
-def _misfit(camera: Any, own_sightings: Sequence[Sighting], board: Board) -> float:
+def _misfit(filmed: LensCamera, own_sightings: Sequence[Sighting], board: Board) -> float:
     """Median over the sightings of the median reprojection error, pixels; infinite for one without a pose."""
     errors = []
-    poses = _poses(camera, own_sightings, board)
+    poses = _poses(filmed, own_sightings, board)
     for sighting in own_sightings:
-        if sighting.instant not in poses:
+        if (pose := poses.get(sighting.instant)) is None:
             errors.append(np.inf)
             continue
-        pose = poses[sighting.instant]
-        local = board.corners[sighting.corners] @ pose[:3, :3].T + pose[:3, 3]
-        errors.append(float(np.median(np.linalg.norm(camera.img_from_cam(local) - sighting.pixels, axis=1))))
+        found = filmed.pixels(board.corners[sighting.corners] @ pose[:3, :3].T + pose[:3, 3])
+        errors.append(float(np.median(np.nan_to_num(np.linalg.norm(found - sighting.pixels, axis=1), nan=np.inf))))
     return float(np.median(errors))
 
 
@@ -307,9 +197,8 @@ def _rig_poses(views: Mapping[str, _View], sensors: Mapping[str, Floats], sighti
     return {instant: best[instant][1] for instant in sorted(best)}
 
 
-def _filmed(cameras: Mapping[str, Any], sensors: Mapping[str, Floats]) -> dict[str, LensCamera]:
-    pose = pycolmap_module().Rigid3d
-    return {name: filmed_camera(camera, pose(sensors[name][:3])) for name, camera in cameras.items()}
+def _placed(filmed: LensCamera, viewmat: Floats) -> LensCamera:
+    return replace(filmed, camera=replace(filmed.camera, viewmat=torch.from_numpy(viewmat.copy())))
 
 
 def _solved(
@@ -331,9 +220,9 @@ def _solved(
     return SolvedCalibration(dict(filmed), np.concatenate(points)[seen], observations, metres=True)
 
 
-def _without_outliers(sightings: Sightings, solved: SolvedCalibration) -> Sightings:
+def _without_outliers(sightings: Sightings, found: SolvedCalibration) -> Sightings:
     """Sightings without the corners that are far from where they should be."""
-    errors = solved.errors()
+    errors = found.errors()
     limit = max(OUTLIER_PIXELS, 6 * float(np.nanmedian(errors)))
     good = iter((errors <= limit).tolist())
     inliers: dict[str, list[Sighting]] = {}
@@ -355,13 +244,13 @@ def adjust_board(
     poses: Mapping[int, Floats],
     *,
     lens: LensModel,
-    known: frozenset[str],
+    rough: bool = False,
 ) -> tuple[dict[str, LensCamera], dict[int, Floats]]:
     """Cameras and board-to-world poses ``[4, 4]`` by instant, adjusted together; the first camera is the world.
 
     Args:
         lens: which distortion is estimated.
-        known: cameras whose intrinsics and lens stay.
+        rough: a few steps only, with the usual noise and differences of lenses; else these are estimated, too.
     """
     number = {instant: index for index, instant in enumerate(poses)}
     seen = [(index, sighting) for index, name in enumerate(cameras) for sighting in sightings[name]]
@@ -379,10 +268,9 @@ def adjust_board(
         (stack[:, :3, :3], stack[:, :3, 3]),
         lens=np.arange(len(cameras)),
         free=(FOCAL, ASPECT, ACROSS, DOWN, *DISTORTION[lens]),
-        fixed=np.array([name in known for name in cameras]),
         rotating=True,
     )
-    bundle, parameters = estimated(bundle, parameters)
+    parameters = solved(bundle, parameters, max_steps=ROUGH_STEPS) if rough else estimated(bundle, parameters)[1]
     parameters = _from_first(parameters)
     return cameras_in(parameters, cameras, bundle.lens), dict(
         zip(poses, _matrices(parameters.body_rotations, parameters.body_positions), strict=True)

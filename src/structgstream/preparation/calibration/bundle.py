@@ -4,7 +4,7 @@
 Apart from cameras, bodies are adjusted: points, or poses of a board whose corners are known. They are eliminated
 from the normal equations (Brown, 1958; Triggs et al., Bundle adjustment: a modern synthesis, 2000), which are solved by
 Levenberg's and Marquardt's method with Huber's loss. Terms of intrinsics may have a prior that cameras share
-(``lens_prior.py``).
+(``lens_terms.py``).
 """
 
 from dataclasses import dataclass, replace
@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.data.calibration import rotation_matrix
-from structgstream.preparation.calibration.lens_prior import LensPrior
-from structgstream.preparation.calibration.lens_terms import derivatives, projected
+from structgstream.geometry import Floats
+from structgstream.preparation.calibration.lens_terms import LensPrior, derivatives, projected
 
 Indices = NDArray[np.intp]
 
@@ -28,70 +27,42 @@ SMALL = 1e-6
 
 @dataclass(frozen=True)
 class BodyObservations:
-    """What was observed.
+    """What was observed."""
 
-    Args:
-        camera: ``[M]``.
-        body: ``[M]``.
-        offset: ``[M, 3]``, from the body's origin in its axes; zeros for points.
-        pixels: ``[M, 2]``.
-    """
-
-    camera: Indices
-    body: Indices
-    offset: Floats
-    pixels: Floats
+    camera: Indices  # ``[M]``
+    body: Indices  # ``[M]``
+    offset: Floats  # ``[M, 3]``, from the body's origin in its axes; zeros for points
+    pixels: Floats  # ``[M, 2]``
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """Everything that is adjusted: poses and lenses of cameras, poses of bodies.
+    """Everything that is adjusted: poses and lenses of cameras, poses of bodies."""
 
-    Args:
-        rotations: ``[C, 3, 3]``, world to camera.
-        translations: ``[C, 3]``.
-        rows: ``[L, TERMS]`` of the lenses.
-        body_rotations: ``[B, 3, 3]`` of the bodies, body to world; identities for points.
-        body_positions: ``[B, 3]`` of the bodies.
-    """
-
-    rotations: Floats
-    translations: Floats
-    rows: Floats
-    body_rotations: Floats
-    body_positions: Floats
+    rotations: Floats  # ``[C, 3, 3]``, world to camera
+    translations: Floats  # ``[C, 3]``
+    rows: Floats  # ``[L, TERMS]`` of the lenses
+    body_rotations: Floats  # ``[B, 3, 3]`` of the bodies, body to world; identities for points
+    body_positions: Floats  # ``[B, 3]`` of the bodies
 
 
 @dataclass(frozen=True)
 class Bundle:
-    """A problem of bundle adjustment.
+    """A problem of bundle adjustment."""
 
-    Args:
-        observations: of the bodies.
-        lens: ``[C]``, which row of lenses a camera has.
-        sizes: ``[C, 2]``, width and height of the pictures.
-        fisheye: ``[C]``, whether a camera's terms are a fisheye's.
-        free: the terms of the rows that are estimated.
-        fixed: ``[L]``, lenses that stay.
-        rotating: whether bodies have rotations.
-        prior: of the terms.
-        noise: standard deviation of the pixels.
-    """
-
-    observations: BodyObservations
-    lens: Indices
-    sizes: Floats
-    fisheye: NDArray[np.bool_]
-    free: tuple[int, ...]
-    fixed: NDArray[np.bool_]
-    rotating: bool
-    prior: LensPrior
-    noise: float = 0.5
+    observations: BodyObservations  # of the bodies
+    lens: Indices  # ``[C]``, which row of lenses a camera has
+    sizes: Floats  # ``[C, 2]``, width and height of the pictures
+    fisheye: NDArray[np.bool_]  # ``[C]``, whether a camera's terms are a fisheye's
+    free: tuple[int, ...]  # the terms of the rows that are estimated
+    rotating: bool  # whether bodies have rotations
+    prior: LensPrior  # of the terms
+    noise: float = 0.5  # standard deviation of the pixels
 
     @property
     def columns(self) -> tuple[int, int, int]:
         """Number of parameters of poses, of lenses, and of a body."""
-        return 6 * len(self.lens), len(self.fixed) * len(self.free), 6 if self.rotating else 3
+        return 6 * len(self.lens), (int(self.lens.max()) + 1) * len(self.free), 6 if self.rotating else 3
 
     def residuals(self, parameters: Parameters) -> Floats:
         """Projected minus observed ``[M, 2]``, pixels; infinite behind a camera."""
@@ -192,7 +163,7 @@ def linearized(bundle: Bundle, parameters: Parameters) -> System:
             A[np.ix_(where, where)] += np.einsum("m,mai,maj->ij", w, J, J, optimize=True)
             gradient[where] += np.einsum("m,mai,ma->i", w, J, residuals[own])
     bundle.prior.add(A, gradient, parameters.rows, start=poses, free=bundle.free)
-    stuck = np.diag(A) == 0  # what is fixed, or observed by no camera
+    stuck = np.diag(A) == 0  # what no camera observes
     A[stuck, stuck] = 1.0
     count = len(parameters.body_positions)
     V, body_gradient = np.zeros((count, size, size)), np.zeros((count, size))
@@ -211,7 +182,6 @@ def _derivatives(bundle: Bundle, parameters: Parameters) -> tuple[Floats, Floats
     turned = np.einsum("mab,mb->ma", parameters.rotations[own], on_body + parameters.body_positions[seen.body])
     local = turned + parameters.translations[own]
     by_point, by_row = derivatives(local, parameters.rows[lens], bundle.sizes[own], bundle.fisheye[own], bundle.free)
-    by_row[bundle.fixed[lens]] = 0.0
     by_camera = np.concatenate([by_point @ _crosses(-turned), by_point, by_row], 2)
     by_world = by_point @ parameters.rotations[own]
     by_body = np.concatenate([by_world @ _crosses(-on_body), by_world], 2) if bundle.rotating else by_world

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv, reduced_picture
+from structgstream.geometry import Floats
 from structgstream.preparation.calibration.colmap import pycolmap_module
 
 MAX_KEYPOINTS = 6000  # of one picture, the largest first
@@ -31,17 +31,11 @@ texture, people who move about add keypoints."""
 
 @dataclass(frozen=True)
 class Keypoints:
-    """Keypoints of one camera.
+    """Keypoints of one camera."""
 
-    Args:
-        pixels: ``[S, 2]``, the top-left pixel's centre at (0.5, 0.5).
-        descriptors: ``[S, 128]`` of unit length (RootSIFT).
-        seen: ``[S, T]``, at which instants.
-    """
-
-    pixels: Floats
-    descriptors: NDArray[np.float32]
-    seen: NDArray[np.bool_]
+    pixels: Floats  # ``[S, 2]``, the top-left pixel's centre at (0.5, 0.5)
+    descriptors: NDArray[np.float32]  # ``[S, 128]`` of unit length (RootSIFT)
+    seen: NDArray[np.bool_]  # ``[S, T]``, at which instants
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -67,7 +61,6 @@ def camera_keypoints(
 
     Raises:
         CancelledError: ``stopping`` was set.
-        MissingExtraError: cv2 or pycolmap is not installed.
     """
     extractor = _extractor()
     count = len(pictures)

@@ -1,53 +1,112 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A model from a view graph: incremental mapping, global mapping and bundle adjustment by COLMAP."""
+"""A model from matches, by COLMAP: pairs that agree with one geometry, mapping, and bundle adjustment."""
 
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from structgstream.data.lenses import LensCamera
+from structgstream.data.matching import Pair
 from structgstream.preparation.calibration.colmap import filmed_camera, pycolmap_module
 from structgstream.preparation.calibration.keypoints import Keypoints
 from structgstream.preparation.calibration.solved import Observations
+
+Matches = Mapping[Pair, NDArray[np.uint32]]
+
+
+MAX_PIXELS = 3.0  # epipolar distance of a match, for pictures of 1000 pixels on the longer side; never under 1
+MIN_MATCHES = 20  # that agree
+MIN_SHARE = 0.3
+"""Smallest share of a pair's matches that agree. In rigs with repetitive walls nearly all pairs have some matches that
+agree by chance; among those of 0.3 and more nearly all were right."""
+MAX_TRIALS = 2000  # samples of the robust estimation
+
+
+def verified_pairs(
+    keypoints: Mapping[str, Keypoints],
+    matches: Matches,
+    cameras: Mapping[str, Any],
+    *,
+    workers: int,
+) -> dict[Pair, Any]:
+    """Two-view geometries of the pairs that pass, with the matches that agree.
+
+    Args:
+        cameras: of pycolmap, with the focal lengths to begin with.
+    """
+    pycolmap = pycolmap_module()
+
+    def estimate(pair: Pair) -> Any:
+        one, two = (cameras[name] for name in pair)
+        options = pycolmap.TwoViewGeometryOptions()
+        options.min_num_inliers = MIN_MATCHES
+        options.detect_watermark = False
+        options.compute_relative_pose = True
+        options.ransac.random_seed = 0
+        options.ransac.max_num_trials = MAX_TRIALS
+        options.ransac.max_error = max(1.0, MAX_PIXELS * max(one.width, one.height, two.width, two.height) / 1000)
+        return pycolmap.estimate_two_view_geometry(
+            one, keypoints[pair[0]].pixels, two, keypoints[pair[1]].pixels, matches[pair], options
+        )
+
+    pairs = [pair for pair, found in matches.items() if len(found) >= MIN_MATCHES]
+    with ThreadPoolExecutor(workers) as pool:
+        found = dict(zip(pairs, pool.map(estimate, pairs), strict=True))
+    return {
+        pair: geometry
+        for pair, geometry in found.items()
+        if len(geometry.inlier_matches) >= max(MIN_MATCHES, MIN_SHARE * len(matches[pair]))
+    }
+
+
+def write_database(
+    path: Path, keypoints: Mapping[str, Keypoints], cameras: Mapping[str, Any], geometries: Mapping[Pair, Any]
+) -> dict[str, int]:
+    """A database of COLMAP's with an image per camera; returns the ids of the images.
+
+    Cameras of one id are one camera with shared intrinsics.
+    """
+    pycolmap = pycolmap_module()
+    number = {name: index for index, name in enumerate(keypoints, 1)}
+    with pycolmap.Database.open(path) as database:
+        for camera in {camera.camera_id: camera for camera in cameras.values()}.values():
+            database.write_camera(camera, use_camera_id=True)
+            rig = pycolmap.Rig(rig_id=camera.camera_id)
+            rig.add_ref_sensor(camera.sensor_id)
+            database.write_rig(rig, use_rig_id=True)
+        for name, index in number.items():
+            image = pycolmap.Image(name=name, camera_id=cameras[name].camera_id, image_id=index)
+            database.write_image(image, use_image_id=True)
+            frame = pycolmap.Frame(frame_id=index, rig_id=cameras[name].camera_id)
+            frame.add_data_id(image.data_id)
+            database.write_frame(frame, use_frame_id=True)
+            database.write_keypoints(index, keypoints[name].pixels.astype(np.float32))
+        for (one, two), geometry in geometries.items():
+            database.write_matches(number[one], number[two], geometry.inlier_matches)
+            database.write_two_view_geometry(number[one], number[two], geometry)
+    return number
+
 
 Mapper = Literal["incremental", "global"]
 HUBER_PIXELS = 1.0
 
 
-@dataclass(frozen=True)
-class Freedom:
-    """What of the intrinsics is estimated.
+def mapped(database: Path, *, mapper: Mapper) -> Any | None:
+    """The model of the most images that a mapper finds, None without one; one thread, so it is repeatable.
 
-    Args:
-        focal: focal lengths.
-        center: principal points, in :func:`adjust` only, and kept near the pictures' centres (Note [Principal points]).
-        lens: distortion.
-    """
-
-    focal: bool = True
-    center: bool = True
-    lens: bool = True
-
-    @property
-    def any(self) -> bool:
-        """Whether anything but poses and points is free."""
-        return self.focal or self.center or self.lens
-
-
-def mapped(database: Path, *, mapper: Mapper, freedom: Freedom, fixed: frozenset[int]) -> Any | None:
-    """The model of the most images that a mapper finds, None without one; one thread, so it is repeatable."""
+    Focal lengths and distortion are estimated; principal points stay (Note [Alike lenses])."""
     pycolmap = pycolmap_module()
     folder = database.parent / mapper
     folder.mkdir()
     pycolmap.set_random_seed(0)
     if mapper == "incremental":
-        found = pycolmap.incremental_mapping(database, folder, folder, _incremental_options(freedom, fixed))
+        found = pycolmap.incremental_mapping(database, folder, folder, _incremental_options())
     else:
-        found = pycolmap.global_mapping(database, folder, folder, _global_options(freedom))
+        found = pycolmap.global_mapping(database, folder, folder, _global_options())
     return max(found.values(), key=size_of, default=None)
 
 
@@ -56,15 +115,14 @@ def size_of(model: Any) -> tuple[int, int]:
     return model.num_reg_images(), model.compute_num_observations()
 
 
-def _incremental_options(freedom: Freedom, fixed: frozenset[int]) -> Any:
+def _incremental_options() -> Any:
     options = pycolmap_module().IncrementalPipelineOptions()
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = 0
     options.num_threads = options.mapper.num_threads = 1
     options.extract_colors = False
     options.min_model_size = 2
-    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = freedom.focal
-    options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = freedom.lens
-    options.constant_cameras = options.mapper.constant_cameras = set(fixed)
+    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = True
+    options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = True
     # A rig has few cameras with wide baselines, so each has fewer matches than a photo collection's.
     options.mapper.init_min_num_inliers = 40
     options.mapper.init_min_tri_angle = 8.0
@@ -73,44 +131,28 @@ def _incremental_options(freedom: Freedom, fixed: frozenset[int]) -> Any:
     return options
 
 
-def _global_options(freedom: Freedom) -> Any:
+def _global_options() -> Any:
     options = pycolmap_module().GlobalPipelineOptions()
     options.random_seed = options.mapper.random_seed = 0
     options.num_threads = options.mapper.num_threads = 1
     options.mapper.global_positioning.use_gpu = False
     options.mapper.bundle_adjustment.ceres.use_gpu = False
-    options.mapper.bundle_adjustment.refine_focal_length = freedom.focal
-    options.mapper.bundle_adjustment.refine_extra_params = freedom.lens
+    options.mapper.bundle_adjustment.refine_focal_length = True
+    options.mapper.bundle_adjustment.refine_extra_params = True
     return options
 
 
-def adjust(
-    model: Any,
-    *,
-    freedom: Freedom,
-    fixed: frozenset[int] = frozenset(),
-    constant_points: bool = False,
-) -> None:
-    """Bundle adjustment of ``model`` in place, with Huber's loss.
-
-    Args:
-        fixed: ids of cameras whose intrinsics stay.
-        constant_points: whether points stay.
-    """
+def adjust(model: Any, *, lens: bool = True) -> None:
+    """Bundle adjustment of ``model`` in place, with Huber's loss: poses, points, focal lengths and, if ``lens``,
+    distortion."""
     pycolmap = pycolmap_module()
     config = pycolmap.BundleAdjustmentConfig()
     for image in model.reg_image_ids():
         config.add_image(image)
-    for camera in model.cameras if not freedom.any else fixed:
-        config.set_constant_cam_intrinsics(camera)
-    if constant_points:
-        for point in model.point3D_ids():
-            config.add_constant_point(point)
-    else:
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length, options.refine_principal_point = freedom.focal, freedom.center
-    options.refine_extra_params = freedom.lens
+    options.refine_focal_length, options.refine_principal_point = True, False
+    options.refine_extra_params = lens
     options.refine_rig_from_world = options.refine_sensor_from_rig = True
     options.min_track_length = 0
     options.ceres.use_gpu = False
@@ -119,48 +161,7 @@ def adjust(
     options.ceres.solver_options.num_threads = 1
     options.ceres.solver_options.function_tolerance = 1e-9
     options.ceres.solver_options.max_num_iterations = 200
-    with _held_centers(model, config, hold=freedom.center and not constant_points):
-        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
-
-
-@contextmanager
-def _held_centers(model: Any, config: Any, *, hold: bool) -> Iterator[None]:
-    """Holds the principal points of a model near the centres of their pictures while it is adjusted.
-
-    Note [Principal points]: cameras that surround a scene hardly distinguish a principal point from a rotation, so
-    freed ones wander off, and focal lengths with them. A point on the optical axis is seen in the principal point
-    whatever focal length and lens are. So each camera gets another picture, of a fixed pose, in which such a point is
-    seen in the picture's centre: one observation more, which hundreds of others overrule where they know better.
-    """
-    free = sorted(set(model.cameras) - set(config.constant_cam_intrinsics))
-    if not hold or not free:
-        yield
-        return
-    pycolmap = pycolmap_module()
-    axis = model.add_point3D(np.array([0.0, 0.0, 1.0]), pycolmap.Track(), np.zeros(3, np.uint8))
-    config.add_constant_point(axis)
-    rigs = {rig.ref_sensor_id.id: number for number, rig in model.rigs.items()}
-    image_id, frame_id = max(model.images), max(model.frames)
-    frames = []
-    for number in free:
-        camera, image_id, frame_id = model.camera(number), image_id + 1, frame_id + 1
-        frame = pycolmap.Frame(frame_id=frame_id, rig_id=rigs[number], rig_from_world=pycolmap.Rigid3d())
-        frame.add_data_id(pycolmap.data_t(camera.sensor_id, image_id))
-        model.add_frame(frame)
-        image = pycolmap.Image(name=f"center {number}", camera_id=number, image_id=image_id, frame_id=frame_id)
-        center = np.array([camera.width / 2, camera.height / 2])
-        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(center, axis)] * 2)  # a track has at least two
-        model.add_image(image)
-        model.register_frame(frame_id)
-        for index in range(2):
-            model.point3D(axis).track.add_element(image_id, index)
-        config.add_image(image_id)
-        config.set_constant_rig_from_world_pose(frame_id)
-        frames.append(frame_id)
-    yield
-    model.delete_point3D(axis)
-    for frame_id in frames:
-        model.deregister_frame(frame_id)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
 
 
 def filtered(model: Any, *, pixels: float, degrees: float) -> int:

@@ -12,10 +12,9 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.data.lenses import LensCamera
-from structgstream.data.matching import Features, Pair, mutually_best
-from structgstream.data.pair_matches import mutual_matches
+from structgstream.data.matching import Features, Pair, mutual_matches, mutually_best
+from structgstream.geometry import Floats
 from structgstream.preparation.calibration.keypoints import Keypoints
 
 Indices = NDArray[np.intp]

@@ -14,7 +14,7 @@ from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.adjustment import Limits, adjust_together
 from structgstream.preparation.calibration.colmap import MODELS, LensModel, holding
 from structgstream.preparation.calibration.lens_terms import ASPECT, DISTORTION, FOCAL
-from structgstream.preparation.calibration.mapping import Freedom, adjust, cameras_of, filtered, observed
+from structgstream.preparation.calibration.mapping import adjust, cameras_of, filtered, observed
 from structgstream.preparation.calibration.matching import epipolar_pixels
 from structgstream.preparation.calibration.solved import SolvedCalibration, normalized, rig_alignment
 from structgstream.preparation.calibration.triangulation import (
@@ -35,21 +35,14 @@ MIN_HELD_OUT = 30
 
 @dataclass(frozen=True)
 class Refinement:
-    """The result of a refinement.
-
-    Args:
-        solved: refined cameras, in the coordinates of the given ones; these themselves if refining did not help.
-        before_pixels: median distance of matches that were held out to the epipolar lines of the given cameras.
-        after_pixels: the same of the refined cameras, before they are adjusted to these matches, too.
-        held_out: number of these matches.
-        changed: whether ``solved`` has refined cameras.
-    """
+    """The result of a refinement."""
 
     solved: SolvedCalibration
-    before_pixels: float
-    after_pixels: float
-    held_out: int
-    changed: bool
+    """Refined cameras, in the coordinates of the given ones; these themselves if refining did not help."""
+    before_pixels: float  # median distance of matches that were held out to the epipolar lines of the given cameras
+    after_pixels: float  # the same of the refined cameras, before they are adjusted to these matches, too
+    held_out: int  # number of these matches
+    changed: bool  # whether ``solved`` has refined cameras
 
 
 def refine(
@@ -73,7 +66,6 @@ def refine(
     Raises:
         CalibrationError: too few matches agree with the given poses, or not all cameras are connected by them.
         ConfigError: the model ``brown``.
-        MissingExtraError: pycolmap or cv2 is not installed.
     """
     if lens == "brown":
         raise ConfigError(
@@ -86,7 +78,6 @@ def refine(
     judges = {pair: graph.matches[pair][judging[pair]] for pair in graph.matches}
     refined = dict(cameras)
     models = {name: MODELS[lens] if lens else holding(filmed.lens) for name, filmed in cameras.items()}
-    freedom = Freedom(lens=lens is not None, center=False)
     limits = Limits.for_pictures(max(max(filmed.camera.width, filmed.camera.height) for filmed in cameras.values()))
     model = None
     for share in ROUNDS:
@@ -94,9 +85,9 @@ def refine(
         focal = max(float(filmed.camera.K[0, 0]) for filmed in refined.values())
         loose = max(limits.pixels, focal * float(np.radians(slack)))
         model = posed_model(learning, refined, pixels=loose, slack_degrees=slack, models=models)
-        adjust(model, freedom=freedom)
+        adjust(model, lens=lens is not None)
         filtered(model, pixels=limits.pixels, degrees=limits.degrees)
-        adjust(model, freedom=freedom)
+        adjust(model, lens=lens is not None)
         found = cameras_of(model)
         refined = {name: found[name] for name in cameras}
     result = SolvedCalibration(refined, *observed(model, graph.keypoints, cameras))
@@ -127,7 +118,6 @@ def _completed(
         normalized(triangulated(graph, refined.cameras, limits=limits)),
         lens=range(count),
         free=terms,
-        fixed=np.zeros(count, np.bool_),
         limits=limits,
     )
 

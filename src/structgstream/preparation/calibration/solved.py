@@ -7,30 +7,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.alignment import Alignment, alignment
-from structgstream.data.arrays import Floats
+from structgstream.data.calibration import Alignment, alignment
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import level_normal
 from structgstream.errors import CalibrationError
+from structgstream.geometry import Floats
 
 Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
 class Observations:
-    """Where points were seen, an entry for each observation.
+    """Where points were seen, an entry for each observation."""
 
-    Args:
-        point: ``[M]``, index of the point.
-        camera: ``[M]``, index of the camera, in the order of the solved cameras.
-        pixels: ``[M, 2]``, as filmed, so with the lens' distortion.
-        instant: ``[M]``, index of the first instant at which it was seen there.
-    """
-
-    point: Indices
-    camera: Indices
-    pixels: Floats
-    instant: Indices
+    point: Indices  # ``[M]``, index of the point
+    camera: Indices  # ``[M]``, index of the camera, in the order of the solved cameras
+    pixels: Floats  # ``[M, 2]``, as filmed, so with the lens' distortion
+    instant: Indices  # ``[M]``, index of the first instant at which it was seen there
 
     def __len__(self) -> int:
         return len(self.point)
@@ -38,21 +31,13 @@ class Observations:
 
 @dataclass(frozen=True)
 class SolvedCalibration:
-    """Cameras with lenses, estimated from their pictures.
+    """Cameras with lenses, estimated from their pictures."""
 
-    Args:
-        cameras: those that could be placed, in the order of the pictures.
-        points: ``[P, 3]``.
-        observations: where the points were seen.
-        missing: names of the cameras that could not be placed.
-        metres: whether the unit is a metre; otherwise it is arbitrary.
-    """
-
-    cameras: Mapping[str, LensCamera]
-    points: Floats
-    observations: Observations
-    missing: tuple[str, ...] = ()
-    metres: bool = False
+    cameras: Mapping[str, LensCamera]  # those that could be placed, in the order of the pictures
+    points: Floats  # ``[P, 3]``
+    observations: Observations  # where the points were seen
+    missing: tuple[str, ...] = ()  # names of the cameras that could not be placed
+    metres: bool = False  # whether the unit is a metre; otherwise it is arbitrary
 
     def residuals(self) -> Floats:
         """Reprojection error ``[M, 2]`` of each observation, pixels; NaN where a point is out of a lens' reach."""

@@ -19,13 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.calibration import listed
-from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Pair, connected_groups
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.adjustment import Limits, adjust_together
 from structgstream.preparation.calibration.colmap import (
     LensModel,
-    colmap_camera,
     field_of_view,
     guessed_camera,
     pycolmap_module,
@@ -33,22 +31,19 @@ from structgstream.preparation.calibration.colmap import (
 from structgstream.preparation.calibration.keypoints import Keypoints, all_keypoints
 from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL
 from structgstream.preparation.calibration.mapping import (
-    Freedom,
+    Matches,
     adjust,
     cameras_of,
     filtered,
     mapped,
     observed,
     size_of,
+    verified_pairs,
+    write_database,
 )
 from structgstream.preparation.calibration.matching import all_matches
 from structgstream.preparation.calibration.solved import SolvedCalibration, normalized
 from structgstream.preparation.calibration.triangulation import rematched
-from structgstream.preparation.calibration.view_graph import (
-    Matches,
-    verified_pairs,
-    write_database,
-)
 
 _log = logging.getLogger(__name__)
 
@@ -70,10 +65,7 @@ def solve_structure(
     *,
     lens: LensModel = "radial",
     intrinsics: Intrinsics = "own",
-    field_of_view: float | Mapping[str, float] | None = None,
     focals: Mapping[str, float] | None = None,
-    centers: bool = True,
-    known: Mapping[str, LensCamera] | None = None,
 ) -> SolvedCalibration:
     """Poses, intrinsics and lenses of still cameras from their own pictures.
 
@@ -81,13 +73,8 @@ def solve_structure(
         pictures: camera name to pictures ``[H, W, 3]`` of the same instants for all cameras, in order of time.
         lens: which distortion is estimated.
         intrinsics: ``"shared"`` for cameras of one make and zoom, else ``"own"``.
-        field_of_view: degrees across the longer side, for all cameras or by name, to begin with; by default some are
-            tried.
         focals: focal lengths in pixels by name, of those cameras that state one. Fields of view that are tried begin
             with these; cameras that state none take the median one.
-        centers: whether principal points are estimated, as those of cameras that are alike (lens_prior.py, Note [Alike
-            lenses]); otherwise they are the centres.
-        known: cameras whose intrinsics and lens are known and stay; their poses are not read.
 
     Returns:
         the calibration in arbitrary units: the mean camera is the origin and the farthest is one unit away, as the
@@ -95,7 +82,6 @@ def solve_structure(
 
     Raises:
         CalibrationError: fewer than three cameras, pictures that do not belong together, or too little in common.
-        MissingExtraError: pycolmap or cv2 is not installed.
     """
     pycolmap_module()
     if len(pictures) < 3:
@@ -108,16 +94,15 @@ def solve_structure(
     matches = all_matches(keypoints, workers=workers)
     best: _Attempt | None = None
     sizes = {name: (shots[0].shape[1], shots[0].shape[0]) for name, shots in pictures.items()}
-    degrees = _fields_of_view(sizes, lens, field_of_view, focals or {}, known or {})
-    for cameras in _starts(sizes, lens, intrinsics, degrees, known or {}):
-        attempt = _attempt(keypoints, matches, cameras, known or {}, workers=workers)
+    for cameras in _starts(sizes, lens, intrinsics, _fields_of_view(sizes, lens, focals or {})):
+        attempt = _attempt(keypoints, matches, cameras, workers=workers)
         best = attempt if best is None or attempt.size > best.size else best
         if best.size[0] == len(pictures):
             break
     assert best is not None
     if best.model is None or best.size[0] < 3:
         raise CalibrationError(_nothing(pictures, matches, best.pairs))
-    solved = _finished(best, keypoints, pictures, lens=lens, centers=centers, workers=workers)
+    solved = _finished(best, keypoints, pictures, lens=lens, workers=workers)
     if solved.missing:
         _log.warning("%s", missing_cameras(solved.missing, matches, best.pairs))
     return solved
@@ -147,8 +132,6 @@ class _Attempt:
 
     model: Any | None
     pairs: Mapping[Pair, Any]
-    freedom: Freedom
-    fixed: frozenset[int]
 
     @property
     def size(self) -> tuple[int, int]:
@@ -158,17 +141,10 @@ class _Attempt:
 def _fields_of_view(
     sizes: Mapping[str, tuple[int, int]],
     lens: LensModel,
-    stated: float | Mapping[str, float] | None,
     focals: Mapping[str, float],
-    known: Mapping[str, LensCamera],
 ) -> list[dict[str, float]]:
     """Degrees by camera, for each start that is tried."""
-    usual = FIELDS_OF_VIEW[lens]
-    if isinstance(stated, Mapping):
-        return [{name: stated.get(name, usual[0]) for name in sizes}]
-    if stated is not None or len(known) == len(sizes):
-        return [dict.fromkeys(sizes, usual[0] if stated is None else stated)]
-    tried = [dict.fromkeys(sizes, degrees) for degrees in usual]
+    tried = [dict.fromkeys(sizes, degrees) for degrees in FIELDS_OF_VIEW[lens]]
     if likely := {name: field_of_view(lens, focal, sizes[name]) for name, focal in focals.items() if name in sizes}:
         middle = float(np.median(list(likely.values())))
         tried.insert(0, {name: likely.get(name, middle) for name in sizes})
@@ -180,23 +156,19 @@ def _starts(
     lens: LensModel,
     intrinsics: Intrinsics,
     tried: Sequence[Mapping[str, float]],
-    known: Mapping[str, LensCamera],
 ) -> list[dict[str, Any]]:
     """Cameras of pycolmap to begin with, for each start that is tried."""
-    if intrinsics == "shared" and (len(set(sizes.values())) > 1 or known):
+    if intrinsics == "shared" and len(set(sizes.values())) > 1:
         raise CalibrationError(
-            f"Shared intrinsics need pictures of one size and no known ones, got "
-            f"{', '.join(sorted({f'{w}x{h}' for w, h in sizes.values()}))}"
-            f"{' and known intrinsics' if known else ''}; use own intrinsics."
+            "Shared intrinsics need pictures of one size, got "
+            f"{', '.join(sorted({f'{w}x{h}' for w, h in sizes.values()}))}; use own intrinsics."
         )
     starts = []
     for degrees in tried:
         middle = float(np.median(list(degrees.values())))
         cameras = {}
         for number, (name, size) in enumerate(sizes.items(), 1):
-            if name in known:
-                cameras[name] = colmap_camera(known[name], number)
-            elif intrinsics == "shared":
+            if intrinsics == "shared":
                 cameras[name] = guessed_camera(lens, 1, size, middle)
             else:
                 cameras[name] = guessed_camera(lens, number, size, degrees[name])
@@ -208,16 +180,12 @@ def _attempt(
     keypoints: Mapping[str, Keypoints],
     matches: Matches,
     cameras: Mapping[str, Any],
-    known: Mapping[str, LensCamera],
     *,
     workers: int,
 ) -> _Attempt:
     """The incremental model, or the global one if that places more cameras."""
     pairs = verified_pairs(keypoints, matches, cameras, workers=workers)
-    fixed = frozenset(cameras[name].camera_id for name in known)
-    every = len(known) == len(keypoints)
-    freedom = Freedom(focal=not every, center=False, lens=not every)
-    attempt = _Attempt(None, pairs, freedom, fixed)
+    attempt = _Attempt(None, pairs)
     if not pairs:
         return attempt
     with tempfile.TemporaryDirectory(prefix="structgstream-sfm-") as folder:
@@ -225,7 +193,7 @@ def _attempt(
         write_database(database, keypoints, cameras, pairs)
         reachable = len(connected_groups(keypoints, pairs)[0])
         for mapper in ("incremental", "global"):
-            found = mapped(database, mapper=mapper, freedom=freedom, fixed=fixed)
+            found = mapped(database, mapper=mapper)
             if found is not None and size_of(found) > attempt.size:
                 attempt = replace(attempt, model=found)
             if attempt.size[0] == reachable:
@@ -239,7 +207,6 @@ def _finished(
     pictures: Pictures,
     *,
     lens: LensModel,
-    centers: bool,
     workers: int,
 ) -> SolvedCalibration:
     """The model with all intrinsics adjusted, matched again, without outliers, in normalised coordinates."""
@@ -248,7 +215,7 @@ def _finished(
     longest = max(max(shots[0].shape[:2]) for shots in pictures.values())
     limits = Limits.for_pictures(longest)
     for _ in range(2):
-        adjust(model, freedom=attempt.freedom, fixed=attempt.fixed)
+        adjust(model)
         filtered(model, pixels=limits.pixels, degrees=limits.degrees)
     found = cameras_of(model)
     cameras = {name: found[name] for name in pictures if name in found}
@@ -260,19 +227,12 @@ def _finished(
     adjusted = partial(
         adjust_together,
         lens=[lenses.index(numbers[name]) for name in cameras],
-        free=_free_terms(lens, freedom=attempt.freedom, centers=centers),
-        fixed=np.array([number in attempt.fixed for number in lenses]),
+        free=(FOCAL, ASPECT, ACROSS, DOWN, *DISTORTION[lens]),
         limits=limits,
     )
     return normalized(
         rematched(normalized(adjusted(rough)), keypoints, limits=limits, adjust=adjusted, workers=workers)
     )
-
-
-def _free_terms(lens: LensModel, *, freedom: Freedom, centers: bool) -> tuple[int, ...]:
-    if not freedom.any:
-        return ()
-    return (FOCAL, ASPECT, *((ACROSS, DOWN) if centers else ()), *DISTORTION[lens])
 
 
 def _agreeing(pair: Pair, matches: Matches, pairs: Mapping[Pair, Any]) -> tuple[int, int]:

@@ -23,14 +23,13 @@ from structgstream.data.matching import Pair
 from structgstream.preparation.calibration.adjustment import Limits, chosen
 from structgstream.preparation.calibration.colmap import colmap_camera, colmap_pose, pycolmap_module
 from structgstream.preparation.calibration.keypoints import Keypoints, all_keypoints
-from structgstream.preparation.calibration.mapping import filtered, observed
+from structgstream.preparation.calibration.mapping import filtered, observed, verified_pairs, write_database
 from structgstream.preparation.calibration.matching import (
     agreeing_matches,
     all_matches,
     guided_matches,
 )
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
-from structgstream.preparation.calibration.view_graph import verified_pairs, write_database
 
 _log = logging.getLogger(__name__)
 

@@ -13,12 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
-from structgstream.data.arrays import Floats
 from structgstream.data.calibration import listed
 from structgstream.data.images import opencv
-from structgstream.data.matching import epipolar_errors, fundamental_matrix, sift_features
-from structgstream.data.pair_matches import KEYPOINT_SIDE, mutual_matches
+from structgstream.data.matching import (
+    KEYPOINT_SIDE,
+    epipolar_errors,
+    fundamental_matrix,
+    mutual_matches,
+    sift_features,
+)
 from structgstream.frames import MultiViewFrame
+from structgstream.geometry import Floats
 from structgstream.pose_check.findings import Finding
 from structgstream.pose_check.tracks import AGREE_PIXELS, Evidence, gather, pixel_scale
 
@@ -35,15 +40,10 @@ Judgement = Literal["bumped", "stood", "unknown"]
 
 @dataclass(frozen=True)
 class Movement:
-    """How what is seen in a picture moved.
+    """How what is seen in a picture moved."""
 
-    Args:
-        pixels: median shift; 0 for a picture that stayed.
-        homography: ``[3, 3]``, from pixels of the first picture to pixels of the other.
-    """
-
-    pixels: float
-    homography: Floats
+    pixels: float  # median shift; 0 for a picture that stayed
+    homography: Floats  # ``[3, 3]``, from pixels of the first picture to pixels of the other
 
     @property
     def stayed(self) -> bool:
@@ -59,9 +59,6 @@ def picture_movement(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Moveme
 
     It moved if hardly a keypoint stayed and most of them follow one homography (a camera that turns on the spot makes
     exactly that). A flat thing that moves in front of a plain background does that too.
-
-    Raises:
-        MissingExtraError: cv2 is not installed.
     """
     before, after = (sift_features(picture, count=KEYPOINTS, longest_side=KEYPOINT_SIDE) for picture in (one, other))
     if min(len(before.pixels), len(after.pixels)) < MIN_MATCHES:
@@ -92,9 +89,6 @@ def bump_findings(
         last: a later one.
         evidence: matches of the first frame.
         cameras: by name.
-
-    Raises:
-        MissingExtraError: cv2 is not installed.
     """
     names = [name for name in cameras if name in first.images and name in last.images]
     movements = {name: picture_movement(first.images[name], last.images[name]) for name in names}

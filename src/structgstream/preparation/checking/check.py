@@ -2,7 +2,8 @@
 """Checks a capture: poses, names, units, overlap, colours and times against its pictures."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -11,17 +12,20 @@ from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import select_cameras
 from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.check import examine_poses
-from structgstream.pose_check.findings import explain, worst_first
+from structgstream.pose_check.findings import Finding, explain, worst_first
 from structgstream.pose_check.tracks import MIN_VIEWS, Evidence, Tracks, pair_errors
 from structgstream.pose_check.verdicts import Suspects, Verdict
 from structgstream.preparation.checking.bumps import bump_findings
 from structgstream.preparation.checking.colors import Color, color_findings, compare_colors
-from structgstream.preparation.checking.findings import (
-    CameraCheck,
-    CheckReport,
-    PairCheck,
+from structgstream.preparation.checking.overlap import (
+    Coverage,
+    coverage,
+    nearest_depth,
+    observed_depths,
+    overlap_findings,
+    overlaps,
+    scale_findings,
 )
-from structgstream.preparation.checking.overlap import coverage, overlap_findings, overlaps
 from structgstream.preparation.checking.presence import (
     Presence,
     note,
@@ -30,7 +34,6 @@ from structgstream.preparation.checking.presence import (
     stated_presence,
     whole_frame,
 )
-from structgstream.preparation.checking.scales import nearest_depth, observed_depths, scale_findings
 from structgstream.preparation.checking.times import (
     MIN_FRAMES,
     SynchronizationCheck,
@@ -39,24 +42,96 @@ from structgstream.preparation.checking.times import (
 )
 from structgstream.preparation.steps import Listener, Silent
 
+
+@dataclass(frozen=True)
+class PairCheck:
+    """Matches of two pictures against the given poses."""
+
+    first: str  # name of a camera
+    second: str  # name of another
+    matches: int  # good matches, found without the poses; 0 where the cameras see too little in common
+    epipolar_pixels: float | None  # their median distance to the epipolar lines of the poses; None without matches
+    share_violating: float | None  # share of them that the poses cannot explain; None without matches
+
+
+@dataclass(frozen=True)
+class CameraCheck:
+    """What was found of one camera."""
+
+    reprojection_pixels: float | None
+    """Median distance of its keypoints to points that other cameras agree on; None without any."""
+    reprojection_pixels_90: float | None  # their 90th percentile
+    points: int  # number of these points
+    overlaps: int  # number of cameras that it has matches with
+    exposure_stops: float | None = None
+    """Exposure relative to the median camera, as a power of two; None without matches."""
+    red_stops: float | None = None  # red against green, relative to the median camera
+    blue_stops: float | None = None  # blue against green, relative to the median camera
+    offset_ms: float | None = None  # time against the other cameras, milliseconds; None where it was not estimated
+    offset_uncertainty_ms: float | None = None  # its standard deviation
+    frames_lacking: int = 0  # number of the capture's frames that it has no picture of
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """The numbers of a check; ``as_json`` is what ``report.json`` holds.
+
+    Args:
+        capture: its name.
+        frame: the frame that was looked at.
+        cameras: by name, in the order of the rig.
+        pairs: all pairs that were matched.
+        coverage: of the points.
+        findings: the worst first.
+        rig_radius: in the capture's units.
+        near: near plane, in the capture's units.
+        nearest: depth that 0.5 % of the points fall below, in the capture's units; None without points.
+        unit: of length, where the capture states it.
+        steps: summaries of the preparation's steps, where there was one.
+    """
+
+    capture: str
+    frame: int
+    cameras: Mapping[str, CameraCheck]
+    pairs: tuple[PairCheck, ...]
+    coverage: Coverage
+    findings: tuple[Finding, ...]
+    rig_radius: float
+    near: float
+    nearest: float | None
+    unit: str | None = None
+    steps: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def errors(self) -> tuple[Finding, ...]:
+        """The findings that spoil a stream."""
+        return tuple(finding for finding in self.findings if finding.severity == "error")
+
+    @property
+    def median_epipolar_pixels(self) -> float | None:
+        """Median over pairs, or None without matches."""
+        known = sorted(pair.epipolar_pixels for pair in self.pairs if pair.epipolar_pixels is not None)
+        return known[len(known) // 2] if known else None
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values, with the median over pairs."""
+        return asdict(self) | {"median_epipolar_pixels": self.median_epipolar_pixels}
+
+
 MIN_TIMED = 3  # cameras, for times that can be compared
 FAR_AWAY = 30.0  # radii of the rig: a camera that stands further away is in another unit
 
 
 @dataclass(frozen=True)
 class Examination:
-    """All that was found at one instant; the pictures of a report are drawn from it.
-
-    Args:
-        presence: by camera, which frames of the capture it has a picture of.
-    """
+    """All that was found at one instant; the pictures of a report are drawn from it."""
 
     frame: MultiViewFrame
     cameras: Mapping[str, Camera]
     evidence: Evidence
     verdict: Verdict
     colors: Mapping[str, Color]
-    presence: Presence = field(default_factory=dict)
+    presence: Presence = field(default_factory=dict)  # by camera, which frames of the capture it has a picture of
 
     @property
     def suspects(self) -> Suspects:
@@ -78,11 +153,7 @@ class Checked:
 
 
 def examine(frame: MultiViewFrame, cameras: Mapping[str, Camera]) -> Examination:
-    """Matches one instant's pictures and holds them against the poses.
-
-    Raises:
-        MissingExtraError: cv2 or scipy is not installed.
-    """
+    """Matches one instant's pictures and holds them against the poses."""
     seen = {name: camera for name, camera in cameras.items() if name in frame.images}
     evidence, verdict = examine_poses(frame, seen)
     return Examination(frame, seen, evidence, verdict, compare_colors(evidence))
@@ -93,7 +164,6 @@ def examine_capture(source: FrameSource) -> Examination:
 
     Raises:
         CaptureError: a frame cannot be read.
-        MissingExtraError: cv2 or scipy is not installed.
     """
     presence = stated_presence(source)
     return replace(examine(whole_frame(source, presence), source.rig.cameras), presence=presence)
@@ -116,7 +186,6 @@ def check_capture(
 
     Raises:
         CaptureError: a frame cannot be read.
-        MissingExtraError: cv2 or scipy is not installed.
     """
     cameras = source.rig.cameras
     listener = listener or Silent()

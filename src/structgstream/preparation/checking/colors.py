@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv
+from structgstream.geometry import Floats
 from structgstream.pose_check.findings import Finding
 from structgstream.pose_check.tracks import Evidence
 
@@ -21,17 +21,11 @@ EXPOSURE_STOPS, BALANCE_STOPS = 0.33, 0.2
 
 @dataclass(frozen=True)
 class Color:
-    """A camera's colour against the median camera, as powers of two of linear light.
+    """A camera's colour against the median camera, as powers of two of linear light."""
 
-    Args:
-        exposure_stops: of green.
-        red_stops: of red over green.
-        blue_stops: of blue over green.
-    """
-
-    exposure_stops: float
-    red_stops: float
-    blue_stops: float
+    exposure_stops: float  # of green
+    red_stops: float  # of red over green
+    blue_stops: float  # of blue over green
 
 
 def compare_colors(evidence: Evidence) -> dict[str, Color]:

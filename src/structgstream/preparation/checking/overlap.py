@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which cameras see the same things, and how much of the scene how many of them see."""
+"""Which cameras see the same things, how much of the scene, and whether lengths fit together."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -8,27 +8,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
-from structgstream.data.arrays import Floats
 from structgstream.data.calibration import listed
 from structgstream.data.matching import Pair, connected_groups, inside, project
+from structgstream.geometry import Floats
 from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.tracks import MIN_VIEWS, Tracks
 
 MIN_OVERLAPS = 2
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """How much of the scene how many cameras see.
+    """How much of the scene how many cameras see."""
 
-    Args:
-        points: number of points that were triangulated.
-        seen_by_three: share of them that at least three cameras see.
-        median_cameras: median number of cameras that see a point.
-    """
-
-    points: int
-    seen_by_three: float
-    median_cameras: float
+    points: int  # number of points that were triangulated
+    seen_by_three: float  # share of them that at least three cameras see
+    median_cameras: float  # median number of cameras that see a point
 
 
 def cameras_per_point(points: Floats, cameras: Mapping[str, Camera]) -> NDArray[np.intp]:
@@ -89,3 +84,123 @@ def overlap_findings(pairs: Collection[Pair], names: Collection[str]) -> list[Fi
                 )
             )
     return findings
+
+
+NEAR_PERCENTILE = 0.5
+MIN_POINTS = 30
+CUT_SHARE = 0.02
+CLOSEST_NEAR = 0.0007  # of the depth of the nearest points: a near plane any closer looks like one in another unit
+PLAUSIBLE_METRES = (0.03, 60.0)  # of a rig's radius: a desk, a stadium's corner
+FACTORS = (1000.0, 0.001, 100.0, 0.01)
+UNITS = {1000.0: "1000 times too small (metres among millimetres)", 0.001: "1000 times too large (millimetres among "
+         "metres)", 100.0: "100 times too small (metres among centimetres)", 0.01: "100 times too large (centimetres "
+         "among metres)"}  # fmt: skip
+FIT = 0.5
+MIN_EXTENT = 0.03  # of the points that a rig sees, as a share of their depth
+
+
+def observed_depths(tracks: Tracks, cameras: Mapping[str, Camera], *, off: Collection[str] = ()) -> Floats:
+    """Depths of points in the cameras, of those not ``off``, that observed them; of three cameras, or else of two."""
+    views = tracks.views
+    min_views = MIN_VIEWS if (views >= MIN_VIEWS).sum() >= MIN_POINTS else 2
+    depths = []
+    for number, name in enumerate(tracks.names):
+        if name in off:
+            continue
+        rows = (tracks.camera == number) & (views[tracks.point] >= min_views) & np.isfinite(tracks.residuals)
+        depths.append(project(cameras[name], tracks.points[tracks.point[rows]])[1])
+    return np.concatenate(depths) if depths else np.empty(0)
+
+
+def nearest_depth(depths: Floats) -> float | None:
+    """The depth that only few points fall below; None when there are too few."""
+    depths = depths[depths > 0]
+    return float(np.percentile(depths, NEAR_PERCENTILE)) if len(depths) >= MIN_POINTS else None
+
+
+def scale_findings(
+    depths: Floats,
+    points: Floats | None,
+    cameras: Mapping[str, Camera],
+    *,
+    radius: float,
+    unit: str | None,
+) -> list[Finding]:
+    """What contradicts in lengths.
+
+    Args:
+        depths: of points that the pictures confirm, see :func:`observed_depths`.
+        points: ``[P, 3]`` that came with the capture, or None.
+        cameras: of the rig.
+        radius: of the rig.
+        unit: of length, where the capture states it.
+    """
+    findings = []
+    near = float(np.median([camera.near for camera in cameras.values()]))
+    depths = depths[depths > 0]
+    if len(depths) >= MIN_POINTS and (cut := float((depths < near).mean())) > CUT_SHARE:
+        typical = float(np.median(depths))
+        hint = "; poses and near plane look like different units of length" if near > 50 * typical else ""
+        findings.append(
+            Finding(
+                "error",
+                f"The near plane lies at {near:.4g}, beyond {cut:.0%} of the points, whose nearest are at "
+                f"{np.percentile(depths, NEAR_PERCENTILE):.4g} and whose median is at {typical:.4g}{hint}; set --near "
+                f"{0.5 * np.percentile(depths, NEAR_PERCENTILE):.3g}.",
+            )
+        )
+    elif (nearest := nearest_depth(depths)) is not None and near < CLOSEST_NEAR * nearest:
+        findings.append(
+            Finding(
+                "warning",
+                f"The near plane lies at {near:.4g}, and the nearest points at {nearest:.4g}: poses and near plane look"
+                " like different units of length, as of positions in millimetres beside a near plane in metres; convert"
+                f" one of them, or set --near {0.5 * nearest:.3g}.",
+            )
+        )
+    if unit == "metres" and not PLAUSIBLE_METRES[0] <= radius <= PLAUSIBLE_METRES[1]:
+        like = "millimetres or centimetres" if radius > 1 else "kilometres"
+        findings.append(
+            Finding(
+                "error",
+                f"The cameras stand up to {radius:.4g} from their middle, and the capture says metres: the positions "
+                f"look like {like}; convert them, or give a distance between two cameras.",
+            )
+        )
+    if points is not None and len(points) >= MIN_POINTS and (sentence := _foreign(points, depths, cameras)):
+        findings.append(Finding("error", sentence))
+    return findings
+
+
+def _foreign(points: Floats, depths: Floats, cameras: Mapping[str, Camera]) -> str | None:
+    """A sentence when the points that came along are not of these cameras."""
+    fits = _share_seen(points, cameras)
+    if len(depths) < MIN_POINTS:
+        return None
+    typical = float(np.median(depths))
+    if fits >= FIT and 0.02 < _typical_depth(points, cameras) / typical < 50:
+        return None
+    extent = float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
+    differences = {
+        factor: abs(np.log(_typical_depth(points * factor, cameras) / typical))
+        for factor in FACTORS
+        if factor * extent > MIN_EXTENT * typical  # any points, made small enough, lie in the middle of a rig
+    }
+    likely = min(differences, key=lambda factor: differences[factor], default=None)
+    if likely is not None and differences[likely] < np.log(5):
+        return (
+            f"The points that come with the capture lie at impossible depths: they look {UNITS[likely]}; convert "
+            "points and positions of cameras to one unit, or leave the points out."
+        )
+    return (
+        f"Only {fits:.0%} of the points that come with the capture lie where two cameras see them: they are of other "
+        "cameras; leave them out, or prepare the capture again."
+    )
+
+
+def _typical_depth(points: Floats, cameras: Mapping[str, Camera]) -> float:
+    return max(float(np.median([np.abs(project(camera, points)[1]) for camera in cameras.values()])), 1e-12)
+
+
+def _share_seen(points: Floats, cameras: Mapping[str, Camera]) -> float:
+    return float((cameras_per_point(points, cameras) >= 2).mean())

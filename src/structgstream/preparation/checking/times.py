@@ -25,7 +25,7 @@ from structgstream.preparation.synchronization.motion_signals import (
     reduced_changes,
     reduced_grey,
 )
-from structgstream.preparation.synchronization.result import WARNED_SECONDS
+from structgstream.preparation.synchronization.synchronize import WARNED_SECONDS
 
 LESS_THAN_A_FRAME = (
     "less than a frame, which choosing frames cannot mend; what moves fast will blur there. Cameras that one signal "
@@ -41,25 +41,19 @@ SIGMAS, SURE_SIGMAS = 3.0, 2.0
 
 @dataclass(frozen=True)
 class SynchronizationCheck:
-    """Result of the check.
-
-    Args:
-        late_seconds: camera to how much later than stated its pictures were taken, relative to most cameras; of the
-            cameras that can be judged. Stated are their own time stamps, where the capture has them.
-        uncertainty_seconds: the standard errors of these.
-        off: cameras that are late or early by more than a quarter of a frame period, and more than chance.
-        undecided: cameras in whose pictures too little moves that others see.
-        period_seconds: the frame period.
-        apart_seconds: camera to how long after their instants its pictures were taken by their time stamps, relative to
-            most cameras; empty where the capture has no time stamps.
-    """
+    """Result of the check."""
 
     late_seconds: Mapping[str, float]
-    uncertainty_seconds: Mapping[str, float]
+    """Camera to how much later than stated its pictures were taken, relative to most cameras; of the cameras that can
+    be judged. Stated are their own time stamps, where the capture has them."""
+    uncertainty_seconds: Mapping[str, float]  # the standard errors of these
     off: tuple[str, ...]
-    undecided: tuple[str, ...]
-    period_seconds: float
+    """Cameras that are late or early by more than a quarter of a frame period, and more than chance."""
+    undecided: tuple[str, ...]  # cameras in whose pictures too little moves that others see
+    period_seconds: float  # the frame period
     apart_seconds: Mapping[str, float] = field(default_factory=dict)
+    """Camera to how long after their instants its pictures were taken by their time stamps, relative to most cameras;
+    empty where the capture has no time stamps."""
 
     @property
     def between(self) -> dict[str, float]:
@@ -85,7 +79,6 @@ def check_synchronization(source: FrameSource) -> SynchronizationCheck:
 
     Raises:
         CaptureError: the pictures cannot be read.
-        MissingExtraError: cv2 or scipy is not installed.
     """
     require_scipy()
     period = 1 / source.fps

@@ -1,7 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Clocks of cameras that run freely, from tables, time stamps, sound or motion."""
 
-from structgstream.preparation.synchronization.result import ClockEstimate, Synchronization
-from structgstream.preparation.synchronization.synchronize import METHODS, Method, Streams, synchronize
+from structgstream.preparation.synchronization.synchronize import (
+    METHODS,
+    ClockEstimate,
+    Method,
+    Streams,
+    Synchronization,
+    synchronize,
+)
 
 __all__ = ["METHODS", "ClockEstimate", "Method", "Streams", "Synchronization", "synchronize"]

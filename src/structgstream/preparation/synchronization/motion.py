@@ -18,13 +18,14 @@ from structgstream.data.matching import connected_groups
 from structgstream.data.timeline import period_seconds
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.correlation import (
+    Line,
     Signal,
     best_lag,
     chance_deviation,
+    fitted_line,
     lag_changes,
     resampled,
 )
-from structgstream.preparation.synchronization.lines import Line, fitted_line
 from structgstream.preparation.synchronization.motion_signals import Changes, Geometry, line_signals
 from structgstream.preparation.synchronization.solving import Solution, TimeCorrespondence, camera_pairs, solve_clocks
 
@@ -52,18 +53,13 @@ OPTIMISM = 1.5  # true errors of pairs over their jackknife errors, measured on 
 
 @dataclass(frozen=True)
 class PairSignals:
-    """Signals of two cameras that rise and fall together.
-
-    Args:
-        epipolar: whether they belong to corresponding epipolar lines, else to whole pictures.
-        estimated: whether the epipolar geometry is an estimate that may be wrong.
-    """
+    """Signals of two cameras that rise and fall together."""
 
     first: str
     second: str
     signals: tuple[Signal, Signal]
-    epipolar: bool
-    estimated: bool = False
+    epipolar: bool  # whether they belong to corresponding epipolar lines, else to whole pictures
+    estimated: bool = False  # whether the epipolar geometry is an estimate that may be wrong
 
 
 def pair_signals(changes: Mapping[str, Changes], geometry: Geometry | None) -> list[PairSignals]:
@@ -214,7 +210,7 @@ def _control(pair: PairSignals, min_overlap: int) -> float:
 def _near(pair: PairSignals, near: Solution, edges: NDArray[np.float64] | None) -> list[TimeCorrespondence]:
     """The correspondence of a whole take near known clocks.
 
-    Where there are blocks it has its changes without each of them and with the shapes of ``lines.py``: an event
+    Where there are blocks it has its changes without each of them and with the shapes of ``correlation.py``: an event
     that is shorter than a frame lies on one of two frames, so that the peak of few such events is that of the majority,
     whichever block is left out.
     """

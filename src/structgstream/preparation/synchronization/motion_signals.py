@@ -15,11 +15,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.data.images import opencv, reduced_picture
 from structgstream.data.lenses import LensCamera
-from structgstream.data.matching import Features, sift_features
-from structgstream.data.pair_matches import mutual_matches
+from structgstream.data.matching import Features, mutual_matches, sift_features
+from structgstream.geometry import Floats
 
 CHANGES_SIDE = 160  # of reduced pictures, pixels: events are compared along lines, so positions need not be finer
 SMOOTHING = 1.0  # standard deviation, reduced pixels
@@ -32,17 +31,12 @@ STILL = 5e-4  # share of MOST of a mean change below which nothing moves
 
 @dataclass(frozen=True)
 class Changes:
-    """Changes of a camera's pictures.
-
-    Args:
-        amounts: ``[T - 1, h, w]`` uint8: change from a frame to the next one above noise, in quarters of a grey level.
-        times: ``[T - 1]`` seconds by the camera's clock, halfway between both frames.
-        size: width and height of the camera's pictures, pixels.
-    """
+    """Changes of a camera's pictures."""
 
     amounts: NDArray[np.uint8]
-    times: Floats
-    size: tuple[int, int]
+    """``[T - 1, h, w]`` uint8: change from a frame to the next one above noise, in quarters of a grey level."""
+    times: Floats  # ``[T - 1]`` seconds by the camera's clock, halfway between both frames
+    size: tuple[int, int]  # width and height of the camera's pictures, pixels
 
     @property
     def activity(self) -> Floats:
@@ -56,11 +50,7 @@ class Changes:
 
 
 def picture_changes(pictures: Iterable[NDArray[np.uint8]], stamps: Floats) -> Changes:
-    """Changes of pictures ``[H, W, 3]`` that follow each other at ``stamps`` ``[T]``; only reduced ones stay in memory.
-
-    Raises:
-        MissingExtraError: cv2 is not installed.
-    """
+    """Changes of pictures ``[H, W, 3]`` that follow each other at ``stamps`` ``[T]``; only reduced ones stay."""
     reduced: list[NDArray[np.uint8]] = []
     size = (0, 0)
     for picture in pictures:
@@ -118,17 +108,11 @@ MIN_INLIERS = 16
 
 @dataclass(frozen=True)
 class PairGeometry:
-    """Epipolar geometry of two views.
+    """Epipolar geometry of two views."""
 
-    Args:
-        F: ``[3, 3]`` with ``x2^T F x1 = 0`` for homogeneous points.
-        straighten: for each view, from filmed pixels to those points.
-        estimated: whether it is an estimate from pictures that may be wrong.
-    """
-
-    F: Floats
-    straighten: tuple[Straighten, Straighten]
-    estimated: bool = False
+    F: Floats  # ``[3, 3]`` with ``x2^T F x1 = 0`` for homogeneous points
+    straighten: tuple[Straighten, Straighten]  # for each view, from filmed pixels to those points
+    estimated: bool = False  # whether it is an estimate from pictures that may be wrong
 
 
 def line_signals(first: Changes, second: Changes, geometry: PairGeometry) -> tuple[Floats, Floats] | None:

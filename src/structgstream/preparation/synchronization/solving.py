@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.arrays import Floats
 from structgstream.data.matching import Pair
+from structgstream.geometry import Floats
 
 TREES = 200
 ITERATIONS = 30
@@ -27,46 +27,29 @@ SIGMAS = 5.0  # correspondences further off than this many standard deviations a
 
 @dataclass(frozen=True)
 class TimeCorrespondence:
-    """One instant by the clocks of two cameras.
+    """One instant by the clocks of two cameras."""
 
-    Args:
-        first: name of a camera.
-        second: name of another.
-        first_seconds: the instant by the first camera's clock.
-        second_seconds: the same instant by the second camera's.
-        sigma_seconds: standard error of their difference.
-        confidence: how distinct the match is, larger is better; only orders correspondences.
-        changes: by how much the second camera's second grows without each block of the take, the same blocks for all
-            correspondences; empty where it is not known. They show errors that those of a camera share.
-    """
-
-    first: str
-    second: str
-    first_seconds: float
-    second_seconds: float
-    sigma_seconds: float
-    confidence: float = 1.0
+    first: str  # name of a camera
+    second: str  # name of another
+    first_seconds: float  # the instant by the first camera's clock
+    second_seconds: float  # the same instant by the second camera's
+    sigma_seconds: float  # standard error of their difference
+    confidence: float = 1.0  # how distinct the match is, larger is better; only orders correspondences
     changes: tuple[float, ...] = ()
+    """By how much the second camera's second grows without each block of the take, the same blocks for all
+    correspondences; empty where it is not known. They show errors that those of a camera share."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Clocks that agree with most correspondences.
+    """Clocks that agree with most correspondences."""
 
-    Args:
-        offsets: camera to seconds; the first camera's is 0.
-        rates: camera to rate; the first camera's is 1.
-        sigmas: camera to the standard error of its common time at the ends of its take, relative to the mean of all
-            cameras.
-        agreeing: for each correspondence whether it agrees.
-        residuals: for each correspondence the difference of its two common times, seconds.
-    """
-
-    offsets: Mapping[str, float]
-    rates: Mapping[str, float]
+    offsets: Mapping[str, float]  # camera to seconds; the first camera's is 0
+    rates: Mapping[str, float]  # camera to rate; the first camera's is 1
     sigmas: Mapping[str, float]
-    agreeing: tuple[bool, ...]
-    residuals: tuple[float, ...]
+    """Camera to the standard error of its common time at the ends of its take, relative to the mean of all cameras."""
+    agreeing: tuple[bool, ...]  # for each correspondence whether it agrees
+    residuals: tuple[float, ...]  # for each correspondence the difference of its two common times, seconds
 
 
 @dataclass(frozen=True)

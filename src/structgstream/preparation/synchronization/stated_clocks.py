@@ -20,10 +20,10 @@ from pathlib import Path
 
 import numpy as np
 
-from structgstream.data.arrays import Floats
 from structgstream.data.text_files import Unreadable, number, read_text, reason, whole
 from structgstream.data.timeline import Clock, period_seconds
 from structgstream.errors import CaptureError
+from structgstream.geometry import Floats
 
 COLUMNS = ("camera", "frame", "seconds")
 MAX_DEVIATION = 0.5  # of a row from a steady clock, in frame periods
@@ -33,17 +33,11 @@ MAX_DRIFT = 0.01
 
 @dataclass(frozen=True)
 class StatedClock:
-    """A camera's clock as files state it.
+    """A camera's clock as files state it."""
 
-    Args:
-        clock: the clock.
-        sigma_seconds: how exact it is; of a table, the spread of its rows.
-        kind: ``table``, ``timecode``, ``creation time`` or ``stamps``.
-    """
-
-    clock: Clock
-    sigma_seconds: float
-    kind: str
+    clock: Clock  # the clock
+    sigma_seconds: float  # how exact it is; of a table, the spread of its rows
+    kind: str  # ``table``, ``timecode``, ``creation time`` or ``stamps``
 
 
 def read_timestamps(file: Path, stamps: Mapping[str, Floats]) -> dict[str, StatedClock]:
@@ -174,15 +168,10 @@ def wall_clocks(stamps: Mapping[str, Floats], metadata: Mapping[str, Mapping[str
 
 @dataclass(frozen=True)
 class Timecode:
-    """A time of day by frames.
+    """A time of day by frames."""
 
-    Args:
-        seconds: since midnight.
-        day_seconds: of the frames from midnight to midnight; not 86,400 where timecode does not follow the clock.
-    """
-
-    seconds: float
-    day_seconds: float
+    seconds: float  # since midnight
+    day_seconds: float  # of the frames from midnight to midnight; not 86,400 where timecode does not follow the clock
 
     def nearest(self, seconds: float) -> float:
         """The time in seconds, on the day on which it is nearest to ``seconds``."""

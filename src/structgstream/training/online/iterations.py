@@ -3,7 +3,7 @@
 
 :class:`OnlineHooks` for ``training.optim.minimize``, in torch, defines the results. Where only a dynamic split is
 trained, without view-space gradients, :func:`minimize_natively` takes the back-end's own iterations
-(``Backend.iterations``, csrc/cpu/fit.cpp), without Python between them.
+(``Backend.iterations``; csrc/cpu/fit.cpp, csrc/cuda/fit_calls.h), without Python between them.
 """
 
 from collections.abc import Callable, Hashable, Iterator, Mapping
@@ -161,11 +161,6 @@ class OnlineHooks(Hooks[View, SceneLoss]):
         patching = self.free_set.config
         return patching.spawn != "off" and patching.collect_from < iteration <= self.patch_at
 
-    @property
-    def native(self) -> bool:
-        """Whether a back-end that has its own iterations can run these."""
-        return None not in (self.start.active_tiles, self.start.split) and not self._tracks_screen(self.patch_at)
-
     def repeats(self, iteration: int, sample: View) -> Hashable | None:
         """Visits of a view that draw the same tiles, until rows of free Gaussians come or go."""
         active, alternates, rests = self.active_tiles_of(sample), self._alternates(sample), self._rests(sample)
@@ -219,7 +214,8 @@ def minimize_natively(
     begin: Callable[[FitFrame], Callable[[int, int], None]],
     on_step: StepListener | None,
 ) -> int:
-    """As ``training.optim.minimize`` where ``hooks.native``, by the back-end's iterations ``begin``."""
+    """As ``training.optim.minimize`` of a dynamic split without view-space gradients, by the back-end's iterations
+    ``begin``."""
     views = list(islice(samples, schedule.iterations))
     plan = _plan(adam, views, schedule, hooks)
     patch_at = hooks.patch_at if hooks.patches and hooks.patch_at <= len(views) else 0

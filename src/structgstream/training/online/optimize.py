@@ -59,8 +59,8 @@ class FrameOptimizer:
     on_step: StepListener | None = None
 
     def run(self, start: StartingPoint) -> FitResult[Scene]:
-        """The scene of ``start``, fitted to its pictures; on a GPU again with more memory if that was short."""
-        if self.backend.name != "cuda":
+        """The scene of ``start``, fitted to its pictures; in torch on a GPU again if memory was short."""
+        if self.backend.name != "cuda" or self._runs_natively(start):
             return self._run(start, self.backend)
         random = self.generator.get_state()
         whole = start.scene if start.split is None else start.split.whole
@@ -73,6 +73,17 @@ class FrameOptimizer:
 
         # The host can run ahead of a GPU because no iteration synchronises.
         return run_with_pair_budget(attempt, capacity=max(1 << 18, 8 * slots), device=self.backend.device)
+
+    def _runs_natively(self, start: StartingPoint) -> bool:
+        """Whether the back-end's own iterations can run these."""
+        patching = self.config.patching
+        tracks_screen = patching.spawn != "off" and patching.collect_from < self._patch_at(start)
+        return (
+            self.backend.iterations is not None and None not in (start.active_tiles, start.split) and not tracks_screen
+        )
+
+    def _patch_at(self, start: StartingPoint) -> int:
+        return math.ceil(self.config.patching.iteration * len(start.seen) / len(start.views))
 
     def _run(self, start: StartingPoint, backend: Backend) -> FitResult[Scene]:
         config, seen, split = self.config, start.seen, start.split
@@ -109,7 +120,7 @@ class FrameOptimizer:
                 start.known, [view.camera for view in start.views], config=config.smoothness
             ),
             free_set=free_set,
-            patch_at=math.ceil(config.patching.iteration * len(seen) / len(start.views)),
+            patch_at=self._patch_at(start),
             patches="free" in config.dynamic,
             last_pass=last_pass,
             backend=backend,
@@ -118,12 +129,13 @@ class FrameOptimizer:
             iterations=iterations,
             average=average,
         )
-        recorder = None if backend.recorder is None else backend.recorder()
         schedule = Schedule(iterations, lambda iteration: online_rates(config, (iteration - 1) / iterations))
         samples = shuffled_views(seen, self.generator)
-        if backend.iterations is not None and hooks.native:
+        recorder = None
+        if backend.iterations is not None and self._runs_natively(start):
             done = minimize_natively(adam, samples, schedule, hooks, begin=backend.iterations, on_step=self.on_step)
         else:
+            recorder = None if backend.recorder is None else backend.recorder()
             done = minimize(adam, samples, schedule, hooks, watch=self.watch, on_step=self.on_step, recorder=recorder)
         if average is not None:
             average.apply(parameters.values)

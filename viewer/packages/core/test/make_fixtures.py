@@ -16,9 +16,9 @@ from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.codec.encoder import SceneEncoder
-from structgstream.codec.fields.free_rows import FREE_PARAMETERS
 from structgstream.codec.fields.packet_fields import CODABLE, dequantize_state, quantize_state
 from structgstream.codec.fields.quantization import round_to_bins
+from structgstream.codec.fields.rows import FREE_PARAMETERS
 from structgstream.codec.fields.static_fields import UNCODED_FIELDS
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.codec.sinks import MemorySink

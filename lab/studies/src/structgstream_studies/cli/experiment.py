@@ -15,7 +15,7 @@ from structgstream.cli.app import Interrupted, UsageError
 from structgstream.cli.options import CaptureOptions, Device, Folder
 from structgstream.cli.progress import print_lines
 from structgstream.cli.tables import compact_table, literal_cells
-from structgstream.executors.opening import ExecutorName, ExecutorOptions
+from structgstream.executors.executor import ExecutorName, ExecutorOptions
 from structgstream_studies.errors import ExperimentError
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ class ExperimentOptions:
     jobs: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Number of parallel runs, each on its share of the cores. Default: one per core, or one per GPU."""
     executor: ExecutorName = "local"
-    """What runs them: processes of this machine, this process (inline), or a Ray cluster (docs/cluster.md)."""
+    """What runs them: processes of this machine, or a Ray cluster (docs/cluster.md)."""
     address: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT", help_behavior_hint="")] = None
     """Head of the Ray cluster, whose machines see the capture and FOLDER at the same place. Default: one begun here."""
     device: Device = "auto"

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from structgstream.evaluation.environment import usable_cores
 from structgstream.executors import task as executors
-from structgstream.executors.executor import Executor, TaskQueue
-from structgstream.executors.opening import ExecutorOptions, open_executor
+from structgstream.executors.executor import ExecutorOptions, TaskQueue, open_executor
 from structgstream.kernels.backend import BackendName
 from structgstream_studies.experiments.worker import Task, command_of
 
@@ -61,7 +60,7 @@ def unique(tasks: Iterable[Task]) -> list[Task]:
 
 def sweep(
     tasks: Sequence[Task],
-    executor: Executor,
+    executor: TaskQueue,
     *,
     folder: Path,
     device: BackendName = "auto",

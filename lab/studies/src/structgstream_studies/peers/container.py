@@ -23,9 +23,9 @@ import torch
 from numpy.typing import NDArray
 
 from structgstream.codec.container.byte_source import ByteSource
-from structgstream.codec.container.index import Period
 from structgstream.codec.container.records import (
     PREFIX,
+    Period,
     RecordType,
     incomplete_reason,
     packed,

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The iterations of a later frame in the GPU's kernels, run on the processor: beside those of the cpu back-end, with
+threads and blocks in both orders, and with too little room for gradients at first.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from structgstream.kernels import cpu_fit, cuda_fit
+from structgstream.kernels.backend import Backend, cpu_backend
+from structgstream.kernels.cuda_library import KernelLibrary
+from structgstream.kernels.native import native_reason
+from structgstream.kernels.values import FitFrame
+from structgstream.scene.state import state_of
+from structgstream.training.online.config import SmoothnessConfig
+from structgstream.training.parameters import RoundingConfig
+from tests.parity.test_native_iterations import fitted, scene_of, start_of
+
+pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+Emulation = Callable[[int], KernelLibrary]
+
+
+def emulated(emulation: Emulation, *, order: int = 0, slots: int | None = None) -> Backend:
+    """The cpu back-end with the GPU's iterations."""
+    return replace(cpu_backend(), iterations=partial(cuda_fit.iterations, emulation(order), slots=slots))
+
+
+def copied(frame: FitFrame) -> FitFrame:
+    """The frame with its own copy of what iterations write."""
+
+    def own(tensor: Tensor | None) -> Tensor | None:
+        return None if tensor is None else tensor.detach().clone()
+
+    leaves = [
+        leaf and leaf._replace(**{name: own(getattr(leaf, name)) for name in ("values", "first", "second", "sums")})
+        for leaf in frame.leaves
+    ]
+    views = [view._replace(image=view.image.clone()) for view in frame.views]
+    plan = frame.plan._replace(terms=frame.plan.terms.clone(), squared_errors=frame.plan.squared_errors.clone())
+    return frame._replace(leaves=leaves, views=views, plan=plan)
+
+
+def first_frame(**options: Any) -> FitFrame:
+    """What the iterations of a frame begin with."""
+    found: list[FitFrame] = []
+
+    def begin(frame: FitFrame) -> Callable[[int, int], None]:
+        found.append(copied(frame))
+        return cpu_fit.iterations(frame)
+
+    fitted(replace(cpu_backend(), iterations=begin), **options)
+    return found[0]
+
+
+@pytest.mark.parametrize("options", [{}, {"appears": False, "free": 0}])
+def test_pictures_and_gradients_are_those_of_the_cpu(emulation: Emulation, options: dict[str, Any]) -> None:
+    frame = first_frame(**options)
+    seen = set[int]()
+    for i, number in enumerate(frame.plan.order.tolist()):
+        if (number, bool(frame.plan.rests[i])) in seen:
+            continue
+        seen.add((number, bool(frame.plan.rests[i])))
+        one, two = copied(frame), copied(frame)
+        cpu_fit.iterations(one)(i, i + 1)
+        cuda_fit.iterations(emulation(0), two)(i, i + 1)
+        assert (one.views[number].image - two.views[number].image).abs().max() < 5e-6
+        assert torch.allclose(one.plan.terms[i], two.plan.terms[i], rtol=1e-4)
+        for mine, theirs in zip(one.leaves, two.leaves, strict=True):
+            if mine is not None and theirs is not None and mine.first is not None and theirs.first is not None:
+                assert (mine.first - theirs.first).norm() <= 1e-3 * mine.first.norm()
+    assert len(seen) == 5
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"smoothness": SmoothnessConfig(), "mean_of_last": 0.0, "rounding": RoundingConfig(rate_weight=0.0)}],
+)
+def test_results_are_those_of_the_cpu(emulation: Emulation, changes: dict[str, Any]) -> None:
+    one, two = fitted(emulated(emulation), **changes), fitted(cpu_backend(), **changes)
+    start = state_of(start_of(scene_of(appears=True, free=9)).scene)
+    before, after = state_of(one.scene), state_of(two.scene)
+    assert one.pruned == two.pruned == 3
+    for name, value in before.items():
+        apart = (value - after[name]).float().norm()
+        moved = (value - start[name][-len(value) :]).float().norm()
+        # Adam steps by as much where a gradient is nearly zero.
+        assert apart <= 1e-2 * moved + 1e-6 * value.float().norm(), (name, float(apart), float(moved))
+    assert one.train_psnr == pytest.approx(two.train_psnr, abs=1e-3)
+    assert one.losses == pytest.approx(two.losses, rel=1e-4)
+
+
+def test_results_depend_neither_on_the_order_of_threads_nor_on_room(emulation: Emulation) -> None:
+    found = [
+        state_of(fitted(emulated(emulation, order=order, slots=slots)).scene)
+        for order, slots in ((0, None), (1, None), (0, 1))
+    ]
+    assert all(torch.equal(value, other[name]) for other in found[1:] for name, value in found[0].items())

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cuda back-end on the pretended device, which counts what a host queues for it and what it waits for.
+
+Its own kernels run in their emulation; gsplat's place is taken by the CPU rasteriser and by the number of launches in
+gsplat's source. Recorded iterations are counted when they are recorded; a replay is one operation.
+"""
+
+import ctypes
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._pytree import tree_leaves
+
+from structgstream.kernels import cpu_raster, cuda, cuda_anchors, cuda_fit, cuda_library, cuda_picture
+from structgstream.kernels.backend import Backend, reference_backend
+from structgstream.kernels.cuda_library import KernelLibrary
+from structgstream.kernels.values import FitFrame, RasterOutput
+from tests.support.pretended_gpu import DEVICE, lies_there, pretended_device, rasterize, values_of
+
+_VIEWS = (
+    "view _unsafe_view expand permute t transpose select slice unsqueeze squeeze alias detach as_strided split "
+    "split_with_sizes unbind narrow _reshape_alias lift_fresh unfold diagonal empty empty_like new_empty "
+    "empty_strided new_empty_strided resize_ view_as reshape movedim swapaxes is_same_size lift set_"
+)
+_WAITS = frozenset(("_local_scalar_dense", "nonzero", "masked_select", "equal", "_unique2", "unique_dim"))
+_LAUNCHES = {"sort": 6, "argsort": 6, "cumsum": 2, "nonzero": 4, "_unique2": 10, "unique_dim": 14, "median": 4}
+"""Launches of operations that have more than one."""
+_GSPLAT_FORWARD, _GSPLAT_BACKWARD = 12, 12  # launches without tile lists; those of the lists are 12 more
+_GSPLAT_LISTS = 12
+
+
+@dataclass
+class Counts:
+    """Operations that a host queues and times that it waits, by name, and launches of the native fit."""
+
+    operations: Counter[str] = field(default_factory=Counter)
+    waits: Counter[str] = field(default_factory=Counter)
+    pauses: int = 0
+
+    def add(self, name: str, operations: int = 1, waits: int = 0) -> None:
+        """Count an operation, unless counting is paused."""
+        if self.pauses == 0:
+            self.operations[name] += operations
+            self.waits[name] += waits
+
+    def see(self, func: Any, args: Any, kwargs: Any, found: Any) -> None:
+        """Count what the dispatcher runs, if it runs on the device."""
+        there = any(lies_there(leaf) for leaf in tree_leaves((args, kwargs)))
+        name = func._schema.name.removeprefix("aten::")
+        if not (there or any(lies_there(leaf) for leaf in tree_leaves(found))) or name in _VIEWS.split():
+            return
+        indices = args[1] if name in ("index", "index_put", "index_put_", "_index_put_impl_") else ()
+        by_mask = any(isinstance(i, Tensor) and i.dtype in (torch.bool, torch.uint8) for i in indices or ())
+        to_host = there and name == "_to_copy" and not any(lies_there(leaf) for leaf in tree_leaves(found))
+        self.add(name, 5 if by_mask else _LAUNCHES.get(name, 1), int(name in _WAITS or by_mask or to_host))
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Nothing is counted within."""
+        self.pauses += 1
+        try:
+            yield
+        finally:
+            self.pauses -= 1
+
+
+class _Library(KernelLibrary):
+    """The emulated kernels on tensors of the pretended device; a call is as many operations as it has launches."""
+
+    counts: Counts
+
+    def call(self, name: str, *arguments: Any, device: torch.device) -> None:
+        launches = {"sgs_cuda_anchor_inputs": 2, "sgs_cuda_l1_ssim": 2, "sgs_cuda_picture": 8}.get(name, 1)
+        self.counts.add(name, launches, waits=int(name == "sgs_cuda_picture"))
+        super().call(name, *(values_of(argument) for argument in arguments), device=device)
+
+    def check_devices(self, *tensors: Tensor | None) -> None:
+        assert all(tensor is None or lies_there(tensor) for tensor in tensors)
+
+
+def _with_values(value: Any) -> Any:
+    """``value`` with the memory of its tensors on the device (``values_of``)."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(value, **{f.name: _with_values(getattr(value, f.name)) for f in fields(value)})
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return type(value)(*map(_with_values, value))
+    return list(map(_with_values, value)) if isinstance(value, list) else values_of(value)
+
+
+def _counted_iterations(library: KernelLibrary, counts: Counts, frame: FitFrame) -> Callable[[int, int], None]:
+    """The native iterations, which are one operation and one wait for each call."""
+    counts.add("iterations begin", waits=1)
+    with counts.paused():
+        run = cuda_fit.iterations(library, _with_values(frame))
+
+    def counted(first: int, last: int) -> None:
+        counts.add("iterations", waits=1)
+        run(first, last)
+
+    return counted
+
+
+class _Recorder:
+    """Runs what it has recorded, and counts it once."""
+
+    def __init__(self, counts: Counts) -> None:
+        self.replays = 0
+        self._counts, self._works, self._counted = counts, dict[Hashable, Callable[[], Any]](), set[Hashable]()
+
+    def __len__(self) -> int:
+        return len(self._works)
+
+    def __contains__(self, key: Hashable) -> bool:
+        return key in self._works
+
+    def record(self, key: Hashable, work: Callable[[], Any]) -> None:
+        self._works[key] = work
+
+    def replay(self, key: Hashable) -> Any:
+        self.replays += 1
+        self._counts.add("replay")
+        if key not in self._counted:
+            self._counted.add(key)
+            return self._works[key]()
+        with self._counts.paused():
+            return self._works[key]()
+
+
+def _counted_rasterizer(counts: Counts) -> Callable[..., RasterOutput]:
+    def draw(*args: Any, budget: Any = None, library: Any = None, **options: Any) -> RasterOutput:
+        del library
+        counts.add("gsplat", _GSPLAT_FORWARD + _GSPLAT_LISTS, waits=int(budget is None))
+        with counts.paused():
+            output = rasterize(cpu_raster.rasterize, *args, **options)
+
+        def backward(gradient: Tensor) -> Tensor:
+            counts.add("gsplat backward", _GSPLAT_BACKWARD)
+            return gradient
+
+        if output.image.requires_grad:
+            output.image.register_hook(backward)
+        return output
+
+    return draw
+
+
+@contextmanager
+def counted_gpu(
+    emulation: ctypes.CDLL, patch: pytest.MonkeyPatch, *, native: bool = True
+) -> Iterator[tuple[Backend, Counts]]:
+    """The cuda back-end on ``DEVICE`` within, and what was counted there so far.
+
+    Args:
+        emulation: the kernels on the processor.
+        patch: to replace gsplat's rasteriser.
+        native: with the iterations of ``kernels.cuda_fit``.
+    """
+    counts = Counts()
+    library = _Library(emulation, DEVICE.type, lambda device: 0)
+    object.__setattr__(library, "counts", counts)
+    draw = _counted_rasterizer(counts)
+    patch.setattr(cuda_library, "kernel_library", lambda: (library, "emulated"))
+    patch.setattr(cuda, "rasterize", draw)
+    plain = KernelLibrary(emulation, "cpu", lambda device: 0)
+    backend = replace(
+        reference_backend(),
+        name="cuda",
+        device=DEVICE,
+        recorder=lambda: _Recorder(counts),
+        iterations=partial(_counted_iterations, plain, counts) if native else None,
+    ).with_functions(
+        rasterize=draw,
+        projected_radii=partial(cuda_picture.projected_radii, library),
+        blending_weights=partial(cuda_picture.blending_weights, library),
+        picture_and_weights=partial(cuda_picture.picture_and_weights, library),
+        adam_step=cuda.adam_step,
+        generate_structured=partial(cuda_anchors.generate_structured, library),
+        l1_ssim=partial(cuda.l1_ssim, library),
+        sweep=partial(cuda.sweep, library),
+    )
+    with pretended_device(counts.see):
+        yield backend, counts
