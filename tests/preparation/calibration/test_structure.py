@@ -38,7 +38,7 @@ def test_a_rig_is_found_from_its_pictures() -> None:
     assert np.median(found.errors()) < 0.3
     # At 320 x 240 and with 20 keypoints to a hundred pixels; half a percent of the focal length is a pixel at the edge.
     for error in calibration_errors(found.cameras, rig).values():
-        assert error.rotation_degrees < 0.3  # principal points are free
+        assert error.rotation_degrees < 0.3
         assert error.position_percent < 1
         assert abs(error.focal_percent) < 1.5
         assert error.lens_pixels < 1.5
