@@ -15,7 +15,7 @@ from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.errors import CaptureError, ConfigError, StorageError, StreamError
 from structgstream.evaluation.evaluate import rendered
 from structgstream.evaluation.report import as_json
-from structgstream.evaluation.run_log import read_log
+from structgstream.evaluation.run_log import log_path, read_log
 from structgstream.kernels.backend import select_backend
 from tests.support.backends import QUICKEST
 from tests.support.small_presets import QUICK
@@ -47,15 +47,11 @@ def test_the_bytes_are_those_of_the_command(stream: Path, tmp_path: Path, monkey
     assert [entry.keys() for entry in logs[0].values()] == [entry.keys() for entry in logs[1].values()]
 
 
-def test_an_interrupted_call_goes_on(stream: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stream_that_was_cut_goes_on(stream: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(structgstream.PRESETS, "tiny", QUICK)
-
-    def stop(report: structgstream.FrameReport) -> None:
-        raise KeyboardInterrupt
-
-    path = tmp_path / "again.sgs"
-    with pytest.raises(KeyboardInterrupt):
-        structgstream.reconstruct(CLIP, path, preset="tiny", on_frame=stop, **PART)
+    path, first = tmp_path / "again.sgs", structgstream.open_stream(stream).packets[0]
+    path.write_bytes(stream.read_bytes()[: first.offset + first.bytes])
+    log_path(path).write_text(log_path(stream).read_text().splitlines(keepends=True)[0])
     with pytest.raises(StorageError, match="exists"):
         structgstream.reconstruct(CLIP, path, preset="tiny", **PART)
     reports = structgstream.reconstruct(CLIP, path, preset="tiny", resume=True, **PART)

@@ -27,10 +27,10 @@ from tests.support.backends import quickest_backend
 from tests.support.small_presets import TINY_RIG
 from tests.support.worlds import World, moving_world
 
-FRAMES = 300
-SETTLED = 80  # caches, pools of allocators and the free set are full by then
-# A kept packet is 15 kB and a kept set of pictures 28 kB a frame: either is more than 3.3 MB over 220 frames.
-MAX_GROWTH_BYTES = 3 * 2**20
+FRAMES = 200
+SETTLED = 60  # caches, pools of allocators and the free set are full by then
+# A kept packet is 15 kB and a kept set of pictures 28 kB a frame: either is more than 2.1 MB over 140 frames.
+MAX_GROWTH_BYTES = 2 * 2**20
 MAX_NEW_OBJECTS = 50
 MEGABYTES_64 = 63 * 2**20
 
@@ -158,7 +158,7 @@ def check_growth(before: tuple[int, int], after: tuple[int, int]) -> None:
 
 @needs_resident
 def test_a_long_run_and_reading_it_back_hold_no_more_at_the_end_than_at_the_beginning(tmp_path: Path) -> None:
-    """300 frames with the real fit, decoded ahead as the command does; scenes are as large as ``max_free`` allows."""
+    """200 frames with the real fit, decoded ahead as the command does; scenes are as large as ``max_free`` allows."""
     points = np.random.default_rng(0).normal(size=(60, 3)) * 0.4
     backend = quickest_backend()
     last = FRAMES - 1

@@ -41,16 +41,6 @@ def test_a_live_run_is_a_stream_a_log_metrics_and_a_recording(tmp_path: Path, ca
     assert len(open_capture(tmp_path / "take")) >= 3
 
 
-def test_resume_goes_on_live(tmp_path: Path) -> None:
-    rig = files(tmp_path, frames=60)
-    assert live(tmp_path, "--frames", "2", rig=rig) == 0
-    assert live(tmp_path, "--frames", "4", "--resume", rig=rig) == 0
-    with open_stream(tmp_path / "x.sgs") as reader:
-        assert len(reader) == 4
-        times = [info.pts_seconds for info in reader.packets]
-        assert times == sorted(set(times))
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [

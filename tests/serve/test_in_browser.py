@@ -12,8 +12,8 @@ import socket
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -154,14 +154,11 @@ def test_the_server_plays_and_compares_and_follows(tab: Tab, stream: Path, tmp_p
 def test_a_site_plays_from_a_server_that_knows_nothing(tab: Tab, stream: Path, tmp_path: Path) -> None:
     site = tmp_path / "site"
     write_site(site, StreamFile(stream))
-    handler = partial(Quiet, directory=str(site))
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        tab.open(f"http://127.0.0.1:{server.server_address[1]}/", width=WIDTH, height=HEIGHT)
+    with python_host(site) as address:
+        tab.open(address, width=WIDTH, height=HEIGHT)
         paused_at(tab, 3)
         looked_through_first(tab)
         assert decibels(canvas_of(tab), stream, 3) > 40
-        server.shutdown()
     assert not tab.complaints
 
 
@@ -175,11 +172,10 @@ def python_host(root: Path) -> Iterator[str]:
 
 
 @contextmanager
-def nginx_host(root: Path) -> Iterator[str]:
+def nginx(root: Path) -> Iterator[str]:
     """nginx with the configuration of docs/segments.md."""
     program = shutil.which("nginx")
-    if program is None:
-        pytest.skip("there is no nginx on this machine")
+    assert program is not None
     work = root.parent / "nginx"
     work.mkdir()
     documented = (DOCS / "segments.md").read_text().split("```nginx\n")[1].split("```")[0]
@@ -208,10 +204,7 @@ def nginx_host(root: Path) -> Iterator[str]:
         running.wait(20)
 
 
-@pytest.mark.parametrize("host", [python_host, nginx_host])
-def test_segments_play_from_a_host_of_files_while_they_are_written(
-    tab: Tab, stream: Path, tmp_path: Path, host: Callable[[Path], AbstractContextManager[str]]
-) -> None:
+def test_segments_play_from_a_host_of_files_while_they_are_written(tab: Tab, stream: Path, tmp_path: Path) -> None:
     root, reader = tmp_path / "root", open_stream(stream)
     store = FolderStore(root / "streams" / "live")
     store.prepare()
@@ -223,7 +216,7 @@ def test_segments_play_from_a_host_of_files_while_they_are_written(
     page = linked_page("live", stream="streams/live/manifest.json", attributes={"autoplay": ""})
     (root / "index.html").write_text(page)
     (root / "player.js").write_bytes(bundle_path().read_bytes())
-    with host(root) as address:
+    with (nginx if shutil.which("nginx") else python_host)(root) as address:
         tab.open(f"{address}index.html", width=WIDTH, height=HEIGHT)
         tab.wait_for(f"{SHOWN} && {PLAYER}.stats.frameIndex === 1 && {PLAYER}.live")
         for packet in packets[2:4]:  # the first of them is a key, so that a segment is closed

@@ -72,6 +72,16 @@ def test_features_are_the_largest_of_the_parents() -> None:
         assert all((parents[:, d] == row[d]).any() for d in range(row.shape[0]))
 
 
+def test_a_new_anchor_has_the_features_of_the_one_whose_gaussians_ask_for_it() -> None:
+    anchors = random_scene(60).anchors
+    far = replace(anchors, offsets=10 * anchors.offsets)
+    gradient = torch.zeros(len(anchors), anchors.offsets_per_anchor)
+    gradient[5] = 1.0
+    new = grown(far, gradient.flatten(), torch.full((slots(anchors),), 100.0))
+    assert len(new) > 0
+    assert (new.features == anchors.features[5]).all()
+
+
 def test_the_cap_holds() -> None:
     anchors = random_scene(60).anchors
     n = slots(anchors)

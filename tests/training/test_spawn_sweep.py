@@ -4,10 +4,12 @@
 from dataclasses import replace
 from typing import Any
 
+import pytest
 import torch
 
 from structgstream.kernels.backend import reference_backend
 from structgstream.kernels.values import RasterOutput
+from structgstream.training.online import spawn
 from structgstream.training.online.config import MotionConfig, SpawnRules
 from structgstream.training.online.spawn import Sweep, missing_share
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
@@ -94,3 +96,24 @@ def test_a_depth_map_is_infinite_where_nothing_is_drawn() -> None:
     solid = depth[depth.isfinite()]
     assert len(solid)
     assert float(solid.min()) > camera.near
+
+
+def test_what_is_found_lies_in_the_middle_of_a_pixel_of_its_view(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before points of several views are merged."""
+    swept, found, merge = sweep(), list[torch.Tensor](), spawn._merge_points
+
+    def noted(points: torch.Tensor, *arguments: Any, **options: Any) -> Any:
+        found.append(points)
+        return merge(points, *arguments, **options)
+
+    monkeypatch.setattr(spawn, "_merge_points", noted)
+    swept.births(swept.missing(), first_birth=0, room=9)
+    (points,) = found
+    beside = []
+    for view in swept.views:
+        viewport = view.camera.viewport(points)
+        seen = (points @ viewport.viewmat[:3, :3].T + viewport.viewmat[:3, 3]) @ viewport.K.T
+        pixels = seen[:, :2] / seen[:, 2:]
+        beside.append((pixels - pixels.floor() - 0.5).abs().amax(1))
+    assert len(points) >= 3
+    assert float(torch.stack(beside).amin(0).max()) < 1e-2

@@ -153,23 +153,9 @@ def test_a_slow_trainer_skips_what_was_filmed_while_nobody_asked(tmp_path: Path)
     assert all(camera.present for camera in status.cameras.values())
 
 
-def test_a_camera_that_is_cut_is_absent_and_comes_back(tmp_path: Path) -> None:
-    with sending("http", "a:cut:3.0:1.0") as urls:  # A busy machine opens all cameras before that.
-        path = rig_file(tmp_path, urls, clock="unix", deadline_seconds=0.2, silent_seconds=1)
-        source = LiveSource(path, tmp_path / "x.sgs")
-        seen = []
-        for frame in source.frames():
-            seen.append("a" in frame.images)
-            if False in seen and seen[-1]:
-                break
-            assert len(seen) < 600
-    assert seen[0]
-    assert source.faults.counts["a"]["gone"] >= 1
-
-
 def test_sets_of_fewer_than_two_training_cameras_are_no_frames(tmp_path: Path) -> None:
     """A camera is held out, so without b only one is left."""
-    with sending("http", "b:cut:3.0:1.0") as urls:  # A busy machine opens all cameras before that.
+    with sending("http", "b:cut:2.0:0.8") as urls:  # A busy machine opens all cameras before that.
         path = rig_file(tmp_path, urls, clock="unix", deadline_seconds=0.2, silent_seconds=1)
         source = LiveSource(path, tmp_path / "x.sgs")
         last, gap = 0.0, 0.0

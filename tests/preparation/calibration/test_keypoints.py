@@ -39,10 +39,10 @@ def test_what_stands_still_is_kept_once_and_what_moves_adds() -> None:
 
 
 def test_reduced_pictures_give_pixels_of_the_whole_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(keypoints, "LONGEST_SIDE", 200)
-    large = np.repeat(np.repeat(scene(0), 4, 0), 4, 1)
+    monkeypatch.setattr(keypoints, "LONGEST_SIDE", 100)
+    large = np.repeat(np.repeat(scene(0)[:100, :100], 4, 0), 4, 1)
     found = camera_keypoints([large]).pixels
-    small = camera_keypoints([scene(0)]).pixels
+    small = camera_keypoints([scene(0)[:100, :100]]).pixels
     assert len(found) == len(small)
     np.testing.assert_allclose(found, 4 * small, atol=0.1)
 
@@ -54,7 +54,7 @@ def test_bare_pictures_give_none() -> None:
 def test_further_instants_are_looked_at_where_the_first_give_little(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(keypoints, "INSTANTS", 2)
     monkeypatch.setattr(keypoints, "ENOUGH", 1)
-    pictures = {"one": [scene(0), scene(20), scene(40), scene(60), scene(80)]}
+    pictures = {"one": [scene(shift)[40:140, :140] for shift in (0, 20, 40, 60, 80)]}
     few = all_keypoints(pictures, workers=1)["one"]
     assert few.seen.any(0).tolist() == [True, False, False, False, True]
     monkeypatch.setattr(keypoints, "ENOUGH", 10**6)
