@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joined packets after a hand-over: a stream that decodes, quieter at its borders."""
+"""Packets of a joined stream after a seam blend: they decode, and borders flicker less."""
 
 from pathlib import Path
 

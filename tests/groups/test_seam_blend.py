@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands still is handed over from group to group: exactly, and only for as long as it stands still."""
+"""Static content continues from group to group, exactly, for as long as it is static."""
 
 from dataclasses import replace
 from itertools import pairwise

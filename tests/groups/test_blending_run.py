@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Borders that several processes hand over give the bytes that one gives."""
+"""Borders that several processes blend have the bytes of a single process."""
 
 from contextlib import closing
 from functools import cache
