@@ -4,6 +4,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from structgstream_studies.experiments.present import present_configs
 from structgstream_studies.experiments.results import Result
 
 CAPTURE: Mapping[str, Any] = {
@@ -36,7 +37,13 @@ def outcome(
     """A result of ``key`` on a capture called ring, unless ``capture`` says otherwise."""
     machine = {"commit": "abc1234", "cpu": "a processor", "gpu": None, "threads": 1, "cores": 4, "torch": "2.0"}
     return Result(
-        identity={"key": key, "method": "m", "seed": seed, "config": {}, "capture": {**CAPTURE, **(capture or {})}},
+        identity={
+            "key": key,
+            "method": "m",
+            "seed": seed,
+            "config": present(key),
+            "capture": {**CAPTURE, **(capture or {})},
+        },
         mean={"psnr": psnr, **(mean or {})},
         cameras={},
         stream=dict(stream or {}),
@@ -44,6 +51,18 @@ def outcome(
         environment=machine,
         trained_by={**machine, **(trained_by or {})},
     )
+
+
+def present(key: str) -> Mapping[str, Any]:
+    """The configuration that a row has today, as results record it; without its seed."""
+    nested: dict[str, Any] = {}
+    for path, value in present_configs().get(key, {}).items():
+        *folders, name = path.split(".")
+        place = nested
+        for folder in folders:
+            place = place.setdefault(folder, {})
+        place[name] = value
+    return nested
 
 
 def outcomes(key: str, psnrs: Iterable[float]) -> list[Result]:

@@ -11,10 +11,13 @@ with ``ablation TABLE STUDY``, ``methods STUDY``, ``folds STUDY OTHER``, ``cited
 STUDY``, ``parts STUDY``, ``rates STUDY``, ``bd-rate STUDY OTHER`` and ``made-by STUDY`` for text, and ``curves TABLE
 STUDY``, ``plot STUDY`` and ``rate-plot STUDY`` for pictures, which go to ``images/`` beside the document. A study is a
 folder of results of one capture and one full method, named after the capture or the study.
+
+A table of results that are not of today's configurations is refused (``present.py``), unless its marker ends with
+``former`` and the fields that differ: ``<!-- readings STUDY former initial.growth.max_anchors -->``. It then says so.
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
 
 from structgstream.errors import ConfigError
@@ -22,9 +25,16 @@ from structgstream_studies.experiments.cited import cited_sheet, cited_words
 from structgstream_studies.experiments.effects import effects_sheet
 from structgstream_studies.experiments.figures import write_comparison, write_curves
 from structgstream_studies.experiments.folds import folds_sheet
-from structgstream_studies.experiments.rate_distortion import bd_sheet, bullet_list, rates_sheet, versus_sheet
+from structgstream_studies.experiments.present import remark
+from structgstream_studies.experiments.rate_distortion import (
+    bd_sheet,
+    bullet_list,
+    curve_titles,
+    rates_sheet,
+    versus_sheet,
+)
 from structgstream_studies.experiments.rate_figures import write_rates
-from structgstream_studies.experiments.readings import readings_sheet
+from structgstream_studies.experiments.readings import READINGS, readings_sheet
 from structgstream_studies.experiments.results import Result, read_results
 from structgstream_studies.experiments.sheets import ablation_sheet, comparison_sheet, markdown
 from structgstream_studies.experiments.studies import (
@@ -90,14 +100,20 @@ def refresh_text(text: str, studies: Studies) -> str:
     """``text`` with every marked part made from the results of ``studies``.
 
     Raises:
-        ConfigError: a marker is unknown, or has no end.
+        ConfigError: a marker is unknown or has no end, or the results are not of today's configurations.
     """
 
     def renewed(match: re.Match[str]) -> str:
-        what, rest = match["what"], match["rest"].split()
+        what, words = match["what"], match["rest"].split()
+        rest, accepted = _before_former(words) if what in _SHOWN else (words, None)
         if what not in _MAKERS or len(rest) != _MAKERS[what][0]:
             raise ConfigError(f"A document asks for {match['what']}{match['rest']}; known are {', '.join(_MAKERS)}.")
-        return f"<!-- {what}{match['rest']} -->\n{_MAKERS[what][1](rest, studies)}<!-- end -->"
+        content = _MAKERS[what][1](rest, studies)
+        if what in _SHOWN and (
+            words := remark(_shown(what, rest, studies), accepted=accepted, table=_named(what, rest))
+        ):
+            content += f"\n{words}\n"
+        return f"<!-- {what}{match['rest']} -->\n{content}<!-- end -->"
 
     new = MARKED.sub(renewed, text)
     begun = sum(len(re.findall(f"<!-- {what} .*-->", text)) for what in _MAKERS)
@@ -106,6 +122,25 @@ def refresh_text(text: str, studies: Studies) -> str:
             "A document begins a table that it does not end; put <!-- end --> on a line of its own below."
         )
     return new
+
+
+def _named(what: str, rest: Sequence[str]) -> str:
+    return " ".join([what, *rest])
+
+
+def _before_former(words: list[str]) -> tuple[list[str], list[str] | None]:
+    """The words of a marker before ``former``, and the fields after it; None without it."""
+    if "former" not in words:
+        return words, None
+    place = words.index("former")
+    return words[:place], words[place + 1 :]
+
+
+def _shown(what: str, words: Sequence[str], studies: Studies) -> list[Result]:
+    """The results that a table shows."""
+    rows = _SHOWN[what](words)
+    names = words[1:] if what == "ablation" else words
+    return [result for name in names for result in studies.get(name, ()) if result.key in rows]
 
 
 def _ablation(words: Sequence[str], studies: Studies) -> str:
@@ -214,3 +249,14 @@ _MAKERS: Mapping[str, tuple[int, Callable[[Sequence[str], Studies], str]]] = {
     "rate-plot": (1, _rate_plot),
 }
 _PICTURES = ("curves", "plot", "rate-plot")
+_SHOWN: Mapping[str, Callable[[Sequence[str]], Container[str]]] = {
+    "ablation": lambda words: TABLES[words[0]].rows,
+    "methods": lambda _: _method_titles(),
+    "folds": lambda _: _method_titles(),
+    "readings": lambda _: READINGS,
+    "effects": lambda _: effect_titles(),
+    "parts": lambda _: part_titles(),
+    "rates": lambda _: curve_titles(),
+    "bd-rate": lambda _: curve_titles(),
+}
+"""Keys of the rows of each table of results."""

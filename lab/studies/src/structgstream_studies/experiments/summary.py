@@ -14,8 +14,10 @@ from typing import Any
 
 from structgstream_studies.experiments.results import Result
 
-STANDARD_ERRORS = 2.0
-"""A difference is established if it has the same sign in all seeds and is this many standard errors from zero."""
+STANDARD_ERRORS: Mapping[int, float] = {3: 4.303, 4: 3.182, 5: 2.776}
+"""By the number of seeds: a difference is established if it is this many standard errors from zero (Student's t test of
+paired differences, two-sided, 5 %). With more than five seeds the value of five is used, with fewer than three none."""
+UNDECIDED = "cannot be decided"
 
 
 @dataclass(frozen=True)
@@ -66,15 +68,6 @@ class Summary:
                 found.append(ours - theirs)
         return spread_of(found)
 
-    def agrees_in_sign(self, other: "Summary", name: str) -> bool:
-        """Whether the differences to ``other`` have the same sign in all common seeds, of which three are needed."""
-        signs = set()
-        seeds = self.results.keys() & other.results.keys()
-        for seed in seeds:
-            ours, theirs = score_of(self.results[seed], name), score_of(other.results[seed], name)
-            signs.add(None if ours is None or theirs is None else math.copysign(1.0, ours - theirs))
-        return len(seeds) >= 3 and len(signs) == 1 and None not in signs
-
     def curve(self, name: str) -> list[Spread | None]:
         """A score for each frame: mean and spread over seeds."""
         frames = min(len(result.frames) for result in self.results.values())
@@ -101,8 +94,9 @@ def summaries(results: Iterable[Result]) -> dict[str, Summary]:
 def verdict(variant: Summary, full: Summary, name: str, *, expected_sign: float) -> str:
     """What three seeds say of a claim that ``variant`` minus ``full`` has ``expected_sign``."""
     difference = variant.difference(full, name)
-    if difference is None or not variant.agrees_in_sign(full, name):
-        return "cannot be told"
-    if abs(difference.mean) <= STANDARD_ERRORS * difference.standard_error:
-        return "cannot be told"
-    return "reproduced" if difference.mean * expected_sign > 0 else "not reproduced"
+    if difference is None or difference.count < min(STANDARD_ERRORS):
+        return UNDECIDED
+    needed = STANDARD_ERRORS[min(difference.count, max(STANDARD_ERRORS))]
+    if abs(difference.mean) <= needed * difference.standard_error:
+        return UNDECIDED
+    return "reproduced" if difference.mean * expected_sign > 0 else "refuted"
