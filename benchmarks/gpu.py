@@ -217,8 +217,9 @@ class Measurement:
 
     def clip(self) -> dict[str, Any]:
         """The bundled clip: frame 0 and three more."""
-        import structgstream
         from structgstream.data.json_videos import bundled_clip_path
+
+        import structgstream
 
         with tempfile.TemporaryDirectory() as folder:
             path, config = Path(folder) / "clip.sgs", {"preset": "compact", "backend": self.backend}
