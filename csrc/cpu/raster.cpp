@@ -8,6 +8,7 @@
 // nevertheless, because otherwise opaque surfaces would be visibly incomplete.
 
 #include <algorithm>
+#include <cmath>
 #include <cstring>
 
 #include "block.h"
@@ -52,13 +53,6 @@ inline vf power_of_two(vf x) {
     return (vf)((vi)p + ((vi)rounded << 23));
 }
 
-struct Lanes {
-    vf x, y;  // pixel centres within a block
-    Lanes() {
-        for (int i = 0; i < kLanes; ++i) x[i] = i % kBlockX + 0.5f, y[i] = i / kBlockX + 0.5f;
-    }
-};
-
 // The centres of a tile's blocks, lane by lane.
 struct BlockCentres {
     static constexpr int kVectors = kBlocks / kLanes, kRows = kLanes / kBlocksX;
@@ -69,12 +63,21 @@ struct BlockCentres {
     }
 };
 
+struct Tile {
+    int left, top, right, bottom;
+    Tile(const Raster& r, int index)
+        : left(index % r.tiles_x * kTile),
+          top(index / r.tiles_x * kTile),
+          right(std::min(left + kTile, r.camera.width)),
+          bottom(std::min(top + kTile, r.camera.height)) {}
+};
+
 // A bit for each block of a tile that a splat may cover: by its ellipse if few vectors contain all blocks, else by its
 // box. The rounding error of the quadratic form is in proportion to its two squares; a share of these is added as slack.
-inline uint64_t near_blocks(const Splat& s, const BlockCentres& centres, int left, int top) {
+inline uint64_t near_blocks(const Splat& s, const BlockCentres& centres, const Tile& tile) {
     uint64_t found = 0;
 #if SGS_LANES > 4
-    const vf dx = centres.x + (left - s.x), first_dy = centres.y + (top - s.y);
+    const vf dx = centres.x - (s.x - tile.left), first_dy = centres.y - (s.y - tile.top);
     const vf along_x = dx * dx * (s.xx * (1.0f - 1e-5f)), mixed = dx * s.xy;
     const float yy = s.yy * (1.0f - 1e-5f);
 #pragma GCC unroll 4
@@ -84,25 +87,25 @@ inline uint64_t near_blocks(const Splat& s, const BlockCentres& centres, int lef
         found |= uint64_t{bits(near)} << (v * kLanes);
     }
 #else
-    const int x0 = std::max(0, s.box[0] - left) / kBlockX;
-    const int x1 = (std::min(kTile, s.box[2] - left) + kBlockX - 1) / kBlockX;
-    const int y0 = std::max(0, s.box[1] - top) / kBlockY;
-    const int y1 = (std::min(kTile, s.box[3] - top) + kBlockY - 1) / kBlockY;
+    const int x0 = std::max(0, s.box[0] - tile.left) / kBlockX;
+    const int x1 = (std::min(kTile, s.box[2] - tile.left) + kBlockX - 1) / kBlockX;
+    const int y0 = std::max(0, s.box[1] - tile.top) / kBlockY;
+    const int y1 = (std::min(kTile, s.box[3] - tile.top) + kBlockY - 1) / kBlockY;
     const uint64_t row = ((uint64_t{1} << (x1 - x0)) - 1) << x0;
     for (int y = y0; y < y1; ++y) found |= row << (y * kBlocksX);
 #endif
     return found;
 }
 
-// One splat over one block of pixels whose transmittance is T. T above `least`, zero or more, is live; a pixel that has
-// stopped stores its transmittance with a minus sign.
+// One splat over one block of pixels at a distance of dx and dy, whose transmittance is T. T above `least`, zero or more,
+// is live; a pixel that has stopped stores its transmittance with a minus sign.
 struct Coverage {
     vf dx, dy, alpha, after;  // after: the transmittance behind the splat, valid for live pixels
     mask used, stopped;
     bool any_stopped;
 
-    [[gnu::always_inline]] bool of(const Splat& s, const Lanes& lanes, float left, float top, vf T, float least) {
-        dx = lanes.x + (left - s.x), dy = lanes.y + (top - s.y);
+    [[gnu::always_inline]] bool of(const Splat& s, vf to_x, vf to_y, vf T, float least) {
+        dx = to_x, dy = to_y;
         const vf power = s.log2_opacity - (dx * (dx * s.xx + dy * s.xy) + dy * dy * s.yy);
         used = both(at_least(power, splat(kLog2MinAlpha)), above(T, splat(least)));
         if (!any(used)) return false;
@@ -118,64 +121,62 @@ struct Coverage {
     }
 };
 
-// Transmittance of each pixel of a tile. The bit of a block without a live pixel in `live` is cleared.
-struct Front {
-    alignas(kAlignment) float T[kTilePixels];
+// The pixels of a block: their centres within the tile, their transmittance, and `Count` further numbers of each.
+template <int Count>
+struct alignas(4 * kLanes) Block {
+    float x[kLanes], y[kLanes], T[kLanes], values[Count][kLanes];
+};
+
+// The pixels of a tile, and a bit for each block that may have a pixel whose transmittance is above kLeast. kTrains: only
+// what gets gradients or weights counts, not what is drawn.
+template <int Count, bool kTrains>
+struct Blocks {
+    static constexpr float kLeast = kTrains ? kMinGradientTransmittance : 0.0f;
+    Block<Count> at[kBlocks];
     uint64_t live = ~uint64_t{0} >> (64 - kBlocks);
-    const float least;
-    explicit Front(float least = 0.0f) : least(least) {
-        for (float& t : T) t = 1.0f;
-    }
-    [[gnu::always_inline]] void pass(int block, const Coverage& c) {
-        store(T + block * kLanes, c.after);
-        if ((c.any_stopped || least > 0.0f) && !any(above(c.after, splat(least)))) live &= ~(uint64_t{1} << block);
-    }
-};
-
-struct Tile {
-    int left, top, right, bottom;
-    float lefts[kBlocks], tops[kBlocks];  // of its blocks
-    Tile(const Raster& r, int index)
-        : left(index % r.tiles_x * kTile),
-          top(index / r.tiles_x * kTile),
-          right(std::min(left + kTile, r.camera.width)),
-          bottom(std::min(top + kTile, r.camera.height)) {
-        for (int b = 0; b < kBlocks; ++b) lefts[b] = left + b % kBlocksX * kBlockX, tops[b] = top + b / kBlocksX * kBlockY;
+    Blocks() {
+        vf x, y;
+        for (int i = 0; i < kLanes; ++i) x[i] = i % kBlockX + 0.5f, y[i] = i / kBlockX + 0.5f;
+        for (int n = 0; n < kBlocks; ++n) {
+            store(at[n].x, x + static_cast<float>(n % kBlocksX * kBlockX));
+            store(at[n].y, y + static_cast<float>(n / kBlocksX * kBlockY));
+            store(at[n].T, splat(1.0f));
+            for (auto& values : at[n].values) store(values, splat(0.0f));
+        }
     }
 };
 
-// Visits the pixels of a tile: their index in the picture and in the tile's order of blocks. Rows of a block are visited
+// Visits the pixels of a tile: their index in the picture, their block, and their lane. Rows of a block are visited
 // together, so that compilers vectorise them.
 template <typename Visit>
 inline void for_pixels(const Tile& t, int width, Visit visit) {
     const int columns = t.right - t.left;
     for (int y = t.top; y < t.bottom; ++y) {
-        const int row = (y - t.top) / kBlockY * kBlocksX * kLanes + (y - t.top) % kBlockY * kBlockX;
+        const int row = (y - t.top) / kBlockY * kBlocksX, lane = (y - t.top) % kBlockY * kBlockX;
         const size_t first = static_cast<size_t>(y) * width + t.left;
         int x = 0;
         for (; x + kBlockX <= columns; x += kBlockX)
 #pragma GCC unroll 4
-            for (int i = 0; i < kBlockX; ++i) visit(first + x + i, row + x / kBlockX * kLanes + i);
-        for (; x < columns; ++x) visit(first + x, row + x / kBlockX * kLanes + x % kBlockX);
+            for (int i = 0; i < kBlockX; ++i) visit(first + x + i, row + x / kBlockX, lane + i);
+        for (; x < columns; ++x) visit(first + x, row + x / kBlockX, lane + x % kBlockX);
     }
 }
 
-// Pixels of a tile between their picture order and their block order. Outside the picture: zero.
-template <int Channels>
-void gather(const float* picture, int width, const Tile& t, float (*planes)[kTilePixels]) {
-    if (t.right - t.left < kTile || t.bottom - t.top < kTile)
-        std::memset(planes, 0, sizeof(float) * Channels * kTilePixels);
-    for_pixels(t, width, [&](size_t pixel, int at) {
+// `Channels` numbers of each pixel from a picture to its block, from number `First` on. Outside the picture: as they were.
+template <int First, int Channels, int Count, bool kTrains>
+void gather(const float* picture, int width, const Tile& t, Blocks<Count, kTrains>& blocks) {
+    for_pixels(t, width, [&](size_t pixel, int block, int lane) {
 #pragma GCC unroll 3
-        for (int c = 0; c < Channels; ++c) planes[c][at] = picture[pixel * Channels + c];
+        for (int c = 0; c < Channels; ++c) blocks.at[block].values[First + c][lane] = picture[pixel * Channels + c];
     });
 }
 
-template <int Channels>
-void scatter(const float (*planes)[kTilePixels], int width, const Tile& t, float* picture) {
-    for_pixels(t, width, [&](size_t pixel, int at) {
+// The first three numbers of each pixel, a colour, to a picture.
+template <int Count, bool kTrains>
+void scatter_color(const Blocks<Count, kTrains>& blocks, int width, const Tile& t, float* picture) {
+    for_pixels(t, width, [&](size_t pixel, int block, int lane) {
 #pragma GCC unroll 3
-        for (int c = 0; c < Channels; ++c) picture[pixel * Channels + c] = planes[c][at];
+        for (int c = 0; c < 3; ++c) picture[3 * pixel + c] = blocks.at[block].values[c][lane];
     });
 }
 
@@ -185,86 +186,95 @@ void scatter(const float (*planes)[kTilePixels], int width, const Tile& t, float
     return raster.splats[raster.pairs[n]];
 }
 
-// Visits the blocks of pixels of a tile that a splat covers, and updates their transmittance: visit(index of the block in
-// the tile, transmittance before, coverage).
-template <typename Visit>
+// Visits the blocks of pixels of a tile that a splat covers, and updates their transmittance: visit(block, transmittance
+// before, coverage).
+template <int Count, bool kTrains, typename Visit>
 [[gnu::always_inline]] inline void for_covered(
-    const Splat& s, const Tile& tile, const Lanes& lanes, const BlockCentres& centres, Front& front, Visit visit) {
-    for (uint64_t rest = front.live & near_blocks(s, centres, tile.left, tile.top); rest != 0; rest &= rest - 1) {
-        const int block = __builtin_ctzll(rest), at = block * kLanes;
-        const vf before = load(front.T + at);
+    const Splat& s, const Tile& tile, const BlockCentres& centres, Blocks<Count, kTrains>& blocks, Visit visit) {
+    constexpr float kLeast = Blocks<Count, kTrains>::kLeast;
+    const float x = s.x - tile.left, y = s.y - tile.top;
+    for (uint64_t rest = blocks.live & near_blocks(s, centres, tile); rest != 0; rest &= rest - 1) {
+        const int n = __builtin_ctzll(rest);
+        Block<Count>& block = blocks.at[n];
+        const vf before = load(block.T);
         Coverage c;
-        if (!c.of(s, lanes, tile.lefts[block], tile.tops[block], before, front.least)) continue;
-        visit(at, before, c);
-        front.pass(block, c);
+        if (!c.of(s, load(block.x) - x, load(block.y) - y, before, kLeast)) continue;
+        visit(block, before, c);
+        store(block.T, c.after);
+        if ((c.any_stopped || kTrains) && !any(above(c.after, splat(kLeast)))) blocks.live &= ~(uint64_t{1} << n);
     }
+}
+
+// Adds the background's share to the colour of each pixel, its first three numbers.
+template <int Count, bool kTrains>
+void add_background(const float* background, Blocks<Count, kTrains>& blocks) {
+    for (Block<Count>& block : blocks.at)
+        for (int k = 0; k < 3; ++k)
+            store(block.values[k], load(block.values[k]) + absolute(load(block.T)) * background[k]);
 }
 
 void blend(const Raster& raster, int index, const float* background, float* image, float* alpha_out) {
     const Tile tile(raster, index);
-    const Lanes lanes;
     const BlockCentres centres;
-    alignas(kAlignment) float color[3][kTilePixels] = {};
-    Front front;
+    Blocks<3, false> blocks;  // color
     const int end = raster.starts[index + 1];
-    for (int n = raster.starts[index]; n < end && front.live != 0; ++n) {
+    for (int n = raster.starts[index]; n < end && blocks.live != 0; ++n) {
         const Splat& s = splat_of(raster, n, end);
-        for_covered(s, tile, lanes, centres, front, [&](int at, vf before, const Coverage& c) {
+        for_covered(s, tile, centres, blocks, [&](Block<3>& block, vf before, const Coverage& c) {
             const vf weight = c.alpha * before;
-            for (int k = 0; k < 3; ++k) store(color[k] + at, load(color[k] + at) + weight * s.color[k]);
+            for (int k = 0; k < 3; ++k) store(block.values[k], load(block.values[k]) + weight * s.color[k]);
         });
     }
-    alignas(kAlignment) float coverage[1][kTilePixels];
-    for (int i = 0; i < kTilePixels; i += kLanes) {
-        const vf rest = absolute(load(front.T + i));
-        store(coverage[0] + i, 1.0f - rest);
-        for (int k = 0; k < 3 && background; ++k) store(color[k] + i, load(color[k] + i) + rest * background[k]);
-    }
-    scatter<3>(color, raster.camera.width, tile, image);
-    scatter<1>(coverage, raster.camera.width, tile, alpha_out);
+    if (background) add_background(background, blocks);
+    scatter_color(blocks, raster.camera.width, tile, image);
+    for_pixels(tile, raster.camera.width, [&](size_t pixel, int block, int lane) {
+        alpha_out[pixel] = 1.0f - std::abs(blocks.at[block].T[lane]);
+    });
 }
 
 void blend_backward(
     const Raster& raster, int index, const float* background, const float* image, const float* alpha,
     const float* grad_image, const float* grad_alpha, float* moments) {
     const Tile tile(raster, index);
-    const Lanes lanes;
     const BlockCentres centres;
     const int width = raster.camera.width;
-    alignas(kAlignment) float rest[kTilePixels];
-    Front front(kMinGradientTransmittance);
-    alignas(kAlignment) float gradient[3][kTilePixels], color[3][kTilePixels];
-    alignas(kAlignment) float grad_coverage[1][kTilePixels] = {}, coverage[1][kTilePixels];
-    gather<3>(grad_image, width, tile, gradient);
-    gather<3>(image, width, tile, color);
-    gather<1>(alpha, width, tile, coverage);
-    if (grad_alpha) gather<1>(grad_alpha, width, tile, grad_coverage);
-    for (int i = 0; i < kTilePixels; ++i) {
-        // The background is visible through the remaining transmittance, so it contributes to the coverage's gradient.
-        if (background)
-            for (int k = 0; k < 3; ++k) grad_coverage[0][i] -= background[k] * gradient[k][i];
-        rest[i] = coverage[0][i] * grad_coverage[0][i];
-        for (int k = 0; k < 3; ++k) {
-            const float behind = background ? background[k] * (1.0f - coverage[0][i]) : 0.0f;
-            rest[i] += (color[k][i] - behind) * gradient[k][i];
+    Blocks<8, true> blocks;  // color, then the remaining colour; its gradient; gradient of coverage; coverage
+    enum { kColor, kRest = kColor, kGradient = 3, kCoverageGradient = 6, kCoverage };
+    gather<kColor, 3>(image, width, tile, blocks);
+    gather<kGradient, 3>(grad_image, width, tile, blocks);
+    if (grad_alpha) gather<kCoverageGradient, 1>(grad_alpha, width, tile, blocks);
+    gather<kCoverage, 1>(alpha, width, tile, blocks);
+    for (Block<8>& block : blocks.at) {
+        auto& v = block.values;
+        for (int i = 0; i < kLanes; ++i) {
+            // The background is visible through the remaining transmittance, so it contributes to the coverage's gradient.
+            if (background)
+                for (int k = 0; k < 3; ++k) v[kCoverageGradient][i] -= background[k] * v[kGradient + k][i];
+            float rest = v[kCoverage][i] * v[kCoverageGradient][i];
+            for (int k = 0; k < 3; ++k) {
+                const float behind = background ? background[k] * (1.0f - v[kCoverage][i]) : 0.0f;
+                rest += (v[kColor + k][i] - behind) * v[kGradient + k][i];
+            }
+            v[kRest][i] = rest;
         }
     }
     int n = raster.starts[index], end = raster.starts[index + 1];
     while (end > n && raster.pairs[end - 1] >= raster.trained) --end;  // Their state is not read any more.
-    for (; n < end && front.live != 0; ++n) {
+    for (; n < end && blocks.live != 0; ++n) {
         const Splat& s = splat_of(raster, n, end);
         const bool trained = raster.pairs[n] < raster.trained;
         float* out = moments + static_cast<size_t>(raster.pair_slots[n]) * kMomentCount;
         vf m[kMomentCount];
         for (vf& v : m) v = splat(0.0f);
         bool hit = false;
-        for_covered(s, tile, lanes, centres, front, [&](int at, vf before, const Coverage& c) {
+        for_covered(s, tile, centres, blocks, [&](Block<8>& block, vf before, const Coverage& c) {
             hit = true;
+            const auto& v = block.values;
             const vf weight = c.alpha * before;
-            const vf g0 = load(gradient[0] + at), g1 = load(gradient[1] + at), g2 = load(gradient[2] + at);
-            const vf q = g0 * s.color[0] + g1 * s.color[1] + g2 * s.color[2] + load(grad_coverage[0] + at);
-            const vf to_come = load(rest + at) - weight * q;
-            store(rest + at, to_come);
+            const vf g0 = load(v[kGradient]), g1 = load(v[kGradient + 1]), g2 = load(v[kGradient + 2]);
+            const vf q = g0 * s.color[0] + g1 * s.color[1] + g2 * s.color[2] + load(v[kCoverageGradient]);
+            const vf to_come = load(v[kRest]) - weight * q;
+            store(block.values[kRest], to_come);
             if (!trained) return;
             const vf slope = before * q - to_come * reciprocal(1.0f - c.alpha);
             const vf d = keep(above(splat(kMaxAlpha), c.alpha), slope * c.alpha);  // a clamped alpha has no gradient
@@ -285,17 +295,14 @@ void blend_backward(
             std::memset(moments + static_cast<size_t>(raster.pair_slots[n]) * kMomentCount, 0, sizeof(float) * kMomentCount);
 }
 
-// The blocks of a tile in which some map is not zero.
-template <int Maps>
-uint64_t blocks_with_values(const float (&values)[Maps][kTilePixels]) {
+// The blocks of a tile in which one of the numbers is not zero.
+template <int Count, bool kTrains>
+uint64_t blocks_with_values(const Blocks<Count, kTrains>& blocks) {
     uint64_t found = 0;
-    for (int block = 0; block < kBlocks; ++block) {
+    for (int n = 0; n < kBlocks; ++n) {
         mask other = above(splat(0.0f), splat(0.0f));
-        for (int k = 0; k < Maps; ++k) {
-            const vf value = load(values[k] + block * kLanes);
-            other = either(other, differs(value, splat(0.0f)));
-        }
-        found |= uint64_t{any(other)} << block;
+        for (const auto& values : blocks.at[n].values) other = either(other, differs(load(values), splat(0.0f)));
+        found |= uint64_t{any(other)} << n;
     }
     return found;
 }
@@ -305,33 +312,30 @@ uint64_t blocks_with_values(const float (&values)[Maps][kTilePixels]) {
 template <int Maps, bool kDraws>
 void weigh(const Raster& raster, int index, const float* maps, int stride, float* sums, const float* background,
            float* image) {
+    constexpr int kFirst = kDraws ? 3 : 0;  // the first map, after the colour
     const Tile tile(raster, index);
-    const Lanes lanes;
     const BlockCentres centres;
-    alignas(kAlignment) float values[Maps][kTilePixels] = {};
-    alignas(kAlignment) float color[3][kTilePixels];
-    if (kDraws) std::memset(color, 0, sizeof color);
-    Front front(kDraws ? 0.0f : kMinGradientTransmittance);
-    for_pixels(tile, raster.camera.width, [&](size_t pixel, int at) {
+    Blocks<kFirst + Maps, !kDraws> blocks;
+    for_pixels(tile, raster.camera.width, [&](size_t pixel, int block, int lane) {
 #pragma GCC unroll 8
-        for (int k = 0; k < Maps; ++k) values[k][at] = maps[pixel * stride + k];
+        for (int k = 0; k < Maps; ++k) blocks.at[block].values[kFirst + k][lane] = maps[pixel * stride + k];
     });
-    if (!kDraws) front.live = blocks_with_values<Maps>(values);
+    if (!kDraws) blocks.live = blocks_with_values(blocks);
     const int end = raster.starts[index + 1];
     int n = raster.starts[index];
-    for (; n < end && front.live != 0; ++n) {
+    for (; n < end && blocks.live != 0; ++n) {
         const Splat& s = splat_of(raster, n, end);
         float* out = sums + static_cast<size_t>(raster.pair_slots[n]) * stride;
         vf m[Maps];
         for (vf& v : m) v = splat(0.0f);
         bool hit = false;
-        for_covered(s, tile, lanes, centres, front, [&](int at, vf before, const Coverage& c) {
+        for_covered(s, tile, centres, blocks, [&](Block<kFirst + Maps>& block, vf before, const Coverage& c) {
             hit = true;
             const vf weight = c.alpha * before;
             const vf lit = kDraws ? keep(above(before, splat(kMinGradientTransmittance)), weight) : weight;
 #pragma GCC unroll 8
-            for (int k = 0; k < Maps; ++k) m[k] += lit * load(values[k] + at);
-            for (int k = 0; k < 3 && kDraws; ++k) store(color[k] + at, load(color[k] + at) + weight * s.color[k]);
+            for (int k = 0; k < Maps; ++k) m[k] += lit * load(block.values[kFirst + k]);
+            for (int k = 0; k < kFirst; ++k) store(block.values[k], load(block.values[k]) + weight * s.color[k]);
         });
         if (hit) {
             store_sums(m, out);
@@ -341,10 +345,8 @@ void weigh(const Raster& raster, int index, const float* maps, int stride, float
     }
     for (; n < end; ++n) std::fill_n(sums + static_cast<size_t>(raster.pair_slots[n]) * stride, Maps, 0.0f);  // hidden
     if (!kDraws) return;
-    for (int i = 0; i < kTilePixels && background; i += kLanes)
-        for (int k = 0; k < 3; ++k)
-            store(color[k] + i, load(color[k] + i) + absolute(load(front.T + i)) * background[k]);
-    scatter<3>(color, raster.camera.width, tile, image);
+    if (background) add_background(background, blocks);
+    scatter_color(blocks, raster.camera.width, tile, image);
 }
 
 // By the number of maps, from one on.
