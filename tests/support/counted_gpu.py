@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cuda back-end on the pretended device, which counts what a host queues for it and what it waits for.
 
-Its own kernels run in their emulation; gsplat's place is taken by the CPU rasteriser and by the number of launches in
-gsplat's source. Recorded iterations are counted when they are recorded; a replay is one operation.
+Its own kernels run in their emulation; gsplat's place is taken by the CPU rasteriser and by an estimate of its
+launches. Recorded iterations are counted when they are recorded; a replay is one operation.
 """
 
 import ctypes

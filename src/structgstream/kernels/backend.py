@@ -145,18 +145,19 @@ def processor_backend() -> Backend:
     return cpu_backend() if native_reason() is None else reference_backend()
 
 
-def cuda_backend(*, needs_gsplat: bool = True) -> Backend:
-    """An NVIDIA GPU: gsplat's rasteriser where gradients are needed, this package's kernels, and torch for the rest.
+def cuda_backend(*, native: bool = False) -> Backend:
+    """An NVIDIA GPU: gsplat's rasteriser, this package's kernels, and torch for the rest.
 
     Args:
-        needs_gsplat: False for who only draws and fits later frames with ``iterations``.
+        native: run iterations of later frames, and draw without gradients, in this package's kernels; gsplat may then
+            be missing. Not the default until it has run on a GPU (``benchmarks.gpu`` measures it).
 
     Raises:
         BackendError: no GPU, or gsplat is not installed or does not load.
     """
     from structgstream.kernels import cuda, cuda_anchors, cuda_fit, cuda_library, cuda_picture
 
-    reason = cuda.cuda_reason(needs_gsplat=needs_gsplat)
+    reason = cuda.cuda_reason(needs_gsplat=not native)
     if reason is not None:
         raise BackendError(reason)
     library, sentence = cuda_library.kernel_library()
@@ -178,14 +179,18 @@ def cuda_backend(*, needs_gsplat: bool = True) -> Backend:
     )
     if library is None:
         return backend
-    return replace(backend, iterations=partial(cuda_fit.iterations, library)).with_functions(
+    backend = backend.with_functions(
         generate_structured=partial(cuda_anchors.generate_structured, library),
         l1_ssim=partial(cuda.l1_ssim, library),
+        sweep=partial(cuda.sweep, library),
+    )
+    if not native:
+        return backend
+    return replace(backend, iterations=partial(cuda_fit.iterations, library)).with_functions(
         rasterize=partial(cuda_picture.rasterize, library, rasterize),
         projected_radii=partial(cuda_picture.projected_radii, library),
         blending_weights=partial(cuda_picture.blending_weights, library),
         picture_and_weights=partial(cuda_picture.picture_and_weights, library),
-        sweep=partial(cuda.sweep, library),
     )
 
 
