@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from structgstream.codec.entropy import adaptive, rans
+from structgstream.codec.entropy.decisions import ArithmeticState
 from structgstream.errors import OutOfMemoryError
 from structgstream.kernels import cpu_anchors, cpu_motion, cpu_raster
 from structgstream.kernels.native import native_reason
@@ -97,6 +98,12 @@ CALLS: dict[str, tuple[object, str, int | None, Callable[[], object]]] = {
         1,
         lambda: rans._native_encode(np.zeros(2, np.uint8), np.zeros(2, np.uint16), tables(), lanes=1),
     ),
+    "decisions": (
+        adaptive,
+        "sgs_code_numbers",
+        1,
+        lambda: adaptive._code_native("sgs_code_numbers", ArithmeticState(None), [], 0),
+    ),
     "decode": (
         rans,
         "sgs_rans_decode",
@@ -117,8 +124,3 @@ def test_no_memory(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_no_memory_for_gradients() -> None:
     with pytest.raises(OutOfMemoryError, match="gradients"):
         backward()
-
-
-def test_no_memory_for_decisions() -> None:
-    with pytest.raises(OutOfMemoryError, match="decisions"):
-        adaptive._check(adaptive._NO_MEMORY)
