@@ -117,7 +117,7 @@ def test_ctrl_c_ends_waiting(
     def interrupted(seconds: float) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("structgstream.cli.play.time.sleep", interrupted)
+    monkeypatch.setattr("structgstream.cli.serve.time.sleep", interrupted)
     assert main(["play", str(tmp_path / "never.sgs"), "--wait"]) == 130
     error = capsys.readouterr().err
     assert "Waiting for" in error

@@ -19,7 +19,6 @@ from structgstream.evaluation.evaluate import compared_frames, evaluate
 from structgstream.evaluation.facts import numbers_of
 from structgstream.evaluation.lpips import ENVIRONMENT
 from structgstream.evaluation.metrics import PSNR_OF_EQUALS
-from structgstream.evaluation.optional_metrics import FlowField
 from structgstream.evaluation.recording import to_device
 from structgstream.evaluation.report import as_json
 from structgstream.frames import MultiViewFrame
@@ -266,20 +265,6 @@ def test_every_score_over_time_is_wired(world: World) -> None:
     assert {"ms_ssim", "lpips_alex", "lpips_vgg", "t_lpips"} == set(missing)
     for name in missing:
         assert getattr(follows.mean, name) is None
-
-
-def test_exact_flow_takes_the_place_of_the_estimate(world: World) -> None:
-    asked = []
-
-    def nowhere(before: np.ndarray, now: np.ndarray, camera: str, index: int) -> FlowField:
-        asked.append((camera, index, before is not now))
-        height, width, _ = now.shape
-        return FlowField(np.zeros((height, width, 2), np.float32), np.ones((height, width), bool))
-
-    stays: Any = in_the_stream(world, similarity=Similarity(), follow=False)
-    report = run(stays, MemoryCapture(world.rig, world.frames), flow=nowhere)
-    assert asked == [("cam00", index, True) for index in (1, 2, 3)]
-    assert report.mean.e_warp == pytest.approx(0.0, abs=1e-12)
 
 
 def test_the_basic_scores_are_those_of_before(world: World) -> None:

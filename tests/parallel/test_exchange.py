@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.executors.task import Task
-from structgstream.parallel import object_folder
+from structgstream.parallel import exchange
 from structgstream.parallel.driver import drive
 from structgstream.parallel.exchange import ObjectFolder, ObjectStore, SharedFolder
 from structgstream.parallel.parts import Parts
@@ -52,7 +52,7 @@ def test_a_store_that_refuses_every_third_request_costs_only_time(
     pytest.importorskip("s3fs", reason="s3fs, of the extra cloud, is not installed")
     pytest.importorskip("moto.server", reason="moto, of the extra dev, is not installed")
     monkeypatch.setenv("STRUCTGSTREAM_SCRATCH", str(tmp_path / "scratch"))
-    monkeypatch.setattr(object_folder, "FIRST_DELAY_SECONDS", 0.001)
+    monkeypatch.setattr(exchange, "FIRST_DELAY_SECONDS", 0.001)
     with flaky_store(3) as (url, application):
         assert sha256(stored(tmp_path, url)) == sha256(plain)
         assert application.refused >= 10

@@ -343,7 +343,7 @@ def test_several_qualities_of_one_stream(server: Served, folder: Path) -> None:
     assert server.ask("/streams/show/preview").body == PNG
 
 
-@pytest.mark.parametrize("seconds", ["null", '"1"', "true", "NaN", "Infinity", "1e300", "[]"])
+@pytest.mark.parametrize("seconds", ["null", '"1"', "true", "1e300", "[]"])
 def test_a_manifest_may_hold_anything(folder: Path, seconds: str) -> None:
     """Values that are no numbers are left out."""
     text = json.dumps({"format": "structgstream-segments", "sequence": 3, "live": False, "edge": {"pts_seconds": 7.5}})

@@ -162,7 +162,7 @@ def other_camera(source: MemoryCapture) -> MemoryCapture:
         ({"source": other_camera(capture())}, "cameras.cam01.K differ"),
         (
             {"source": replace(capture(), rig=capture().rig.with_held_out(frozenset()))},
-            "cameras.cam00.held out differ",
+            "cameras.cam00.held_out differ",
         ),
     ],
 )
