@@ -204,7 +204,7 @@ class Measurement:
         """Pictures a second, from the scene to bytes in the host's memory."""
         found = {}
         for title, world in self.worlds.items():
-            scene, cameras = moved(world.before, self.backend.device), list(world.rig.values())
+            scene, cameras = moved(world.before, self.backend.device), list(world.rig.cameras.values())
 
             def draw(scene: Any = scene, cameras: Sequence[Any] = cameras) -> None:
                 with torch.no_grad():
@@ -218,9 +218,8 @@ class Measurement:
 
     def clip(self) -> dict[str, Any]:
         """The bundled clip: frame 0 and three more."""
-        from structgstream.data.json_videos import bundled_clip_path
-
         import structgstream
+        from structgstream.data.dataset_layouts import bundled_clip_path
 
         with tempfile.TemporaryDirectory() as folder:
             path, config = Path(folder) / "clip.sgs", {"preset": "compact", "backend": self.backend}
