@@ -55,7 +55,7 @@ def moved(value: Any, device: torch.device) -> Any:
     if isinstance(value, Tensor):
         return value.detach().to(device, copy=True)
     if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{f.name: moved(getattr(value, f.name), device) for f in fields(value)})
+        return replace(value, **{f.name: moved(getattr(value, f.name), device) for f in fields(value) if f.init})
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         return type(value)(*(moved(part, device) for part in value))
     return [moved(part, device) for part in value] if isinstance(value, list) else value

@@ -19,11 +19,14 @@ def test_parts_are_measured_and_one_that_fails_ends_none(tmp_path: Path, capsys:
 
     sizes = {"tiny": {"anchors": 120, "width": 48, "height": 32, "cameras": 3}}
     measurement = Measurement(cpu_backend(), sizes, lambda: None)
-    parts = {"fails": fails, "correctness": measurement.correctness, "pictures": measurement.pictures}
+    names = ("correctness", "iterations", "pictures", "frames")
+    parts = {"fails": fails, **{name: getattr(measurement, name) for name in names}}
     out = tmp_path / "out.json"
     found = measured(parts, out, until=float("inf"))
     assert json.loads(out.read_text()).keys() == parts.keys()
-    assert found["fails"]["failed"] == "ValueError: no such thing"
+    assert {name: part["failed"] for name, part in found.items() if "failed" in part} == {
+        "fails": "ValueError: no such thing"
+    }
     assert found["correctness"]["tiny"]["gradient error"] == 0.0
     assert found["correctness"]["tiny"]["equal bits"]
     assert "(predicted: " in capsys.readouterr().out

@@ -79,7 +79,7 @@ class Film:
     def _seen(self, plane: Plane, rays: Floats) -> tuple[Floats, NDArray[np.float32]]:
         """Distance along each ray and the colour there; NaN beside the plane."""
         depth, places = self._places(plane, rays)
-        inside: NDArray[np.bool_] = ((places > 0) & (places < 1)).all(-1)
+        inside = np.asarray(((places > 0) & (places < 1)).all(-1))
         if not inside.any():
             return depth, np.full((*depth.shape, 3), np.nan, np.float32)
         height, width = plane.texture.shape[:2]
