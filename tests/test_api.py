@@ -28,11 +28,11 @@ PART: dict[str, Any] = {"frames": 2, "scale": 0.25, "backend": QUICKEST}
 def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two frames of 80x60 pixels, hardly trained."""
     path = tmp_path_factory.mktemp("stream") / "clip.sgs"
-    told = []
+    reported = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(structgstream.PRESETS, "tiny", QUICK)
-        reports = structgstream.reconstruct(str(CLIP), path, preset="tiny", on_frame=told.append, **PART)
-    assert reports == told
+        reports = structgstream.reconstruct(str(CLIP), path, preset="tiny", on_frame=reported.append, **PART)
+    assert reports == reported
     assert [report.index for report in reports] == [0, 1]
     return path
 
@@ -82,7 +82,9 @@ def test_a_capture_that_is_open(stream: Path, tmp_path: Path) -> None:
         ({"scale": 3.0}, "(0, 1]"),
     ],
 )
-def test_wrong_wishes_are_told_before_anything_is_written(tmp_path: Path, wishes: dict[str, Any], words: str) -> None:
+def test_wrong_wishes_are_reported_before_anything_is_written(
+    tmp_path: Path, wishes: dict[str, Any], words: str
+) -> None:
     with pytest.raises(ConfigError) as caught:
         structgstream.reconstruct(CLIP, tmp_path / "x.sgs", **wishes)
     assert words in str(caught.value)

@@ -94,7 +94,7 @@ def test_what_ends_the_writing_leaves_what_was_there_and_nothing_else(
 
 
 @pytest.mark.parametrize(
-    ("number", "told"),
+    ("number", "reported"),
     [
         (errno.ENOSPC, r"\(No space left on device\); make room\."),
         (errno.EDQUOT, r"\(Disk quota exceeded\); make room\."),
@@ -102,13 +102,13 @@ def test_what_ends_the_writing_leaves_what_was_there_and_nothing_else(
     ],
 )
 @pytest.mark.parametrize("step", ["os.fsync", "pathlib.Path.replace"])
-def test_a_disk_that_fails_at_a_step_is_told_and_leaves_what_was_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, told: str, step: str
+def test_a_disk_that_fails_at_a_step_is_reported_and_leaves_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, reported: str, step: str
 ) -> None:
     (tmp_path / "a").write_bytes(OLD)
     with monkeypatch.context() as patch:
         patch.setattr(step, refuse(number))
-        with pytest.raises(StorageError, match=rf"^The picture .*a cannot be written {told}$"):
+        with pytest.raises(StorageError, match=rf"^The picture .*a cannot be written {reported}$"):
             atomic_write(tmp_path / "a", NEW, called="The picture")
     assert [(entry.name, entry.read_bytes()) for entry in tmp_path.iterdir()] == [("a", OLD)]
 
@@ -155,19 +155,19 @@ def test_a_real_disk_without_room(tmp_path: Path) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == ["a"]
 
 
-def test_a_folder_without_permission_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_without_permission_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "open", refuse(errno.EACCES))  # root may write anywhere
     with pytest.raises(StorageError, match=r"denied\); correct its permissions, or choose another place\.$"):
         atomic_write(tmp_path / "a", NEW)
 
 
-def test_a_file_in_the_place_of_the_folder_is_told(tmp_path: Path) -> None:
+def test_a_file_in_the_place_of_the_folder_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(StorageError, match=r"file/x cannot be written \(.*file is a file\)\.$"):
         atomic_write(tmp_path / "file" / "x", b"", new_folder=True)
 
 
-def test_a_folder_in_the_place_of_the_file_is_told(tmp_path: Path) -> None:
+def test_a_folder_in_the_place_of_the_file_is_reported(tmp_path: Path) -> None:
     (tmp_path / "taken").mkdir()
     with pytest.raises(StorageError, match=r"taken cannot be written \(Is a directory\)"):
         atomic_write(tmp_path / "taken", NEW)
@@ -190,7 +190,7 @@ def test_a_file_system_that_cannot_sync_folders_gets_its_files(
     assert (tmp_path / "a").read_bytes() == NEW
 
 
-def test_a_disk_that_fails_to_sync_a_folder_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_fails_to_sync_a_folder_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "fsync", refuse(errno.EIO))
     with pytest.raises(OSError, match="Input/output error"):
         sync_folder(tmp_path)

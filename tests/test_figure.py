@@ -35,7 +35,7 @@ def test_no_two_colours_are_alike() -> None:
     assert min(apart) > 40
 
 
-def test_what_is_in_the_way_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_in_the_way_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError, match="cannot be written"):
         save_figure(figure_of(1.0, 1.0), tmp_path / "file" / "x.png")

@@ -37,12 +37,12 @@ def test_a_file_and_its_bytes_are_the_same_widget(file: Path) -> None:
         player.close()
 
 
-def test_other_bytes_and_another_height_are_told_to_the_browser(file: Path) -> None:
+def test_other_bytes_and_another_height_are_reported_to_the_browser(file: Path) -> None:
     player = Player(file, height_pixels=200)
-    told: list[str] = []
-    player.observe(lambda change: told.append(change["name"]), ["stream", "height_pixels"])
+    reported: list[str] = []
+    player.observe(lambda change: reported.append(change["name"]), ["stream", "height_pixels"])
     player.stream, player.height_pixels = STREAM[:-1], 300
-    assert told == ["stream", "height_pixels"]
+    assert reported == ["stream", "height_pixels"]
     with pytest.raises(traitlets.TraitError):
         player.height_pixels = "tall"  # type: ignore[assignment]
 
@@ -51,12 +51,12 @@ def test_other_bytes_and_another_height_are_told_to_the_browser(file: Path) -> N
     ("stream", "words"),
     [(b"", "is empty"), (b"hello, this is no stream", "is not a structgstream file"), ("no.sgs", "No such file")],
 )
-def test_what_cannot_be_shown_is_told(stream: bytes | str, words: str) -> None:
+def test_what_cannot_be_shown_is_reported(stream: bytes | str, words: str) -> None:
     with pytest.raises(StreamError, match=words):
         Player(stream)
 
 
-def test_a_missing_extra_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_extra_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "structgstream.notebook")
     monkeypatch.setitem(sys.modules, "anywidget", None)  # type: ignore[arg-type]
     with pytest.raises(MissingExtraError, match=r"pip install 'structgstream\[notebook\]'"):

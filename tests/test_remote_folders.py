@@ -20,7 +20,7 @@ def test_a_url_is_a_folder(tmp_path: Path) -> None:
     assert (tmp_path / "a").read_bytes() == b"content"
 
 
-def test_what_is_no_url_is_told() -> None:
+def test_what_is_no_url_is_reported() -> None:
     with pytest.raises(StorageError, match=r"^nonsense://a cannot be used as a store \(.*nonsense"):
         open_url("nonsense://a")
 

@@ -59,7 +59,7 @@ def test_every_target_names_a_contestant() -> None:
         assert {target.contestant for target in benchmark.targets} <= set(entries)
 
 
-def test_a_target_is_told_with_what_was_got() -> None:
+def test_a_target_is_reported_with_what_was_got() -> None:
     entry = {"seconds": {"median": 0.05}, "times_faster": {"median": 2.5}}
     missed, met = judged(Target("ours", at_least_times=3.0), entry), judged(Target("ours", at_most_seconds=0.06), entry)
     assert (missed["got"], missed["met"]) == (2.5, False)

@@ -45,7 +45,7 @@ class _Costs(torch.autograd.Function):
         return gradients[0], None
 
 
-def test_an_operation_is_told_its_own_forward_and_backward(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_operation_is_reported_its_own_forward_and_backward(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = [0.0]
     monkeypatch.setattr("benchmarks.stages.time.perf_counter", lambda: clock[0])
 

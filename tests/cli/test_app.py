@@ -95,14 +95,14 @@ def test_exhausted_memory_is_one_sentence(command, error: MemoryError, capsys: p
         (PermissionError("a message"), "unexpected error, PermissionError: a message."),
     ],
 )
-def test_what_the_system_refuses_is_told(
+def test_what_the_system_refuses_is_reported(
     command, error: OSError, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command(raising(error))
     assert main(["demo"]) == 1
-    told = capsys.readouterr().err
-    assert told.startswith(f"structgstream: {said}")
-    assert told.count("\n") == 1
+    reported = capsys.readouterr().err
+    assert reported.startswith(f"structgstream: {said}")
+    assert reported.count("\n") == 1
     assert main(["demo", "--debug"]) == 1
     assert "Traceback" in capsys.readouterr().err
 
@@ -169,7 +169,7 @@ def test_exit_status_of_the_program() -> None:
     assert "--json" in result.stderr
 
 
-def test_paths_that_cannot_work_are_told(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_paths_that_cannot_work_are_reported(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     new = str(tmp_path / "new.sgs")
     assert "does not exist" in error_of(["reconstruct", str(tmp_path / "no"), "-o", new], capsys, status=1)
     assert "is a folder" in error_of(["reconstruct", CLIP, "-o", str(tmp_path)], capsys, status=1)

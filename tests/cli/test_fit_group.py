@@ -24,13 +24,13 @@ def words(tmp_path: Path) -> list[str]:
 
 
 class Shown:
-    """A display that keeps what it is told."""
+    """A display that keeps what it is shown."""
 
     def __init__(self) -> None:
-        self.told: list[Any] = []
+        self.reported: list[Any] = []
 
     def __call__(self, frames: int, *, done: int) -> "Shown":
-        self.told.append((frames, done))
+        self.reported.append((frames, done))
         return self
 
     def __enter__(self) -> "Shown":
@@ -40,10 +40,10 @@ class Shown:
         pass
 
     def step(self, step: object) -> None:
-        self.told.append(step)
+        self.reported.append(step)
 
     def frame(self, report: Any) -> None:
-        self.told.append(report.index)
+        self.reported.append(report.index)
 
 
 @pytest.fixture
@@ -83,7 +83,7 @@ def test_what_is_asked_for_is_fitted_and_shown(
     start = GroupStartConfig(iterations=9, rounds=2)
     task = unit.SegmentTask(Path(CLIP), Path(words[3]), Path("t"), 60, 63, start)
     assert asked == [(Path(words[5]), task, True)]
-    assert shown.told == [(63, 61), "step 61", 61, "step 62", 62]
+    assert shown.reported == [(63, 61), "step 61", 61, "step 62", 62]
     assert capsys.readouterr().out == f"Wrote {words[5]}\n"
 
 
@@ -133,7 +133,7 @@ def test_the_former_spelling_names_the_command(words: list[str], capsys: pytest.
     assert "reconstruct has no --init: a group of frames is fitted by structgstream fit-group." in error
 
 
-def test_a_group_without_a_track_and_a_header_that_is_none_are_told(
+def test_a_group_without_a_track_and_a_header_that_is_none_are_reported(
     words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "header.sgs").write_bytes(b"A letter to someone.")

@@ -115,7 +115,7 @@ def test_pictures_that_cannot_be(streams: dict[str, Path], tmp_path: Path, capsy
     assert "cannot be written" in capsys.readouterr().err
 
 
-def test_damage_is_told_and_what_follows_it_is_listed(
+def test_damage_is_reported_and_what_follows_it_is_listed(
     streams: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data = bytearray(streams["compact"].read_bytes())
@@ -134,7 +134,7 @@ def test_damage_is_told_and_what_follows_it_is_listed(
     assert [packet["index"] for packet in content["packets"]] == listed
 
 
-def test_what_came_and_went_is_told_where_the_log_is(
+def test_what_came_and_went_is_reported_where_the_log_is(
     streams: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     stream = tmp_path / "logged.sgs"
@@ -145,8 +145,8 @@ def test_what_came_and_went_is_told_where_the_log_is(
     append_log(stream, {"index": 2, "grown": 0, "removed": 0, "spawned": 5, "pruned": 4})
     output = tmp_path / "out.json"
     lines = shown([str(stream), "--json", str(output)], capsys)
-    told = " ".join(next(words for words in lines if words[:1] == ["came,"]))
-    assert "anchors (+1,200 -30), free Gaussians (+5 -4)" in told
+    reported = " ".join(next(words for words in lines if words[:1] == ["came,"]))
+    assert "anchors (+1,200 -30), free Gaussians (+5 -4)" in reported
     packets = json.loads(output.read_text())["packets"]
     assert packets[0]["changes"] == {"grown": 1_200, "removed": 30, "spawned": 0, "pruned": 0}
     assert packets[1]["changes"] == {}

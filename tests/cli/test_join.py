@@ -38,7 +38,7 @@ def test_plain_copies_the_packets_of_every_group(segments: list[str], tmp_path: 
     assert out.read_bytes() == copied.read_bytes()
 
 
-def test_what_is_there_is_replaced_only_when_told(
+def test_what_is_there_is_replaced_only_when_asked(
     segments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out.sgs"

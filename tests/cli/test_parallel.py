@@ -87,7 +87,7 @@ def test_again_it_says_so_and_makes_nothing(stream: Path, capsys: pytest.Capture
         ),
     ],
 )
-def test_wrong_options_are_told(
+def test_wrong_options_are_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], status: int, said: str
 ) -> None:
     assert said in error_of(["parallel", CLIP, "-o", str(tmp_path / "out.sgs"), *words], capsys, status=status)

@@ -124,7 +124,7 @@ def test_ctrl_c_ends_waiting(
     assert "Traceback" not in error
 
 
-def test_a_port_that_is_taken_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_port_that_is_taken_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "s.sgs"
     file.write_bytes(STREAM)
     with socket.socket() as other:
@@ -161,7 +161,7 @@ def test_what_cannot_be_played(
     assert words in error_of([str(file), "--no-browser", *extra], capsys, status=status)
 
 
-def test_the_capture_of_another_stream_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_capture_of_another_stream_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "s.sgs"
     scene = random_scene(5)
     write_stream(FileSink(file), [scene], header=header_for(scene))
@@ -170,7 +170,7 @@ def test_the_capture_of_another_stream_is_told(tmp_path: Path, capsys: pytest.Ca
 
 
 @pytest.mark.parametrize("missing", ["starlette", "uvicorn"])
-def test_a_missing_extra_is_told(
+def test_a_missing_extra_is_reported(
     tmp_path: Path, missing: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in [name for name in sys.modules if name.startswith(("structgstream.serve", missing))]:

@@ -154,7 +154,7 @@ def test_what_may_not_be_read_or_written(
         ("7x5", "A board is COLUMNSxROWS:SQUARE"),
     ],
 )
-def test_a_board_that_cannot_be_is_told_before_anything_takes_time(
+def test_a_board_that_cannot_be_is_reported_before_anything_takes_time(
     tmp_path: Path, board: str, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_room(tmp_path / "videos")

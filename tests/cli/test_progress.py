@@ -104,7 +104,7 @@ def test_bytes_for_reading(count: float, words: str) -> None:
     assert human_bytes(count) == words
 
 
-def test_several_qualities_of_a_frame_are_told_apart() -> None:
+def test_several_qualities_of_a_frame_are_distinguished() -> None:
     for terminal in (False, True):
         out = console(terminal=terminal)
         with display(20, done=1, console=out) as shown:

@@ -33,7 +33,7 @@ def test_reconstruct_writes_the_log_beside_the_stream(stream: Path) -> None:
     assert {entry["peak_memory_kind"] for entry in entries} <= {"stage", "process"}
 
 
-def test_a_rig_that_is_not_the_papers_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_rig_that_is_not_the_papers_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asked = ["reconstruct", CLIP, "-o", str(tmp_path / "s.sgs"), "--frames", "1", "--scale", "0.25", *QUICK]
     assert main([*asked, "--preset", "paper-meetroom"]) == 0
     said = " ".join(capsys.readouterr().out.split())
@@ -139,7 +139,7 @@ def test_every_second_frame_is_resumed_and_scored_against_the_same_frames(
         (["--online.spawn.least-hits", "3"], 2, "--online.spawn.least-hits is no option any more: it is always 4."),
     ],
 )
-def test_wrong_options_are_told_before_anything_is_written(
+def test_wrong_options_are_reported_before_anything_is_written(
     tmp_path: Path, extra: list[str], status: int, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "new.sgs"

@@ -123,7 +123,7 @@ def test_what_is_no_folder_of_streams(folder: Path, capsys: pytest.CaptureFixtur
     assert "is a file; serve takes a folder" in output_of(["serve", str(file)], capsys, expected=1)
 
 
-def test_a_missing_extra_is_told(
+def test_a_missing_extra_is_reported(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in [name for name in sys.modules if name.startswith("structgstream.serve")]:

@@ -94,7 +94,7 @@ def test_a_long_stream_is_listed_in_part_unless_every_packet_is_asked_for() -> N
     assert packet_table([], every=False).row_count == 0
 
 
-def test_large_packets_are_told_in_kilobytes() -> None:
+def test_large_packets_are_reported_in_kilobytes() -> None:
     assert "packets, bytes" in shown(packet_table(rows(2), every=True))[0]
     large = shown(packet_table(rows(2, bytes=250_000), every=True))
     assert "packets, kB" in large[0]

@@ -76,7 +76,7 @@ def test_what_is_asked_for_is_tracked(
     assert ": 0:4 4:8 8:12; 0.38 core-seconds a frame" in out
 
 
-def test_a_group_is_a_key_interval_long_unless_told(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_group_is_a_key_interval_long_unless_asked(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     asked = tracks(monkeypatch)
     assert main(words) == 0
     assert asked[0][1].length == 30

@@ -205,7 +205,7 @@ def test_an_interrupted_write_is_replaced_by_the_index(tmp_path: Path, disk: typ
     assert sink.path.read_bytes() == expected.data
 
 
-def test_a_disk_that_is_nearly_full_is_told_of_and_the_stream_gets_its_index(
+def test_a_disk_that_is_nearly_full_is_reported_and_the_stream_gets_its_index(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Three packets and the header are kept free."""

@@ -85,8 +85,8 @@ def check_mutants(
             read()
         except StructGStreamError as error:
             refused += 1
-            told = str(error).replace(str(folder), "FOLDER").replace(str(folder.parent), "FOLDER")
-            assert not PYTHONS_WORDS.search(told), f"mutant {seed} of {file.name}: {told}"
+            reported = str(error).replace(str(folder), "FOLDER").replace(str(folder.parent), "FOLDER")
+            assert not PYTHONS_WORDS.search(reported), f"mutant {seed} of {file.name}: {reported}"
         except BaseException as error:
             raise AssertionError(f"mutant {seed} of {file.name}") from error
         finally:

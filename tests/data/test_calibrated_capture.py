@@ -99,7 +99,7 @@ def test_a_video_without_calibration(tmp_path: Path) -> None:
         open_capture(tmp_path)
 
 
-def test_a_calibrated_camera_that_did_not_film_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_calibrated_camera_that_did_not_film_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_anipose(tmp_path, truths(names=(*NAMES, "cam03")))
     write_videos(tmp_path, NAMES, frames=2)
     assert list(open_capture(tmp_path).rig) == NAMES

@@ -169,7 +169,7 @@ def test_the_first_frame_alone_is_that_of_the_whole_capture(ahead: bool) -> None
     assert all(np.array_equal(found.images[name], expected.images[name]) for name in RIG)
 
 
-def test_a_frame_that_cannot_be_read_ends_the_mean_and_is_told_when_it_is_its_turn() -> None:
+def test_a_frame_that_cannot_be_read_ends_the_mean_and_is_reported_when_it_is_its_turn() -> None:
     class Broken(MemoryCapture):
         def frames(self, start: int = 0):
             for frame in super().frames(start):

@@ -19,7 +19,7 @@ def test_files_of_a_kind_are_sorted_and_hidden_ones_are_none(tmp_path: Path) -> 
     assert [file.name for file in files_of(tmp_path, (".jpg",))] == ["a.jpg", "b.JPG"]
 
 
-def test_two_files_of_one_name_are_told(tmp_path: Path) -> None:
+def test_two_files_of_one_name_are_reported(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match=r"a\.jpg and a\.png in .* are of one name, 'a'; expected one file of each"):
         by_stem([tmp_path / "a.jpg", tmp_path / "a.png"])
 

@@ -158,7 +158,7 @@ def test_a_later_version_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "reported"),
     [
         (lambda values: values["cameras"]["cam02"].pop("K"), r"Camera 'cam02' of .*capture\.json cannot be read"),
         (lambda values: values["cameras"]["cam02"]["lens"].update(model="soft"), r"Camera 'cam02' .*soft"),
@@ -181,10 +181,12 @@ def test_a_later_version_is_refused(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_broken_content_names_its_camera(tmp_path: Path, change: Callable[[dict[str, Any]], object], told: str) -> None:
+def test_broken_content_names_its_camera(
+    tmp_path: Path, change: Callable[[dict[str, Any]], object], reported: str
+) -> None:
     write_prepared(tmp_path, content())
     edit(tmp_path, change)
-    with pytest.raises(CalibrationError, match=told):
+    with pytest.raises(CalibrationError, match=reported):
         read_prepared(tmp_path)
 
 

@@ -39,9 +39,12 @@ def test_where_json_and_toml_break(tmp_path: Path) -> None:
     file = tmp_path / "rig"
     file.write_bytes(b"\xef\xbb\xbf" + json.dumps({"a": 1}).encode())
     assert read_json(file) == {"a": 1}
-    for text, told in (('{"a": 1,\n}', "it is not JSON from line 2, column 1 on"), ("[" * 100_000, "it is not JSON")):
+    for text, reported in (
+        ('{"a": 1,\n}', "it is not JSON from line 2, column 1 on"),
+        ("[" * 100_000, "it is not JSON"),
+    ):
         file.write_text(text)
-        with pytest.raises(Unreadable, match=told):
+        with pytest.raises(Unreadable, match=reported):
             read_json(file)
     file.write_text("a = 1\n")
     assert read_toml(file) == {"a": 1}
@@ -53,15 +56,23 @@ def test_where_json_and_toml_break(tmp_path: Path) -> None:
 def test_numbers() -> None:
     assert [number(value) for value in (1, "0,5", " -2.5e1 ")] == [1.0, 0.5, -25.0]
     assert (whole("320.0"), pixels(["640", 480.0])) == (320, (640, 480))
-    for value, told in ((None, "nothing in place of a number"), ("x", "'x' in place"), (10**400, r"10000.*\.\.\. in")):
-        with pytest.raises(Unreadable, match=told):
+    for value, reported in (
+        (None, "nothing in place of a number"),
+        ("x", "'x' in place"),
+        (10**400, r"10000.*\.\.\. in"),
+    ):
+        with pytest.raises(Unreadable, match=reported):
             number(value)
     with pytest.raises(Unreadable, match=r"not finite \(nan\)"):
         number("nan")
     with pytest.raises(Unreadable, match=r"1\.5 in place of a whole number"):
         whole(1.5)
-    for size, told in ((7, "7 in place of width and height"), ([0, 4], "of 0x4 pixels"), ([70_000, 4], "of 70000x4")):
-        with pytest.raises(Unreadable, match=told):
+    for size, reported in (
+        (7, "7 in place of width and height"),
+        ([0, 4], "of 0x4 pixels"),
+        ([70_000, 4], "of 70000x4"),
+    ):
+        with pytest.raises(Unreadable, match=reported):
             pixels(size)
 
 

@@ -50,7 +50,7 @@ def messages(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.getMessage() for record in caplog.records]
 
 
-def test_a_hole_is_told_once_and_the_range_stays(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_hole_is_reported_once_and_the_range_stays(caplog: pytest.LogCaptureFixture) -> None:
     assert common(a=[0, 1, 2, 3, 4], b=[0, 1, 4], c=[0, 1, 2, 3, 4]) == range(5)
     assert messages(caplog) == ["take: camera 'b' lacks 2 of 5 frames, the first of them frame 2; it is absent there"]
 
@@ -78,7 +78,7 @@ def test_two_training_cameras_reach_the_end() -> None:
     assert common_slots(slots, where="take", label=label) == range(10)
 
 
-def test_frames_that_nobody_has_are_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_frames_that_nobody_has_are_reported(caplog: pytest.LogCaptureFixture) -> None:
     assert common(a=[0, 1, 3], b=[0, 1, 3], c=[0, 1, 2, 3]) == range(4)
     assert "1 frames, the first of them frame 2, have pictures of fewer than 2 training cameras" in caplog.text
 

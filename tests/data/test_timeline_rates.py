@@ -51,7 +51,7 @@ def test_instants_lie_amid_the_cameras(offsets: list[float], shift: float) -> No
     assert np.abs(np.median(apart)) < 1e-6
 
 
-def test_two_frames_of_one_instant_are_told_from_a_higher_rate() -> None:
+def test_two_frames_of_one_instant_are_reported_from_a_higher_rate() -> None:
     assert place(np.array([0.0, 1.0, 2.0, 2.25, 3.0])).repeated == (2,)
     assert place(np.arange(0, 6, 0.5)).repeated == ()
 

@@ -244,9 +244,9 @@ def test_a_damage_makes_its_camera_absent_up_to_the_next_key_frame(
     lost = [index for index, there in enumerate(present) if not there]
     assert 1 <= len(lost) <= 4  # within one group of 4
     assert lost == list(range(lost[0], lost[-1] + 1))
-    (told,) = [record.getMessage() for record in caplog.records if "decoded" in record.getMessage()]
-    assert f"cam01.mp4 of camera 'cam01' cannot be decoded at {lost[0] / 30:.3f} s" in told
-    assert f"absent until {(lost[-1] + 1) / 30:.3f} s" in told
+    (reported,) = [record.getMessage() for record in caplog.records if "decoded" in record.getMessage()]
+    assert f"cam01.mp4 of camera 'cam01' cannot be decoded at {lost[0] / 30:.3f} s" in reported
+    assert f"absent until {(lost[-1] + 1) / 30:.3f} s" in reported
     list(source.frames())
     assert sum("decoded" in record.getMessage() for record in caplog.records) == 1
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures by time stamp, and what is told of damage; as a capture they are read in ``test_video``."""
+"""Pictures by time stamp, and what counts as damage; as a capture they are read in ``test_video``."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +29,7 @@ def track_of(folder: Path, *, noisy: bool = False) -> VideoTrack:
 
 def read(track: VideoTrack, stamps: list[int | None], *, size: tuple[int, int] = SIZE) -> tuple[list, Damages]:
     damages: Damages = []
-    shown = pictures_at(track, stamps, size=size, on_damage=lambda *told: damages.append(told))
+    shown = pictures_at(track, stamps, size=size, on_damage=lambda *reported: damages.append(reported))
     found = [None if one is None else one[0] for one in shown]
     return found, damages
 
@@ -72,7 +72,7 @@ def test_a_video_whose_size_changes_is_refused_where_it_does(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("share", [0.6, 0.97])
-def test_damage_is_told_with_what_is_lost_up_to_the_next_key_frame(tmp_path: Path, share: float) -> None:
+def test_damage_is_reported_with_what_is_lost_up_to_the_next_key_frame(tmp_path: Path, share: float) -> None:
     track = track_of(tmp_path, noisy=True)
     data = bytearray(track.path.read_bytes())
     middle = int(share * len(data))

@@ -48,7 +48,7 @@ def test_stored_pictures_are_found_where_they_are_larger() -> None:
     assert stored_capture(whole, bundled_clip_path(), frames=3) is None
 
 
-def test_a_capture_that_ends_before_the_stream_begins_is_told() -> None:
+def test_a_capture_that_ends_before_the_stream_begins_is_reported() -> None:
     header = replace(header_for(small_scene()), metadata={"start": 12})
     with pytest.raises(CaptureError, match="12 frames"):
         capture_of(header, bundled_clip_path(), frames=1)

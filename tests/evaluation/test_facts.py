@@ -99,7 +99,7 @@ def with_camera(rig: CameraRig, name: str, **change: Any) -> CameraRig:
         (lambda rig: with_camera(rig, "cam01", viewmat=rig["cam02"].viewmat), "another calibration"),
     ],
 )
-def test_another_rig_is_told(change: Callable[[CameraRig], CameraRig], words: str) -> None:
+def test_another_rig_is_reported(change: Callable[[CameraRig], CameraRig], words: str) -> None:
     check_same_rig(HEADER, Source(HEADER.rig), ("cam00", "cam01"))
     other = Source(change(HEADER.rig))
     with pytest.raises(CaptureError, match=words):
@@ -110,7 +110,7 @@ def test_a_camera_that_is_not_scored_may_differ() -> None:
     check_same_rig(HEADER, Source(without(HEADER.rig, "cam01")), ("cam00", "cam02"))
 
 
-def test_a_capture_that_is_too_short_or_begins_elsewhere_is_told() -> None:
+def test_a_capture_that_is_too_short_or_begins_elsewhere_is_reported() -> None:
     source, four = Source(HEADER.rig), [{"free": 1}] * 4
     check_same_frames(recording(four), source)
     with pytest.raises(CaptureError, match="5 frames and this part of the capture hall only 4"):
@@ -143,7 +143,7 @@ def log(index: int, seconds: float, peak: int | None, **stages: int) -> dict[str
     }
 
 
-def test_what_training_took_is_told_of_frame_0_and_of_the_others_apart() -> None:
+def test_what_training_took_is_reported_frame_0_and_of_the_others_apart() -> None:
     facts = training_facts(
         [log(0, 9.0, 50, fit=50), log(1, 1.0, 70, fit=70, store=5), {}, log(2, 3.0, 60, fit=60, store=6)]
     )

@@ -46,7 +46,7 @@ def noise(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (40, 48, 3)).astype(np.uint8)
 
 
-def test_missing_weights_are_told_and_nothing_takes_their_place() -> None:
+def test_missing_weights_are_reported_and_nothing_takes_their_place() -> None:
     optional_metrics = load_optional_metrics(cameras(640, 360), frames=5, device=CPU)
     assert set(optional_metrics.not_available) == {"lpips_alex", "t_lpips", "lpips_vgg"}
     assert ALEX.file in optional_metrics.not_available["t_lpips"]
@@ -59,7 +59,7 @@ def test_missing_weights_are_told_and_nothing_takes_their_place() -> None:
     assert scores["flip"] == flip(noise(1), noise(0))
 
 
-def test_missing_packages_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_packages_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
     optional_metrics = load_optional_metrics(cameras(640, 360), frames=5, device=CPU)
     for name in ("flip", "temporal_flip", "e_warp"):
@@ -74,7 +74,7 @@ def test_missing_packages_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     assert scores["flicker"] == 0.0
 
 
-def test_small_pictures_and_short_streams_are_told() -> None:
+def test_small_pictures_and_short_streams_are_reported() -> None:
     optional_metrics = load_optional_metrics(cameras(48, 32), frames=1, device=CPU)
     assert "161 pixels a side, fewer are those of cam00 (32)" in optional_metrics.not_available["ms_ssim"]
     assert {optional_metrics.not_available[name] for name in TEMPORAL} == {

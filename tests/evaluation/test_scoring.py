@@ -16,7 +16,7 @@ def test_every_pixel_changed_leaves_no_still_one() -> None:
     assert scores.psnr_changed == PSNR_OF_EQUALS
 
 
-def test_pictures_of_different_sizes_are_told() -> None:
+def test_pictures_of_different_sizes_are_reported() -> None:
     small, large = np.zeros((8, 9, 3), np.uint8), np.zeros((16, 18, 3), np.uint8)
     with pytest.raises(CaptureError, match="9x8 pixels .* truth of 18x16"):
         score(small, large, large, backend=reference_backend())

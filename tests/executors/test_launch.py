@@ -32,7 +32,7 @@ def test_it_is_the_same_process() -> None:
     assert process.communicate()[0] == f"{process.pid}\n"
 
 
-def test_a_command_that_is_not_there_is_told_in_a_sentence(tmp_path: Path) -> None:
+def test_a_command_that_is_not_there_is_reported_in_a_sentence(tmp_path: Path) -> None:
     absent = launched("no-such-command")
     assert (absent.returncode, absent.stderr) == (1, "no-such-command cannot be run (No such file or directory).\n")
     (tmp_path / "text").write_text("no program")

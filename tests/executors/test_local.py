@@ -69,7 +69,7 @@ def test_a_task_without_a_gpu_leaves_it_to_those_that_need_one(tmp_path: Path) -
         assert all(ending.done for ending in all_endings(executor).values())
 
 
-def test_a_gpu_that_is_not_there_is_told_at_once() -> None:
+def test_a_gpu_that_is_not_there_is_reported_at_once() -> None:
     with local() as executor, pytest.raises(ConfigError, match="needs 1 GPUs, and a worker here has 0"):
         executor.submit(module("a", "this"), gpus=1)
 

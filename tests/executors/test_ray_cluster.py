@@ -142,7 +142,7 @@ def test_a_cluster_without_a_token_is_not_joined(ray: FakeRay, monkeypatch: pyte
     joined.stop()
 
 
-def test_a_cluster_that_refuses_is_told(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cluster_that_refuses_is_reported(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(**given: Any) -> None:
         raise ConnectionError("Failed to connect")
 
@@ -154,7 +154,7 @@ def test_a_cluster_that_refuses_is_told(ray: FakeRay, monkeypatch: pytest.Monkey
         RayEngine(RayOptions())
 
 
-def test_an_old_ray_or_none_is_told(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_old_ray_or_none_is_reported(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ray, "__version__", "2.51.2", raising=False)
     with pytest.raises(ConfigError, match="Ray 2.51.2 has no token authentication; 2.52 is the first"):
         RayEngine(RayOptions())

@@ -73,7 +73,7 @@ def test_a_run_tells_its_borders_and_records(tmp_path: Path) -> None:
     assert len(run.records) == 4
 
 
-def test_a_worker_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_that_fails_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def failing(paths: list[Path], output: Path, *, device: str) -> Task:
         return Task(output.name, (PYTHON, "-c", "raise SystemExit('no room')"), str(output))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The list of groups comes back, and what is no list of a whole capture is told."""
+"""The list of groups comes back, and what is no list of a whole capture is reported."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -41,7 +41,7 @@ def test_undecided_groups_are_none(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", [b"\n", b"four\n", b"0:4 4\n", b"0-4\n", b"\xff\xfe\n", b"0:4\n8:12\n", b"4:8\n"])
-def test_what_are_no_groups_is_told(tmp_path: Path, text: bytes) -> None:
+def test_what_are_no_groups_is_reported(tmp_path: Path, text: bytes) -> None:
     groups_path(tmp_path / "track").write_bytes(text)
     with pytest.raises(StreamError, match=r"track\.groups"):
         read_groups(tmp_path / "track")

@@ -137,7 +137,7 @@ def test_the_first_frame_is_compared_with_frame_0_and_others_with_the_one_before
 
 
 @pytest.mark.parametrize("index", [FIRST, FIRST + 2])
-def test_short_memory_lowers_the_budget_once_and_is_told(
+def test_short_memory_lowers_the_budget_once_and_is_reported(
     usual: Usual, index: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     made, usual.fails = group(), 1

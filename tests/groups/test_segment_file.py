@@ -196,12 +196,12 @@ def hashed(first: object, end: object) -> bytes:
         (hashed(-1, 3), "frames -1 to before 3"),
     ],
 )
-def test_notes_that_are_none_are_told(tmp_path: Path, note: bytes, why: str) -> None:
+def test_notes_that_are_none_are_reported(tmp_path: Path, note: bytes, why: str) -> None:
     with pytest.raises(StreamError, match=rf"The note of the segment .*g\.sgs does not follow the format \(.*{why}"):
         opened(tmp_path, base().init + packed(NOTE, note))
 
 
-def test_what_is_no_segment_is_told(tmp_path: Path) -> None:
+def test_what_is_no_segment_is_reported(tmp_path: Path) -> None:
     with pytest.raises(StreamError, match="is a stream, not a segment of one; expected what structgstream fit-group"):
         opened(tmp_path, small_stream(2))
     with pytest.raises(StreamError, match=r"g\.sgs is damaged before its first frame: "):

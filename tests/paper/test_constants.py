@@ -82,7 +82,7 @@ def test_what_published_loaders_do_where_the_paper_is_silent() -> None:
     assert [data.scale for data in PAPER_DATA.values()] == [0.5, 1.0, 0.5]
 
 
-def test_another_rig_than_the_papers_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_rig_than_the_papers_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = arc_rig(4)
     assert departures("paper-immersive", rig) == [
         "pictures of 48x32 instead of 1280x960 (--scale 0.5 of the stored)",

@@ -22,11 +22,11 @@ GROUPS = [(0, 4), (4, 8), (8, 12)]
 
 
 def run(given: Job, parts: Parts, executor: TaskQueue | None = None) -> list[Status]:
-    """Drives to the end, and returns what was told."""
-    told: list[Status] = []
+    """Drives to the end, and returns what was reported."""
+    reported: list[Status] = []
     with parts.locked(), workers() if executor is None else executor as queue:
-        assert list(drive(given, parts, queue, listener=told.append)) == GROUPS
-    return told
+        assert list(drive(given, parts, queue, listener=reported.append)) == GROUPS
+    return reported
 
 
 @pytest.fixture(scope="module")
@@ -68,11 +68,11 @@ def test_what_tasks_on_other_machines_print_is_kept_here(tmp_path: Path) -> None
 
 
 def test_states_go_from_waiting_to_done(tmp_path: Path) -> None:
-    told = run(job(tmp_path), Parts(tmp_path / "parts"))
-    assert told[0].stage == "header"
-    assert told[-1].stage == "join"
-    assert set(told[-1].states) == {"done"}
-    counts = [sum(state == "done" for state in status.states) for status in told]
+    reported = run(job(tmp_path), Parts(tmp_path / "parts"))
+    assert reported[0].stage == "header"
+    assert reported[-1].stage == "join"
+    assert set(reported[-1].states) == {"done"}
+    counts = [sum(state == "done" for state in status.states) for status in reported]
     assert counts == sorted(counts)
 
 
@@ -106,7 +106,7 @@ def test_a_segment_that_is_not_what_it_was_is_made_again(undisturbed: Path, tmp_
     assert {name for name in after if after[name] != before[name]} == {victim.name}
 
 
-def test_a_group_that_fails_is_told_and_the_others_are_kept(undisturbed: Path, tmp_path: Path) -> None:
+def test_a_group_that_fails_is_reported_and_the_others_are_kept(undisturbed: Path, tmp_path: Path) -> None:
     given = job(tmp_path)
     bad = replace(given, unit=replace(given.unit, device=("--fail", "4")))
     with pytest.raises(TaskError, match=r"The task group-000004-000008 failed: There was no power\. \(complete output"):
@@ -144,7 +144,7 @@ with Parts(Path({str(parts.folder)!r})).locked():
         assert "StorageError: Another process makes the parts" in other.stderr
 
 
-def test_a_worker_that_does_not_see_the_folder_is_told(tmp_path: Path) -> None:
+def test_a_worker_that_does_not_see_the_folder_is_reported(tmp_path: Path) -> None:
     given = job(tmp_path)
     with pytest.raises(StorageError, match="do all machines see this folder at the same place"):
         run(replace(given, unit=replace(given.unit, program=("true",))), Parts(tmp_path / "parts"))

@@ -37,7 +37,7 @@ def test_a_group_that_was_killed_is_not_measured(folder: Path) -> None:
     assert measured_in(folder).groups == 1
 
 
-def test_a_run_that_is_not_finished_is_told(folder: Path, tmp_path: Path) -> None:
+def test_a_run_that_is_not_finished_is_reported(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no finished parallel run"):
         measured_in(tmp_path / "nothing")
     lines = (folder / "done.jsonl").read_text().splitlines(keepends=True)

@@ -67,6 +67,6 @@ def test_failures_are_tried_again_so_often(store: ObjectFolder, monkeypatch: pyt
             store.read("a")
 
 
-def test_a_url_of_no_scheme_that_is_known_is_told() -> None:
+def test_a_url_of_no_scheme_that_is_known_is_reported() -> None:
     with pytest.raises(StorageError, match="nonsense://a cannot be used as a store"):
         ObjectFolder("nonsense://a")

@@ -45,7 +45,7 @@ def test_a_replay_reads_new_numbers_and_writes_into_the_first_result() -> None:
 
 
 @pytest.mark.needs_cuda
-def test_what_spoils_a_recording_is_told_and_the_next_one_works() -> None:
+def test_what_spoils_a_recording_is_reported_and_the_next_one_works() -> None:
     recorder = GraphMemory(torch.device("cuda")).recorder()
     value = torch.ones(3, device="cuda")
 

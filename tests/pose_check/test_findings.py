@@ -26,7 +26,7 @@ def farther(camera: Camera, factor: float) -> Camera:
     return replace(camera, viewmat=viewmat)
 
 
-def test_three_names_that_went_round_are_told_one_by_one() -> None:
+def test_three_names_that_went_round_are_reported_one_by_one() -> None:
     true = wide_ring(8, degrees=100)
     stated = {**true, "cam1": true["cam4"], "cam4": true["cam6"], "cam6": true["cam1"]}
     (found,) = explained(stated, true=true)
@@ -77,7 +77,7 @@ def test_the_mistake_of_one_camera_is_found_among_all(stated: object, descriptio
     assert description in found.sentence
 
 
-def test_poses_of_another_rig_are_told_as_such() -> None:
+def test_poses_of_another_rig_are_reported_as_such() -> None:
     """Most disagree, and no reading of all poses explains it."""
     true = wide_ring(6)
     generator = np.random.default_rng(1)

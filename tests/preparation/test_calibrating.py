@@ -65,13 +65,13 @@ def test_what_would_have_no_effect_is_refused(tmp_path: Path) -> None:
     there = find_footage(tmp_path)
     given = chosen_method(there, PrepareOptions())
     stills = Footage(tmp_path, {}, {}, {})
-    for method, options, told in (
+    for method, options, reported in (
         ("sfm", PrepareOptions(fps=25), "leave out --fps"),
         ("sfm", PrepareOptions(board_videos=tmp_path), "--calibration board alone"),
         ("board", PrepareOptions(intrinsics="shared"), "by structure from motion alone"),
         (given, PrepareOptions(lens="fisheye"), r"cameras\.json states the lenses, so --lens fisheye has no effect"),
     ):
-        with pytest.raises(ConfigError, match=told):
+        with pytest.raises(ConfigError, match=reported):
             check_used(method, there, options)
     check_used("sfm", stills, PrepareOptions(fps=25))
     check_used("board", there, PrepareOptions(board_videos=tmp_path, lens="brown"))

@@ -144,7 +144,7 @@ def test_another_calibration_is_another_result(room: Path, tmp_path: Path) -> No
     assert isinstance(chosen_method(CameraSteps(changed).find(), options), Calibration)
 
 
-def test_focal_lengths_that_pictures_state_are_told(tmp_path: Path) -> None:
+def test_focal_lengths_that_pictures_state_are_reported(tmp_path: Path) -> None:
     """Pictures of 290 pixels on a diagonal of 400, which is 31.4 mm on film; one camera was held upright."""
     rig, pictures = still_room(3)
     for name in rig:

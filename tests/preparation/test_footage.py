@@ -79,7 +79,7 @@ def test_sound_is_on_the_pictures_clock(tmp_path: Path, delay_seconds: float) ->
     assert np.abs(samples).argmax() / rate == pytest.approx(0.2, abs=0.002)
 
 
-def test_what_is_no_footage_is_told(tmp_path: Path) -> None:
+def test_what_is_no_footage_is_reported(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match=r"is missing; give the folder that holds the cameras' videos"):
         find_footage(tmp_path / "nowhere")
     (tmp_path / "notes.txt").write_text("")
@@ -115,7 +115,7 @@ def test_pictures_of_another_size_are_named(tmp_path: Path) -> None:
         list(footage.pictures("a", [0, 1]))
 
 
-def test_ambiguous_files_are_told(tmp_path: Path) -> None:
+def test_ambiguous_files_are_reported(tmp_path: Path) -> None:
     write_videos(tmp_path / "twice", ["a"], frames=2)
     write_videos(tmp_path / "twice" / "a", ["b"], frames=2)
     with pytest.raises(CaptureError, match=r"b\.mp4 and a\.mp4 in .* are both of camera 'a'|a\.mp4 and b\.mp4"):

@@ -23,7 +23,7 @@ def test_pictures_of_one_moment_by_the_clocks(tmp_path: Path) -> None:
     assert len(shots["b"][1:]) == 2
 
 
-def test_videos_shorter_than_the_offset_are_told(tmp_path: Path) -> None:
+def test_videos_shorter_than_the_offset_are_reported(tmp_path: Path) -> None:
     write_videos(tmp_path, ["a", "b"], frames=10)
     footage = find_footage(tmp_path)
     with pytest.raises(

@@ -77,7 +77,7 @@ def test_the_videos_own_folder_is_no_capture(videos: Path) -> None:
         mark_output(videos / ".." / "take", videos)
 
 
-def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, videos: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_reported(tmp_path: Path, videos: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError, match="cannot be written"):
         mark_output(tmp_path / "file" / "capture", videos)
@@ -185,7 +185,7 @@ def test_folders_come_file_by_file(tmp_path: Path) -> None:
     assert sorted(file.name for file in (tmp_path / "out" / "cam").iterdir()) == ["0.png", "1.png", "2.png"]
 
 
-def test_no_room_is_told(tmp_path: Path) -> None:
+def test_no_room_is_reported(tmp_path: Path) -> None:
     (tmp_path / "a").write_text("film")
     (tmp_path / "file").write_text("")
     with pytest.raises(StorageError, match=r"cannot be linked or copied to .*--link symlink"):

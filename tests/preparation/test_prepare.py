@@ -135,7 +135,7 @@ def test_a_pickle_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "reported"),
     [
         (PrepareOptions(synchronize="none", without=("cam9",)), "no camera 'cam9' to leave out"),
         (PrepareOptions(synchronize="none", held_out=("cam9",)), "no camera 'cam9' to hold out"),
@@ -145,9 +145,9 @@ def test_a_pickle_is_refused(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_options_of_cameras_that_are_not_there(tmp_path: Path, options: PrepareOptions, told: str) -> None:
+def test_options_of_cameras_that_are_not_there(tmp_path: Path, options: PrepareOptions, reported: str) -> None:
     write_room(tmp_path / "videos", cameras=4)
-    with pytest.raises(ConfigError, match=told):
+    with pytest.raises(ConfigError, match=reported):
         prepare_capture(tmp_path / "videos", tmp_path / "out", options=options)
 
 

@@ -130,7 +130,7 @@ def test_refined_and_in_metres(tmp_path: Path) -> None:
     assert across == pytest.approx(scale * float((rig["cam01"].center - rig["cam03"].center).norm()), rel=0.02)
 
 
-def test_a_wrong_calibration_is_told(tmp_path: Path) -> None:
+def test_a_wrong_calibration_is_reported(tmp_path: Path) -> None:
     """Other mistakes: tests/pose_check."""
     write_room(tmp_path / "videos", cameras=8)
     file = tmp_path / "videos" / "cameras.json"
@@ -143,7 +143,7 @@ def test_a_wrong_calibration_is_told(tmp_path: Path) -> None:
     assert "are exchanged" in made.report.read_text()
 
 
-def test_dead_cameras_are_told_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_dead_cameras_are_reported_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_room(tmp_path / "videos", cameras=4, frames=9)
     short = tmp_path / "short"
     write_room(short, cameras=4, frames=4)
@@ -180,7 +180,7 @@ def test_videos_shorter_than_their_offset(tmp_path: Path) -> None:
         prepare_capture(tmp_path / "videos", tmp_path / "out")
 
 
-def test_a_broken_table_of_times_is_told_before_the_calibration(tmp_path: Path) -> None:
+def test_a_broken_table_of_times_is_reported_before_the_calibration(tmp_path: Path) -> None:
     write_videos(tmp_path, ["a", "b", "c"], frames=2)
     (tmp_path / "timestamps.csv").write_text("camera,frame,seconds\na,zero,0\n")
     with pytest.raises(CaptureError, match=r"Line 2 of .*timestamps\.csv is not a camera, a frame number and seconds"):

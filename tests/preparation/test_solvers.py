@@ -69,7 +69,7 @@ def test_single_pictures_have_no_clocks(tmp_path: Path) -> None:
     assert synchronized(footage, PrepareOptions(synchronize="audio")).method == "none"
 
 
-def test_who_asked_for_nothing_is_told_of_none(tmp_path: Path) -> None:
+def test_who_asked_for_nothing_is_reported_none(tmp_path: Path) -> None:
     footage = filmed(tmp_path)
     with pytest.raises(CaptureError, match="--synchronize none") as asked:
         synchronized(footage, PrepareOptions())

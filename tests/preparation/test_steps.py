@@ -96,7 +96,7 @@ def test_killed_at_any_step_of_writing_it_is_done_again_or_was_done(tmp_path: Pa
         assert sorted(path.name for path in (folder / FOLDER).iterdir()) == ["a.json", "a.npz"]
 
 
-def test_a_full_disk_is_told(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported(tmp_path: Path) -> None:
     (tmp_path / FOLDER).write_text("")
     with pytest.raises(StorageError, match=r"step 'a' cannot be written .* it goes on from there"):
         run(Steps(tmp_path, Silent()), "a", 1, [])

@@ -179,7 +179,7 @@ def test_each_frame_is_read_and_prepared_once_and_frame_0_fitted_once(
     ]
     first, second = (one.report.seconds for one in reports[:2])
     assert "rasterise" in first
-    assert "rasterise" not in second, "the seconds of the fit are told once"
+    assert "rasterise" not in second, "the seconds of the fit are reported once"
 
 
 def test_the_list_the_logs_and_the_metrics(tmp_path: Path) -> None:

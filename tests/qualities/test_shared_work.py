@@ -41,7 +41,7 @@ def test_others_wait_for_it_and_not_for_something_else() -> None:
         assert sorted(one.result() for one in both) == [(1, False), (1, True)]
 
 
-def test_an_error_is_told_and_not_kept() -> None:
+def test_an_error_is_reported_and_not_kept() -> None:
     once = Once[int](2)
 
     def fails() -> int:

@@ -111,8 +111,8 @@ def test_an_immutable_file_has_ranges_and_a_validator(server: Served, folder: Pa
     for given in (etag, f"W/{etag}", f'"x", {etag}', "*"):
         known = server.ask(address, If_None_Match=given)
         assert (known.status, known.body, known.headers["etag"]) == (304, b"", etag)
-    told = server.ask(address, method="HEAD")
-    assert (told.status, told.body, told.headers["content-length"]) == (200, b"", str(len(content)))
+    reported = server.ask(address, method="HEAD")
+    assert (reported.status, reported.body, reported.headers["content-length"]) == (200, b"", str(len(content)))
 
 
 def test_the_manifest_has_a_validator(server: Served, folder: Path) -> None:
@@ -180,7 +180,7 @@ def test_who_goes_away_no_longer_waits(tmp_path: Path) -> None:
             time.sleep(0.05)
 
 
-def test_too_many_connections_are_told_to_come_back(tmp_path: Path) -> None:
+def test_too_many_connections_are_reported_to_come_back(tmp_path: Path) -> None:
     GrowingFolder(tmp_path / "studio", STREAM).write()
     with hosted(ServerSettings(tmp_path), connections=2) as server, server.connected() as connection:
         connection.sendall(b"GET /streams/studio/manifest.json?after=1 HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -197,7 +197,7 @@ def test_a_head_does_not_wait(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[1]", b'{"format": "other"}', b"[" * 100_000])
-def test_a_broken_manifest_is_told(folder: Path, content: bytes) -> None:
+def test_a_broken_manifest_is_reported(folder: Path, content: bytes) -> None:
     (folder / "studio" / "manifest.json").write_bytes(content)
     with hosted(ServerSettings(folder)) as server:
         answer = server.ask("/streams/studio/manifest.json")
@@ -315,12 +315,12 @@ def test_several_qualities_of_one_stream(server: Served, folder: Path) -> None:
         assert time.monotonic() < last
         time.sleep(0.05)  # A fast machine would ask too often.
     assert 'src="qualities.json"' in server.ask("/streams/show/").body.decode()
-    told = server.ask("/streams/show/qualities.json")
-    assert list_from_json(told.body, name="it") == tuple(listed)
-    assert (told.headers["cache-control"], told.headers["content-type"]) == ("no-cache", "application/json")
-    assert server.ask("/streams/show/qualities.json", If_None_Match=told.headers["etag"]).status == 304
+    reported = server.ask("/streams/show/qualities.json")
+    assert list_from_json(reported.body, name="it") == tuple(listed)
+    assert (reported.headers["cache-control"], reported.headers["content-type"]) == ("no-cache", "application/json")
+    assert server.ask("/streams/show/qualities.json", If_None_Match=reported.headers["etag"]).status == 304
     write_list(folder / "show", listed[::-1])
-    assert server.ask("/streams/show/qualities.json", If_None_Match=told.headers["etag"]).status == 200
+    assert server.ask("/streams/show/qualities.json", If_None_Match=reported.headers["etag"]).status == 200
     for name in ("low", "high"):
         manifest = manifest_from_json(server.ask(f"/streams/show/{name}/manifest.json").body, name="it")
         part = server.ask(f"/streams/show/{name}/{manifest.parts[0].file}")

@@ -121,7 +121,7 @@ def test_the_bundle_can_be_inlined() -> None:
     assert "</script" not in inline_module(bundle()).lower()
 
 
-def test_a_stream_that_is_too_long_for_a_page_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stream_that_is_too_long_for_a_page_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pages, "MAX_PAGE_STREAM_BYTES", len(STREAM) - 1)
     with pytest.raises(PlayerError, match="structgstream play"):
         single_page("a clip", module="", stream=STREAM)
@@ -141,7 +141,7 @@ def test_it_states_its_licence_and_asks_nobody_for_anything() -> None:
     assert all("www.w3.org" in address for address in addresses), addresses  # names of XML, never fetched
 
 
-def test_an_installation_without_it_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_installation_without_it_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pages, "files", lambda _: tmp_path)
     with pytest.raises(PlayerError, match="reinstall structgstream"):
         bundle()

@@ -121,8 +121,8 @@ def test_a_page_switches_between_the_qualities_of_a_stream(tab: Tab, tmp_path: P
         while np.array_equal(high, low) and time.monotonic() < last:  # A busy machine has not fetched it yet.
             tab.evaluate(f"{player}.seek(0.01), 1")
             high = shown(2)
-        told = numbers()
-    assert answered(told, "segment", "show/high")
-    assert 'status="401"' not in told
+        reported = numbers()
+    assert answered(reported, "segment", "show/high")
+    assert 'status="401"' not in reported
     assert np.abs(low - high).mean() > 5
     assert not tab.complaints

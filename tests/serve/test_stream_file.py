@@ -53,7 +53,7 @@ def test_a_footer_that_points_to_no_index_is_none(file: StreamFile, end: bytes) 
         (STREAM[:8] + b"\x09\x00" + STREAM[10:], "version 9.0"),
     ],
 )
-def test_what_cannot_be_shown_is_told(file: StreamFile, data: bytes, words: str) -> None:
+def test_what_cannot_be_shown_is_reported(file: StreamFile, data: bytes, words: str) -> None:
     file.path.write_bytes(data)
     with pytest.raises(StreamError, match=words):
         file.check()
@@ -61,7 +61,7 @@ def test_what_cannot_be_shown_is_told(file: StreamFile, data: bytes, words: str)
         check_has_header(data, "memory")
 
 
-def test_a_missing_file_is_told(file: StreamFile) -> None:
+def test_a_missing_file_is_reported(file: StreamFile) -> None:
     with pytest.raises(StreamError, match=r"No such file or directory"):
         file.check()
 

@@ -62,7 +62,7 @@ def test_nobody_and_never(source: FrameSource) -> None:
     assert [truth.jpeg(camera, frame) for camera, frame in [("cam01", 0), ("cam00", 12), ("cam00", -1)]] == [None] * 3
 
 
-def test_a_video_that_breaks_is_told_and_asked_again(tmp_path: Path) -> None:
+def test_a_video_that_breaks_is_reported_and_asked_again(tmp_path: Path) -> None:
     folder = tmp_path / "clip"
     shutil.copytree(bundled_clip_path(), folder)
     truth = Truth(open_capture(folder), ("cam00",))

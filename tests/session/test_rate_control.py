@@ -15,7 +15,7 @@ FPS, KEY_EVERY = 30.0, 30
 
 
 class Run:
-    """A controller and what it is told of, in a session's order.
+    """A controller and what it is given, in a session's order.
 
     Args:
         target_mbits: the target.

@@ -45,7 +45,7 @@ class Collected:
 
 
 def moving_pictures(count: int = 12, *, width: int = 128, height: int = 96) -> list[NDArray[np.uint8]]:
-    """A bright block that moves over a smooth ground, so that every picture can be told from the others."""
+    """A bright block that moves over a smooth ground, so that no two pictures are alike."""
     down, across = np.mgrid[:height, :width]
     ground = (40 + 60 * np.sin(across / 20) + 40 * np.cos(down / 15)).clip(0, 255)
     pictures = []

@@ -40,13 +40,13 @@ def test_a_whole_wheel_is_accepted(contents: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     "name", ["structgstream/py.typed", "structgstream/_native/cuda/ssim.cu", "structgstream/flow.py"]
 )
-def test_a_missing_file_is_told(contents: dict[str, Any], name: str) -> None:
+def test_a_missing_file_is_reported(contents: dict[str, Any], name: str) -> None:
     wanted = contents["sources"]()
     names = (wanted | set(contents["NEEDED"])) - {name}
     assert contents["problems"](names, wanted) == [f"The wheel lacks {name}."]
 
 
-def test_a_file_too_many_is_told(contents: dict[str, Any]) -> None:
+def test_a_file_too_many_is_reported(contents: dict[str, Any]) -> None:
     wanted = contents["sources"]()
     names = wanted | set(contents["NEEDED"]) | {"tests/conftest.py"}
     assert contents["problems"](names, wanted) == [

@@ -28,7 +28,7 @@ def textured(height: int = 120, width: int = 160) -> np.ndarray:
     return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2.5), np.empty_like(noise), 0, 255, cv2.NORM_MINMAX)
 
 
-def test_a_shifted_patch_is_told_at_half_the_size_in_whole_pixels() -> None:
+def test_a_shifted_patch_is_reported_at_half_the_size_in_whole_pixels() -> None:
     first = textured()
     second = first.copy()
     second[40:80, 56:106] = first[40:80, 50:100]  # six to the right

@@ -102,11 +102,11 @@ def test_directions_of_features_are_independent_and_worth_the_same() -> None:
 
 
 def test_the_worth_of_another_gauge_is_that_of_the_numbers_there() -> None:
-    """Of features the sum over an anchor is told, of all other fields every number."""
-    scene, told = after()
+    """Of features the sum over an anchor is reported, of all other fields every number."""
+    scene, reported = after()
     found = estimate_sensitivity(scene, RIG, backend=BACKEND, seed=0)
-    assert torch.equal(found.used, told.used)
-    one, other = found.fields, told.fields
+    assert torch.equal(found.used, reported.used)
+    one, other = found.fields, reported.fields
     for name in ("anchor_offsets", "base_scales"):
         torch.testing.assert_close(one[name], other[name], rtol=2e-2, atol=1e-4 * float(one[name].max()))
     torch.testing.assert_close(one["anchor_features"].sum(), other["anchor_features"].sum(), rtol=2e-2, atol=0)

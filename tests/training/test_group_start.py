@@ -84,7 +84,7 @@ def test_tracked_positions_and_two_rounds_reach_the_far_frame() -> None:
     assert tracked.counts["corrected"] > 0
 
 
-def test_it_has_the_iterations_of_eleven_online_frames_unless_told() -> None:
+def test_it_has_the_iterations_of_eleven_online_frames_unless_asked() -> None:
     world = scenery(movers=20)
     config = replace(CONFIG, iterations=3)
     usual = replace(START, iterations=None, rounds=3)

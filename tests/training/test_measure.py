@@ -63,7 +63,7 @@ def test_weighed_ones_are_what_a_gaussian_covers_and_what_is_in_front_takes_from
     ball = emerging_ball(0.99)
     before = replace(ball, means=torch.tensor([[0.0, 0.0, -1.5]]), scales=torch.full((1, 3), 0.4))
     covered = accumulate(gaussians, CAMERA, maps, BACKEND, static=before)
-    assert covered.shape == alone.shape, "what hides is not told of"
+    assert covered.shape == alone.shape, "what hides is not reported"
     assert float(covered.sum()) < 0.8 * float(alone.sum())
     assert (covered <= alone + 1e-4).all()
     together = concatenate(gaussians, before)

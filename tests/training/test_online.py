@@ -132,7 +132,7 @@ def test_a_lifetime_of_one_frame_starts_without_free_gaussians() -> None:
     assert (second.scene.free.births >= 2 * IDS_PER_FRAME).all()
 
 
-def test_progress_is_told_after_every_iteration() -> None:
+def test_progress_is_reported_after_every_iteration() -> None:
     steps: list[Step] = []
     world = moving_world(2)
     result = fit(world.scene, world, 1, on_step=steps.append)

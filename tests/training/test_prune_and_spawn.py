@@ -111,7 +111,7 @@ def test_off_nothing_is_born() -> None:
     assert found.kept.all()
 
 
-def test_when_everything_is_missing_nothing_is_born_and_that_is_told() -> None:
+def test_when_everything_is_missing_nothing_is_born_and_that_is_reported() -> None:
     found = renewed(quickest_backend(), config=varied(CONFIG, RULES=replace(CONFIG.RULES, max_missing_share=1e-4)))
     assert found.refused
     assert len(found.new_free) == 0
@@ -198,7 +198,7 @@ def test_the_second_sweep_bears_nothing_where_it_would_bear_more_than_thin_conte
         assert found.counts["refused thin"] == number - born, "counted in the log"
 
 
-def test_a_cap_that_makes_births_coarser_is_told_in_the_log() -> None:
+def test_a_cap_that_makes_births_coarser_is_reported_in_the_log() -> None:
     free = len(renewed(quickest_backend(), config=CONFIG).new_free)
     capped = renewed(quickest_backend(), config=replace(CONFIG, most=free - 1))
     assert 0 < len(capped.new_free) < free

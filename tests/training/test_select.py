@@ -90,7 +90,7 @@ def test_what_moved_before_moves_more_easily() -> None:
     assert torch.equal(moved[20:], first[20:])
 
 
-def test_what_changed_is_told_by_row_and_by_birth() -> None:
+def test_what_changed_is_reported_by_row_and_by_birth() -> None:
     older = random_scene(6, free=4)
     births = torch.tensor([1, 4, 6, 9])
     older = replace(older, free=replace(older.free, births=births))

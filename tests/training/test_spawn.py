@@ -132,7 +132,7 @@ def test_where_there_are_too_many_births_are_coarser() -> None:
     rules = replace(RULES, overflow="coarser", most=9, min_hits=1)
     found = _merge_points(lines(4, 8, 3), torch.rand(15, 3), torch.ones(15), first_birth=0, rules=rules)
     assert (0 < len(found.free) <= 9, found.refused_count) == (True, 0)
-    assert found.merged_count == 15 - len(found.free), "a cap that binds is told"
+    assert found.merged_count == 15 - len(found.free), "a cap that binds is reported"
     assert float(found.free.log_scales.mean()) > float(torch.tensor(RULES.size).log())
     unbound = replace(rules, most=15)
     assert (

@@ -74,7 +74,7 @@ def test_what_stands_still_keeps_its_bits() -> None:
     assert (found.moved, float(found.velocities.abs().max())) == (0, 0.0)
 
 
-def test_cameras_are_taken_in_turn_and_the_change_is_told() -> None:
+def test_cameras_are_taken_in_turn_and_the_change_is_reported() -> None:
     scenery = world()
     chosen = tracker(scenery, replace(CONFIG, cameras=3))
     first = chosen.pictures(scenery.frames[0], None)

@@ -246,7 +246,7 @@ def streamed(header: StreamHeader, scenes: Sequence[Scene], kinds: Sequence[Pack
     return sink.data
 
 
-def told(scenes: Sequence[Scene], kinds: Sequence[PacketKind]) -> dict[str, Any]:
+def reported(scenes: Sequence[Scene], kinds: Sequence[PacketKind]) -> dict[str, Any]:
     """What is in a stream, as plain values: tensors as shape and flat list, in the order of the state table."""
     frames = []
     for index, (scene, kind) in enumerate(zip(scenes, kinds, strict=True)):
@@ -289,11 +289,11 @@ def main() -> None:
     raw, compact = [golden_scene(i) for i in range(3)], [compact_scene(i) for i in range(6)]
     files = {
         STREAM: golden_stream(),
-        EXPECTED: (json.dumps(told(raw, KINDS)) + "\n").encode(),
+        EXPECTED: (json.dumps(reported(raw, KINDS)) + "\n").encode(),
         COMPACT_STREAM: compact_stream(),
-        COMPACT_EXPECTED: (json.dumps(told(compact, COMPACT_KINDS)) + "\n").encode(),
+        COMPACT_EXPECTED: (json.dumps(reported(compact, COMPACT_KINDS)) + "\n").encode(),
         PERIODS_STREAM: periods_stream(),
-        PERIODS_EXPECTED: (json.dumps(told(periods_scenes(), PERIODS_KINDS)) + "\n").encode(),
+        PERIODS_EXPECTED: (json.dumps(reported(periods_scenes(), PERIODS_KINDS)) + "\n").encode(),
     }
     for path, data in files.items():
         if not path.exists():

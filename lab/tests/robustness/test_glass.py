@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stages of frames from what run, manifests and page told."""
+"""Stages of frames from what run, manifests and page reported."""
 
 from pathlib import Path
 from typing import Any

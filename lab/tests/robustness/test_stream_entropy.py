@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from lab.stream_entropy import counted_init, packet_bytes, told
+from lab.stream_entropy import counted_init, packet_bytes, reported
 from structgstream.codec.entropy.adaptive import AdaptiveDecoder
 from structgstream.codec.entropy.section_coder import SectionDecoder
 from structgstream.codec.reader import open_stream
@@ -37,8 +37,8 @@ def test_bytes_of_packets_add_up(stream: str) -> None:
     assert found["anchor_positions.change"] > 100
 
 
-def test_what_is_told(stream: str) -> None:
-    lines = told(stream).splitlines()
+def test_what_is_reported(stream: str) -> None:
+    lines = reported(stream).splitlines()
     assert lines[0] == stream
     assert lines[1].startswith("  init record: ")
     assert lines[1].endswith(" % over")

@@ -32,7 +32,7 @@ def test_pieces_are_those_of_bytes(path: Path, key: slice) -> None:
     )
 
 
-def test_what_is_appended_is_not_seen_and_what_is_cut_is_told_of(path: Path) -> None:
+def test_what_is_appended_is_not_seen_and_what_is_cut_is_reported(path: Path) -> None:
     stored = FileBytes(path)
     with path.open("ab") as file:
         file.write(b"more")

@@ -85,7 +85,7 @@ def test_numbers_that_no_decoder_takes_are_refused_by_the_encoder() -> None:
         ({"a": 9}, "bytes of a, which are not all"),
     ],
 )
-def test_damage_is_told_with_its_place(change: dict[str, bytes | int | None], words: str) -> None:
+def test_damage_is_reported_with_its_place(change: dict[str, bytes | int | None], words: str) -> None:
     """A field that is missing, too short, senseless, or goes on where it should end."""
     fields = encoded()
     for name, data in change.items():

@@ -220,7 +220,7 @@ def test_states_that_do_not_come_home_are_refused(native) -> None:
         decode(b"\x14\x00" + struct.pack("<I", (1 << 16) + 1), context, tables, native=native)
 
 
-def test_an_encoder_is_told_what_does_not_fit() -> None:
+def test_an_encoder_is_reported_what_does_not_fit() -> None:
     tables = FrequencyTables(np.array([[4095, 1, 0]], np.uint16))
     zero = np.zeros(2, np.uint16)
     cases: list[tuple[list[int], np.ndarray, str]] = [

@@ -41,7 +41,7 @@ def test_what_is_written_is_read(naturals: list[int], residuals: list[int]) -> N
     back.end()
 
 
-def test_what_is_left_over_is_told() -> None:
+def test_what_is_left_over_is_reported() -> None:
     writer = SectionEncoder(Tables())
     writer.number("one.count", 5)
     with pytest.raises(StreamError, match="Packet 0 has more bytes of one than it should"):

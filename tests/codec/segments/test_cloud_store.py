@@ -43,7 +43,7 @@ def test_objects_are_written_replaced_listed_and_removed(server: Emulator) -> No
         store.get(MANIFEST)
 
 
-def test_browsers_are_told_what_may_be_cached(server: Emulator) -> None:
+def test_browsers_are_reported_what_may_be_cached(server: Emulator) -> None:
     store = s3(server, "headers")
     written(store, SENT[:1])
     found = {}
@@ -65,8 +65,8 @@ def test_a_stream_is_written_to_s3_stopped_continued_and_archived(server: Emulat
 
 
 def test_an_outage_of_s3_costs_nothing(server: Emulator, tmp_path: Path) -> None:
-    here, told = folder(tmp_path / "here"), []
-    mirror = MirroredStore(here, s3(server, "outage"), options=MirrorOptions(report=told.append))
+    here, reported = folder(tmp_path / "here"), []
+    mirror = MirroredStore(here, s3(server, "outage"), options=MirrorOptions(report=reported.append))
 
     def outage(frame: int) -> None:
         if frame == 2:
@@ -85,7 +85,7 @@ def test_an_outage_of_s3_costs_nothing(server: Emulator, tmp_path: Path) -> None
     assert (tmp_path / "a.sgs").read_bytes() == as_file(SENT)
 
 
-def test_what_cannot_be_reached_is_told_in_words(server: Emulator) -> None:
+def test_what_cannot_be_reached_is_reported_in_words(server: Emulator) -> None:
     store = CloudStore(f"s3://no-such-bucket-{BUCKET}/x", **server.options)
     with pytest.raises(StorageError, match="Cannot write 1 bytes to manifest.json in s3://no-such-bucket"):
         store.put(MANIFEST, b"1")

@@ -77,9 +77,9 @@ def test_everything_is_copied_and_every_manifest_is_whole(tmp_path: Path) -> Non
 
 def test_the_writer_goes_on_while_the_other_store_cannot_be_reached(tmp_path: Path) -> None:
     here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
-    told: list[str] = []
+    reported: list[str] = []
     remote.reachable.clear()
-    mirror = MirroredStore(here, remote, options=MirrorOptions(report=told.append))
+    mirror = MirroredStore(here, remote, options=MirrorOptions(report=reported.append))
     written(mirror, SENT)
     for _ in range(2):
         assert remote.refused.acquire(timeout=60)
@@ -89,12 +89,12 @@ def test_the_writer_goes_on_while_the_other_store_cannot_be_reached(tmp_path: Pa
     assert mirror.finish(wait_seconds=60) == 0
     assert named(remote) == named(here)
     assert remote.edges == [8]  # Those before were replaced while they waited.
-    assert len(told) == 2
-    assert "cannot be reached (No route to host.); the stream goes on in" in told[0]
-    assert "can be reached again" in told[1]
+    assert len(reported) == 2
+    assert "cannot be reached (No route to host.); the stream goes on in" in reported[0]
+    assert "can be reached again" in reported[1]
 
 
-def test_what_was_not_copied_is_told_and_copied_by_the_next_run(tmp_path: Path) -> None:
+def test_what_was_not_copied_is_reported_and_copied_by_the_next_run(tmp_path: Path) -> None:
     here, remote = folder(tmp_path / "here"), Remote(tmp_path / "remote")
     remote.reachable.clear()
     mirror = MirroredStore(here, remote)
@@ -124,18 +124,18 @@ def test_another_stream_is_never_replaced(tmp_path: Path, marked: bool) -> None:
 
 
 def test_another_stream_that_is_found_after_an_outage_is_not_replaced(tmp_path: Path) -> None:
-    remote, told = Remote(tmp_path / "remote"), list[str]()
+    remote, reported = Remote(tmp_path / "remote"), list[str]()
     first = MirroredStore(folder(tmp_path / "first"), remote)
     written(first, packets(4))
     assert first.finish(wait_seconds=60) == 0
     before = contents(remote)
-    options = MirrorOptions(grace_seconds=0.0, report=told.append)
+    options = MirrorOptions(grace_seconds=0.0, report=reported.append)
     second = MirroredStore(folder(tmp_path / "second"), remote, options=options)
     written(second, SENT)
     assert second.finish(wait_seconds=1.0) > 0
     assert contents(remote) == before
-    assert len(told) == 1
-    assert "did not send" in told[0]
+    assert len(reported) == 1
+    assert "did not send" in reported[0]
 
 
 def contents(store: FolderStore) -> dict[str, bytes]:
@@ -194,7 +194,7 @@ def test_a_file_that_is_to_go_while_it_is_copied_goes_when_its_manifest_is_there
     written(here, SENT[:1])  # ends with a short segment, which another run replaces
     (short,) = (name for name in here.names() if name.startswith("segment"))
     inside, done = threading.Event(), threading.Event()
-    told: list[str] = []
+    reported: list[str] = []
 
     def before(name: str) -> None:
         if name != MARKER:
@@ -202,7 +202,7 @@ def test_a_file_that_is_to_go_while_it_is_copied_goes_when_its_manifest_is_there
             assert done.wait(60)
 
     remote.before = before
-    mirror = MirroredStore(here, remote, options=MirrorOptions(report=told.append))
+    mirror = MirroredStore(here, remote, options=MirrorOptions(report=reported.append))
     mirror.copy_all()
     assert inside.wait(60)
     written(mirror, SENT, options=SegmentsOptions(grace_seconds=0.5))
@@ -210,7 +210,7 @@ def test_a_file_that_is_to_go_while_it_is_copied_goes_when_its_manifest_is_there
     done.set()
     assert mirror.finish(wait_seconds=60) == 0
     assert remote.edges == [0, 8]  # The remote raises where a manifest names what is not there.
-    assert told == []
+    assert reported == []
     assert short not in here.names()
     assert named(remote) == named(here)
 

@@ -55,14 +55,14 @@ def test_other_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("size", "told"), [((3, 3), "3x3 with 6 numbers"), ((9999, 9999), "9999x9999"), ((-2, -3), "-2x-3")]
+    ("size", "reported"), [((3, 3), "3x3 with 6 numbers"), ((9999, 9999), "9999x9999"), ((-2, -3), "-2x-3")]
 )
-def test_matrices_of_another_size_than_stated(tmp_path: Path, size: tuple[int, int], told: str) -> None:
+def test_matrices_of_another_size_than_stated(tmp_path: Path, size: tuple[int, int], reported: str) -> None:
     """OpenCV writes beyond its memory here."""
     file = written(tmp_path / "rig.yml")
     text = file.read_text().replace("rows: 2", f"rows: {size[0]}", 1).replace("cols: 3", f"cols: {size[1]}", 1)
     file.write_text(text)
-    with pytest.raises(Unreadable, match=f"a matrix of {told}"):
+    with pytest.raises(Unreadable, match=f"a matrix of {reported}"):
         read_storage(file)
 
 

@@ -33,7 +33,7 @@ def test_what_was_wrong_in_a_clause(error: Exception, said: str) -> None:
     assert str(found.value) == f"rig.json cannot be read ({said}); expected fx and fy."
 
 
-def test_what_is_told_already_is_not_told_again() -> None:
+def test_what_is_reported_already_is_not_reported_again() -> None:
     with pytest.raises(CalibrationError, match="^as it is$"), readable(FILE, "more"):
         raise CalibrationError("as it is")
     with pytest.raises(AssertionError), readable(FILE, "more"):

@@ -156,7 +156,7 @@ def test_a_picture_of_other_proportions_is_left_out(caplog: pytest.LogCaptureFix
     assert "64x96 pixels, its calibration is for 128x96" in caplog.text
 
 
-def test_a_reduced_picture_is_taken_and_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_reduced_picture_is_taken_and_reported(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         received, faults = read(sent_stream("size:0.8:0.4"))
     assert {(p.content.width, p.content.height) for p in received.pictures} == {(128, 96), (64, 48)}
@@ -180,7 +180,7 @@ def test_a_picture_that_stands_still_is_left_out_if_others_change(still: bool) -
 
 
 @pytest.mark.parametrize("fault", ["jump", "back"])
-def test_a_clock_that_is_set_is_told_and_the_pictures_go_on(fault: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_clock_that_is_set_is_reported_and_the_pictures_go_on(fault: str, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         received, faults = read(sent_stream(f"{fault}:0.8:0.4"))
     assert faults["jump"] == 2
@@ -224,13 +224,15 @@ def test_waits_grow_to_a_limit() -> None:
     assert received.waits == [1.0, 2.0, 4.0, 8.0, 8.0, 8.0, 8.0, 8.0]
 
 
-def test_an_error_of_the_network_is_told_in_words(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_error_of_the_network_is_reported_in_words(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         read(av.error.ExitError(1414092869, "Immediate exit requested", "udp://nowhere"))
     assert "is gone (nothing came for 5 s)" in caplog.text
 
 
-def test_an_error_that_nobody_expects_is_told_and_the_camera_is_opened_again(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_error_that_nobody_expects_is_reported_and_the_camera_is_opened_again(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     received, faults = read(RuntimeError("what is this?"), sent_stream(frames=24))
     assert received.numbers == [*range(12), *range(12)]
     assert faults["gone"] == 2

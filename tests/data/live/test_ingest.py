@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras of files at work, and what is told of those that are out of step."""
+"""Cameras of files at work, and what is reported of those out of step."""
 
 import re
 import threading

@@ -194,9 +194,9 @@ def test_a_file_that_cannot_be_read_is_absent_and_the_stream_ends(
         frames = list(LiveSource(path, tmp_path / "x.sgs", LiveOptions()).frames())
     assert len(frames) >= 20
     assert all([*frame.images] == ["b", "c"] for frame in frames)
-    (told,) = [text for text in caplog.messages if "camera 'a'" in text]
-    assert f"its file {tmp_path / 'a.ts'} cannot be read (" in told
-    assert "correct its url in the rig file, or give follow = true" in told
+    (reported,) = [text for text in caplog.messages if "camera 'a'" in text]
+    assert f"its file {tmp_path / 'a.ts'} cannot be read (" in reported
+    assert "correct its url in the rig file, or give follow = true" in reported
     assert "have come to their end" in caplog.text
 
 

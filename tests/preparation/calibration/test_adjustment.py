@@ -52,7 +52,7 @@ def guessed(truth: SolvedCalibration) -> SolvedCalibration:
     return replace(truth, cameras=cameras)
 
 
-def test_lenses_of_phones_are_told_from_focal_lengths(caplog: pytest.LogCaptureFixture) -> None:
+def test_lenses_of_phones_are_reported_from_focal_lengths(caplog: pytest.LogCaptureFixture) -> None:
     truth, wrong = rig()
     with caplog.at_level(logging.INFO):
         found = adjust_together(guessed(truth), lens=range(CAMERAS), free=FREE, limits=LIMITS)

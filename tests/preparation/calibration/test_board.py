@@ -110,12 +110,12 @@ def test_a_row_of_corners_is_no_sighting() -> None:
     assert [sight.instant for sight in found["cam00"]] == [0, 1, 3, 4]
 
 
-def test_too_few_sightings_are_told_with_their_number() -> None:
+def test_too_few_sightings_are_reported_with_their_number() -> None:
     pictures = {**filmed(), "cam01": [*filmed()["cam01"][:3], *[np.full((270, 360, 3), 127, np.uint8)] * 2]}
     with pytest.raises(CalibrationError, match=r"'cam01' in 3 of 5 pictures, where 4 with 6 corners each are needed"):
         board_sightings(pictures, BOARD)
 
 
-def test_more_markers_than_the_board_has_are_told() -> None:
+def test_more_markers_than_the_board_has_are_reported() -> None:
     with pytest.raises(CalibrationError, match=r"markers up to number 21, a board of 9 x 4 squares has 18"):
         board_sightings(filmed(), Board(9, 4, 0.09))

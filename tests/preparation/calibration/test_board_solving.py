@@ -101,7 +101,7 @@ def test_a_camera_that_sees_it_at_other_instants_only_is_named() -> None:
         solve_board(apart, BOARD, lens="pinhole")
 
 
-def test_a_board_of_another_dictionary_is_told_by_its_name() -> None:
+def test_a_board_of_another_dictionary_is_reported_by_its_name() -> None:
     pictures = {name: shots[:2] for name, shots in filmed("pinhole")[1].items()}
     with pytest.raises(CalibrationError, match="given as of DICT_6X6_100, but the pictures show markers of DICT_5X5"):
         solve_board(pictures, Board(7, 5, 0.12, dictionary="DICT_6X6_100"), lens="pinhole")

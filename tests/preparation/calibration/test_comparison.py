@@ -29,7 +29,7 @@ def test_the_same_rig_elsewhere_and_larger_has_no_errors() -> None:
         assert (error.focal_percent, error.lens_pixels) == pytest.approx((0, 0), abs=1e-6)
 
 
-def test_a_turned_camera_is_told_by_its_angle() -> None:
+def test_a_turned_camera_is_reported_by_its_angle() -> None:
     """One of six: the rotation of the others is the rig's, by most of the angle."""
     turned = RIG | {"cam02": changed(RIG["cam02"], degrees=0.6)}
     errors = calibration_errors({name: MOVED.filmed(filmed) for name, filmed in turned.items()}, RIG)
@@ -37,7 +37,7 @@ def test_a_turned_camera_is_told_by_its_angle() -> None:
     assert errors["cam05"].rotation_degrees == pytest.approx(0.1, abs=0.02)
 
 
-def test_a_moved_camera_is_told_in_percent_of_the_radius() -> None:
+def test_a_moved_camera_is_reported_in_percent_of_the_radius() -> None:
     viewmat = RIG["cam02"].camera.viewmat.clone()
     viewmat[0, 3] += 0.02 * 2.0
     moved = RIG | {"cam02": replace(RIG["cam02"], camera=replace(RIG["cam02"].camera, viewmat=viewmat))}
@@ -47,7 +47,7 @@ def test_a_moved_camera_is_told_in_percent_of_the_radius() -> None:
     assert error == pytest.approx(100 * 0.04 / radius, rel=0.25)
 
 
-def test_focal_lengths_are_told_with_their_sign_and_in_pixels() -> None:
+def test_focal_lengths_are_reported_with_their_sign_and_in_pixels() -> None:
     wide, long = changed(RIG["cam02"], focal=0.98), changed(RIG["cam02"], focal=1.01)
     assert calibration_errors(RIG | {"cam02": wide}, RIG)["cam02"].focal_percent == pytest.approx(-2)
     assert calibration_errors(RIG | {"cam02": long}, RIG)["cam02"].focal_percent == pytest.approx(1)

@@ -9,7 +9,7 @@ from structgstream.preparation.calibration.matching import all_matches, guided_m
 from tests.support.repetitive import POINTS, keypoints_of, ring
 
 
-def test_what_looks_alike_is_told_apart_by_epipolar_lines() -> None:
+def test_what_looks_alike_is_distinguished_by_epipolar_lines() -> None:
     cameras = ring()
     keypoints = keypoints_of(cameras)
     alone = all_matches(keypoints, workers=1)

@@ -89,7 +89,7 @@ def test_the_camera_that_was_turned_is_named() -> None:
     assert check.report.cameras["cam02"].reprojection_pixels > 2  # type: ignore[operator]
 
 
-def test_exchanged_names_are_told() -> None:
+def test_exchanged_names_are_reported() -> None:
     def swap(cameras: Cameras) -> None:
         cameras["cam01"], cameras["cam05"] = cameras["cam05"], cameras["cam01"]
 
@@ -112,7 +112,7 @@ def flipped(cameras: Cameras) -> None:
 @pytest.mark.parametrize(
     ("change", "message"), [(inverted, "camera to world in place of world to camera"), (flipped, "OpenGL axes")]
 )
-def test_a_convention_of_all_poses_is_told(change: Callable[[Cameras], None], message: str) -> None:
+def test_a_convention_of_all_poses_is_reported(change: Callable[[Cameras], None], message: str) -> None:
     (sentence,) = errors(checked(change))
     assert message in sentence
     assert "all cameras" in sentence
@@ -126,7 +126,7 @@ def test_a_convention_of_all_poses_is_told(change: Callable[[Cameras], None], me
         (lambda camera: scaled(camera, 0.5), "intrinsics of a picture of 80x60 pixels, its pictures have 160x120"),
     ],
 )
-def test_a_mistake_of_one_camera_is_told(change: Callable[[Camera], Camera], message: str) -> None:
+def test_a_mistake_of_one_camera_is_reported(change: Callable[[Camera], Camera], message: str) -> None:
     def mistake(cameras: Cameras) -> None:
         cameras["cam03"] = change(cameras["cam03"])
 
@@ -135,7 +135,7 @@ def test_a_mistake_of_one_camera_is_told(change: Callable[[Camera], Camera], mes
     assert message in found[0].sentence
 
 
-def test_a_near_plane_behind_the_scene_is_told() -> None:
+def test_a_near_plane_behind_the_scene_is_reported() -> None:
     def far(cameras: Cameras) -> None:
         for name, camera in cameras.items():
             cameras[name] = replace(camera, near=300.0)
@@ -145,7 +145,7 @@ def test_a_near_plane_behind_the_scene_is_told() -> None:
     assert "different units" in sentence
 
 
-def test_positions_in_millimetres_are_told() -> None:
+def test_positions_in_millimetres_are_reported() -> None:
     def large(cameras: Cameras) -> None:
         for name, camera in cameras.items():
             cameras[name] = replace(moved(camera, 1000.0), near=300.0)
@@ -154,7 +154,7 @@ def test_positions_in_millimetres_are_told() -> None:
     assert "millimetres" in sentence
 
 
-def test_points_of_another_unit_are_told() -> None:
+def test_points_of_another_unit_are_reported() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform([-0.5, -0.4, 0.3], [0.5, 0.6, 1.5], (200, 3))
     assert not errors(checked(points=points))
@@ -162,7 +162,7 @@ def test_points_of_another_unit_are_told() -> None:
     assert "1000 times too large (millimetres among metres)" in sentence
 
 
-def test_points_that_were_estimated_with_a_camera_of_another_unit_are_not_told_beside_it() -> None:
+def test_points_that_were_estimated_with_a_camera_of_another_unit_are_not_reported_beside_it() -> None:
     def mistake(cameras: Cameras) -> None:
         cameras["cam03"] = moved(cameras["cam03"], 1000.0)
 
@@ -185,7 +185,7 @@ def test_exposure_is_measured() -> None:
     assert any("Exposure differs" in finding.sentence and "'cam04'" in finding.sentence for finding in after.findings)
 
 
-def test_a_camera_that_was_bumped_in_between_is_told() -> None:
+def test_a_camera_that_was_bumped_in_between_is_reported() -> None:
     rig, frame = room()
     shifted = {**frame.images, "cam06": np.roll(frame.images["cam06"], (5, 9), axis=(0, 1))}
     source = MemoryCapture(rig, [frame, replace(frame, index=1, images=shifted)])
@@ -195,7 +195,7 @@ def test_a_camera_that_was_bumped_in_between_is_told() -> None:
     assert shift == pytest.approx(np.hypot(5, 9), abs=0.5)
 
 
-def test_cameras_without_overlap_are_told() -> None:
+def test_cameras_without_overlap_are_reported() -> None:
     rig, frame = room()
     blind = {name: room_frame(rig, textured=False).images[name] for name in ("cam00", "cam01")}
     check = check_capture(MemoryCapture(rig, [replace(frame, images={**frame.images, **blind})]))

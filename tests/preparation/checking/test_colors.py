@@ -64,7 +64,7 @@ def test_findings_name_the_cameras_with_their_stops() -> None:
     assert color_findings({name: color for name, color in colors.items() if name in "abe"}) == []
 
 
-def test_the_worst_of_many_are_told_first() -> None:
+def test_the_worst_of_many_are_reported_first() -> None:
     colors = {f"cam{number}": Color(0.5 + 0.1 * number, 0.0, 0.0) for number in range(8)}
     (found,) = color_findings(colors)
     assert "'cam7' +1.20, 'cam6' +1.10" in found.sentence

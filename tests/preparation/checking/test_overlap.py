@@ -28,22 +28,22 @@ def test_cameras_are_counted_that_have_a_point_in_their_picture() -> None:
 
 
 @examples(60)
-@example({("cam0", "cam1"), ("cam2", "cam3")})  # two groups of one size: one of them is told
+@example({("cam0", "cam1"), ("cam2", "cam3")})  # two groups of one size: one of them is reported
 @given(st.sets(st.sampled_from(EVERY), min_size=1))
 def test_groups_are_those_of_the_graph(pairs: set[tuple[str, str]]) -> None:
-    """All groups but the largest are told, single cameras together; so is who has one neighbour."""
+    """All groups but the largest are reported, single cameras together; so is who has one neighbour."""
     ends = np.array([[NAMES.index(name) for name in pair] for pair in sorted(pairs)]).T
     graph = coo_matrix((np.ones(len(pairs)), ends), shape=(len(NAMES), len(NAMES)))
     count, label = connected_components(graph, directed=False)
     findings = overlap_findings(pairs, NAMES)
     apart = [finding for finding in findings if "no matches" in finding.sentence]
-    told = [set(finding.cameras) for finding in apart]
+    reported = [set(finding.cameras) for finding in apart]
     groups = [{name for name, own in zip(NAMES, label, strict=True) if own == group} for group in range(count)]
     single = [group for group in groups if len(group) == 1]
     together = set().union(*single)
-    assert len(told) == count - 1 - max(len(single) - 1, 0)
-    assert all(group in groups or group == together for group in told)
-    whole = set(NAMES) - set().union(*told)
+    assert len(reported) == count - 1 - max(len(single) - 1, 0)
+    assert all(group in groups or group == together for group in reported)
+    whole = set(NAMES) - set().union(*reported)
     assert len(whole) == max(map(len, groups))
     alone = {finding.cameras for finding in findings if "1 other camera only" in finding.sentence}
     assert alone == {(name,) for name, number in overlaps(pairs, NAMES).items() if number == 1 and name in whole}

@@ -55,9 +55,9 @@ def test_a_slow_clock_drops_nothing(tmp_path: Path) -> None:
     (at,) = passed[slow]
     assert 20 < at < 90
     assert {name: list(frames) for name, frames in passed.items()} == {slow: [at], lossy: [at]}
-    told, dropped = presence_findings(presence, source.fps, passed=passed)
-    assert (told.severity, told.cameras) == ("note", (slow, lossy))
-    assert f"{slow!r} 1, the first at {at / source.fps:.2f} s" in told.sentence
+    reported, dropped = presence_findings(presence, source.fps, passed=passed)
+    assert (reported.severity, reported.cameras) == ("note", (slow, lossy))
+    assert f"{slow!r} 1, the first at {at / source.fps:.2f} s" in reported.sentence
     assert (dropped.severity, dropped.cameras) == ("warning", (lossy,))
     assert "lacks 1 of" in dropped.sentence
 
@@ -72,7 +72,7 @@ def test_all_and_nothing(present: list[bool]) -> None:
     )  # fmt: skip
 
 
-def test_cameras_that_are_stopped_by_hand_are_told_of_once() -> None:
+def test_cameras_that_are_stopped_by_hand_are_reported_once() -> None:
     """Three of four end 2 to 14 frames of 300 early; one ends 30 early, which costs a second."""
     presence = {name: np.arange(300) < end for name, end in (("a", 300), ("b", 298), ("c", 286), ("d", 270))}
     note, warning = presence_findings(presence, 30.0)
@@ -83,7 +83,7 @@ def test_cameras_that_are_stopped_by_hand_are_told_of_once() -> None:
     assert "ends with frame 269" in warning.sentence
 
 
-def test_what_is_dropped_is_told_of_a_camera_that_ends_a_little_early() -> None:
+def test_what_is_dropped_is_reported_a_camera_that_ends_a_little_early() -> None:
     present = np.arange(300) < 295
     present[100:103] = False
     note, warning = presence_findings({"a": np.ones(300, bool), "b": present}, 30.0)

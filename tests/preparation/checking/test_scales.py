@@ -16,7 +16,9 @@ def depths_of(cameras: Cameras) -> np.ndarray:
     return np.concatenate([project(camera, WORLD)[1] for camera in cameras.values()])
 
 
-def told(cameras: Cameras, points: np.ndarray | None = None, *, radius: float = 3.0, unit: str | None = None) -> str:
+def reported(
+    cameras: Cameras, points: np.ndarray | None = None, *, radius: float = 3.0, unit: str | None = None
+) -> str:
     """The sentences of all findings, each of which is an error."""
     findings = scale_findings(depths_of(wide_ring(4)), points, cameras, radius=radius, unit=unit)
     assert all(finding.severity == "error" for finding in findings)
@@ -44,20 +46,20 @@ def with_near(near: float) -> Cameras:
 
 def test_a_near_plane_in_front_of_nearly_all_points_is_fine() -> None:
     at = float(np.percentile(depths_of(wide_ring(4)), 1))
-    assert told(with_near(at)) == ""
+    assert reported(with_near(at)) == ""
 
 
 def test_a_near_plane_that_cuts_gets_one_that_does_not() -> None:
     depths = depths_of(wide_ring(4))
-    sentence = told(with_near(float(np.percentile(depths, 30))))
+    sentence = reported(with_near(float(np.percentile(depths, 30))))
     assert "beyond 30% of the points" in sentence
     assert "units of length" not in sentence
     proposed = float(sentence.split("--near ")[1].rstrip("."))
     assert depths.min() / 3 < proposed < depths.min()
-    assert "look like different units of length" in told(with_near(3000.0))
+    assert "look like different units of length" in reported(with_near(3000.0))
 
 
-def test_a_near_plane_in_metres_before_positions_in_millimetres_is_told() -> None:
+def test_a_near_plane_in_metres_before_positions_in_millimetres_is_reported() -> None:
     depths = depths_of(wide_ring(4))
     nearest = nearest_depth(depths)
     assert nearest is not None
@@ -81,7 +83,7 @@ def test_a_near_plane_in_metres_before_positions_in_millimetres_is_told() -> Non
 def test_a_rig_is_no_larger_than_a_stadium_and_no_smaller_than_a_hand(
     radius: float, unit: str | None, sentence: str
 ) -> None:
-    found = told(wide_ring(4), radius=radius, unit=unit)
+    found = reported(wide_ring(4), radius=radius, unit=unit)
     assert sentence in found
     assert bool(sentence) == bool(found)
 
@@ -90,7 +92,7 @@ def test_a_rig_is_no_larger_than_a_stadium_and_no_smaller_than_a_hand(
     ("points", "sentence"),
     [
         (WORLD, ""),
-        (0.001 * WORLD + (0, 0, 0.4), ""),  # small and in sight: no unit can be told from that
+        (0.001 * WORLD + (0, 0, 0.4), ""),  # small and in sight: no unit follows from that
         (1000 * WORLD, "1000 times too large"),
         (100 * WORLD, "100 times too large"),
         (np.add(WORLD, (0, -40, 0)), "where two cameras see them: they are of other cameras"),
@@ -98,6 +100,6 @@ def test_a_rig_is_no_larger_than_a_stadium_and_no_smaller_than_a_hand(
     ],
 )
 def test_points_that_came_along_must_lie_where_cameras_look(points: np.ndarray, sentence: str) -> None:
-    found = told(wide_ring(4), points)
+    found = reported(wide_ring(4), points)
     assert sentence in found
     assert bool(sentence) == bool(found)

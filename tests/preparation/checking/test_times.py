@@ -41,12 +41,12 @@ def test_less_than_chance_is_nothing() -> None:
     assert len(time_findings(measured(off=("b",), sigma=0.01, a=0.0, b=0.031))) == 1
 
 
-def test_a_little_is_told_of_those_that_are_off_alone() -> None:
+def test_a_little_is_reported_those_that_are_off_alone() -> None:
     assert time_findings(measured(a=0.0, b=0.007)) == []
     assert len(time_findings(measured(a=0.0, b=0.1))) == 1
 
 
-def test_what_cannot_be_told_is_a_note() -> None:
+def test_what_cannot_be_reported_is_a_note() -> None:
     unknown = SynchronizationCheck({}, {}, (), ("a", "b"), PERIOD)
     (finding,) = time_findings(unknown)
     assert finding.severity == "note"
@@ -91,7 +91,7 @@ def test_the_camera_that_is_off_is_named(frames: float) -> None:
     assert abs(check.late_seconds["cam2"] - frames / 30) < 3 * check.uncertainty_seconds["cam2"]
 
 
-def test_without_motion_it_cannot_be_told() -> None:
+def test_without_motion_it_cannot_be_reported() -> None:
     check = check_synchronization(MadeSource(RIG, {}, still=True))
     assert not check.conclusive
     assert check.undecided == tuple(RIG)

@@ -117,8 +117,8 @@ def test_the_rig_is_drawn_upright_and_in_its_proportions(drawn: Callable[..., An
     assert np.median(np.asarray(points.get_offsets())[:, 1]) > places[0][:, 1].max()
 
 
-def test_names_are_told_once_each(drawn: Callable[..., Any], examined: Examination) -> None:
+def test_names_are_reported_once_each(drawn: Callable[..., Any], examined: Examination) -> None:
     above, side, _ = drawn(charts.draw_coverage, examined, near=0.1, unit="metres").axes
-    told = [name for text in above.texts for name in text.get_text().split("\n") if name]
-    assert sorted(told) == sorted(examined.cameras)
+    reported = [name for text in above.texts for name in text.get_text().split("\n") if name]
+    assert sorted(reported) == sorted(examined.cameras)
     assert not any(text.get_text() for text in side.texts)

@@ -41,7 +41,7 @@ def test_an_earlier_report_goes_and_nothing_else(tmp_path: Path) -> None:
     assert not (tmp_path / "camera_old.png").exists()
 
 
-def test_no_room_is_told(tmp_path: Path) -> None:
+def test_no_room_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     rig = room_rig(4)
     checked = check_capture(MemoryCapture(rig, [room_frame(rig, textured=False)]))

@@ -112,7 +112,7 @@ def test_a_rate_that_is_not_known_widens_what_is_stated() -> None:
     assert min(unknown.sigmas.values()) > 5e-3
 
 
-def test_errors_that_ties_of_a_camera_share_are_told_by_its_blocks() -> None:
+def test_errors_that_ties_of_a_camera_share_are_reported_by_its_blocks() -> None:
     """All ties of b are off alike; what they change by without each of ten blocks tells by how much."""
     scores = []
     for seed in range(40):

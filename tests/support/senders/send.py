@@ -150,7 +150,7 @@ def loops_of(pictures: Sequence[NDArray[np.uint8]], *, codec: str = "libx264") -
 
 
 def film(cameras: Sequence[SentCamera], stop: threading.Event, *, seconds: float = float("inf")) -> None:
-    """Sends in step until told to stop."""
+    """Sends in step until asked to stop."""
     begun_unix, begun = time.time(), time.monotonic()
     for number in _numbers():
         due = number / cameras[0].fps

@@ -123,7 +123,7 @@ def test_a_second_time_prints_the_table_and_does_nothing_again(
         ("compare", ["--scratch-every", "0"], 2, "--scratch-every counts frames, from 1; got 0."),
     ],
 )
-def test_wrong_options_are_told_before_anything_is_written(
+def test_wrong_options_are_reported_before_anything_is_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, extra: list[str], status: int, words: str
 ) -> None:
     out = tmp_path / "out"

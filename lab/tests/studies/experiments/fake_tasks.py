@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A task that a process of its own can import: it writes numbered frames, and misbehaves as it is told."""
+"""A task that a process of its own can import: it writes numbered frames, and misbehaves as it is reported."""
 
 import os
 import time

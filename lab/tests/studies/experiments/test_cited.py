@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is cited of the paper: marked as cited, as printed, and told of which data."""
+"""What is cited of the paper: marked as cited, as printed, and reported of which data."""
 
 import re
 

@@ -148,7 +148,7 @@ def test_a_marker_that_asks_for_something_unknown(marker: str, words: str) -> No
         "<!-- methods ring --> <!-- end -->\n",
     ],
 )
-def test_a_table_without_an_end_is_told_and_swallows_no_words(text: str) -> None:
+def test_a_table_without_an_end_is_reported_and_swallows_no_words(text: str) -> None:
     with pytest.raises(ConfigError, match="does not end"):
         refresh_text(text, results())
 

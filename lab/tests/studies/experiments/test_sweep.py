@@ -72,7 +72,7 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Stopped:
     return Stopped(tmp_path_factory.mktemp("sweep"))
 
 
-def test_a_failure_is_told_by_name_and_takes_along_what_needs_it(stopped: Stopped) -> None:
+def test_a_failure_is_reported_by_name_and_takes_along_what_needs_it(stopped: Stopped) -> None:
     assert stopped.first == Outcome(failed=("bad",), blocked=("after bad", "after after bad"), skipped=("ready",))
     assert set(stopped.after_first) == {f"{name}.log.jsonl" for name in ("ready", "left", "right", "bad", "after left")}
     assert "bad: there was no power." in (stopped.folder / "logs" / "bad.txt").read_text()

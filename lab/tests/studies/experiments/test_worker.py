@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a task's program does: computes where it was told to, and says why it failed."""
+"""What a task's program does: computes where it was reported to, and says why it failed."""
 
 from pathlib import Path
 from typing import Any
