@@ -2,7 +2,7 @@
 """The iterations of a later frame in C++ beside the loop in torch over the same kernels and over the reference's."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -112,6 +112,16 @@ def test_without_free_gaussians_results_are_those_of_the_loop_bit_for_bit(loss: 
     assert one.losses == two.losses
     assert "iterations" in one.seconds
     assert "iterations" not in two.seconds
+
+
+@dataclass(frozen=True)
+class WithSize(LossWeights):
+    size: float = 0.0
+
+
+@pytest.mark.parametrize("size", [0.0, 0.1])
+def test_a_loss_that_they_do_not_know_is_minimised_in_torch(size: float) -> None:
+    assert ("iterations" in fitted(cpu_backend(), losses=WithSize(size=size)).seconds) == (size == 0.0)
 
 
 @pytest.mark.parametrize("oracle", [cpu_backend, reference_backend])

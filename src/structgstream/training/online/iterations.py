@@ -31,6 +31,8 @@ from structgstream.training.views import View
 
 LEAVES: tuple[ParameterName, ...] = (*ANCHOR_ROWS, *FREE_ROWS)
 """Tensors of a frame's fit (``values.FIT_LEAVES``)."""
+NATIVE_LOSSES = frozenset({"l1", "ssim", "volume"})
+"""Weights of a view's loss that back-ends' own iterations know."""
 REPORT_INTERVAL = 10
 """Iterations between reports of progress, where a back-end runs them."""
 

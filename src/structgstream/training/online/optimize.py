@@ -23,7 +23,7 @@ from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, ParameterName, fields_of
 from structgstream.training.losses import GradientStatistics
 from structgstream.training.online.config import OnlineConfig, online_rates
-from structgstream.training.online.iterations import OnlineHooks, StartingPoint, minimize_natively
+from structgstream.training.online.iterations import NATIVE_LOSSES, OnlineHooks, StartingPoint, minimize_natively
 from structgstream.training.online.measure import slot_count
 from structgstream.training.online.patching import FreeSet
 from structgstream.training.online.smoothness import MotionSmoothness
@@ -76,11 +76,11 @@ class FrameOptimizer:
 
     def _runs_natively(self, start: StartingPoint) -> bool:
         """Whether the back-end's own iterations can run these."""
-        patching = self.config.patching
+        patching, losses = self.config.patching, self.config.losses
         tracks_screen = patching.spawn != "off" and patching.collect_from < self._patch_at(start)
-        return (
-            self.backend.iterations is not None and None not in (start.active_tiles, start.split) and not tracks_screen
-        )
+        weights = {name for name, value in vars(losses).items() if isinstance(value, float) and value}
+        splits = None not in (start.active_tiles, start.split)
+        return self.backend.iterations is not None and splits and not tracks_screen and weights <= NATIVE_LOSSES
 
     def _patch_at(self, start: StartingPoint) -> int:
         return math.ceil(self.config.patching.iteration * len(start.seen) / len(start.views))
