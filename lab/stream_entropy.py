@@ -79,7 +79,7 @@ def packet_bytes(path: str) -> Counter[str]:
     return found
 
 
-def told(path: str) -> str:
+def reported(path: str) -> str:
     """One line for the init record, and one for each name."""
     init, packets = counted_init(path), packet_bytes(path)
     share = f", {100 * (init.bytes / init.entropy_bytes - 1):.2f} % over" if init.entropy_bytes else ""
@@ -90,4 +90,4 @@ def told(path: str) -> str:
 
 if __name__ == "__main__":
     for argument in sys.argv[1:]:
-        print(told(argument))
+        print(reported(argument))
