@@ -18,12 +18,19 @@ import torch
 from structgstream.codec.fields.quantization import RateTerm
 from structgstream.kernels.backend import Backend, nonblocking
 from structgstream.kernels.cuda_tiles import PairBudget, run_with_pair_budget
+from structgstream.kernels.values import FIT_LEAVES
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, ParameterName, fields_of
 from structgstream.training.losses import GradientStatistics
 from structgstream.training.online.config import OnlineConfig, online_rates
-from structgstream.training.online.iterations import NATIVE_LOSSES, OnlineHooks, StartingPoint, minimize_natively
+from structgstream.training.online.iterations import (
+    LEAVES,
+    NATIVE_LOSSES,
+    OnlineHooks,
+    StartingPoint,
+    minimize_natively,
+)
 from structgstream.training.online.measure import slot_count
 from structgstream.training.online.patching import FreeSet
 from structgstream.training.online.smoothness import MotionSmoothness
@@ -79,8 +86,9 @@ class FrameOptimizer:
         patching, losses = self.config.patching, self.config.losses
         tracks_screen = patching.spawn != "off" and patching.collect_from < self._patch_at(start)
         weights = {name for name, value in vars(losses).items() if isinstance(value, float) and value}
+        knows = weights <= NATIVE_LOSSES and len(LEAVES) == FIT_LEAVES
         splits = None not in (start.active_tiles, start.split)
-        return self.backend.iterations is not None and splits and not tracks_screen and weights <= NATIVE_LOSSES
+        return self.backend.iterations is not None and splits and not tracks_screen and knows
 
     def _patch_at(self, start: StartingPoint) -> int:
         return math.ceil(self.config.patching.iteration * len(start.seen) / len(start.views))
