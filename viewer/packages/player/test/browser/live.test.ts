@@ -7,7 +7,7 @@ import { LiveRun, type RunOptions } from "../liveRun.ts";
 import { periodFile } from "../periodFile.ts";
 import { CLIP } from "../served.ts";
 import { TestServer } from "./server.ts";
-import { ask, darkest, StagedTests, shows, told } from "./stage.ts";
+import { ask, darkest, reported, StagedTests, shows } from "./stage.ts";
 
 vi.setConfig({ testTimeout: 60_000, hookTimeout: 60_000 });
 
@@ -54,7 +54,7 @@ describe.skipIf(StagedTests.skipped)("a live stream in a browser", () => {
     const asked = stage.server.requests.map(({ path }) => path);
     expect(asked.filter((path) => path.includes("history"))).toEqual([]);
     expect(asked.filter((path) => path.includes("segment")).length).toBeLessThanOrEqual(1);
-    expect(await told(page)).toEqual([]);
+    expect(await reported(page)).toEqual([]);
     stage.expectQuiet();
   });
 
@@ -75,12 +75,12 @@ describe.skipIf(StagedTests.skipped)("a live stream in a browser", () => {
     stage.server.publish("/live/", live.files);
     clearInterval(writing);
     await page.getByText("The stream has ended; it is a recording now.").waitFor();
-    await page.waitForFunction(() => heard.told.some(([name]) => name === "ended"));
-    expect(await told(page)).toEqual([]);
+    await page.waitForFunction(() => heard.reported.some(([name]) => name === "ended"));
+    expect(await reported(page)).toEqual([]);
     stage.expectQuiet();
   });
 
-  test("a host that fails for a while is told of, and gone on with", async () => {
+  test("a host that fails for a while is reported, and playing goes on", async () => {
     const live = run(FEW, 10, { frameSeconds: 1 });
     const page = await stage.open('src="live/manifest.json" autoplay');
     await shows(page, 9);
@@ -89,11 +89,11 @@ describe.skipIf(StagedTests.skipped)("a live stream in a browser", () => {
       .getByText("The server answered the request for manifest.json with 503. The next attempt is in")
       .waitFor();
     await page.waitForTimeout(1500);
-    expect((await told(page, "notice")).length).toBe(1);
+    expect((await reported(page, "notice")).length).toBe(1);
     write(live, 2);
     await shows(page, 11);
-    expect((await told(page, "notice")).at(-1)).toBe("The stream can be reached again.");
-    expect(await told(page)).toEqual([]);
+    expect((await reported(page, "notice")).at(-1)).toBe("The stream can be reached again.");
+    expect(await reported(page)).toEqual([]);
     stage.expectQuiet(/503/);
   });
 
@@ -110,7 +110,7 @@ describe.skipIf(StagedTests.skipped)("a live stream in a browser", () => {
     await page.getByText("Playback was too slow and continues with the newest frames.").waitFor({ timeout: 50_000 });
     const frames = await ask(page, (_, __, shown) => shown);
     expect(frames).toEqual([...frames].sort((a, b) => a - b));
-    expect(await told(page)).toEqual([]);
+    expect(await reported(page)).toEqual([]);
     stage.expectQuiet();
   });
 
@@ -125,7 +125,7 @@ describe.skipIf(StagedTests.skipped)("a live stream in a browser", () => {
     expect(pictures).toBeGreaterThan(3);
     expect(light).toBeGreaterThan(5);
     expect(stage.server.requests.filter(({ path }) => path.includes("init-")).length).toBe(2);
-    expect(await told(page)).toEqual([]);
+    expect(await reported(page)).toEqual([]);
     stage.expectQuiet();
   });
 
@@ -143,7 +143,7 @@ describe.skipIf(StagedTests.skipped)("a live stream in a browser", () => {
     await ask(page, (player) => player.seek(6 / 5));
     await shows(page, 6);
     expect(inits.length).toBe(2);
-    expect(await told(page)).toEqual([]);
+    expect(await reported(page)).toEqual([]);
     stage.expectQuiet();
   });
 
@@ -163,11 +163,11 @@ describe.skipIf(StagedTests.skipped)("a live stream in a browser", () => {
     await ask(page, (player) => player.seek(0.2));
     await shows(page, 1);
     expect(await ask(page, (player) => player.cameras)).toEqual(before);
-    expect(await told(page)).toEqual([]);
+    expect(await reported(page)).toEqual([]);
     stage.expectQuiet();
   });
 
-  test("the page's token opens its streams, and is told to no other host", async () => {
+  test("the page's token opens its streams, and is sent to no other host", async () => {
     run(FEW, 5, { frameSeconds: 1 });
     const elsewhere = await TestServer.started();
     try {
@@ -182,7 +182,7 @@ describe.skipIf(StagedTests.skipped)("a live stream in a browser", () => {
       );
       await expect.poll(() => elsewhere.requests.length, { timeout: 15_000 }).toBeGreaterThan(3);
       expect(elsewhere.requests.every(({ query }) => !query.includes("token"))).toBe(true);
-      expect(await told(page)).toEqual([]);
+      expect(await reported(page)).toEqual([]);
       stage.expectQuiet();
     } finally {
       await elsewhere.stop();
@@ -228,7 +228,7 @@ describe.skipIf(StagedTests.skipped)("a live stream in a browser", () => {
     const after = await state();
     expect({ ...after, usedSize: 0 }).toEqual({ ...before, usedSize: 0 });
     expect(after.usedSize).toBeLessThan(before.usedSize * 1.1 + 2e5);
-    expect(await told(page)).toEqual([]);
+    expect(await reported(page)).toEqual([]);
     // The window goes on while requests are under way.
     stage.expectQuiet(/404/);
   });

@@ -6,7 +6,7 @@ import { readStream } from "@structgstream/core";
 import { describe, expect, test, vi } from "vitest";
 import { CLIP } from "../served.ts";
 import { TestServer } from "./server.ts";
-import { ask, pageWith, StagedTests, shows, told } from "./stage.ts";
+import { ask, pageWith, reported, StagedTests, shows } from "./stage.ts";
 
 vi.setConfig({ testTimeout: 60_000, hookTimeout: 60_000 });
 
@@ -34,7 +34,7 @@ describe.skipIf(StagedTests.skipped)("the player in a browser", () => {
       player.playbackRate = 0.1;
       player.play();
     });
-    await page.waitForFunction(() => heard.told.some(([name]) => name === "ended"), undefined, { timeout: 30_000 });
+    await page.waitForFunction(() => heard.reported.some(([name]) => name === "ended"), undefined, { timeout: 30_000 });
     await shows(page, LAST);
     const frames = await ask(page, (_, __, shown) => shown);
     expect(frames).toEqual([...frames].sort((a, b) => a - b));
@@ -124,9 +124,9 @@ describe.skipIf(StagedTests.skipped)("the player in a browser", () => {
     }
     await page.getByText(/Frame 3, next in about \d+ s/).waitFor();
     stage.server.put("/clip.sgs", CLIP, { changed: new Date() });
-    await page.waitForFunction(() => heard.told.some(([name]) => name === "ended"), undefined, { timeout: 30_000 });
+    await page.waitForFunction(() => heard.reported.some(([name]) => name === "ended"), undefined, { timeout: 30_000 });
     await shows(page, LAST);
-    expect(await told(page)).toEqual([]);
+    expect(await reported(page)).toEqual([]);
     stage.expectQuiet();
   });
 
@@ -159,18 +159,20 @@ describe.skipIf(StagedTests.skipped)("the player in a browser", () => {
   test("plays a cut stream up to the cut, and a damaged one around the damage", async () => {
     stage.server.put("/clip.sgs", CLIP.subarray(0, PACKETS[5]!.offset + 9));
     const page = await stage.open('src="clip.sgs" autoplay');
-    await page.waitForFunction(() => heard.told.some(([name]) => name === "ended"));
+    await page.waitForFunction(() => heard.reported.some(([name]) => name === "ended"));
     await shows(page, 4);
     const flipped = CLIP.slice();
     flipped[PACKETS[4]!.offset + 40]! ^= 16;
     stage.server.put("/flipped.sgs", flipped);
     await ask(page, (player) => {
-      heard.told.length = 0;
+      heard.reported.length = 0;
       player.setAttribute("src", "flipped.sgs");
     });
-    await page.waitForFunction(() => heard.told.some(([name]) => name === "ended"));
+    await page.waitForFunction(() => heard.reported.some(([name]) => name === "ended"));
     await shows(page, LAST);
-    expect(await told(page)).toEqual([`Frames 4 to 5 are lost: its record at byte ${PACKETS[4]!.offset} is damaged.`]);
+    expect(await reported(page)).toEqual([
+      `Frames 4 to 5 are lost: its record at byte ${PACKETS[4]!.offset} is damaged.`,
+    ]);
     stage.expectQuiet();
   });
 
@@ -180,10 +182,10 @@ describe.skipIf(StagedTests.skipped)("the player in a browser", () => {
     stage.server.put("/clip.sgs", CLIP, { bytesPerSecond: 5_000 });
     const page = await stage.open('src="clip.sgs" autoplay');
     await page.getByRole("progressbar").waitFor();
-    await page.waitForFunction(() => heard.told.some(([name]) => name === "ended"), undefined, { timeout: 40_000 });
+    await page.waitForFunction(() => heard.reported.some(([name]) => name === "ended"), undefined, { timeout: 40_000 });
     await shows(page, LAST);
     expect(await ask(page, (_, events) => events.filter(([name]) => name === "stall").length)).toBeGreaterThan(0);
-    expect(await told(page)).toEqual([]);
+    expect(await reported(page)).toEqual([]);
     stage.expectQuiet();
   });
 
@@ -306,7 +308,7 @@ describe.skipIf(StagedTests.skipped)("the player in a browser", () => {
     await ask(page, (player) => player.seek(0));
     await shows(page, 0);
     expect(await picture()).toEqual(before);
-    expect(await told(page)).toEqual([]);
+    expect(await reported(page)).toEqual([]);
     stage.expectQuiet(/CONTEXT_LOST/);
   });
 
@@ -340,7 +342,7 @@ describe.skipIf(StagedTests.skipped)("the player in a browser", () => {
     }, base64);
     await shows(page, 0);
     await page.getByRole("button", { name: "Play", exact: true }).first().click();
-    await page.waitForFunction(() => heard.told.some(([name]) => name === "ended"));
+    await page.waitForFunction(() => heard.reported.some(([name]) => name === "ended"));
     stage.expectQuiet();
   });
 });

@@ -11,7 +11,7 @@ import { TestServer } from "./server.ts";
 
 declare global {
   /** What `pageWith` gathers in the page. */
-  var heard: { told: [name: string, message: string][]; frames: number[] };
+  var heard: { reported: [name: string, message: string][]; frames: number[] };
   interface HTMLElementTagNameMap {
     "structgstream-player": StructgstreamPlayer;
   }
@@ -107,9 +107,9 @@ export class StagedTests {
   }
 }
 
-/** The messages of an event that the player has told. */
-export function told(page: Page, event: "error" | "notice" = "error"): Promise<string[]> {
-  return page.evaluate((name) => heard.told.filter(([one]) => one === name).map(([, message]) => message), event);
+/** The messages of an event that the player has reported. */
+export function reported(page: Page, event: "error" | "notice" = "error"): Promise<string[]> {
+  return page.evaluate((name) => heard.reported.filter(([one]) => one === name).map(([, message]) => message), event);
 }
 
 export function pageWith(attributes: string): string {
@@ -117,21 +117,21 @@ export function pageWith(attributes: string): string {
 <meta name="viewport" content="width=device-width"><style>html,body{margin:0;height:100%}</style>
 <structgstream-player ${attributes} style="width:100%;height:100%;aspect-ratio:auto"></structgstream-player>
 <script>
-  const player = document.querySelector("structgstream-player"); globalThis.heard = { told: [], frames: [] };
+  const player = document.querySelector("structgstream-player"); globalThis.heard = { reported: [], frames: [] };
   customElements.whenDefined("structgstream-player").then(() => {
-    for (const name of ["error", "notice", "stall", "ended"]) player.on(name, (event) => heard.told.push([name, event.message ?? ""]));
+    for (const name of ["error", "notice", "stall", "ended"]) player.on(name, (event) => heard.reported.push([name, event.message ?? ""]));
     player.on("drawn", ({ stats }) => { if (heard.frames.at(-1) !== stats.frameIndex) heard.frames.push(stats.frameIndex); });
   });
 </script>
 <script type="module" src="/player.js"></script></html>`;
 }
 
-/** Runs in the page: gives back what it gives, with the element and what it has told. */
+/** Runs in the page: gives back what it gives, with the element and what it has reported. */
 export function ask<Result>(
   page: Page,
-  question: (player: StructgstreamPlayer, told: [string, string][], frames: number[]) => Result | Promise<Result>,
+  question: (player: StructgstreamPlayer, reported: [string, string][], frames: number[]) => Result | Promise<Result>,
 ): Promise<Result> {
-  const text = `(${question.toString()})(document.querySelector("structgstream-player"), heard.told, heard.frames)`;
+  const text = `(${question.toString()})(document.querySelector("structgstream-player"), heard.reported, heard.frames)`;
   return page.evaluate(text) as Promise<Result>;
 }
 
@@ -161,7 +161,7 @@ export async function darkest(page: Page, first: number, last: number): Promise<
     },
     [first, last] as const,
   );
-  await page.waitForFunction(() => heard.told.some(([name]) => name === "ended"), undefined, { timeout: 50_000 });
+  await page.waitForFunction(() => heard.reported.some(([name]) => name === "ended"), undefined, { timeout: 50_000 });
   return (await page.evaluate("least")) as { light: number; pictures: number };
 }
 
