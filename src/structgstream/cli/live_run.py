@@ -168,10 +168,8 @@ def live_display(values: Values, *, frames: int | None, done: int = 0, console: 
     """A dashboard when ``console`` (default: standard output) is a terminal, else a line a frame.
 
     Args:
-        values: of ``RunMetrics``.
         frames: number of frames of the stream when it is finished; None where that is unknown.
         done: how many of them are stored already.
-        console: where to write.
     """
     console = Console() if console is None else console
     if console.is_terminal:

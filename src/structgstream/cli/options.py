@@ -68,8 +68,6 @@ def check_ending(output: Path | None, *endings: str, command: str, option: str =
     Args:
         output: the file or folder to write; None for none.
         endings: of :data:`KNOWN_ENDINGS`, those that the command writes.
-        command: for the message.
-        option: which names the output.
         folder: whether another name gives a folder.
 
     Raises:

@@ -288,7 +288,6 @@ class ParallelDisplay:
     """Shows the status: all groups, redrawn on a terminal, else lines.
 
     Args:
-        console: where to write.
         frames_of: number of fitted frames of a group.
     """
 

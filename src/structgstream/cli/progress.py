@@ -72,7 +72,6 @@ def display(frames: int | None, *, done: int = 0, console: Console | None = None
     Args:
         frames: number of frames of the stream when it is finished; None where that is unknown.
         done: how many of them are stored already.
-        console: where to write.
     """
     console = Console() if console is None else console
     return Bars(frames, done, console=console) if console.is_terminal else Lines(frames, done, console=console)
@@ -212,11 +211,7 @@ MIN_SHOWN_SECONDS = 0.05
 
 
 class StepDisplay(AbstractContextManager["StepDisplay"]):
-    """A listener of steps; bars are shown on a terminal only.
-
-    Args:
-        console: where to write.
-    """
+    """A listener of steps; bars are shown on a terminal only."""
 
     def __init__(self, console: Console) -> None:
         self._console = console

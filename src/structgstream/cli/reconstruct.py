@@ -150,19 +150,12 @@ def _reconstruct(
 
 @dataclass(frozen=True)
 class OpenedScene:
-    """What a run reads, and with what it computes.
+    """What a run reads, and with what it computes."""
 
-    Args:
-        source: a recording, or live cameras.
-        captured: when a frame was filmed, Unix time, by its number; None for a recording.
-        backend: the compute back-end.
-        metadata: of the run, for headers.
-    """
-
-    source: "FrameStream"
-    captured: "Captured | None"
+    source: "FrameStream"  # a recording, or live cameras
+    captured: "Captured | None"  # when a frame was filmed, Unix time, by its number; None for a recording
     backend: "Backend"
-    metadata: Mapping[str, object]
+    metadata: Mapping[str, object]  # of the run, for headers
 
 
 def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, console: Console) -> OpenedScene:
@@ -222,10 +215,6 @@ def run_reconstruction(
 
     Args:
         source: the capture, or live cameras, which need ``metrics``.
-        config: of the stream.
-        output: the stream file.
-        backend: the compute back-end.
-        metadata: for the header.
         resume: continue after the last whole frame.
         metrics: the metrics of the run, written next to ``output``.
 

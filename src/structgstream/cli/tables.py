@@ -71,9 +71,7 @@ def compact_table(*titles: str, left: Collection[str] = (), title: str | Text | 
     """A table with columns of these titles, of which ten columns of numbers fit into 80 characters.
 
     Args:
-        titles: of the columns.
         left: titles of those that are not of numbers.
-        title: of the table.
     """
     table = Table(
         title=title, box=SIMPLE_HEAD, header_style="bold", title_justify="left", padding=(0, 1, 0, 0), show_edge=False

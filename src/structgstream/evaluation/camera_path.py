@@ -41,7 +41,6 @@ def orbit(rig: CameraRig, frames: int, *, around: str | None = None) -> list[Cam
     """A flat ellipse around a camera of the rig, directed at the point in the centre of that camera's picture.
 
     Args:
-        rig: the cameras.
         frames: number of cameras on the path; the last is one step before the first.
         around: the camera in the middle; None for the one nearest to the mean of the rig.
 
@@ -67,7 +66,6 @@ def arc(rig: CameraRig, frames: int, *, between: tuple[str, str] | None = None) 
     """A path from one camera of the rig to another, at interpolated distances from the focus point.
 
     Args:
-        rig: the cameras.
         frames: number of cameras on the path.
         between: the ends; None for the two most distant cameras within 50 degrees of the middle camera.
 

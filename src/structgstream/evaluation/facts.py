@@ -158,8 +158,6 @@ def comparison_facts(
     Cameras without such data are left out.
 
     Args:
-        frames: the evaluated frames.
-        names: names of the scored cameras.
         left_out: share of masked pixels in each of a camera's pictures, by camera name.
     """
     absent = {name: sum(name not in frame.cameras for frame in frames) for name in names}

@@ -208,15 +208,10 @@ def psnr_affine(picture: Picture, truth: Picture) -> float:
 
 @dataclass(frozen=True)
 class ChannelFit:
-    """A camera's colour response, ``gain * rendering + bias`` per channel (Note [Colour of a camera]).
+    """A camera's colour response, ``gain * rendering + bias`` per channel (Note [Colour of a camera])."""
 
-    Args:
-        gains: gain of red, green and blue.
-        biases: bias of red, green and blue, full scale 1.
-    """
-
-    gains: tuple[float, float, float]
-    biases: tuple[float, float, float]
+    gains: tuple[float, float, float]  # gain of red, green and blue
+    biases: tuple[float, float, float]  # bias of red, green and blue, full scale 1
 
 
 def channel_fit(picture: Picture, truth: Picture) -> ChannelFit:
@@ -292,14 +287,9 @@ def score(
     """The scores of a rendering against ``truth``.
 
     Args:
-        picture: the rendering.
-        truth: the camera's picture.
         first: the camera's picture of frame 0.
-        backend: computes SSIM.
-        seconds: duration of the rendering.
         color: the camera's colour response, fitted to frame 0; None to leave out that score.
         mask: ``[H, W]`` bool, the pixels that count; None for all. Pictures are black in the others.
-        first_mask: mask of ``first``.
 
     Raises:
         CaptureError: the pictures have different sizes.

@@ -84,9 +84,7 @@ def contact_sheet(path: Path, pictures: Mapping[str, Mapping[int, tuple[Picture,
     The rows are truth, rendering, and their difference times four.
 
     Args:
-        path: the PNG to write.
         pictures: camera name to frame number to ``(truth, rendering)``, each ``[H, W, 3]`` uint8.
-        title: a line above everything.
 
     Raises:
         MissingExtraError: matplotlib, which writes the labels, is not installed.

@@ -70,7 +70,6 @@ def part_metadata(*, start: int, scale: float, every: int) -> dict[str, object]:
     """Metadata of a header on the part of a capture that a stream is made from; :func:`capture_of` reads it.
 
     Args:
-        start: first frame.
         scale: size of the pictures relative to the stored ones.
         every: step between frames; 1 is left out, because older streams have no step.
     """
@@ -82,8 +81,6 @@ def capture_of(header: StreamHeader, folder: Path | str, *, frames: int | None) 
     """The part of the capture in ``folder`` that a stream was made from, at the stream's sizes.
 
     Args:
-        header: header of the stream.
-        folder: folder of the capture.
         frames: number of frames of the stream; None for all from the stream's first frame on.
 
     Raises:

@@ -66,10 +66,8 @@ def half_scores(
     """PSNR and SSIM, by their names in ``Scores``, of a rendering at half size against the area mean of the truth.
 
     Args:
-        scene: the drawable.
         camera: camera of the whole picture, or the result of :func:`halved` if the caller has it; scene units.
         truth: the camera's picture ``[H, W, 3]``, black outside ``mask``.
-        backend: the compute back-end.
         mask: ``[H, W]``, the pixels that count; None for all.
     """
     small = None if mask is None else block_mask(mask, 2)
@@ -79,19 +77,12 @@ def half_scores(
 
 @dataclass
 class StoredSize:
-    """Scores at the size of the capture's stored pictures, which are larger than those that a stream was made from.
+    """Scores at the size of the capture's stored pictures, which are larger than those that a stream was made from."""
 
-    Args:
-        source: the capture at that size, the same frames.
-        views: cameras of the stream by name, scene units.
-        backend: the compute back-end.
-        frames: numbers of the scored frames.
-    """
-
-    source: FrameSource
-    views: Mapping[str, Camera]
+    source: FrameSource  # the capture at that size, the same frames
+    views: Mapping[str, Camera]  # cameras of the stream by name, scene units
     backend: Backend
-    frames: frozenset[int]
+    frames: frozenset[int]  # numbers of the scored frames
     _frame: tuple[int, MultiViewFrame] | None = field(default=None, init=False)
 
     def scores(self, camera: str, scene: Drawable, *, index: int) -> dict[str, float | None]:

@@ -85,7 +85,6 @@ class TaskQueue:
         """Adds a task, which is started in :meth:`wait`.
 
         Args:
-            task: a task with a unique name.
             after: names of tasks that must succeed first; they may be submitted later.
             gpus: number of GPUs that it needs, 0 or 1.
 
@@ -159,27 +158,19 @@ ExecutorName = Literal["local", "ray"]
 
 @dataclass(frozen=True)
 class ExecutorOptions:
-    """Options of an executor.
+    """Options of an executor."""
 
-    Args:
-        name: ``local``: processes of this machine; ``ray``: a Ray cluster.
-        workers: number of concurrent tasks; None for one per GPU, or one per core. An existing cluster has its own
-            number.
-        threads: threads of each worker; None for its share of the cores, and 1 on a cluster.
-        address: address of the Ray cluster; None starts one on this machine.
-    """
-
-    name: ExecutorName = "local"
+    name: ExecutorName = "local"  # local: processes of this machine; ray: a Ray cluster
+    # number of concurrent tasks; None for one per GPU, or one per core. An existing cluster has its own number.
     workers: int | None = None
-    threads: int | None = None
-    address: str | None = None
+    threads: int | None = None  # threads of each worker; None for its share of the cores, and 1 on a cluster
+    address: str | None = None  # address of the Ray cluster; None starts one on this machine
 
 
 def open_executor(options: ExecutorOptions, *, cores: int, gpus: int = 0) -> TaskQueue:
     """The executor; use it as a context manager.
 
     Args:
-        options: options of the executor.
         cores: number of cores of this machine that may be used.
         gpus: number of GPUs of this machine that may be used.
 

@@ -25,12 +25,7 @@ ENDING_SECONDS = 10.0
 
 
 class CommandProcess:
-    """The running command of a task. It is killed when this process ends.
-
-    Args:
-        task: the task to run.
-        environment: variables of its worker slot; the task's own variables take precedence.
-    """
+    """The running command of a task. It is killed when this process ends."""
 
     def __init__(self, task: Task, *, environment: Mapping[str, str]) -> None:
         self.name = task.name

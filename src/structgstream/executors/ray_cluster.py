@@ -31,18 +31,13 @@ TOKEN_FILE = Path(".ray") / "auth_token"
 
 @dataclass(frozen=True)
 class RayOptions:
-    """Options of a Ray cluster and its workers.
+    """Options of a Ray cluster and its workers."""
 
-    Args:
-        address: ``HOST:PORT`` of the cluster's head, or ``auto`` for one on this machine; None starts one on this
-            machine, for this process only, with ``workers``.
-        workers: number of workers of a cluster that is started here.
-        cores: number of cores of a worker.
-    """
-
+    # HOST:PORT of the cluster's head, or auto for one on this machine; None starts one on this machine, for this
+    # process only, with workers
     address: str | None = None
-    workers: int = 1
-    cores: int = 1
+    workers: int = 1  # number of workers of a cluster that is started here
+    cores: int = 1  # number of cores of a worker
 
 
 class RayEngine:

@@ -20,43 +20,27 @@ class Task:
 
     It must be idempotent: restarted after it was killed, or run twice at the same time, it has the same result, which
     it writes atomically.
-
-    Args:
-        name: a name that is unique in an executor, usable as a file name.
-        command: the argument vector; the first word may be :data:`PYTHON`.
-        result: path or URL of its result; frames are not transferred in any other way.
-        log: its output is appended to this file; None discards all but the last :data:`TAIL_BYTES`.
-        environment: variables to set, in addition to those of its worker slot.
-        retries: number of restarts after it was killed. A command that fails by itself is not repeated.
     """
 
-    name: str
-    command: tuple[str, ...]
-    result: str = ""
-    log: Path | None = None
+    name: str  # a name that is unique in an executor, usable as a file name
+    command: tuple[str, ...]  # the argument vector; the first word may be PYTHON
+    result: str = ""  # path or URL of its result; frames are not transferred in any other way
+    log: Path | None = None  # its output is appended to this file; None discards all but the last TAIL_BYTES
+    # variables to set, in addition to those of its worker slot
     environment: Mapping[str, str] = field(default_factory=dict)
-    retries: int = 5
+    retries: int = 5  # number of restarts after it was killed. A command that fails by itself is not repeated.
 
 
 @dataclass(frozen=True)
 class TaskResult:
-    """The result of a task.
+    """The result of a task."""
 
-    Args:
-        name: name of the task.
-        status: exit status of the command; the negative signal number if a signal ended it.
-        seconds: duration of the last attempt.
-        attempts: number of attempts.
-        peak_bytes: largest resident memory of the command; 0 if unknown.
-        output: the end of its output.
-    """
-
-    name: str
-    status: int
-    seconds: float = 0.0
-    attempts: int = 1
-    peak_bytes: int = 0
-    output: str = ""
+    name: str  # name of the task
+    status: int  # exit status of the command; the negative signal number if a signal ended it
+    seconds: float = 0.0  # duration of the last attempt
+    attempts: int = 1  # number of attempts
+    peak_bytes: int = 0  # largest resident memory of the command; 0 if unknown
+    output: str = ""  # the end of its output
 
     @property
     def done(self) -> bool:
@@ -103,7 +87,6 @@ def allocate_slots(
     Args:
         workers: number of slots; None for one per GPU, or one per core without GPUs.
         cores: number of cores that may be used; each slot gets its share, at least one.
-        gpus: number of GPUs.
         threads: threads of each slot; None for its share of the cores.
 
     Raises:

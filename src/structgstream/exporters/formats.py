@@ -19,21 +19,13 @@ MAX_SH_DEGREE = 3
 
 @dataclass(frozen=True)
 class FormatInfo:
-    """A row of the table.
+    """A row of the table."""
 
-    Args:
-        purpose: what the format is good for.
-        readers: programs that open it.
-        max_degree: highest degree of spherical harmonics.
-        all_frames: whether one file contains all frames.
-        suffixes: further endings of file names.
-    """
-
-    purpose: str
-    readers: str
-    max_degree: int = MAX_SH_DEGREE
-    all_frames: bool = False
-    suffixes: tuple[str, ...] = ()
+    purpose: str  # what the format is good for
+    readers: str  # programs that open it
+    max_degree: int = MAX_SH_DEGREE  # highest degree of spherical harmonics
+    all_frames: bool = False  # whether one file contains all frames
+    suffixes: tuple[str, ...] = ()  # further endings of file names
 
 
 FORMATS: Mapping[Format, FormatInfo] = {
@@ -125,7 +117,6 @@ def destination(
     """The path to write to, and the format.
 
     Args:
-        stream: the stream's file.
         output: the file or folder to write; None for one next to the stream.
         format: the format; None for the suffix of ``output``, else ``ply``.
         frame: the only frame to write, or None.

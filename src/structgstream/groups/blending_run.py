@@ -29,15 +29,10 @@ MAX_GROUPS = 8
 
 @dataclass(frozen=True)
 class BlendedRun:
-    """Result of a run.
+    """Result of a run."""
 
-    Args:
-        borders: result at each border, in order.
-        records: records of the packets of all its groups, in order.
-    """
-
-    borders: tuple[Border, ...]
-    records: tuple[bytes, ...]
+    borders: tuple[Border, ...]  # result at each border, in order
+    records: tuple[bytes, ...]  # records of the packets of all its groups, in order
 
     @classmethod
     def read(cls, path: Path) -> "BlendedRun":

@@ -74,13 +74,9 @@ def relocate_lost_anchors(
     Args:
         dynamic: the dynamic part of a scene.
         first: its anchors in frame 0, in the same order.
-        views: views of the frame.
         active_tiles: by view index, with up-to-date renderings; views without an entry are skipped.
-        floor: baseline residuals of frame 0; None for none.
         min_pixels: views in which an anchor covers fewer pixels do not count.
         births: thresholds of the outlier test.
-        config: configuration of the relocation.
-        backend: the compute back-end.
 
     Raises:
         MissingExtraError: SciPy is not installed.
@@ -199,19 +195,10 @@ def fit_group_start(
     """Fit ``scene``, the decoded scene of frame 0, to a later frame.
 
     Args:
-        scene: of frame 0.
         displacements: ``[M + F, 3]`` of its primitives (Note [Primitives]) since frame 0, as tracked.
-        views: the pictures of the frame.
         changes: change of each picture since frame 0; a view with None does not vote.
         frame_index: index of the frame, for the identities of spawned Gaussians.
-        config: configuration of online frames.
-        start: configuration of this fit.
-        backend: the compute back-end.
-        seed: seed of all random numbers.
-        steps: quantization steps (Note [Bins]).
-        floor: baseline residuals of frame 0; None for none.
         light: exposure reference of frame 0, for ``config.exposure``; None for none.
-        on_step: called after every iteration.
     """
     iterations = USUAL_FRAMES * config.iterations if start.iterations is None else start.iterations
     each = replace(

@@ -44,11 +44,9 @@ def join_segments(
 
     Args:
         paths: finished segments, in any order.
-        output: the stream file.
         check: decode every frame of the result and check the identities of free Gaussians before it is renamed.
         backend: the compute back-end that renders the frames around borders; None to copy packets.
         workers: processes that blend borders, each with one thread; 1 for this process. A GPU needs 1.
-        on_border: called for each border, in order.
 
     Raises:
         StreamError: a segment is damaged or not finished, or frames are missing or duplicated.
@@ -192,7 +190,6 @@ def check_births(path: Path, firsts: Sequence[int]) -> None:
     The identity of a spawned Gaussian is its frame times 2^32 plus a number, so identities of groups do not collide.
 
     Args:
-        path: of the stream.
         firsts: the first frame of each group, ascending.
 
     Raises:

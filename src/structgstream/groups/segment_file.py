@@ -45,23 +45,14 @@ FORMAT, VERSION = "structgstream-group", 1
 
 @dataclass(frozen=True)
 class SegmentIdentity:
-    """Everything that determines the bytes of a segment, except the machine.
+    """Everything that determines the bytes of a segment, except the machine."""
 
-    Args:
-        header: SHA-256 of header and frame 0 (``base.GroupBase.sha256``), including the configuration.
-        capture: fingerprint of the capture.
-        track: SHA-256 of the track's start at the first frame; empty for the group of frame 0.
-        options: options of the group, as plain JSON values.
-        first: the first frame.
-        end: the frame after the last one.
-    """
-
-    header: str
-    capture: str
-    track: str
-    options: Mapping[str, object]
-    first: int
-    end: int
+    header: str  # SHA-256 of header and frame 0 (base.GroupBase.sha256), including the configuration
+    capture: str  # fingerprint of the capture
+    track: str  # SHA-256 of the track's start at the first frame; empty for the group of frame 0
+    options: Mapping[str, object]  # options of the group, as plain JSON values
+    first: int  # the first frame
+    end: int  # the frame after the last one
 
     @property
     def sha256(self) -> str:
@@ -76,27 +67,16 @@ class SegmentIdentity:
 
 @dataclass(frozen=True)
 class Segment:
-    """The complete records of a segment file, up to the first that is missing or damaged.
+    """The complete records of a segment file, up to the first that is missing or damaged."""
 
-    Args:
-        name: name of the file, for messages.
-        data: bytes of the file.
-        identity: what the segment was fitted from.
-        init: bytes of prefix and init record.
-        entries: frame, type and offset of each packet.
-        end: offset after the last complete packet.
-        complete: whether every frame is present, index and footer are valid, and nothing follows.
-        reason: why the segment is not complete; None if it is.
-    """
-
-    name: str
-    data: ByteSource
-    identity: SegmentIdentity
-    init: bytes
-    entries: list[tuple[int, int, int]]
-    end: int
-    complete: bool
-    reason: str | None
+    name: str  # name of the file, for messages
+    data: ByteSource  # bytes of the file
+    identity: SegmentIdentity  # what the segment was fitted from
+    init: bytes  # bytes of prefix and init record
+    entries: list[tuple[int, int, int]]  # frame, type and offset of each packet
+    end: int  # offset after the last complete packet
+    complete: bool  # whether every frame is present, index and footer are valid, and nothing follows
+    reason: str | None  # why the segment is not complete; None if it is
 
     @property
     def next_frame(self) -> int:
@@ -131,23 +111,14 @@ def open_segment(path: Path) -> Segment:
 
 @dataclass(frozen=True)
 class SegmentFacts:
-    """Result of :func:`inspect_segment`.
+    """Result of :func:`inspect_segment`."""
 
-    Args:
-        first: first frame of the group.
-        end: the frame after its last one.
-        frames: number of complete frames, from the first on.
-        complete: whether the segment is finished and undamaged.
-        identity: SHA-256 of what the segment was fitted from.
-        reason: why the segment is not complete; None if it is.
-    """
-
-    first: int
-    end: int
-    frames: int
-    complete: bool
-    identity: str
-    reason: str | None = None
+    first: int  # first frame of the group
+    end: int  # the frame after its last one
+    frames: int  # number of complete frames, from the first on
+    complete: bool  # whether the segment is finished and undamaged
+    identity: str  # SHA-256 of what the segment was fitted from
+    reason: str | None = None  # why the segment is not complete; None if it is
 
 
 def inspect_segment(path: Path) -> SegmentFacts:
@@ -220,9 +191,6 @@ class SegmentSink:
     """Appends the packets of a group; the file is renamed after the last one.
 
     Args:
-        path: path of the finished segment.
-        base: the part of the stream that all groups share.
-        identity: identity of the segment.
         found: existing part that is retained; None for a new segment.
 
     Raises:
@@ -283,16 +251,11 @@ class GroupSoFar:
     """What a session resumes from: frame 0 and the packets of the group that exist.
 
     Its length is the index of the next frame, as if the frames before the group existed.
-
-    Args:
-        base: the part of the stream that all groups share.
-        first: the group's first frame.
-        records: records of the group's packets, framing included.
     """
 
     base: GroupBase
-    first: int
-    records: Sequence[bytes]
+    first: int  # the group's first frame
+    records: Sequence[bytes]  # records of the group's packets, framing included
 
     @property
     def header(self) -> StreamHeader:

@@ -46,19 +46,13 @@ class TrackStart:
     """Displacements of primitives (Note [Primitives]) in a frame, in quantization steps of positions.
 
     Primitives that are not listed have not moved since frame 0.
-
-    Args:
-        frame: the frame.
-        primitives: ``[r]`` int32, ascending.
-        displacements: ``[r, 3]`` int32, since frame 0.
-        velocities: ``[r, 3]`` int32, since the frame before.
-        changed: ``[n]`` float32, share of changed pixels in each frame after the last start, up to this one.
     """
 
-    frame: int
-    primitives: NDArray[np.int32]
-    displacements: NDArray[np.int32]
-    velocities: NDArray[np.int32]
+    frame: int  # the frame
+    primitives: NDArray[np.int32]  # [r] int32, ascending
+    displacements: NDArray[np.int32]  # [r, 3] int32, since frame 0
+    velocities: NDArray[np.int32]  # [r, 3] int32, since the frame before
+    # [n] float32, share of changed pixels in each frame after the last start, up to this one
     changed: NDArray[np.float32]
 
     def packed(self) -> bytes:
@@ -92,23 +86,14 @@ class TrackStart:
 
 @dataclass(frozen=True)
 class TrackHead:
-    """What a track was made from.
+    """What a track was made from."""
 
-    Args:
-        header: SHA-256 of the header and frame 0 (``base.GroupBase.sha256``).
-        capture: fingerprint of the capture.
-        step: quantization step of positions, in units of the scene.
-        primitives: number of primitives of frame 0.
-        every: frames from one possible start to the next.
-        config: configuration of the pass, as plain JSON values.
-    """
-
-    header: str
-    capture: str
-    step: float
-    primitives: int
-    every: int
-    config: Mapping[str, Any]
+    header: str  # SHA-256 of the header and frame 0 (base.GroupBase.sha256)
+    capture: str  # fingerprint of the capture
+    step: float  # quantization step of positions, in units of the scene
+    primitives: int  # number of primitives of frame 0
+    every: int  # frames from one possible start to the next
+    config: Mapping[str, Any]  # configuration of the pass, as plain JSON values
 
 
 class TrackFile:
@@ -208,8 +193,6 @@ class TrackWriter:
     """Writes the track ``path``.
 
     Args:
-        path: path of the finished track.
-        head: what the track is made from.
         keep: bytes of an interrupted pass to retain; 0 to start again.
 
     Raises:

@@ -31,19 +31,13 @@ from structgstream.training.online.split import with_displacements
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """Options of a pass.
+    """Options of a pass."""
 
-    Args:
-        length: frames of a group.
-        quiet: whether groups begin at frames with little motion rather than at equal distances.
-        after: a finished group from whose last frame the pass starts, which corrects earlier tracking errors.
-        tracking: configuration of the tracking.
-    """
-
-    length: int
-    quiet: bool = False
+    length: int  # frames of a group
+    quiet: bool = False  # whether groups begin at frames with little motion rather than at equal distances
+    # a finished group from whose last frame the pass starts, which corrects earlier tracking errors
     after: Segment | None = None
-    tracking: TrackConfig = field(default_factory=TrackConfig)
+    tracking: TrackConfig = field(default_factory=TrackConfig)  # configuration of the tracking
 
     @property
     def first(self) -> int:
@@ -53,23 +47,14 @@ class TrackOptions:
 
 @dataclass(frozen=True)
 class TrackProgress:
-    """Report of one tracked frame.
+    """Report of one tracked frame."""
 
-    Args:
-        frame: its index.
-        moved: number of primitives that were displaced.
-        changed: share of changed pixels.
-        cpu_seconds: processor time of all threads.
-        seconds: wall-clock seconds by stage.
-        stored_bytes: size of its start record; 0 if it has none.
-    """
-
-    frame: int
-    moved: int
-    changed: float
-    cpu_seconds: float
-    seconds: Mapping[str, float]
-    stored_bytes: int = 0
+    frame: int  # its index
+    moved: int  # number of primitives that were displaced
+    changed: float  # share of changed pixels
+    cpu_seconds: float  # processor time of all threads
+    seconds: Mapping[str, float]  # wall-clock seconds by stage
+    stored_bytes: int = 0  # size of its start record; 0 if it has none
 
 
 def track_capture(
@@ -189,21 +174,13 @@ def _existing(path: Path, head: TrackHead) -> TrackFile | None:
 
 @dataclass
 class Pass:
-    """State of a pass.
+    """State of a pass."""
 
-    Args:
-        first: scene of frame 0.
-        tracker: follows primitives from frame to frame.
-        step: quantization step of positions, in units of the scene.
-        tracked: primitives in the last frame.
-        index: index of the last frame.
-    """
-
-    first: Scene
-    tracker: Tracker
-    step: float
-    tracked: Tracked
-    index: int
+    first: Scene  # scene of frame 0
+    tracker: Tracker  # follows primitives from frame to frame
+    step: float  # quantization step of positions, in units of the scene
+    tracked: Tracked  # primitives in the last frame
+    index: int  # index of the last frame
 
     @classmethod
     def at(cls, base: GroupBase, config: TrackConfig, backend: Backend, start: TrackStart | None) -> "Pass":

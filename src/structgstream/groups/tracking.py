@@ -64,16 +64,11 @@ class TrackConfig:
 
 @dataclass(frozen=True)
 class TrackPictures:
-    """Reduced pictures of one frame.
+    """Reduced pictures of one frame."""
 
-    Args:
-        index: index of the frame.
-        views: views of all cameras.
-        changes: change since the frame before, with flow, of the cameras in use, by position in ``views``.
-    """
-
-    index: int
-    views: list[View]
+    index: int  # index of the frame
+    views: list[View]  # views of all cameras
+    # change since the frame before, with flow, of the cameras in use, by position in views
     changes: Mapping[int, PictureChange] = field(default_factory=dict)
 
     @property
@@ -85,20 +80,12 @@ class TrackPictures:
 
 @dataclass(frozen=True)
 class Tracker:
-    """Follows the primitives of a scene.
+    """Follows the primitives of a scene."""
 
-    Args:
-        config: sizes and cameras.
-        motion: thresholds of the selection, for pictures of the stream.
-        lift: configuration of the scene flow.
-        rig: rig of the stream, in the units of the scene.
-        backend: the compute back-end.
-    """
-
-    config: TrackConfig
-    motion: MotionConfig
-    lift: LiftConfig
-    rig: CameraRig
+    config: TrackConfig  # sizes and cameras
+    motion: MotionConfig  # thresholds of the selection, for pictures of the stream
+    lift: LiftConfig  # configuration of the scene flow
+    rig: CameraRig  # rig of the stream, in the units of the scene
     backend: Backend
 
     def stride(self, cameras: int) -> int:
@@ -131,19 +118,12 @@ class Tracker:
 
 @dataclass(frozen=True)
 class Tracked:
-    """The primitives of a scene after a tracked frame.
+    """The primitives of a scene after a tracked frame."""
 
-    Args:
-        scene: the displaced scene.
-        velocities: ``[M + F, 3]`` displacements by the last frame.
-        seconds: wall-clock seconds by stage of the last frame.
-        moved: number of primitives that the last frame displaced.
-    """
-
-    scene: Scene
-    velocities: Tensor
-    seconds: Mapping[str, float] = field(default_factory=dict)
-    moved: int = 0
+    scene: Scene  # the displaced scene
+    velocities: Tensor  # [M + F, 3] displacements by the last frame
+    seconds: Mapping[str, float] = field(default_factory=dict)  # wall-clock seconds by stage of the last frame
+    moved: int = 0  # number of primitives that the last frame displaced
 
     @classmethod
     def at_rest(cls, scene: Scene) -> "Tracked":
@@ -155,9 +135,7 @@ def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tra
     """Displace the primitives of ``past`` to the next frame.
 
     Args:
-        tracker: thresholds and cameras.
         past: primitives in the frame before.
-        pictures: pictures of this frame.
     """
     watch, velocities = Stopwatch(), torch.zeros_like(past.velocities)
     scene = past.scene.with_folded_appearance()
@@ -241,9 +219,7 @@ def _occluded(motion: MotionConfig, scene: Scene, seen: Sequence[_ViewEvidence],
     Anchors outside these tiles are neither selected nor used as neighbours, because nothing is measured there.
 
     Args:
-        motion: thresholds.
         scene: the scene before the frame.
-        seen: measurements of the cameras.
         moving: mask ``[M]`` of the anchors that are dynamic by votes.
     """
     anchors, occluded = len(moving), torch.zeros_like(moving)

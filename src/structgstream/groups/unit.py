@@ -47,19 +47,12 @@ _OUT_OF_MEMORY = (MemoryError, torch.OutOfMemoryError)
 
 @dataclass(frozen=True)
 class GroupEntry:
-    """Start of a group.
+    """Start of a group."""
 
-    Args:
-        frame: its first frame, after frame 0.
-        displacements: ``[M + F, 3]`` displacements of frame 0's primitives (Note [Primitives]) since frame 0.
-        velocities: ``[M + F, 3]`` displacements since the frame before.
-        first_pictures: returns the pictures of frame 0.
-    """
-
-    frame: int
-    displacements: Tensor
-    velocities: Tensor
-    first_pictures: Callable[[], MultiViewFrame]
+    frame: int  # its first frame, after frame 0
+    displacements: Tensor  # [M + F, 3] displacements of frame 0's primitives (Note [Primitives]) since frame 0
+    velocities: Tensor  # [M + F, 3] displacements since the frame before
+    first_pictures: Callable[[], MultiViewFrame]  # returns the pictures of frame 0
 
 
 @dataclass
@@ -67,18 +60,12 @@ class GroupMethod:
     """The method of a group's frames. The state before its first frame is frame 0.
 
     If memory runs out it lowers its budget once and fits the frame again.
-
-    Args:
-        config: configuration of the stream.
-        start: configuration of the first frame's fit.
-        entry: start of the group; None for the group of frame 0, which is fitted as any stream.
-        lowered: whether the budget has been lowered.
     """
 
-    config: StreamConfig
-    start: GroupStartConfig
-    entry: GroupEntry | None
-    lowered: bool = False
+    config: StreamConfig  # configuration of the stream
+    start: GroupStartConfig  # configuration of the first frame's fit
+    entry: GroupEntry | None  # start of the group; None for the group of frame 0, which is fitted as any stream
+    lowered: bool = False  # whether the budget has been lowered
     _first: MultiViewFrame | None = field(default=None, repr=False)
 
     @property
@@ -206,23 +193,14 @@ MIN_PIXELS = 0.5
 
 @dataclass(frozen=True)
 class SegmentTask:
-    """A group of frames.
+    """A group of frames."""
 
-    Args:
-        capture: folder of the capture.
-        header: stream file whose init record and frame 0 the groups share.
-        track: track of the capture, made from that header; may be None for the group of frame 0.
-        first: the first frame, counted from the header's.
-        end: the frame after the last one.
-        start: configuration of the first frame's fit.
-    """
-
-    capture: Path
-    header: Path
-    track: Path | None
-    first: int
-    end: int
-    start: GroupStartConfig = field(default_factory=GroupStartConfig)
+    capture: Path  # folder of the capture
+    header: Path  # stream file whose init record and frame 0 the groups share
+    track: Path | None  # track of the capture, made from that header; may be None for the group of frame 0
+    first: int  # the first frame, counted from the header's
+    end: int  # the frame after the last one
+    start: GroupStartConfig = field(default_factory=GroupStartConfig)  # configuration of the first frame's fit
 
 
 def fit_segment(
@@ -240,12 +218,7 @@ def fit_segment(
     of the stream.
 
     Args:
-        path: path of the segment.
-        task: the group.
-        backend: the compute back-end.
         overwrite: remove an existing segment.
-        on_step: called after every optimisation step.
-        remarks: see ``recorder.LogExtras``.
 
     Returns:
         the run; None if the segment exists, finished and undamaged.

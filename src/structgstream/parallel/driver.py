@@ -52,30 +52,20 @@ def cut_track(track: Path, first: int) -> bytes:
 
 @dataclass(frozen=True)
 class Unit:
-    """Options of the commands.
+    """Options of the commands."""
 
-    Args:
-        capture: folder of the capture.
-        frames: number of frames; None for all.
-        header: further arguments of ``reconstruct`` for frame 0: preset, scale, held-out cameras.
-        track: further arguments of ``track``: length of groups.
-        track_threads: threads of the tracking pass, which all groups wait for; None for those of its worker slot.
-        device: further arguments of all commands: the back-end.
-        join: further arguments of ``join``: number of processes.
-        program: runs the commands.
-        starts: the frames at which a group may start, of a track that is finished or growing.
-        cut: extracts from a track what one group needs.
-    """
-
-    capture: str
-    frames: int | None = None
-    header: tuple[str, ...] = ()
-    track: tuple[str, ...] = ()
+    capture: str  # folder of the capture
+    frames: int | None = None  # number of frames; None for all
+    header: tuple[str, ...] = ()  # further arguments of reconstruct for frame 0: preset, scale, held-out cameras
+    track: tuple[str, ...] = ()  # further arguments of track: length of groups
+    # threads of the tracking pass, which all groups wait for; None for those of its worker slot
     track_threads: int | None = None
-    device: tuple[str, ...] = ()
-    join: tuple[str, ...] = ()
-    program: tuple[str, ...] = PROGRAM
+    device: tuple[str, ...] = ()  # further arguments of all commands: the back-end
+    join: tuple[str, ...] = ()  # further arguments of join: number of processes
+    program: tuple[str, ...] = PROGRAM  # runs the commands
+    # the frames at which a group may start, of a track that is finished or growing
     starts: Callable[[Path], Collection[int]] = field(default=starts_in, compare=False)
+    # extracts from a track what one group needs
     cut: Callable[[Path, int], bytes] = field(default=cut_track, compare=False)
 
     def header_task(self, parts: Parts) -> Task:
@@ -122,21 +112,13 @@ class State(StrEnum):
 
 @dataclass(frozen=True)
 class Status:
-    """Progress of a run.
+    """Progress of a run."""
 
-    Args:
-        stage: header, track, groups (perhaps while the track grows) or join.
-        groups: frames of each group, once they are known.
-        states: state of each group.
-        tracked: number of groups whose start has been tracked.
-        failed: names of tasks that failed.
-    """
-
-    stage: str
-    groups: Groups = ()
-    states: tuple[State, ...] = ()
-    tracked: int = 0
-    failed: tuple[str, ...] = ()
+    stage: str  # header, track, groups (perhaps while the track grows) or join
+    groups: Groups = ()  # frames of each group, once they are known
+    states: tuple[State, ...] = ()  # state of each group
+    tracked: int = 0  # number of groups whose start has been tracked
+    failed: tuple[str, ...] = ()  # names of tasks that failed
 
 
 Listener = Callable[[Status], object]
@@ -144,17 +126,11 @@ Listener = Callable[[Status], object]
 
 @dataclass(frozen=True)
 class Job:
-    """A parallel run.
+    """A parallel run."""
 
-    Args:
-        unit: its commands.
-        output: the stream file.
-        gpus: number of GPUs that a task needs, 0 or 1.
-    """
-
-    unit: Unit
+    unit: Unit  # its commands
     output: Path
-    gpus: int = 0
+    gpus: int = 0  # number of GPUs that a task needs, 0 or 1
 
     @property
     def key(self) -> str:
@@ -182,11 +158,8 @@ def drive(
     Call it again after an interruption: complete parts are not made again.
 
     Args:
-        job: the run.
         parts: the folder of parts, locked by this process (:meth:`Parts.locked`).
-        executor: runs the tasks, except the join, which runs here.
         exchange: how parts are transferred; by default all machines see the folder.
-        listener: called with the status twice a second and when a task ends.
 
     Raises:
         TaskError: tasks failed; complete parts remain.

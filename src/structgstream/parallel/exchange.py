@@ -190,8 +190,6 @@ class ObjectStore(SharedFolder):
     """Parts are exchanged through an object store; the driver has copies.
 
     Args:
-        store: the folder of the store.
-        parts: the driver's folder.
         cut: extracts from a track what one group needs.
     """
 

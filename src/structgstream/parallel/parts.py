@@ -36,27 +36,16 @@ _PIECE_BYTES = 2**20
 
 @dataclass(frozen=True)
 class CompletedTask:
-    """Record of a completed task and its part.
+    """Record of a completed task and its part."""
 
-    Args:
-        name: name of the task.
-        key: hash of its arguments.
-        sha256: of the part.
-        bytes: size of the part.
-        seconds: duration of the last attempt.
-        attempts: number of attempts.
-        peak_bytes: largest resident memory; 0 if unknown.
-        frames: number of fitted, or tracked, frames.
-    """
-
-    name: str
-    key: str
-    sha256: str
-    bytes: int
-    seconds: float
-    attempts: int
-    peak_bytes: int
-    frames: int
+    name: str  # name of the task
+    key: str  # hash of its arguments
+    sha256: str  # of the part
+    bytes: int  # size of the part
+    seconds: float  # duration of the last attempt
+    attempts: int  # number of attempts
+    peak_bytes: int  # largest resident memory; 0 if unknown
+    frames: int  # number of fitted, or tracked, frames
 
 
 class Parts:

@@ -25,15 +25,10 @@ _GIVEN = re.compile(r"([^=]*)=([^=]*)")
 
 @dataclass(frozen=True)
 class Quality:
-    """One of the qualities.
+    """One of the qualities."""
 
-    Args:
-        name: name of its folder.
-        fineness: ``online.rounding.quality``: 0 is the preset's own, 1 halves every quantization step.
-    """
-
-    name: str
-    fineness: float
+    name: str  # name of its folder
+    fineness: float  # online.rounding.quality: 0 is the preset's own, 1 halves every quantization step
 
 
 def qualities_in(given: Sequence[str]) -> tuple[Quality, ...]:
@@ -99,7 +94,6 @@ class BitRates:
 
     Args:
         folder: contains the list and a folder of segments for each quality.
-        qualities: the listed qualities.
     """
 
     def __init__(self, folder: Path, qualities: Sequence[Quality]) -> None:
@@ -123,9 +117,6 @@ class BitRates:
 
     def refresh(self, *, last: bool = False) -> None:
         """Rewrites the list if a measured rate differs from the listed one.
-
-        Args:
-            last: no frame follows, so the rates of any number of packets are listed.
 
         Raises:
             StorageError: it cannot be written; the earlier list is not affected.

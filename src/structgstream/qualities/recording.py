@@ -94,26 +94,18 @@ class Once(Generic[Value]):
 
 @dataclass(frozen=True)
 class SharedWork:
-    """Shared results of the qualities of one run.
+    """Shared results of the qualities of one run."""
 
-    Args:
-        pictures: preprocessed pictures, by the numbers of a frame and of the frame before.
-        first: fits of first frames, by frame number.
-    """
-
+    # preprocessed pictures, by the numbers of a frame and of the frame before
     pictures: Once[FramePictures] = field(default_factory=lambda: Once(PICTURES_KEPT))
-    first: Once[FitResult[Scene]] = field(default_factory=lambda: Once(1))
+    first: Once[FitResult[Scene]] = field(default_factory=lambda: Once(1))  # fits of first frames, by frame number
 
 
 @dataclass(frozen=True)
 class SharedMethod(StructGStream):
-    """The method of one of several qualities (Note [Shared work]).
+    """The method of one of several qualities (Note [Shared work])."""
 
-    Args:
-        shared: the shared results.
-    """
-
-    shared: SharedWork = field(default_factory=SharedWork)
+    shared: SharedWork = field(default_factory=SharedWork)  # the shared results
 
     def observe(
         self, frame: MultiViewFrame, before: MultiViewFrame | None, *, rig: CameraRig, backend: Backend
@@ -183,30 +175,19 @@ def joint_entry(report: FrameReport, entries: Mapping[str, Mapping[str, Any]]) -
 
 @dataclass(frozen=True)
 class QualityReport:
-    """Report of a stored frame of a quality.
+    """Report of a stored frame of a quality."""
 
-    Args:
-        quality: name of the quality.
-        report: report of the frame.
-        whole: whether all qualities have the frame now.
-    """
-
-    quality: str
-    report: FrameReport
-    whole: bool
+    quality: str  # name of the quality
+    report: FrameReport  # report of the frame
+    whole: bool  # whether all qualities have the frame now
 
 
 @dataclass(frozen=True)
 class QualitiesRun:
-    """A reconstruction into several qualities.
+    """A reconstruction into several qualities."""
 
-    Args:
-        done: number of frames that all qualities had at the start.
-        reports: reports of the further frames; each step of the generator fits, stores and logs one frame of one
-            quality.
-    """
-
-    done: int
+    done: int  # number of frames that all qualities had at the start
+    # reports of the further frames; each step of the generator fits, stores and logs one frame of one quality
     reports: Generator[QualityReport, None, None]
 
 
@@ -254,14 +235,11 @@ def record_qualities(
 
     Args:
         folder: contains ``qualities.json`` and a folder for each quality; logs are next to these.
-        source: the capture, or live cameras.
         config: configuration of all qualities, without their fineness.
         qualities: at least one, the coarsest first.
-        backend: the compute back-end.
         storages: opens the sink of each quality, by name.
         resume: continue after the last complete frame of each quality.
         metadata: plain JSON values for the headers.
-        on_step: called after every optimisation step.
         metrics: receives every frame; has these qualities.
 
     Raises:
@@ -300,7 +278,6 @@ def _in_step(
     Args:
         reports: reports of each session, by name; closed with the result.
         done: number of frames of each session.
-        close: called after these are closed.
     """
     frames, going = dict(done), [*reports]
     with ExitStack() as stack:

@@ -135,15 +135,10 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Query:
-    """The query parameters that the server knows; others are ignored.
+    """The query parameters that the server knows; others are ignored."""
 
-    Args:
-        token: access token; None if there is none.
-        after: sequence of the manifest that the client has; None if it does not wait for a newer one.
-    """
-
-    token: str | None
-    after: int | None
+    token: str | None  # access token; None if there is none
+    after: int | None  # sequence of the manifest that the client has; None if it does not wait for a newer one
 
 
 def parsed_query(raw: bytes, headers: Mapping[str, str]) -> Query:
@@ -184,7 +179,6 @@ class Authorizer:
 
     Args:
         keys: secrets; None gives everyone access.
-        clock: Unix seconds.
     """
 
     def __init__(self, keys: TokenKeys | None, *, clock: Callable[[], float] = time.time) -> None:

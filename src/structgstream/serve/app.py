@@ -63,29 +63,17 @@ _NOTHING_HERE: Final = "There is nothing at this address."
 
 @dataclass(frozen=True)
 class ServerSettings:
-    """Settings of the server.
+    """Settings of the server."""
 
-    Args:
-        folder: contains the streams, or is one.
-        keys: secrets of access tokens; None gives everyone access.
-        origins: origins whose pages may read responses, ``*`` for all; empty: only pages of this server.
-        hosts: host names that requests may have; ``*`` for any.
-        wait_seconds: longest time that a request waits for a newer manifest.
-    """
-
-    folder: Path
-    keys: TokenKeys | None = None
-    origins: tuple[str, ...] = ()
-    hosts: tuple[str, ...] = LOOPBACK_NAMES
-    wait_seconds: float = 25.0
+    folder: Path  # contains the streams, or is one
+    keys: TokenKeys | None = None  # secrets of access tokens; None gives everyone access
+    origins: tuple[str, ...] = ()  # origins whose pages may read responses, * for all; empty: only pages of this server
+    hosts: tuple[str, ...] = LOOPBACK_NAMES  # host names that requests may have; * for any
+    wait_seconds: float = 25.0  # longest time that a request waits for a newer manifest
 
 
 def application(settings: ServerSettings, *, clock: Callable[[], float] = time.time) -> Starlette:
     """The application (Note [What is served]).
-
-    Args:
-        settings: settings of the server.
-        clock: Unix seconds.
 
     Raises:
         PlayerError: the folder cannot be read, or the installation lacks the player.

@@ -84,9 +84,6 @@ def checked_origins(origins: tuple[str, ...]) -> tuple[str, ...]:
 def bound(port: int, *, address: str = LOOPBACK) -> socket.socket:
     """A listening socket, which queues connections before the server runs.
 
-    Args:
-        port: the port; 0 for a free one.
-
 
     Raises:
         PlayerError: the port is taken, or may not be used.
@@ -112,8 +109,6 @@ def server(app: ASGIApp, *, proxies: Sequence[str] = (), connections: int | None
     """A server, not yet running.
 
     Args:
-        app: the application.
-        proxies: addresses or networks whose ``X-Forwarded-For`` and ``-Proto`` are trusted.
         connections: number of connections above which requests are answered with 503; None for no limit.
     """
     config = uvicorn.Config(
@@ -139,9 +134,6 @@ def run(server: uvicorn.Server, *, port: int, address: str = LOOPBACK, on_start:
     """Serve until Ctrl-C or SIGTERM.
 
     Args:
-        server: see :func:`server`.
-        port: the port; 0 for a free one.
-        address: the address to listen on.
         on_start: called with the server's address once the port is bound.
 
     Raises:

@@ -52,7 +52,6 @@ class ManifestWatch:
 
     Args:
         open_file: opens the file; called in a thread.
-        clock: monotonic seconds.
     """
 
     def __init__(

@@ -112,7 +112,6 @@ def linked_page(
     """A page that loads the player and the stream, for a server.
 
     Args:
-        title: title of the window.
         stream: address of the stream, relative to the page.
         module: address of the player, relative to the page.
         attributes: further attributes of the element.
@@ -124,11 +123,6 @@ def linked_page(
 
 def single_page(title: str, *, module: str, stream: ByteSource) -> bytes:
     """A page that contains player and stream, and can be opened from a disk without a server.
-
-    Args:
-        title: title of the window.
-        module: the player's source.
-        stream: the whole stream file.
 
     Raises:
         PlayerError: the stream is too long for a page.
@@ -166,14 +160,7 @@ def _element(attributes: Mapping[str, str]) -> str:
 
 
 def html_page(title: str, *, head: str, body: str, rules: str) -> str:
-    """A whole page.
-
-    Args:
-        title: title of the window, as plain text.
-        head: further elements of the head, as HTML.
-        body: content, as HTML.
-        rules: its Content-Security-Policy.
-    """
+    """A whole page."""
     return f"""<!doctype html>
 <html lang="en">
 <head>

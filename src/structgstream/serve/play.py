@@ -113,7 +113,6 @@ def application(stream: StreamFile, *, truth: Truth | None = None) -> Starlette:
     """The application; each request opens the file anew, so it may grow meanwhile.
 
     Args:
-        stream: the file to play.
         truth: the capture's pictures to compare with, or None.
 
     Raises:

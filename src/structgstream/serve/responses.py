@@ -69,7 +69,6 @@ def requested_part(request: Mapping[str, str], size_bytes: int, *, etag: str | N
 
     Args:
         request: headers by their names in lower case.
-        size_bytes: length of the file.
         etag: strong validator of the bytes. Without one a request with ``If-Range`` gets all of them, because the
             version of its part is unknown.
     """
@@ -114,10 +113,6 @@ def file_response(
 
     Args:
         opened: the file at its current length.
-        request: GET or HEAD.
-        headers: headers of the response.
-        etag: strong validator of the bytes.
-        media_type: media type of the bytes.
     """
     if etag is not None:
         headers = {**headers, "ETag": etag}

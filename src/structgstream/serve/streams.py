@@ -158,20 +158,14 @@ class StreamKind(Enum):
 
 @dataclass(frozen=True)
 class ServedStream:
-    """A stream in the folder ``root``.
+    """A stream in the folder ``root``."""
 
-    Args:
-        root: the folder.
-        name: of the folder of segments, of the folder of renditions (qualities), or of the file with its suffix; a
-            rendition is named FOLDER/RENDITION.
-        kind: how it is stored.
-        renditions: folders of segments in the folder of renditions, by rising bit rate.
-    """
-
-    root: Path
+    root: Path  # the folder
+    # of the folder of segments, of the folder of renditions (qualities), or of the file with its suffix; a rendition is
+    # named FOLDER/RENDITION
     name: str
-    kind: StreamKind
-    renditions: tuple[str, ...] = ()
+    kind: StreamKind  # how it is stored
+    renditions: tuple[str, ...] = ()  # folders of segments in the folder of renditions, by rising bit rate
 
     @property
     def segments(self) -> tuple["ServedStream", ...]:
@@ -210,10 +204,6 @@ class Catalog:
     """The streams of a folder, listed again when the last listing is a second old.
 
     A folder of segments, or of renditions, is one stream: itself.
-
-    Args:
-        folder: the folder.
-        clock: monotonic seconds.
 
     Raises:
         PlayerError: it is no folder, or cannot be read.
