@@ -22,8 +22,7 @@ from collections import defaultdict
 from pathlib import Path
 
 from structgstream.data.dataset_layouts import bundled_clip_path
-from structgstream.executors.executor import ExecutorName, ExecutorOptions, open_executor
-from structgstream.executors.task import PYTHON, Task
+from structgstream.executors.tasks import PYTHON, ExecutorName, ExecutorOptions, Task, open_executor
 from structgstream.parallel.driver import Job, Status, Unit, drive
 from structgstream.parallel.parts import Parts
 from tests.support import stand_in

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.errors import ConfigError, TaskError
-from structgstream.executors.task import PYTHON, Task
+from structgstream.executors.tasks import PYTHON, Task
 from structgstream.groups import join
 from structgstream.groups.base import GroupBase, open_for
 from structgstream.groups.blending_run import MAX_GROUPS, BlendedRun, main, runs_of

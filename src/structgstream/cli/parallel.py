@@ -29,11 +29,11 @@ from structgstream.cli.options import (
 )
 from structgstream.cli.progress import human_bytes, print_lines
 from structgstream.cli.tables import compact_table, literal_cells
-from structgstream.executors.executor import ExecutorName, ExecutorOptions
+from structgstream.executors.tasks import ExecutorName, ExecutorOptions
 
 if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
-    from structgstream.executors.executor import TaskQueue
+    from structgstream.executors.tasks import TaskQueue
     from structgstream.parallel.cost import Estimate, Measured, Work
     from structgstream.parallel.driver import Job, State, Status
     from structgstream.parallel.exchange import ObjectStore
@@ -177,7 +177,7 @@ def open_tasks(options: ExecutorOptions, device: Device) -> "TaskQueue":
         MissingExtraError: a package is missing.
     """
     from structgstream.evaluation.environment import usable_cores
-    from structgstream.executors.executor import open_executor
+    from structgstream.executors.tasks import open_executor
 
     return open_executor(options, cores=usable_cores(), gpus=gpus_of(device))
 
@@ -194,7 +194,7 @@ def gpus_of(device: Device) -> int:
 def join_arguments(options: WorkerOptions, device: Device) -> tuple[str, ...]:
     """As many processes as the workers have threads; on a cluster and with GPUs the default of ``join``."""
     from structgstream.evaluation.environment import usable_cores
-    from structgstream.executors.task import allocate_slots
+    from structgstream.executors.tasks import allocate_slots
 
     if options.executor == "ray" or gpus_of(device):
         return ()

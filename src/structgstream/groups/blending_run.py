@@ -18,7 +18,7 @@ from structgstream.atomic_files import atomic_write
 from structgstream.codec.container.records import PREFIX, read_record
 from structgstream.codec.header import unpack_header
 from structgstream.codec.packets import StreamHeader
-from structgstream.executors.task import PYTHON, Task
+from structgstream.executors.tasks import PYTHON, Task
 from structgstream.groups.seam_blend import OWN_FRAMES, Border, GroupBlender
 from structgstream.groups.segment_file import open_segment
 from structgstream.kernels.backend import BackendName, select_backend

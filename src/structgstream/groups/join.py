@@ -12,9 +12,7 @@ from structgstream.atomic_files import atomic_file
 from structgstream.codec.container.records import pack_index
 from structgstream.codec.reader import open_stream
 from structgstream.errors import ConfigError, StreamError, TaskError
-from structgstream.executors.executor import TaskQueue
-from structgstream.executors.local import LocalEngine
-from structgstream.executors.task import allocate_slots
+from structgstream.executors.tasks import LocalEngine, TaskQueue, allocate_slots
 from structgstream.groups.blending_run import BlendedRun, header_of, run_task, runs_of
 from structgstream.groups.seam_blend import Border, GroupBlender
 from structgstream.groups.segment_file import Segment, open_segment

@@ -11,9 +11,15 @@ from pathlib import Path
 
 from structgstream.atomic_files import atomic_write, partial_path
 from structgstream.errors import StorageError, StreamError, TaskError
-from structgstream.executors.executor import TaskQueue
-from structgstream.executors.local import LocalEngine
-from structgstream.executors.task import PYTHON, Task, TaskResult, WorkerSlot, thread_environment
+from structgstream.executors.tasks import (
+    PYTHON,
+    LocalEngine,
+    Task,
+    TaskQueue,
+    TaskResult,
+    WorkerSlot,
+    thread_environment,
+)
 from structgstream.groups.boundaries import Groups, groups_path, read_groups
 from structgstream.parallel.exchange import SharedFolder
 from structgstream.parallel.parts import Parts, group_name, key_of, sha256_of

@@ -26,7 +26,7 @@ from typing import TypeVar
 from structgstream.atomic_files import atomic_write, partial_path
 from structgstream.errors import StorageError, StructGStreamError
 from structgstream.evaluation.run_log import log_path
-from structgstream.executors.task import PYTHON, Task, argv_of
+from structgstream.executors.tasks import PYTHON, Task, argv_of
 from structgstream.groups.boundaries import groups_path
 from structgstream.owned_folders import MARKER, Owner, own_folder, owner_of, parse_owner, remove_own
 from structgstream.parallel.parts import PART_NAMES, Parts

@@ -17,7 +17,7 @@ from typing import Any
 
 from structgstream.atomic_files import atomic_write, lock_file, open_lockable
 from structgstream.errors import ConfigError, StorageError
-from structgstream.executors.task import TaskResult
+from structgstream.executors.tasks import TaskResult
 from structgstream.owned_folders import Owner, check_owned, own_folder, remove_own
 
 PLAN = "plan.json"
