@@ -65,7 +65,6 @@ def record(
     Args:
         path: the file; an existing one is replaced unless it is resumed.
         source: the capture; frames of a recording are read ahead.
-        resume: continue after the last complete frame of an existing file.
         storage: opens another sink than a file at ``path``, such as :func:`segments_at`.
         metadata: plain JSON values for the header, equal in all runs of a stream.
 
@@ -89,7 +88,6 @@ def log_reports(
     """The reports of a session, each written to the log next to ``path`` before it is yielded.
 
     Args:
-        reports: the reports; closed with the result.
         done: number of existing frames, whose lines of the log are retained.
 
     Raises:
@@ -209,11 +207,7 @@ class PreviewSink:
 
 
 def preview(header: StreamHeader, packet: Packet) -> NDArray[np.uint8]:
-    """A key frame ``[H, W, 3]`` (8-bit sRGB) from the middle training camera, at most 320 pixels wide.
-
-    Args:
-        header: header of the packet's period.
-    """
+    """A key frame ``[H, W, 3]`` (8-bit sRGB) from the middle training camera, at most 320 pixels wide."""
     name = header.rig.training[len(header.rig.training) // 2]
     camera = header.rig[name]
     width = min(WIDTH, camera.width)

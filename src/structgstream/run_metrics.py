@@ -81,9 +81,6 @@ class RunMetrics:
     """Collects and writes the metrics of a run.
 
     Args:
-        total: number of frames; None if unknown.
-        done: number of frames that existed at the start.
-        live: returns the state of live cameras; None for a recording.
         captured: returns the time of capture of a frame by its index, Unix time; None if unknown.
         qualities: names of the qualities of each frame; empty for a single stream.
     """

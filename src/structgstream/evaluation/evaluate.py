@@ -17,14 +17,6 @@ from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import select_cameras
 from structgstream.errors import CaptureError
 from structgstream.evaluation.environment import environment
-from structgstream.evaluation.facts import (
-    check_same_frames,
-    check_same_rig,
-    comparison_facts,
-    scored_cameras,
-    stream_facts,
-    training_facts,
-)
 from structgstream.evaluation.ghosts import Ghosts, GhostSearch
 from structgstream.evaluation.metrics import ChannelFit, Mask, Picture, blackened, both, channel_fit, counting, score
 from structgstream.evaluation.optional_metrics import (
@@ -35,7 +27,17 @@ from structgstream.evaluation.optional_metrics import (
     load_optional_metrics,
     optional_scores,
 )
-from structgstream.evaluation.recording import Drawable, Recording, to_device
+from structgstream.evaluation.recording import (
+    Drawable,
+    Recording,
+    check_same_frames,
+    check_same_rig,
+    comparison_facts,
+    scored_cameras,
+    stream_facts,
+    to_device,
+    training_facts,
+)
 from structgstream.evaluation.report import FrameScores, Report, Scores, drawing_facts, mean_scores, psnr_trend
 from structgstream.evaluation.sizes import StoredSize, half_scores, halved, stored_size
 from structgstream.evaluation.worst import worst_facts

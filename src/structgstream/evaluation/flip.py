@@ -47,11 +47,7 @@ class FlipFeatures:
 
 
 def opencv() -> ModuleType:
-    """The module OpenCV, which filters pictures.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
+    """The module OpenCV, which filters pictures. Raises MissingExtraError if it is not installed."""
     try:
         import cv2
     except ImportError:

@@ -28,7 +28,7 @@ from structgstream.evaluation.metrics import (
     mean_of_squares,
     squared_errors,
 )
-from structgstream.evaluation.sizes import block_mask, block_means
+from structgstream.evaluation.pictures import block_mask, block_means
 
 OCCUPIED, RESTORED, WRONG = 20, 8, 8  # levels of 255; noise of cameras and compression is 2 to 4 after the 3x3 mean
 REACH, MARGIN = 12 / 640, 6 / 640  # shares of the longer side: soft edges, and shadows next to moving objects

@@ -120,11 +120,7 @@ class ComparedFrame:
 
 
 def load_optional_metrics(
-    cameras: Iterable[tuple[str, Camera]],
-    *,
-    frames: int,
-    device: torch.device,
-    lpips_weights: Path | None = None,
+    cameras: Iterable[tuple[str, Camera]], *, frames: int, device: torch.device, lpips_weights: Path | None = None
 ) -> OptionalMetrics:
     """The metrics that are available here for these cameras (by name) and this number of frames.
 

@@ -21,7 +21,7 @@ from structgstream.evaluation.metrics import (
     squared_errors,
     ssim,
 )
-from structgstream.evaluation.pictures import spread_indices
+from structgstream.evaluation.pictures import block_mask, block_means, spread_indices
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.scene.render import Drawable, render, to_8bit_image
@@ -29,29 +29,6 @@ from structgstream.scene.render import Drawable, render, to_8bit_image
 STORED_FRAMES, STORED_SHARE = 5, 4
 """At most five frames, and at most one in four, are scored at the stored size: twice the size has four times the
 pixels."""
-
-
-def block_means(picture: Picture, factor: int) -> Picture:
-    """``picture`` ``[H, W, 3]`` reduced by a whole factor, by area mean, rounded.
-
-    Rows and columns at the end that do not fill a pixel are left out.
-    """
-    if factor == 1:
-        return picture
-    height, width = picture.shape[0] // factor, picture.shape[1] // factor
-    blocks = picture[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)
-    total = np.zeros((height, width, 3), np.uint32)
-    for row in range(factor):  # many times faster than sums over so short axes
-        for column in range(factor):
-            total += blocks[:, row, :, column]
-    return ((total + factor**2 // 2) // factor**2).astype(np.uint8)
-
-
-def block_mask(mask: Mask, factor: int) -> Mask:
-    """``mask`` ``[H, W]`` reduced as in :func:`block_means`: a pixel counts if all its source pixels count."""
-    height, width = mask.shape[0] // factor, mask.shape[1] // factor
-    blocks = mask[: height * factor, : width * factor].reshape(height, factor, width, factor)
-    return np.logical_and.reduce(blocks, axis=(1, 3))
 
 
 def halved(camera: Camera) -> Camera:

@@ -169,9 +169,6 @@ def write_worst(folder: Path, crops: Sequence[Crop]) -> list[str]:
 def write_page(folder: Path, crops: Sequence[Crop], *, title: str, pictures: Sequence[str]) -> None:
     """Writes ``index.html`` and the crops into the folder of a report.
 
-    Args:
-        pictures: file names of further pictures in the folder.
-
     Raises:
         StorageError: a file cannot be written.
     """

@@ -34,8 +34,6 @@ class RayEngine:
     Args:
         address: ``HOST:PORT`` of the cluster's head, or ``auto`` for one on this machine; None starts one on this
             machine, for this process only, with ``workers``.
-        workers: number of workers of a cluster that is started here.
-        cores: number of cores of a worker.
 
     Raises:
         MissingExtraError: Ray is not installed.
@@ -115,11 +113,7 @@ class RayEngine:
 
 
 def _protect(*, begins_one: bool) -> None:
-    """Enables token authentication and disables usage statistics; must be called before Ray is imported.
-
-    Raises:
-        ConfigError: authentication is turned off, or there is no token for the cluster to join.
-    """
+    """Enables token authentication and disables usage statistics; must be called before Ray is imported."""
     mode = os.environ.setdefault("RAY_AUTH_MODE", "token")
     if mode == "disabled":
         raise ConfigError(
@@ -150,11 +144,7 @@ def _imported() -> Any:
 
 
 def _join(ray: Any, address: str | None, cores: int, folder: Path) -> None:
-    """Joins the cluster, or starts one of so many cores.
-
-    Raises:
-        ConfigError: it cannot be reached, refuses the token, or cannot be started.
-    """
+    """Joins the cluster, or starts one of so many cores."""
     given: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address is None:
         given |= {"num_cpus": cores, "include_dashboard": False}

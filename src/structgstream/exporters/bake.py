@@ -107,7 +107,6 @@ def bake(scene: Scene, cameras: Iterable[Camera], backend: Backend, *, degree: i
     """Plain Gaussians that approximate ``scene`` as seen from ``cameras`` and between them (Note [Baking]).
 
     Args:
-        scene: the scene, on the device of ``backend``.
         cameras: the training cameras of the stream, in the scene's units.
 
     Returns:
@@ -135,7 +134,6 @@ def with_low_pass(gaussians: BakedGaussians, sampling: RigSampling, variance: fl
     smaller pixels.
 
     Args:
-        sampling: sampling by the scene's training cameras.
         variance: squared training pixels, at least 0; scenes are trained with 0.3.
     """
     intervals = sampling.intervals(gaussians.means)

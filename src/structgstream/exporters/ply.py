@@ -111,11 +111,7 @@ def find_sequence(folder: Path) -> list[Path]:
 
 
 def read_header(path: Path) -> PlyHeader:
-    """The header of a ``.ply`` of Gaussians.
-
-    Raises:
-        CaptureError: it is not one, or lacks a property.
-    """
+    """The header of a ``.ply`` of Gaussians. Raises CaptureError if it is not one, or lacks a property."""
     with path.open("rb") as file:
         data = file.read(_MAX_HEADER_BYTES)
     text, separator, _ = data.partition(b"end_header\n")

@@ -18,9 +18,8 @@ from structgstream.errors import StorageError, StreamError
 from structgstream.exporters.all_frames import FourDgsFile, UsdFile
 from structgstream.exporters.bake import BakedGaussians, bake, with_low_pass
 from structgstream.exporters.formats import FORMATS, Format, FrameOptions, is_one_file
-from structgstream.exporters.glb import glb_bytes
 from structgstream.exporters.ply import ply_bytes
-from structgstream.exporters.web import sog_bytes, splat_bytes, spz_bytes
+from structgstream.exporters.web import glb_bytes, sog_bytes, splat_bytes, spz_bytes
 from structgstream.kernels.backend import Backend
 from structgstream.scene.render import Drawable, render
 from structgstream.scene.scene import Scene

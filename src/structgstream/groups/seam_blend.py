@@ -63,7 +63,6 @@ class SeamBlend:
 
     Args:
         before: the decoded last frame of the group before, itself blended.
-        first: the group's own first frame.
         moving: mask ``[M]`` of the anchors that move at the border.
         steps: quantization steps by field; a field without one is not blended.
     """
@@ -200,8 +199,6 @@ def moving_at_border(
     slow motion, and fast motion of an untextured surface, change the pictures by less than the two fits differ.
 
     Args:
-        before: the last frame of the group before.
-        first: the first frame of the group.
         rig: in the units of the scene.
         earlier: the last but one frame of the group before; None if that group has one frame only.
         second: the second frame of the group; None if it has one frame only.
@@ -242,7 +239,6 @@ def visible_mixtures(mixed: Scene, pictures: BorderPictures, rig: CameraRig, bac
     A pixel may have any colour between those of the two.
 
     Args:
-        mixed: the group's first frame, blended.
         pictures: renderings of the last frame of the group before and of the group's own first frame.
         rig: in the units of the scene.
     """
@@ -315,9 +311,9 @@ class GroupBlender:
             StreamError: a packet is damaged.
         """
         if not self._shown:
-            for number, (_, scene) in enumerate(self._decoded(segment)):
+            for data, (_, scene) in zip(segment.records(), self._decoded(segment)):
                 self._shown.append(scene)
-                yield segment.record(number)
+                yield data
             return
         frames = self._decoded(segment)
         begun = [next(frames)] + [frame for frame in (next(frames, None),) if frame is not None]
@@ -359,8 +355,8 @@ class GroupBlender:
 
     def _decoded(self, segment: Segment) -> Iterator[tuple[Packet, Scene]]:
         decoder = SceneDecoder(self._header)
-        for number in range(len(segment.entries)):
-            record = read_record(segment.record(number), 0)
+        for data in segment.records():
+            record = read_record(data, 0)
             assert record is not None, "verified when the segment was opened"
             packet = parse_packet(record.payload, PACKET_KINDS[record.type])
             yield packet, decoder.decode(packet)

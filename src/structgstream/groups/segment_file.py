@@ -78,16 +78,21 @@ class Segment:
     complete: bool  # whether every frame is present, index and footer are valid, and nothing follows
     reason: str | None  # why the segment is not complete; None if it is
 
-    @property
-    def next_frame(self) -> int:
-        """The first frame that is missing."""
-        return self.identity.first + len(self.entries)
+    def __enter__(self) -> "Segment":
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self.close()
 
     def record(self, number: int) -> bytes:
         """The record of the segment's packet ``number``, framing included."""
         start = self.entries[number][2]
         stop = self.entries[number + 1][2] if number + 1 < len(self.entries) else self.end
         return bytes(self.data[start:stop])
+
+    def records(self) -> Iterator[bytes]:
+        """The records of all its packets."""
+        return map(self.record, range(len(self.entries)))
 
     def close(self) -> None:
         """Closes the file."""
@@ -109,30 +114,6 @@ def open_segment(path: Path) -> Segment:
         raise
 
 
-@dataclass(frozen=True)
-class SegmentFacts:
-    """Result of :func:`inspect_segment`."""
-
-    first: int  # first frame of the group
-    end: int  # the frame after its last one
-    frames: int  # number of complete frames, from the first on
-    complete: bool  # whether the segment is finished and undamaged
-    identity: str  # SHA-256 of what the segment was fitted from
-    reason: str | None = None  # why the segment is not complete; None if it is
-
-
-def inspect_segment(path: Path) -> SegmentFacts:
-    """Verifies a segment file.
-
-    Raises:
-        StreamError: see :func:`open_segment`.
-    """
-    found = open_segment(path)
-    found.close()
-    identity = found.identity
-    return SegmentFacts(identity.first, identity.end, len(found.entries), found.complete, identity.sha256, found.reason)
-
-
 def _read(data: ByteSource, name: str) -> Segment:
     check_prefix(data, name)
     init = read_record(data, PREFIX.size)
@@ -144,8 +125,13 @@ def _read(data: ByteSource, name: str) -> Segment:
     identity = _identity(note, name)
     entries: list[tuple[int, int, int]] = []
     end = note.end
-    for record in _packets(data, note.end, identity):
-        entries.append((identity.first + len(entries), record.type, record.offset))
+    for frame in range(identity.first, identity.end):
+        record = read_record(data, end)
+        if record is None or record.type not in PACKET_KINDS or len(record.payload) < FRAME.size:
+            break
+        if FRAME.unpack_from(record.payload)[0] != frame:
+            break
+        entries.append((frame, record.type, record.offset))
         end = record.end
     frames = identity.end - identity.first
     closing = pack_index(entries, end)
@@ -155,18 +141,6 @@ def _read(data: ByteSource, name: str) -> Segment:
         cut = "its index is damaged" if len(entries) == frames else incomplete_reason(data, end)
         reason = f"it has {len(entries)} of {frames} frames; {cut}"
     return Segment(name, data, identity, bytes(data[: init.end]), entries, end, complete, reason)
-
-
-def _packets(data: ByteSource, offset: int, identity: SegmentIdentity) -> Iterator[Record]:
-    """The complete packets from byte ``offset`` on, up to the first that is not the group's next frame."""
-    for frame in range(identity.first, identity.end):
-        record = read_record(data, offset)
-        if record is None or record.type not in PACKET_KINDS or len(record.payload) < FRAME.size:
-            return
-        if FRAME.unpack_from(record.payload)[0] != frame:
-            return
-        yield record
-        offset = record.end
 
 
 def _identity(note: Record, name: str) -> SegmentIdentity:
@@ -213,11 +187,7 @@ class SegmentSink:
         return 0
 
     def begin(self, header: StreamHeader) -> int:
-        """Not supported: groups share one header.
-
-        Raises:
-            ConfigError: always.
-        """
+        """Not supported: groups share one header. Raises ConfigError always."""
         raise ConfigError("A group cannot begin another period; leave out --period.")
 
     def write(self, packet: Packet) -> int:

@@ -41,25 +41,22 @@ from structgstream.training.views import View, area_mean, as_picture, blackened,
 
 FEWEST_HALVED, MAX_CAMERAS = 6, 14
 """A frame uses half of a rig's cameras if that number is within these bounds."""
+FLOW = FlowConfig(apart=True, far=True)
+PRIOR = 0.7
+"""Initial displacement of a primitive, as a share of its last displacement."""
+RENDERED_EVERY = 3
+"""Flow from the rendering is computed in every n-th of the cameras of a frame, in turn."""
 
 
 @dataclass(frozen=True)
 class TrackConfig:
     """Tracking; not in the paper."""
 
-    scale: float = 1.0
-    """Size of the pictures relative to those of the stream."""
     cameras: int | None = None
     """Approximate upper bound of the cameras used in a frame. Of a larger rig every second or third camera is used, in
     turn. None: half of the cameras (:data:`FEWEST_HALVED`, :data:`MAX_CAMERAS`)."""
     picture_scale: float = 0.25
-    """Scale at which coverage is computed, relative to these pictures."""
-    flow: FlowConfig = FlowConfig(apart=True, far=True)
-    """Configuration of optical flow."""
-    prior: float = 0.7
-    """Initial displacement of a primitive, as a share of its last displacement."""
-    rendered_every: int = 3
-    """Flow from the rendering is computed in every n-th of these cameras, in turn; 0: in none."""
+    """Scale at which coverage is computed, relative to the pictures of the stream."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +94,7 @@ class Tracker:
 
     def pictures(self, frame: MultiViewFrame, before: Sequence[View] | None) -> TrackPictures:
         """The reduced pictures of ``frame`` and their change since ``before``; independent of the scene."""
-        views = [view.reduced(self.config.scale) for view in training_views(frame, self.rig, self.backend.device)]
+        views = training_views(frame, self.rig, self.backend.device)
         if before is None:
             return TrackPictures(frame.index, views)
         stride = self.stride(len(views))
@@ -109,8 +106,7 @@ class Tracker:
             config=replace(self.motion, picture_scale=self.config.picture_scale),
             backend=self.backend,
             flow_from=[view.index for view in taken],
-            flow=self.config.flow,
-            reach_pixels=max(1, round(self.motion.REACH_PIXELS * self.config.scale)),
+            flow=FLOW,
         )
         changes = {n: change for n, change in zip(chosen, found, strict=True) if change is not None}
         return TrackPictures(frame.index, views, changes)
@@ -132,11 +128,7 @@ class Tracked:
 
 
 def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tracked:
-    """Displace the primitives of ``past`` to the next frame.
-
-    Args:
-        past: primitives in the frame before.
-    """
+    """Displace the primitives of ``past`` to the next frame."""
     watch, velocities = Stopwatch(), torch.zeros_like(past.velocities)
     scene = past.scene.with_folded_appearance()
     with torch.no_grad():
@@ -156,13 +148,13 @@ def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tra
             views = [entry.view for entry in seen]
             evidence = flow_evidence([entry.flows[primitives] for entry in seen])
             centers = primitive_centers(scene, _coverage(seen, scene))
-            priors, lift = tracker.config.prior * past.velocities[primitives], tracker.lift
+            priors, lift = PRIOR * past.velocities[primitives], tracker.lift
             found = lift_flow(evidence, centers[primitives], priors, views, config=lift, backend=tracker.backend)
             velocities[primitives] = found.displacements
-        if len(primitives) and (every := tracker.config.rendered_every):
+        if len(primitives):
             with watch.stage("flow from the rendering"):
                 turn = pictures.index // tracker.stride(len(pictures.views))
-                part = [entry for n, entry in enumerate(seen) if (n + turn) % every == 0] or seen
+                part = [entry for n, entry in enumerate(seen) if (n + turn) % RENDERED_EVERY == 0] or seen
                 flows = [_rendered_flow(tracker, scene, entry, velocities)[primitives] for entry in part]
                 again = lift_flow(
                     flow_evidence(flows),
@@ -205,7 +197,7 @@ def _measure_view(tracker: Tracker, scene: Scene, view: View, change: PictureCha
     maps = torch.cat([change.flow[..., :3], inside[..., None], colors, part[..., None]], dim=-1)
     primitives = primitive_of(gaussians, scene)
     sums = accumulate(gaussians, small.camera, maps, backend)
-    sums *= _pixel_area(tracker, view, size)
+    sums *= _pixel_area(view, size)
     moved = sum_by_primitive(sums, primitives, scene)
     total, changed = moved[:, 3], moved[:, 7]
     votes = (changed > motion.MIN_PIXELS) & (changed > motion.MIN_SHARE * total)
@@ -219,7 +211,6 @@ def _occluded(motion: MotionConfig, scene: Scene, seen: Sequence[_ViewEvidence],
     Anchors outside these tiles are neither selected nor used as neighbours, because nothing is measured there.
 
     Args:
-        scene: the scene before the frame.
         moving: mask ``[M]`` of the anchors that are dynamic by votes.
     """
     anchors, occluded = len(moving), torch.zeros_like(moving)
@@ -250,11 +241,11 @@ def _rendered_flow(tracker: Tracker, scene: Scene, seen: _ViewEvidence, velociti
     picture = seen.tiles.choose(blackened(rendered, view.mask), view.image)
     small = view.evidence(tracker.config.picture_scale)
     size = (small.camera.height, small.camera.width)
-    found = flow_map(picture, view.image, counting, size, mask=counting, config=tracker.config.flow, backend=backend)
+    found = flow_map(picture, view.image, counting, size, mask=counting, config=FLOW, backend=backend)
     inside = area_mean(counting[None, None].float(), size)[0, 0]
     maps = torch.cat([found.maps, inside[..., None], small.colors * inside[..., None]], dim=-1)
     sums = accumulate(moved, small.camera, maps, backend)
-    sums *= _pixel_area(tracker, view, size)
+    sums *= _pixel_area(view, size)
     return sum_by_primitive(sums, seen.primitives, scene)
 
 
@@ -266,9 +257,9 @@ def _coverage(seen: Sequence[_ViewEvidence], scene: Scene) -> Tensor:
     return found
 
 
-def _pixel_area(tracker: Tracker, view: View, size: tuple[int, int]) -> float:
+def _pixel_area(view: View, size: tuple[int, int]) -> float:
     """Pixels of the stream's pictures at the reference size, the unit of thresholds, per pixel of the maps."""
-    width, height = (side / tracker.config.scale for side in (view.camera.width, view.camera.height))
+    width, height = view.camera.width, view.camera.height
     return width * height / enlargement(width, height) ** 2 / (size[0] * size[1])
 
 

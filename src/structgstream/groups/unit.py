@@ -22,14 +22,14 @@ from structgstream.errors import ConfigError, StorageError
 from structgstream.frames import MIN_CAMERAS, MultiViewFrame
 from structgstream.groups.base import GroupBase, fingerprint, open_for
 from structgstream.groups.first_frame import GroupStartConfig, fit_group_start
-from structgstream.groups.segment_file import GroupSoFar, Segment, SegmentIdentity, SegmentSink, resume_segment
+from structgstream.groups.segment_file import GroupSoFar, SegmentIdentity, SegmentSink, resume_segment
 from structgstream.groups.track_file import TrackStart, open_track
 from structgstream.groups.track_pass import dense
 from structgstream.kernels.backend import Backend
 from structgstream.recorder import LogExtras, Run, record
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
-from structgstream.session.pipeline import FrameTask, Past, Pipeline
+from structgstream.session.pipeline import FrameTask, Past
 from structgstream.session.presets import StreamConfig
 from structgstream.session.rate_control import with_rate_control
 from structgstream.session.struct_gstream import FrameZeroContext, StructGStream, stream_pipeline
@@ -99,11 +99,7 @@ class GroupMethod:
         return preprocess(frame, rig, before=first, motion=online.motion, start=without_flow, backend=backend)
 
     def first(self, task: FrameTask) -> FitResult[Scene]:
-        """Not supported: frame 0 is that of the header.
-
-        Raises:
-            ConfigError: always.
-        """
+        """Not supported: frame 0 is that of the header. Raises ConfigError always."""
         raise ConfigError("A group needs a header with frame 0; give one with --init.")
 
     def prepare(self, state: Scene, task: Callable[[], FrameTask]) -> FrameZeroContext:
@@ -217,9 +213,6 @@ def fit_segment(
     The call checks existing files. The segment is written while the run's reports are consumed; frames have the indices
     of the stream.
 
-    Args:
-        overwrite: remove an existing segment.
-
     Returns:
         the run; None if the segment exists, finished and undamaged.
 
@@ -242,7 +235,24 @@ def fit_segment(
     if found is not None and found.complete:
         found.close()
         return None
-    return _run(path, source, base, identity, found, task.start, start, backend, on_step=on_step, remarks=remarks)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    records = [base.first] if found is None and not identity.first else []
+    if found is not None:
+        records = [*found.records()]
+        found.close()
+    sink, so_far = SegmentSink(path, base, identity, found), GroupSoFar(base, identity.first, records)
+    method = GroupMethod(base.config, task.start, None if start is None else _entry(start, base, source))
+    return record(
+        path,
+        source,
+        # The group's first frame is denoised as frame 0 is.
+        replace(stream_pipeline(base.config), method=method, denoised=(0, identity.first)),
+        backend,
+        storage=lambda _: (sink, so_far),
+        metadata=base.header.metadata,
+        on_step=on_step,
+        remarks=remarks,
+    )
 
 
 def _start(task: SegmentTask, base: GroupBase) -> TrackStart | None:
@@ -259,39 +269,6 @@ def _start(task: SegmentTask, base: GroupBase) -> TrackStart | None:
     return track.start(task.first)
 
 
-def _run(
-    path: Path,
-    source: FrameSource,
-    base: GroupBase,
-    identity: SegmentIdentity,
-    found: Segment | None,
-    config: GroupStartConfig,
-    start: TrackStart | None,
-    backend: Backend,
-    *,
-    on_step: StepListener | None,
-    remarks: LogExtras | None,
-) -> Run:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    records = [base.first] if found is None and not identity.first else []
-    if found is not None:
-        records = [found.record(number) for number in range(len(found.entries))]
-        found.close()
-    sink = SegmentSink(path, base, identity, found)
-    so_far = GroupSoFar(base, identity.first, records)
-    method = GroupMethod(base.config, config, None if start is None else _entry(start, base, source))
-    return record(
-        path,
-        source,
-        _pipeline(base, method, identity.first),
-        backend,
-        storage=lambda _: (sink, so_far),
-        metadata=base.header.metadata,
-        on_step=on_step,
-        remarks=remarks,
-    )
-
-
 def _entry(start: TrackStart, base: GroupBase, source: FrameSource) -> GroupEntry:
     displacements, velocities = dense(base.scene(), start, step=base.position_step)
     # Smaller displacements are within the tracking error; these primitives retain frame 0's exact values.
@@ -303,11 +280,6 @@ def _entry(start: TrackStart, base: GroupBase, source: FrameSource) -> GroupEntr
         return next(denoised(source, base.config.denoising).frames(0))
 
     return GroupEntry(start.frame, displacements, velocities, first_pictures)
-
-
-def _pipeline(base: GroupBase, method: GroupMethod, first: int) -> Pipeline[Scene, FrameZeroContext]:
-    """The pipeline of the stream with the group's method; the group's first frame is denoised as frame 0 is."""
-    return replace(stream_pipeline(base.config), method=method, denoised=(0, first))
 
 
 def _remove(path: Path) -> None:

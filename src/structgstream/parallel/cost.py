@@ -18,7 +18,7 @@ from typing import Any
 
 from structgstream.errors import ConfigError
 from structgstream.evaluation.run_log import read_log
-from structgstream.groups.boundaries import read_groups
+from structgstream.groups.track_file import read_groups
 from structgstream.parallel.driver import HEADER, JOIN, TRACK
 from structgstream.parallel.parts import CompletedTask, Parts, group_name
 

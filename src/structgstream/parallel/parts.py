@@ -105,11 +105,7 @@ class Parts:
             yield
 
     def clear(self) -> None:
-        """Removes all parts and records, and nothing else.
-
-        Raises:
-            StorageError: they cannot be removed.
-        """
+        """Removes all parts and records, and nothing else. Raises StorageError if they cannot be removed."""
         # The records go first and the plan last: parts that remain if this is killed are incomplete ones of the plan.
         remove_own(self.folder, PURPOSE, PART_NAMES, order={COMPLETED: 0, PLAN: 2})
         (self.folder / "segments").mkdir(exist_ok=True)
@@ -210,11 +206,7 @@ def key_of(*facts: object) -> str:
 
 
 def sha256_of(path: Path) -> str:
-    """Of a file, which is read in pieces.
-
-    Raises:
-        OSError: it cannot be read.
-    """
+    """Of a file, which is read in pieces. Raises OSError if it cannot be read."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while piece := file.read(_PIECE_BYTES):

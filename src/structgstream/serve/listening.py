@@ -54,11 +54,7 @@ def accepted_hosts(address: str, names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def checked_proxies(proxies: tuple[str, ...]) -> tuple[str, ...]:
-    """Addresses or networks of proxies.
-
-    Raises:
-        ConfigError: a text is neither.
-    """
+    """Addresses or networks of proxies. Raises ConfigError if a text is neither."""
     for proxy in proxies:
         try:
             ipaddress.ip_network(proxy)
@@ -68,11 +64,7 @@ def checked_proxies(proxies: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def checked_origins(origins: tuple[str, ...]) -> tuple[str, ...]:
-    """Origins as a browser writes them.
-
-    Raises:
-        ConfigError: a text is not an origin.
-    """
+    """Origins as a browser writes them. Raises ConfigError if a text is not an origin."""
     for origin in origins:
         scheme, separator, host = origin.partition("://")
         plain = host == host.lower() and not set(host) & set("/?#@* \\")

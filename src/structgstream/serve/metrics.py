@@ -117,12 +117,7 @@ def stream_families(
     runs: Mapping[str, Mapping[str, float]],
     unix_seconds: float,
 ) -> list[Metric]:
-    """Gauges of streams and of the runs that write them.
-
-    Args:
-        waiters: number of requests that wait for a manifest, by stream.
-        runs: metrics of a run by name, by stream.
-    """
+    """Gauges of streams and of the runs that write them."""
     published = {name: one.edge("published_unix_seconds") for name, one in manifests.items()}
     ages = {name: None if then is None else unix_seconds - then for name, then in published.items()}
     run = GaugeMetricFamily(

@@ -175,11 +175,7 @@ class ServedStream:
         return tuple(ServedStream(self.root, f"{self.name}/{one}", StreamKind.SEGMENTS) for one in self.renditions)
 
     def open(self, file: str) -> OpenedFile | None:
-        """A file of its folder; None if there is none. Blocks.
-
-        Raises:
-            OSError: the system cannot open files now.
-        """
+        """A file of its folder; None if there is none. Blocks. Raises OSError if the system cannot open files now."""
         return open_below(self.root, *self.name.split("/"), file)
 
     def open_whole(self) -> OpenedFile | None:
@@ -223,11 +219,7 @@ class Catalog:
             raise PlayerError(f"The folder {folder} cannot be read ({error.strerror}).") from None
 
     def found(self) -> Mapping[str, ServedStream]:
-        """The streams by their names, sorted. Blocks; thread-safe.
-
-        Raises:
-            OSError: the folder cannot be read.
-        """
+        """The streams by their names, sorted. Blocks; thread-safe. Raises OSError if the folder cannot be read."""
         with self._lock:
             if self._clock() - self._listed_at >= REFRESH_SECONDS:
                 self._found = self._list()
