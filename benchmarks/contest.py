@@ -22,7 +22,7 @@ class Contestant:
         name: how tables call it.
         run: does the work once and returns what is checked.
         threads: how many it may use.
-        units: pieces of work in one run (iterations, say); seconds are told for one piece.
+        units: pieces of work in one run (iterations, say); seconds are reported per piece.
         facts: other numbers about it, asked for once after timing (quality, shares of stages).
     """
 

@@ -39,8 +39,7 @@ def recalled(scene: Scene, *, config: LostAnchorConfig = CONFIG) -> tuple[torch.
         views,
         find_active_tiles(split, views, config=motion, backend=BACKEND),
         floor=None,
-        min_pixels=motion.MIN_PIXELS,
-        births=SpawnRules(picture_width=96),
+        rules=SpawnRules(picture_width=96),
         config=config,
         backend=BACKEND,
     )

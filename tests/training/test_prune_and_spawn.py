@@ -47,7 +47,6 @@ def renewed(
         first_birth=1 << 32,
         floor=residual_floor(WORLD.scene, first, scale=1.0, backend=backend) if floor is None else floor,
         room=room,
-        min_pixels=motion.MIN_PIXELS,
         config=config,
         backend=backend,
     )
@@ -150,7 +149,6 @@ def test_a_ghost_dies() -> None:
         first_birth=1 << 32,
         floor=floor,
         room=1000,
-        min_pixels=0.3,
         config=CONFIG,
         backend=backend,
     )

@@ -29,10 +29,10 @@ VIEWS = training_views(WORLD.frames[0], WORLD.rig, torch.device("cpu"))
 def test_blame_takes_two_views_and_half_of_those_that_see() -> None:
     coverage = torch.tensor([[10.0, 10, 10, 10], [10, 10, 10, 0.1], [10, 10, 10, 0.1], [10, 0, 10, 0.1]])
     wrong = torch.tensor([[6.0, 6, 6, 6], [6, 0, 6, 0.1], [0, 0, 6, 0.1], [0, 0, 0, 0.1]])
-    found = outlier_mask(coverage, wrong, min_pixels=0.3, rules=RULES)
+    found = outlier_mask(coverage, wrong, rules=RULES)
     # Two of four; one of three; three of four; one, since the others do not see it.
     assert found.tolist() == [True, False, True, False]
-    assert not outlier_mask(coverage, 0.5 * coverage, min_pixels=0.3, rules=RULES).any(), "half is not more than half"
+    assert not outlier_mask(coverage, 0.5 * coverage, rules=RULES).any(), "half is not more than half"
 
 
 def spoiled(view: View) -> torch.Tensor:

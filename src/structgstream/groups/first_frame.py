@@ -64,8 +64,7 @@ def relocate_lost_anchors(
     active_tiles: Mapping[int, ActiveTiles],
     *,
     floor: ResidualFloor | None,
-    min_pixels: float,
-    births: SpawnRules,
+    rules: SpawnRules,
     config: LostAnchorConfig,
     backend: Backend,
 ) -> tuple[Scene, int]:
@@ -77,8 +76,7 @@ def relocate_lost_anchors(
         views: views of the frame.
         active_tiles: by view index, with up-to-date renderings; views without an entry are skipped.
         floor: baseline residuals of frame 0; None for none.
-        min_pixels: views in which an anchor covers fewer pixels do not count.
-        births: thresholds of the outlier test.
+        rules: thresholds of the outlier test.
         config: configuration of the relocation.
         backend: the compute back-end.
 
@@ -89,7 +87,7 @@ def relocate_lost_anchors(
     if not config.enabled or pixel is None or len(first) < 2:
         return dynamic, 0
     with torch.no_grad():
-        outliers = _outlier_anchors(dynamic, views, active_tiles, floor, min_pixels, births, backend)
+        outliers = _outlier_anchors(dynamic, views, active_tiles, floor, rules, backend)
         if not outliers.any() or outliers.all():
             return dynamic, 0
         positions = dynamic.anchors.positions
@@ -107,17 +105,16 @@ def _outlier_anchors(
     views: Sequence[View],
     active_tiles: Mapping[int, ActiveTiles],
     floor: ResidualFloor | None,
-    min_pixels: float,
-    births: SpawnRules,
+    rules: SpawnRules,
     backend: Backend,
 ) -> Tensor:
-    """Mask ``[M]`` of the anchors that are outliers in several views (``births.outlier_mask``)."""
+    """Mask ``[M]`` of the anchors that are outliers in several views (``spawn.outlier_mask``)."""
     folded, coverage, wrong = dynamic.with_folded_appearance(), [], []
     for view in views:
         active = active_tiles.get(view.index)
         if active is None:
             continue
-        found = view_residual(active.picture, view, dynamic.camera_color, floor=floor, rules=births, backend=backend)
+        found = view_residual(active.picture, view, dynamic.camera_color, floor=floor, rules=rules, backend=backend)
         small = found.view
         pixels = found.wrong.to(active.picture)
         counting = torch.ones_like(pixels) if small.mask is None else small.mask.to(pixels)
@@ -129,7 +126,7 @@ def _outlier_anchors(
         wrong.append(sums[: len(dynamic.anchors), 1])
     if not coverage:
         return torch.zeros(len(dynamic.anchors), dtype=torch.bool, device=dynamic.anchors.positions.device)
-    return outlier_mask(torch.stack(coverage), torch.stack(wrong), min_pixels=min_pixels, rules=births)
+    return outlier_mask(torch.stack(coverage), torch.stack(wrong), rules=rules)
 
 
 def _displacements_of_neighbours(
@@ -266,7 +263,6 @@ class _Rounds:
                 first_birth=self._first_birth(current.free),
                 floor=self.floor,
                 room=config.patching.max_free - len(split.static.free),
-                min_pixels=config.motion.MIN_PIXELS,
                 config=config.spawn,
                 backend=backend,
             )
@@ -308,8 +304,7 @@ class _Rounds:
             views,
             find_active_tiles(split, views, config=config.motion, backend=fit.backend),
             floor=self.floor,
-            min_pixels=config.motion.MIN_PIXELS,
-            births=config.spawn.rules,
+            rules=config.spawn.rules,
             config=self.start.lost_anchors,
             backend=fit.backend,
         )

@@ -349,9 +349,9 @@ def code_activity(
     with _Coder(arithmetic, models[0]) as coder:
         for level, (first, step) in enumerate(PASSES):
             for b in range(first, blocks, step):
-                beside = there[b - first] + there[b + first] if level else 0
+                adjacent = there[b - first] + there[b + first] if level else 0
                 wide = min(ever[b].bit_length(), 5) * 11 + last[b] + last[b + 2]
-                there[b] = coder.decide(true[b], ((last[b + 1] * 3 + beside) * 5 + level, wide * 3 + beside), 0)
+                there[b] = coder.decide(true[b], ((last[b + 1] * 3 + adjacent) * 5 + level, wide * 3 + adjacent), 0)
     found = [0] * (count + 2 * pad)
     given = active.tolist()
     with _Coder(arithmetic, models[1]) as coder:
@@ -360,14 +360,14 @@ def code_activity(
                 if not there[i // BLOCK]:
                     continue
                 at = i + pad
-                beside = found[at - first] + found[at + first] if level else 0
-                beyond = found[at - 3 * first] + found[at + 3 * first] if level else 0
+                adjacent = found[at - first] + found[at + first] if level else 0
+                farther = found[at - 3 * first] + found[at + 3 * first] if level else 0
                 wide = sum(before[max(i - 8, 0) : i + 9]) - before[i]
                 around = moved[i] + moved[i + 1] + moved[i + 3] + moved[i + 4]
                 contexts = (
-                    (wide * 3 + beside) * 5 + level,
-                    (min(moved[i + 2].bit_length(), 5) * 3 + beside) * 6 + min(around.bit_length(), 5),
-                    ((level * 3 + beyond) * 3 + beside) * 8 + (past[i] & 7),
+                    (wide * 3 + adjacent) * 5 + level,
+                    (min(moved[i + 2].bit_length(), 5) * 3 + adjacent) * 6 + min(around.bit_length(), 5),
+                    ((level * 3 + farther) * 3 + adjacent) * 8 + (past[i] & 7),
                 )
                 found[at] = coder.decide(given[i], contexts, 0)
     active[:] = found[pad : pad + count]
@@ -406,20 +406,20 @@ def code_residuals(
 def _residual_contexts(
     past: list[int], row: list[int], own: int, above: int, below: int, column: int, level: int, other: int
 ) -> tuple[int, ...]:
-    columns, beside = len(past), abs(above) + abs(below)
+    columns, adjacent = len(past), abs(above) + abs(below)
     size = sum(map(abs, row[:column]))
     first = row[column - 1] if column else 0
     off = first - past[column - 1] if column else 0
-    beginning = 8 * (above + below)
-    going_on = 10 * own + 3 * (above + below) if level else 16 * own
-    led = going_on if any(past) else beginning
-    expected = size_class(abs(led) + 4 >> 3)
+    started = 8 * (above + below)
+    continued = 10 * own + 3 * (above + below) if level else 16 * own
+    predicted = continued if any(past) else started
+    expected = size_class(abs(predicted) + 4 >> 3)
     return (
         (_limited(own, 8) + 8) * columns + column,
         (_limited(above, 4) + 4) * 9 + _limited(below, 4) + 4,
-        ((-expected if led < 0 else expected) + 15) * 5 + level,
-        (min(size, 9) * 6 + min(beside, 5)) * columns + column,
-        (other * columns + column) * 16 + size_class(2 * abs(own) + beside),
+        ((-expected if predicted < 0 else expected) + 15) * 5 + level,
+        (min(size, 9) * 6 + min(adjacent, 5)) * columns + column,
+        (other * columns + column) * 16 + size_class(2 * abs(own) + adjacent),
         ((_limited(first, 3) + 3) * 7 + _limited(off, 3) + 3) * 7 + _limited(own, 3) + 3,
     )
 

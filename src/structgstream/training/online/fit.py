@@ -105,7 +105,6 @@ def fit_next_frame(
             first_birth=frame.index * IDS_PER_FRAME,
             floor=floor,
             room=config.patching.max_free - len(split.static.free),
-            min_pixels=config.motion.MIN_PIXELS,
             config=config.spawn,
             backend=backend,
         )

@@ -28,7 +28,7 @@ from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import SpawnConfig, SpawnRules
-from structgstream.training.online.measure import accumulate
+from structgstream.training.online.measure import VISIBLE_PIXELS, accumulate
 from structgstream.training.online.split import DynamicSplit, changed_tiles
 from structgstream.training.residuals import ResidualFloor, box_mean
 from structgstream.training.views import View, mean_of_counting
@@ -101,16 +101,15 @@ def view_residual(
     return ViewResidual(small, off > rules.residual_threshold, missing if small.mask is None else missing * small.mask)
 
 
-def outlier_mask(coverage: Tensor, wrong: Tensor, *, min_pixels: float, rules: SpawnRules) -> Tensor:
-    """Mask ``[F]`` of the free Gaussians to remove, as outliers in several views.
+def outlier_mask(coverage: Tensor, wrong: Tensor, *, rules: SpawnRules) -> Tensor:
+    """Mask ``[F]`` of the free Gaussians to remove, as outliers in several of the views in which they are visible.
 
     Args:
         coverage: ``[V, F]`` pixels that each covers, by blending weight.
         wrong: ``[V, F]`` wrong pixels among them.
-        min_pixels: views where a Gaussian covers fewer pixels do not count.
         rules: the rule.
     """
-    seen = coverage > min_pixels
+    seen = coverage > VISIBLE_PIXELS
     bad = (seen & (wrong > rules.outlier_share * coverage)).sum(0)
     return (bad >= rules.outlier_views) & (2 * bad >= seen.sum(0))
 
@@ -470,7 +469,6 @@ def prune_and_spawn(
     first_birth: int,
     floor: ResidualFloor | None,
     room: int,
-    min_pixels: float,
     config: SpawnConfig,
     backend: Backend,
 ) -> SpawnResult:
@@ -483,7 +481,6 @@ def prune_and_spawn(
         first_birth: identity of the first birth.
         floor: residuals of frame 0; None for none.
         room: largest number of births.
-        min_pixels: views where a Gaussian covers fewer pixels do not count.
         config: the rules.
         backend: the compute back-end.
     """
@@ -502,7 +499,7 @@ def prune_and_spawn(
             return replace(none, refused=True)
         kept = everything
         if len(dynamic.free):
-            kept = ~_outlier_mask(dynamic, missing, active_tiles, min_pixels=min_pixels, rules=rules, backend=backend)
+            kept = ~_outlier_mask(dynamic, missing, active_tiles, rules=rules, backend=backend)
         if not kept.all():
             sweep = replace(sweep, dynamic=replace(dynamic, free=dynamic.free.select(kept)))
             missing = sweep.drawn(missing)
@@ -530,7 +527,6 @@ def _outlier_mask(
     missing: Sequence[Missing],
     active_tiles: Mapping[int, ActiveTiles],
     *,
-    min_pixels: float,
     rules: SpawnRules,
     backend: Backend,
 ) -> Tensor:
@@ -550,4 +546,4 @@ def _outlier_mask(
         of_free = sums[len(sums) - len(dynamic.free) :]  # Free Gaussians are the last, and all there.
         coverage.append(of_free[:, 0])
         wrong.append(of_free[:, 1])
-    return outlier_mask(torch.stack(coverage), torch.stack(wrong), min_pixels=min_pixels, rules=rules)
+    return outlier_mask(torch.stack(coverage), torch.stack(wrong), rules=rules)
