@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adaptive binary decisions: their state, and their coding in Python, the oracle, used when the C++ is not built
-(docs/entropy.md, Decisions).
+"""Adaptive binary decisions: their state, and their coding in C++ or, where that is not built and in tests, in Python
+(docs/entropy.md, Decisions). An encoder reads the array of values, a decoder fills it; both update models and
+arithmetic code in place.
 
 Note [One state a field]
 ~~~~~~~~~~~~~~~~~~~~~~~~
@@ -17,6 +18,10 @@ from functools import cache, cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.codec.entropy.rans import uses_native
+from structgstream.errors import OutOfMemoryError, StreamError
+from structgstream.kernels.native import native_library
+
 HALF = 1 << 15
 NEAR_SIZES = 6
 LENGTH_NODES = 9
@@ -28,6 +33,7 @@ BLOCK_CONTEXTS = (90, 198)
 ACTIVITY_CONTEXTS = (255, 108, 360)
 AHEAD = 3
 """Bytes that a decoder reads past the end of the data."""
+_NO_MEMORY, _DAMAGED = 1, 2  # results of the C++ coders
 _NUMBER_BYTES = 64  # upper bound of the bytes of a number or of two flags
 
 
@@ -317,6 +323,29 @@ class _Coder:
         return -size if negative else size
 
 
+def _code_native(name: str, arithmetic: ArithmeticState, models: Sequence[Model], *given: int | np.ndarray) -> bool:
+    """Calls a C++ coder with sizes and arrays; returns whether the coded values are within bounds.
+
+    Raises:
+        OutOfMemoryError: there is not enough memory.
+        StreamError: a model has the wrong shape.
+    """
+    state, arguments = arithmetic.native(), list[int]()
+    for value in given:
+        if isinstance(value, np.ndarray):
+            assert value.flags.c_contiguous
+            value = value.ctypes.data
+        arguments.append(value)
+    coder = getattr(native_library(), name)
+    result = coder(*map(ctypes.byref, (state, *(model.native for model in models))), arithmetic.encodes, *arguments)
+    arithmetic.take(state)
+    if result == _NO_MEMORY:
+        raise OutOfMemoryError("to code decisions")
+    if result > _DAMAGED:
+        raise StreamError("Decisions to code do not fit their models.")
+    return not result
+
+
 def size_class(size: int) -> int:
     """Classes 0 to 15 of sizes: one per size below 8, then two per octave."""
     if size < 8:
@@ -332,8 +361,22 @@ def code_activity(
     history: NDArray[np.uint8],
     sizes: NDArray[np.int32],
     active: NDArray[np.uint8],
+    native: bool | None = None,
 ) -> None:
-    """As in ``adaptive.py``."""
+    """Codes which rows are active (docs/bitstream.md, section Rows).
+
+    Args:
+        arithmetic: of the field.
+        models: of blocks and of rows.
+        history: ``[n]``: bit 0 is the row's activity in the last frame, bits 1 and 2 in the two before.
+        sizes: ``[n]``, sum of the magnitudes of each row's last residuals.
+        active: ``[n]``, read or filled.
+        native: C++ or Python; None takes C++ if available.
+    """
+    arithmetic.reserve(len(active))
+    if uses_native(native):
+        _code_native("sgs_code_activity", arithmetic, models, len(active), history, sizes, active)
+        return
     count, pad = len(active), 24
     blocks = -(-count // BLOCK)
     past, before = history.tolist(), [past & 1 for past in history.tolist()]
@@ -380,8 +423,21 @@ def code_residuals(
     last: NDArray[np.int32],
     others: NDArray[np.int32],
     residuals: NDArray[np.int32],
+    native: bool | None = None,
 ) -> bool:
-    """As in ``adaptive.py``."""
+    """Codes residuals of active rows (docs/bitstream.md, section Rows); returns whether they are within bounds.
+
+    Args:
+        arithmetic: of the field.
+        model: of the group of columns.
+        last: ``[n, c]``, the rows' last residuals.
+        others: ``[n]``, sizes of the residuals in earlier groups.
+        residuals: ``[n, c]``, read or filled.
+        native: as in :func:`code_activity`.
+    """
+    arithmetic.reserve(residuals.size)
+    if uses_native(native):
+        return _code_native("sgs_code_residuals", arithmetic, [model], *residuals.shape, last, others, residuals)
     count, columns = residuals.shape
     past: list[list[int]] = last.tolist()
     found: list[list[int]] = residuals.tolist()
@@ -434,9 +490,22 @@ def code_numbers(
     *,
     contexts: NDArray[np.int32],
     values: NDArray[np.int64],
-    flags: bool,
+    flags: bool = False,
+    native: bool | None = None,
 ) -> bool:
-    """As in ``adaptive.py``."""
+    """Codes signed 32-bit numbers, or flags; returns whether they are within bounds.
+
+    Args:
+        arithmetic: of the field.
+        model: with one input per column of the contexts.
+        contexts: ``[n, K]``, each below the model's number of contexts for its input.
+        values: ``[n]``, read or filled.
+        flags: whether the values are 0 and 1, with a model of one node.
+        native: as in :func:`code_activity`.
+    """
+    arithmetic.reserve(len(values))
+    if uses_native(native):
+        return _code_native("sgs_code_numbers", arithmetic, [model], len(values), contexts, flags, values)
     given = values.tolist()
     with _Coder(arithmetic, model) as coder:
         for i, places in enumerate(contexts.tolist()):
