@@ -93,7 +93,8 @@ class Fit {
             if (const int error = to_host(&found, state_, sizeof found, stream_)) return error;
             if (const int error = wait(stream_)) return error;
             if (found.stopped < 0) break;
-            first = found.stopped, capacity_ = found.slots + found.slots / 2;
+            if (found.slots > kMostPairs) return kNoMemory;
+            first = found.stopped, capacity_ = std::min(found.slots + found.slots / 2, kMostPairs);
             if (const int error = release(pair_memory_, stream_)) return error;
             pair_memory_ = nullptr;
             if (const int error = reset()) return error;
@@ -366,14 +367,13 @@ extern "C" {
 
 int sgs_cuda_fit_new(const sgs_fit_frame* frame, int64_t slots, void* stream, void** fit) {
     using structgstream::cuda::fit::Fit;
-    constexpr int kNoMemory = 2;  // cudaErrorMemoryAllocation
     *fit = nullptr;
     try {
         Fit* made = new Fit(*frame, slots, stream);
         *fit = made;
         return made->begin();
     } catch (const std::bad_alloc&) {
-        return kNoMemory;
+        return structgstream::cuda::fit::kNoMemory;
     }
 }
 
