@@ -106,9 +106,9 @@ def test_parts_near_each_other_are_searched_together() -> None:
 WIDTHS = pytest.mark.parametrize("width", [320, 960, 1920])
 
 
-def thrown(width: int, *, far: bool, by: float = 60 / 320) -> tuple[FlowMaps, torch.Tensor]:
+def thrown(width: int, *, far: bool, by: float = 60 / 320, body: bool = False) -> tuple[FlowMaps, torch.Tensor]:
     """Flow, at the size of the pictures, of a ball that crosses a share of the width over a resting ground; the ball's
-    pixels in the first picture."""
+    pixels in the first picture. With ``body`` something large below it moves as well, by a hundredth."""
     height, radius, moved = width * 3 // 4, width // 20, round(by * width)
     small = textured(120, 160)
     ground = cv2.resize(small // 4 + 96, (width, height), interpolation=cv2.INTER_CUBIC)
@@ -116,6 +116,9 @@ def thrown(width: int, *, far: bool, by: float = 60 / 320) -> tuple[FlowMaps, to
     rows, columns = np.mgrid[:height, :width]
     ball = (rows - height // 2) ** 2 + (columns - width // 3) ** 2 < radius**2
     first, second = ground.copy(), ground.copy()
+    if body:
+        below = slice(height * 3 // 5, height)
+        first[below], second[below] = skin[below, ::-1], np.roll(skin[below, ::-1], width // 100, 1)
     first[ball], second[np.roll(ball, moved, 1)] = skin[ball], skin[ball]
     pictures = torch.from_numpy(first), torch.from_numpy(second)
     changed = reference_backend().changed_pixels(*pictures, threshold=0.05, reach_pixels=3)
@@ -136,6 +139,15 @@ def test_a_ball_that_crosses_a_share_of_the_width_is_found_at_every_size(width: 
     assert right[confidence > 0].float().mean() > 0.95
     nothing = thrown(width, far=False, by=by)[0].maps[ball]
     assert ((nothing[:, 1:] - expected).norm(dim=1) < 0.01 * width).float().mean() < 0.3, "else this tests nothing"
+
+
+@WIDTHS
+def test_a_ball_is_found_next_to_a_body_whose_flow_is_consistent(width: int) -> None:
+    found, ball = thrown(width, far=True, by=0.14, body=True)
+    assert found.far_boxes == 1
+    expected = torch.tensor([round(0.14 * width), 0.0])
+    confidence, flow = found.maps[ball][:, 0], found.maps[ball][:, 1:]
+    assert (confidence * ((flow - expected).norm(dim=1) < 0.01 * width)).mean() > 0.6
 
 
 @WIDTHS
