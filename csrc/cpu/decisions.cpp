@@ -25,7 +25,6 @@ constexpr int kLengths = 30;
 constexpr int kNodes = 2 + kNearSizes + kLengthNodes;
 constexpr int64_t kLargestNumber = (int64_t{1} << 31) - 1;
 constexpr int32_t kLargestResidual = 1 << 23;
-constexpr int kTop = 16;  // distance of rows in the first pass
 constexpr int kBlock = 32;
 
 // 65536 / (1 + exp(-j / 4)), rounded.

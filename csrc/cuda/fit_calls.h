@@ -260,7 +260,7 @@ class Fit {
             m.k, v.viewmat, v.K, {v.width, v.height}, v.near_plane, drawn, m.seen};
         if (const int error = for_each<kAnchorThreads>(AnchorInputs{m, seen, v.center}, m.anchors, stream_)) return error;
         if (const int error = for_each<kAnchorThreads>(AnchorHead{m}, kHeads * m.anchors, stream_)) return error;
-        if (const int error = for_each<kAnchorThreads>(Dress{m, camera, drawn, counts_}, m.rows(), stream_)) return error;
+        if (const int error = for_each<kAnchorThreads>(DecodeGaussians{m, camera, drawn, counts_}, m.rows(), stream_)) return error;
         const Starts starts = {counts_, camera.tiles(), starts_, cursors_, m.rows(), slots_,
                                f_.volume == 0.0f ? nullptr : m.scales, m.opacities, i, capacity_, state_, nullptr, nullptr};
         return for_blocks(starts, 1, stream_);
@@ -287,8 +287,8 @@ class Fit {
 
     int generate_backward(const Camera& camera, const uint8_t* drawn) {
         const Model& m = model_;
-        const DressBackward dress = {m, camera, state_, drawn, slots_, moments_, f_.volume, f_.mean_volume != 0};
-        if (const int error = for_each<kAnchorThreads>(dress, m.rows(), stream_)) return error;
+        const DecodeGaussiansBackward decode = {m, camera, state_, drawn, slots_, moments_, f_.volume, f_.mean_volume != 0};
+        if (const int error = for_each<kAnchorThreads>(decode, m.rows(), stream_)) return error;
         if (m.trains_inputs())
             if (const int error = for_each<kAnchorThreads>(AnchorHeadBackward{m, state_}, kHeads * m.anchors, stream_))
                 return error;

@@ -260,7 +260,7 @@ class _Rounds:
                 displaced,
                 inliers,
                 active_tiles,
-                first_birth=self._first_birth(current.free),
+                first_identity=self._first_identity(current.free),
                 floor=self.floor,
                 room=config.patching.max_free - len(split.static.free),
                 config=config.spawn,
@@ -328,7 +328,7 @@ class _Rounds:
             split = split.displaced(found.displacements)
         return split, lifted
 
-    def _first_birth(self, free: FreeGaussians) -> int:
+    def _first_identity(self, free: FreeGaussians) -> int:
         """The first identity of the frame that no earlier round has used."""
         first = self.fit.frame_index * IDS_PER_FRAME
         return max(first, int(free.births.max()) + 1) if len(free) else first

@@ -135,7 +135,7 @@ def spawn_by_sweep(
     depths: Mapping[int, Tensor],
     color: CameraColor,
     *,
-    first_birth: int,
+    first_identity: int,
     rules: SpawnRules,
     backend: Backend,
 ) -> Spawned:
@@ -145,7 +145,7 @@ def spawn_by_sweep(
         missing: of every training view.
         depths: by view index, rendered depth ``[h, w]``, infinite where nothing is rendered.
         color: colour corrections of the cameras.
-        first_birth: identity of the first.
+        first_identity: identity of the first.
         rules: the rule.
         backend: the compute back-end.
 
@@ -181,7 +181,7 @@ def spawn_by_sweep(
     if not points or not sum(len(group) for group in points):
         return Spawned(FreeGaussians.empty(views[0].colors))
     return _merge_points(
-        torch.cat(points), torch.cat(colors), torch.cat(spacings), first_birth=first_birth, rules=rules
+        torch.cat(points), torch.cat(colors), torch.cat(spacings), first_identity=first_identity, rules=rules
     )
 
 
@@ -202,7 +202,9 @@ def _strided_mask(step: int, like: Tensor) -> Tensor:
     return mask
 
 
-def _merge_points(points: Tensor, colors: Tensor, spacings: Tensor, *, first_birth: int, rules: SpawnRules) -> Spawned:
+def _merge_points(
+    points: Tensor, colors: Tensor, spacings: Tensor, *, first_identity: int, rules: SpawnRules
+) -> Spawned:
     """One free Gaussian per voxel of the points, if at least ``min_hits`` points lie around it."""
     try:
         from scipy.spatial import KDTree
@@ -238,7 +240,7 @@ def _merge_points(points: Tensor, colors: Tensor, spacings: Tensor, *, first_bir
             quats=unit.expand(count, 4).clone(),
             logit_opacities=opacity.expand(count).clone(),
             colors=looks.contiguous(),
-            births=first_birth + torch.arange(count, device=points.device),
+            births=first_identity + torch.arange(count, device=points.device),
         ),
         refused_count=wanted - count if rules.overflow == "small-clusters" else 0,
         merged_count=max(0, finest - count) if rules.overflow == "coarser" else 0,
@@ -274,7 +276,7 @@ def _cells(values: Tensor, tree: Any, voxel: float) -> tuple[Tensor, Tensor]:
 MIN_COVERAGE = 0.5
 """Pixels with less coverage have no depth."""
 DEPTH_WIDTH = 240
-"""Depth maps are drawn at most this wide, pixels, and enlarged: they cost most of a frame without births."""
+"""Depth maps are drawn at most this wide, pixels, and enlarged: they cost most of a frame without spawning."""
 
 
 @dataclass(frozen=True)
@@ -331,15 +333,15 @@ class Sweep:
     backend: Backend
     known: Mapping[int, Missing] = field(default_factory=dict)
 
-    def missing(self, *, blames: bool = True) -> list[Missing]:
+    def missing(self, *, prunes: bool = True) -> list[Missing]:
         """Missing pixels of every view, none outside its active tiles.
 
         Args:
-            blames: whether outliers will be pruned by wrong pixels, which then must be rendered again as well.
+            prunes: whether outliers will be pruned by wrong pixels, which then must be rendered again as well.
         """
         # The pictures are from before the second round: tiles without missing pixels then are assumed to have none.
-        found = [self._before(view, wrong=blames) for view in self.views]
-        every = blames and len(self.dynamic.free) > 0
+        found = [self._before(view, wrong=prunes) for view in self.views]
+        every = prunes and len(self.dynamic.free) > 0
         if not every and not self._enough(found):
             return found
         return [self._drawn(entry) if every or entry.any else entry for entry in found]
@@ -348,7 +350,7 @@ class Sweep:
         """The same views, drawn again."""
         return [self._drawn(entry, again=True) for entry in missing]
 
-    def births(self, missing: Sequence[Missing], *, first_birth: int, room: int) -> Spawned:
+    def spawn(self, missing: Sequence[Missing], *, first_identity: int, room: int) -> Spawned:
         """New free Gaussians where several views miss the same; at most ``room``."""
         if not self._enough(missing):
             return Spawned(FreeGaussians.empty(self.dynamic.free.means))
@@ -357,13 +359,13 @@ class Sweep:
             residuals,
             {entry.view.index: self.depth_map(entry.view) for entry in residuals},
             self.dynamic.camera_color,
-            first_birth=first_birth,
+            first_identity=first_identity,
             rules=replace(self.rules, most=min(self.rules.most, room)),
             backend=self.backend,
         )
 
     def _enough(self, missing: Sequence[Missing]) -> bool:
-        """Whether enough views have missing pixels for a birth."""
+        """Whether enough views have missing pixels to spawn from."""
         return sum(entry.any for entry in missing) > self.rules.min_supports
 
     def _before(self, view: View, *, wrong: bool) -> Missing:
@@ -466,7 +468,7 @@ def prune_and_spawn(
     views: Sequence[View],
     active_tiles: Mapping[int, ActiveTiles],
     *,
-    first_birth: int,
+    first_identity: int,
     floor: ResidualFloor | None,
     room: int,
     config: SpawnConfig,
@@ -478,9 +480,9 @@ def prune_and_spawn(
         split: with its dynamic part after the scene flow.
         views: of the frame.
         active_tiles: by view index, the tiles that the dynamic part reaches.
-        first_birth: identity of the first birth.
+        first_identity: identity of the first new Gaussian.
         floor: residuals of frame 0; None for none.
-        room: largest number of births.
+        room: largest number of new Gaussians.
         config: the rules.
         backend: the compute back-end.
     """
@@ -504,22 +506,22 @@ def prune_and_spawn(
             sweep = replace(sweep, dynamic=replace(dynamic, free=dynamic.free.select(kept)))
             missing = sweep.drawn(missing)
         room = max(0, room - int(kept.sum()))
-        large = sweep.births(missing, first_birth=first_birth, room=room)
+        large = sweep.spawn(missing, first_identity=first_identity, room=room)
         if len(large.free) or not config.thin.enabled:
             return SpawnResult(kept, large.free, merged_count=large.merged_count)
         known = {entry.view.index: entry for entry in missing}
         # With all of frame 0's floor: by these low thresholds an eased one would take all that moves for thin content.
         thin_sweep = replace(sweep, floor=floor, rules=config.thin_rules, known=known)
-        thin = _thin_births(thin_sweep, first_birth=first_birth, room=room)
+        thin = _spawn_thin(thin_sweep, first_identity=first_identity, room=room)
     return SpawnResult(kept, thin.free, len(thin.free), thin.refused_count)
 
 
-def _thin_births(sweep: Sweep, *, first_birth: int, room: int) -> Spawned:
+def _spawn_thin(sweep: Sweep, *, first_identity: int, room: int) -> Spawned:
     """Spawn thin content, where nothing large is spawned."""
-    missing = sweep.missing(blames=False)
+    missing = sweep.missing(prunes=False)
     if missing_share(missing) > sweep.rules.max_missing_share:
         return Spawned(FreeGaussians.empty(sweep.dynamic.free.means))
-    return sweep.births(missing, first_birth=first_birth, room=room)
+    return sweep.spawn(missing, first_identity=first_identity, room=room)
 
 
 def _outlier_mask(
