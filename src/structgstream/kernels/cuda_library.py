@@ -46,7 +46,7 @@ CUDA_PROTOTYPES: Mapping[str, tuple[str, str]] = {
 """For each function of csrc/cuda: result type, argument types in order (``native.TYPES``)."""
 FLAGS = ("-O3", "-std=c++17", "-shared", "-Xcompiler", "-fPIC", "--threads", "0")
 SHARED_HEADERS = ("include", "cpu")
-"""Folders beside that of the sources; they have the headers of the C interface of the CPU kernels."""
+"""Folders next to that of the sources, with the headers of the C interface of the CPU kernels."""
 _OPERATIONS = "L1, SSIM, anchors, sweeps and tile lists"
 _NO_MEMORY = 2  # cudaErrorMemoryAllocation
 _LAST_LINES = 5  # of a failing compiler's output that an error quotes

@@ -83,7 +83,7 @@ class Fields:
         return value
 
     def file(self, name: str = "file") -> str:
-        """The plain name of a file beside the manifest: no folder, no scheme, no leading dot."""
+        """The plain name of a file in the manifest's folder: no folder, no scheme, no leading dot."""
         value = self._get(name)
         if not isinstance(value, str) or not _FILE.fullmatch(value):
             self._refuse(name, value, "the plain name of a file beside it (letters, digits, '.', '_' and '-')")

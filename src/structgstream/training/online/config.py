@@ -79,7 +79,8 @@ class MotionConfig:
     REACH_PIXELS: ClassVar[int] = 3
     """Changed pixels are dilated by this many pixels."""
     MIN_CHANGED_PIXELS: ClassVar[float] = 0.3
-    """Least number of changed pixels, summed by blending weight, that a primitive covers in a view to get its vote."""
+    """Least number of changed pixels, summed by blending weight, that a primitive covers in a view to get its vote: in
+    ``select.select_dynamic`` and, for tracks of groups, in ``groups/tracking.py``, as the two below."""
     MIN_CHANGED_SHARE: ClassVar[float] = 0.3
     """Least share of changed pixels among all that a primitive covers in a view to get its vote."""
     MIN_VOTES: ClassVar[int] = 2
@@ -264,7 +265,7 @@ class ExposureConfig:
     """Largest mean difference over the channels (full scale 1), beyond the light followed so far, of a pixel that shows
     the same as in frame 0."""
     MIN_SHARE: ClassVar[float] = 0.2
-    """Least share of such pixels, weighted by what they tell (black and white ones little), in a view that counts."""
+    """Least share of such pixels, weighted by information (black and white ones little), in a view that counts."""
     MIN_CHANGE: ClassVar[float] = 1 / 256
     """Smallest change of a bias that is followed at first, at most a quarter of an 8-bit level: flicker below it costs
     no bits."""

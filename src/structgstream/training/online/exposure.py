@@ -84,7 +84,7 @@ def with_exposure_of(
 def _light_change(
     scene: Scene, views: Sequence[View], reference: ExposureReference, so_far: Tensor, config: ExposureConfig
 ) -> Tensor:
-    """Change ``[3]`` of the biases since frame 0; ``so_far`` if too few views tell."""
+    """Change ``[3]`` of the biases since frame 0; ``so_far`` if too few views can be compared."""
     found = []
     with torch.no_grad():
         for view in views:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Coherent motion: a penalty on anchors that move unlike their neighbours.
 
-Pictures do not tell every anchor's motion: along an edge, on a plain surface, or behind another anchor, what is left is
+Pictures do not show every anchor's motion: along an edge, on a plain surface, or behind another anchor, what is left is
 noise, which costs bits, and which shows in views that were not trained on. Neighbours on one body move alike. So
 differences of displacement between neighbours are penalised by their length and not its square (like L1), as two
 bodies that pass each other differ much at few places.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Free Gaussians where content is missing, before the first iteration (not in the paper).
 
-Spawning by gradients places a faint child beside a parent, which then needs frames to converge. Where pixels of several
+Spawning by gradients places a faint child near a parent, which then needs frames to converge. Where pixels of several
 views still have a large residual after the scene flow, new content is located directly by a plane sweep: along the ray
 of such a pixel, in front of the rendered depth, at the depth where other views have the same missing colour. Free
 Gaussians that are outliers in several views are pruned first.
