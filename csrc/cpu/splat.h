@@ -9,7 +9,6 @@
 namespace structgstream {
 
 constexpr int kTile = 16;                          // pixels
-constexpr int kTilePixels = kTile * kTile;
 constexpr float kLowPass = 0.3f;                   // square pixels: reference_raster.LOW_PASS_PIXELS
 constexpr float kScreenLowPass = 0.15f;            // reference_raster.SCREEN_LOW_PASS_PIXELS
 constexpr float kMinAlpha = 1.0f / 255.0f;
