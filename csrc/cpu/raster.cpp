@@ -38,18 +38,14 @@ inline void store_sums(const vf (&m)[Count], float* out) {
     std::memcpy(out, sums, sizeof(float) * Count);
 }
 
-// 2^x for x in [-8, 0.1]: integer part by rounding, fraction by a polynomial fitted around zero.
+// 2^x for x in [-8, 0.1]: integer part by rounding, fraction by a polynomial (error 9e-8) whose terms do not wait for
+// each other.
 inline vf power_of_two(vf x) {
     const vf magic = splat(12582912.0f);
     const vf rounded = x + magic;
-    const vf f = x - (rounded - magic);
-    vf p = splat(1.54035304e-4f);
-    p = p * f + 1.33335581e-3f;
-    p = p * f + 9.61812911e-3f;
-    p = p * f + 5.55041087e-2f;
-    p = p * f + 2.40226507e-1f;
-    p = p * f + 6.93147181e-1f;
-    p = p * f + 1.0f;
+    const vf f = x - (rounded - magic), ff = f * f;
+    const vf high = splat(9.67151299e-3f) + f * 1.32647273e-3f, middle = splat(0.240222424f) + f * 5.55073359e-2f, low = splat(1.0f) + f * 0.693147004f;
+    const vf p = low + ff * (middle + ff * high);
     return (vf)((vi)p + ((vi)rounded << 23));
 }
 
@@ -104,11 +100,10 @@ struct Coverage {
     mask used, stopped;
     bool any_stopped;
 
-    [[gnu::always_inline]] bool of(const Splat& s, vf to_x, vf to_y, vf T, float least) {
+    [[gnu::always_inline]] void of(const Splat& s, vf to_x, vf to_y, vf T, float least) {
         dx = to_x, dy = to_y;
-        const vf power = s.log2_opacity - (dx * (dx * s.xx + dy * s.xy) + dy * dy * s.yy);
+        const vf power = (s.log2_opacity - dy * (dy * s.yy)) - dx * (dx * s.xx + dy * s.xy);
         used = both(at_least(power, splat(kLog2MinAlpha)), above(T, splat(least)));
-        if (!any(used)) return false;
         alpha = keep(used, smallest(power_of_two(power), splat(kMaxAlpha)));
         after = T * (1.0f - alpha);
         stopped = both(used, at_least(splat(kMinTransmittance), after));
@@ -117,7 +112,6 @@ struct Coverage {
             alpha = keep(without(used, stopped), alpha);
             after = choose(stopped, -T, after);
         }
-        return true;
     }
 };
 
@@ -198,7 +192,7 @@ template <int Count, bool kTrains, typename Visit>
         Block<Count>& block = blocks.at[n];
         const vf before = load(block.T);
         Coverage c;
-        if (!c.of(s, load(block.x) - x, load(block.y) - y, before, kLeast)) continue;
+        c.of(s, load(block.x) - x, load(block.y) - y, before, kLeast);
         visit(block, before, c);
         store(block.T, c.after);
         if ((c.any_stopped || kTrains) && !any(above(c.after, splat(kLeast)))) blocks.live &= ~(uint64_t{1} << n);
