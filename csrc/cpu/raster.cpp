@@ -93,23 +93,26 @@ inline uint64_t near_blocks(const Splat& s, const BlockCentres& centres, const T
     return found;
 }
 
-// One splat over one block of pixels at a distance of dx and dy, whose transmittance is T. T above `least`, zero or more,
-// is live; a pixel that has stopped stores its transmittance with a minus sign.
+// Opacity of a splat at pixels at a distance of dx and dy, 0 below 1/255.
+[[gnu::always_inline]] inline vf opacity_at(const Splat& s, vf dx, vf dy) {
+    const vf power = (s.log2_opacity - dy * (dy * s.yy)) - dx * (dx * s.xx + dy * s.xy);
+    return keep(at_least(power, splat(kLog2MinAlpha)), smallest(power_of_two(power), splat(kMaxAlpha)));
+}
+
+// One splat over one block of pixels whose transmittance is T. T above `least`, zero or more, is live; a pixel that has
+// stopped stores its transmittance with a minus sign.
 struct Coverage {
-    vf dx, dy, alpha, after;  // after: the transmittance behind the splat, valid for live pixels
-    mask used, stopped;
+    vf alpha, after;  // after: the transmittance behind the splat, valid for live pixels
     bool any_stopped;
 
-    [[gnu::always_inline]] void of(const Splat& s, vf to_x, vf to_y, vf T, float least) {
-        dx = to_x, dy = to_y;
-        const vf power = (s.log2_opacity - dy * (dy * s.yy)) - dx * (dx * s.xx + dy * s.xy);
-        used = both(at_least(power, splat(kLog2MinAlpha)), above(T, splat(least)));
-        alpha = keep(used, smallest(power_of_two(power), splat(kMaxAlpha)));
+    [[gnu::always_inline]] Coverage(vf opacity, vf T, float least) {
+        const mask live = above(T, splat(least));
+        alpha = keep(live, opacity);
         after = T * (1.0f - alpha);
-        stopped = both(used, at_least(splat(kMinTransmittance), after));
+        const mask stopped = both(live, at_least(splat(kMinTransmittance), after));
         any_stopped = any(stopped);
         if (any_stopped) {
-            alpha = keep(without(used, stopped), alpha);
+            alpha = keep(without(live, stopped), alpha);
             after = choose(stopped, -T, after);
         }
     }
@@ -181,21 +184,31 @@ void scatter_color(const Blocks<Count, kTrains>& blocks, int width, const Tile& 
 }
 
 // Visits the blocks of pixels of a tile that a splat covers, and updates their transmittance: visit(block, transmittance
-// before, coverage).
+// before, coverage). The opacity of the next block is computed ahead: processors then overlap its long chain of dependent
+// instructions with that of the visit. Returns whether there are any.
 template <int Count, bool kTrains, typename Visit>
-[[gnu::always_inline]] inline void for_covered(
+[[gnu::always_inline]] inline bool for_covered(
     const Splat& s, const Tile& tile, const BlockCentres& centres, Blocks<Count, kTrains>& blocks, Visit visit) {
     constexpr float kLeast = Blocks<Count, kTrains>::kLeast;
     const float x = s.x - tile.left, y = s.y - tile.top;
-    for (uint64_t rest = blocks.live & near_blocks(s, centres, tile); rest != 0; rest &= rest - 1) {
-        const int n = __builtin_ctzll(rest);
+    const auto opacity_of = [&](const Block<Count>& block) { return opacity_at(s, load(block.x) - x, load(block.y) - y); };
+    uint64_t rest = blocks.live & near_blocks(s, centres, tile);
+    if (rest == 0) return false;
+    int next = __builtin_ctzll(rest);
+    vf opacity = opacity_of(blocks.at[next]);
+    while (true) {
+        const int n = next;
         Block<Count>& block = blocks.at[n];
         const vf before = load(block.T);
-        Coverage c;
-        c.of(s, load(block.x) - x, load(block.y) - y, before, kLeast);
+        const vf here = opacity;
+        rest &= rest - 1;
+        next = rest != 0 ? __builtin_ctzll(rest) : n;
+        opacity = opacity_of(blocks.at[next]);
+        const Coverage c(here, before, kLeast);
         visit(block, before, c);
         store(block.T, c.after);
         if ((c.any_stopped || kTrains) && !any(above(c.after, splat(kLeast)))) blocks.live &= ~(uint64_t{1} << n);
+        if (rest == 0) return true;
     }
 }
 
@@ -260,9 +273,8 @@ void blend_backward(
         float* out = moments + static_cast<size_t>(raster.pair_slots[n]) * kMomentCount;
         vf m[kMomentCount];
         for (vf& v : m) v = splat(0.0f);
-        bool hit = false;
-        for_covered(s, tile, centres, blocks, [&](Block<8>& block, vf before, const Coverage& c) {
-            hit = true;
+        const float x = s.x - tile.left, y = s.y - tile.top;
+        const bool hit = for_covered(s, tile, centres, blocks, [&](Block<8>& block, vf before, const Coverage& c) {
             const auto& v = block.values;
             const vf weight = c.alpha * before;
             const vf g0 = load(v[kGradient]), g1 = load(v[kGradient + 1]), g2 = load(v[kGradient + 2]);
@@ -272,9 +284,10 @@ void blend_backward(
             if (!trained) return;
             const vf slope = before * q - to_come * reciprocal(1.0f - c.alpha);
             const vf d = keep(above(splat(kMaxAlpha), c.alpha), slope * c.alpha);  // a clamped alpha has no gradient
-            const vf dx = d * c.dx, dy = d * c.dy;
+            const vf to_x = load(block.x) - x, to_y = load(block.y) - y;
+            const vf dx = d * to_x, dy = d * to_y;
             m[0] += d, m[1] += dx, m[2] += dy;
-            m[3] += dx * c.dx, m[4] += dx * c.dy, m[5] += dy * c.dy;
+            m[3] += dx * to_x, m[4] += dx * to_y, m[5] += dy * to_y;
             m[6] += weight * g0, m[7] += weight * g1, m[8] += weight * g2;
         });
         if (!trained) continue;
@@ -322,9 +335,7 @@ void weigh(const Raster& raster, int index, const float* maps, int stride, float
         float* out = sums + static_cast<size_t>(raster.pair_slots[n]) * stride;
         vf m[Maps];
         for (vf& v : m) v = splat(0.0f);
-        bool hit = false;
-        for_covered(s, tile, centres, blocks, [&](Block<kFirst + Maps>& block, vf before, const Coverage& c) {
-            hit = true;
+        const bool hit = for_covered(s, tile, centres, blocks, [&](Block<kFirst + Maps>& block, vf before, const Coverage& c) {
             const vf weight = c.alpha * before;
             const vf lit = kDraws ? keep(above(before, splat(kMinGradientTransmittance)), weight) : weight;
 #pragma GCC unroll 8
