@@ -183,16 +183,32 @@ void scatter_color(const Blocks<Count, kTrains>& blocks, int width, const Tile& 
     return raster.splats[raster.pairs[n]];
 }
 
+// Visits the pairs n ... end - 1 of a tile until all blocks are hidden: visit(splat, pair, blocks that it may cover). The
+// blocks of the next splat are found ahead, so that a processor that did not foresee the end of a visit has them at once.
+// Returns the first pair that was not visited.
+template <int Count, bool kTrains, typename Visit>
+[[gnu::always_inline]] inline int for_splats(
+    const Raster& raster, const Tile& tile, int n, int end, const Blocks<Count, kTrains>& blocks, Visit visit) {
+    const BlockCentres centres;
+    const auto near = [&](int pair) { return near_blocks(splat_of(raster, pair, end), centres, tile); };
+    for (uint64_t ahead = n < end ? near(n) : 0; n < end && blocks.live != 0; ++n) {
+        const uint64_t here = ahead;
+        ahead = near(std::min(n + 1, end - 1));
+        visit(raster.splats[raster.pairs[n]], n, here);
+    }
+    return n;
+}
+
 // Visits the blocks of pixels of a tile that a splat covers, and updates their transmittance: visit(block, transmittance
 // before, coverage). The opacity of the next block is computed ahead: processors then overlap its long chain of dependent
 // instructions with that of the visit. Returns whether there are any.
 template <int Count, bool kTrains, typename Visit>
 [[gnu::always_inline]] inline bool for_covered(
-    const Splat& s, const Tile& tile, const BlockCentres& centres, Blocks<Count, kTrains>& blocks, Visit visit) {
+    const Splat& s, uint64_t near, const Tile& tile, Blocks<Count, kTrains>& blocks, Visit visit) {
     constexpr float kLeast = Blocks<Count, kTrains>::kLeast;
     const float x = s.x - tile.left, y = s.y - tile.top;
     const auto opacity_of = [&](const Block<Count>& block) { return opacity_at(s, load(block.x) - x, load(block.y) - y); };
-    uint64_t rest = blocks.live & near_blocks(s, centres, tile);
+    uint64_t rest = blocks.live & near;
     if (rest == 0) return false;
     int next = __builtin_ctzll(rest);
     vf opacity = opacity_of(blocks.at[next]);
@@ -222,16 +238,13 @@ void add_background(const float* background, Blocks<Count, kTrains>& blocks) {
 
 void blend(const Raster& raster, int index, const float* background, float* image, float* alpha_out) {
     const Tile tile(raster, index);
-    const BlockCentres centres;
     Blocks<3, false> blocks;  // color
-    const int end = raster.starts[index + 1];
-    for (int n = raster.starts[index]; n < end && blocks.live != 0; ++n) {
-        const Splat& s = splat_of(raster, n, end);
-        for_covered(s, tile, centres, blocks, [&](Block<3>& block, vf before, const Coverage& c) {
+    for_splats(raster, tile, raster.starts[index], raster.starts[index + 1], blocks, [&](const Splat& s, int, uint64_t near) {
+        for_covered(s, near, tile, blocks, [&](Block<3>& block, vf before, const Coverage& c) {
             const vf weight = c.alpha * before;
             for (int k = 0; k < 3; ++k) store(block.values[k], load(block.values[k]) + weight * s.color[k]);
         });
-    }
+    });
     if (background) add_background(background, blocks);
     scatter_color(blocks, raster.camera.width, tile, image);
     for_pixels(tile, raster.camera.width, [&](size_t pixel, int block, int lane) {
@@ -243,7 +256,6 @@ void blend_backward(
     const Raster& raster, int index, const float* background, const float* image, const float* alpha,
     const float* grad_image, const float* grad_alpha, float* moments) {
     const Tile tile(raster, index);
-    const BlockCentres centres;
     const int width = raster.camera.width;
     Blocks<8, true> blocks;  // color, then the remaining colour; its gradient; gradient of coverage; coverage
     enum { kColor, kRest = kColor, kGradient = 3, kCoverageGradient = 6, kCoverage };
@@ -267,14 +279,13 @@ void blend_backward(
     }
     int n = raster.starts[index], end = raster.starts[index + 1];
     while (end > n && raster.pairs[end - 1] >= raster.trained) --end;  // Their state is not read any more.
-    for (; n < end && blocks.live != 0; ++n) {
-        const Splat& s = splat_of(raster, n, end);
+    n = for_splats(raster, tile, n, end, blocks, [&](const Splat& s, int n, uint64_t near) {
         const bool trained = raster.pairs[n] < raster.trained;
         float* out = moments + static_cast<size_t>(raster.pair_slots[n]) * kMomentCount;
         vf m[kMomentCount];
         for (vf& v : m) v = splat(0.0f);
         const float x = s.x - tile.left, y = s.y - tile.top;
-        const bool hit = for_covered(s, tile, centres, blocks, [&](Block<8>& block, vf before, const Coverage& c) {
+        const bool hit = for_covered(s, near, tile, blocks, [&](Block<8>& block, vf before, const Coverage& c) {
             const auto& v = block.values;
             const vf weight = c.alpha * before;
             const vf g0 = load(v[kGradient]), g1 = load(v[kGradient + 1]), g2 = load(v[kGradient + 2]);
@@ -290,13 +301,13 @@ void blend_backward(
             m[3] += dx * to_x, m[4] += dx * to_y, m[5] += dy * to_y;
             m[6] += weight * g0, m[7] += weight * g1, m[8] += weight * g2;
         });
-        if (!trained) continue;
+        if (!trained) return;
         if (hit) {
             store_sums(m, out);
         } else {
             std::memset(out, 0, sizeof(float) * kMomentCount);
         }
-    }
+    });
     for (; n < end; ++n)  // hidden
         if (raster.pairs[n] < raster.trained)
             std::memset(moments + static_cast<size_t>(raster.pair_slots[n]) * kMomentCount, 0, sizeof(float) * kMomentCount);
@@ -321,7 +332,6 @@ void weigh(const Raster& raster, int index, const float* maps, int stride, float
            float* image) {
     constexpr int kFirst = kDraws ? 3 : 0;  // the first map, after the colour
     const Tile tile(raster, index);
-    const BlockCentres centres;
     Blocks<kFirst + Maps, !kDraws> blocks;
     for_pixels(tile, raster.camera.width, [&](size_t pixel, int block, int lane) {
 #pragma GCC unroll 8
@@ -329,13 +339,11 @@ void weigh(const Raster& raster, int index, const float* maps, int stride, float
     });
     if (!kDraws) blocks.live = blocks_with_values(blocks);
     const int end = raster.starts[index + 1];
-    int n = raster.starts[index];
-    for (; n < end && blocks.live != 0; ++n) {
-        const Splat& s = splat_of(raster, n, end);
+    int n = for_splats(raster, tile, raster.starts[index], end, blocks, [&](const Splat& s, int n, uint64_t near) {
         float* out = sums + static_cast<size_t>(raster.pair_slots[n]) * stride;
         vf m[Maps];
         for (vf& v : m) v = splat(0.0f);
-        const bool hit = for_covered(s, tile, centres, blocks, [&](Block<kFirst + Maps>& block, vf before, const Coverage& c) {
+        const bool hit = for_covered(s, near, tile, blocks, [&](Block<kFirst + Maps>& block, vf before, const Coverage& c) {
             const vf weight = c.alpha * before;
             const vf lit = kDraws ? keep(above(before, splat(kMinGradientTransmittance)), weight) : weight;
 #pragma GCC unroll 8
@@ -347,7 +355,7 @@ void weigh(const Raster& raster, int index, const float* maps, int stride, float
         } else {
             std::fill_n(out, Maps, 0.0f);
         }
-    }
+    });
     for (; n < end; ++n) std::fill_n(sums + static_cast<size_t>(raster.pair_slots[n]) * stride, Maps, 0.0f);  // hidden
     if (!kDraws) return;
     if (background) add_background(background, blocks);
