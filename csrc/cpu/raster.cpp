@@ -179,8 +179,8 @@ void scatter_color(const Blocks<Count, kTrains>& blocks, int width, const Tile& 
 
 // The splat of pair `n` < `end`. A later one is prefetched, because neighbours in depth are distant in memory.
 [[gnu::always_inline]] inline const Splat& splat_of(const Raster& raster, int n, int end) {
-    __builtin_prefetch(&raster.splats[raster.pairs[std::min(n + kAhead, end - 1)]]);
-    return raster.splats[raster.pairs[n]];
+    __builtin_prefetch(&raster.splats[raster.pairs[std::min(n + kAhead, end - 1)].splat]);
+    return raster.splats[raster.pairs[n].splat];
 }
 
 // Visits the pairs n ... end - 1 of a tile until all blocks are hidden: visit(splat, pair, blocks that it may cover). The
@@ -194,7 +194,7 @@ template <int Count, bool kTrains, typename Visit>
     for (uint64_t ahead = n < end ? near(n) : 0; n < end && blocks.live != 0; ++n) {
         const uint64_t here = ahead;
         ahead = near(std::min(n + 1, end - 1));
-        visit(raster.splats[raster.pairs[n]], n, here);
+        visit(raster.splats[raster.pairs[n].splat], n, here);
     }
     return n;
 }
@@ -278,10 +278,10 @@ void blend_backward(
         }
     }
     int n = raster.starts[index], end = raster.starts[index + 1];
-    while (end > n && raster.pairs[end - 1] >= raster.trained) --end;  // Their state is not read any more.
+    while (end > n && raster.pairs[end - 1].splat >= raster.trained) --end;  // Their state is not read any more.
     n = for_splats(raster, tile, n, end, blocks, [&](const Splat& s, int n, uint64_t near) {
-        const bool trained = raster.pairs[n] < raster.trained;
-        float* out = moments + static_cast<size_t>(raster.pair_slots[n]) * kMomentCount;
+        const bool trained = raster.pairs[n].splat < raster.trained;
+        float* out = moments + static_cast<size_t>(raster.pairs[n].slot) * kMomentCount;
         vf m[kMomentCount];
         for (vf& v : m) v = splat(0.0f);
         const float x = s.x - tile.left, y = s.y - tile.top;
@@ -309,8 +309,8 @@ void blend_backward(
         }
     });
     for (; n < end; ++n)  // hidden
-        if (raster.pairs[n] < raster.trained)
-            std::memset(moments + static_cast<size_t>(raster.pair_slots[n]) * kMomentCount, 0, sizeof(float) * kMomentCount);
+        if (raster.pairs[n].splat < raster.trained)
+            std::memset(moments + static_cast<size_t>(raster.pairs[n].slot) * kMomentCount, 0, sizeof(float) * kMomentCount);
 }
 
 // The blocks of a tile in which one of the numbers is not zero.
@@ -340,7 +340,7 @@ void weigh(const Raster& raster, int index, const float* maps, int stride, float
     if (!kDraws) blocks.live = blocks_with_values(blocks);
     const int end = raster.starts[index + 1];
     int n = for_splats(raster, tile, raster.starts[index], end, blocks, [&](const Splat& s, int n, uint64_t near) {
-        float* out = sums + static_cast<size_t>(raster.pair_slots[n]) * stride;
+        float* out = sums + static_cast<size_t>(raster.pairs[n].slot) * stride;
         vf m[Maps];
         for (vf& v : m) v = splat(0.0f);
         const bool hit = for_covered(s, near, tile, blocks, [&](Block<kFirst + Maps>& block, vf before, const Coverage& c) {
@@ -356,7 +356,7 @@ void weigh(const Raster& raster, int index, const float* maps, int stride, float
             std::fill_n(out, Maps, 0.0f);
         }
     });
-    for (; n < end; ++n) std::fill_n(sums + static_cast<size_t>(raster.pair_slots[n]) * stride, Maps, 0.0f);  // hidden
+    for (; n < end; ++n) std::fill_n(sums + static_cast<size_t>(raster.pairs[n].slot) * stride, Maps, 0.0f);  // hidden
     if (!kDraws) return;
     if (background) add_background(background, blocks);
     scatter_color(blocks, raster.camera.width, tile, image);
