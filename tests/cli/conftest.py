@@ -8,16 +8,19 @@ import pytest
 
 from structgstream.cli import main
 from tests.support.quick_streams import CLIP, QUICK, SMALL
+from tests.support.shared_folder import made_once
 from tests.support.small_presets import few_points
 
 
 @pytest.fixture(scope="session")
-def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def stream() -> Path:
     """Three frames of 80x60 pixels, hardly trained; nobody changes it."""
-    path = tmp_path_factory.mktemp("stream") / "clip.sgs"
+    return made_once("stream", _make_stream) / "clip.sgs"
+
+
+def _make_stream(folder: Path) -> None:
     with few_points("tiny"):
-        assert main(["reconstruct", CLIP, "-o", str(path), *SMALL, *QUICK]) == 0
-    return path
+        assert main(["reconstruct", CLIP, "-o", str(folder / "clip.sgs"), *SMALL, *QUICK]) == 0
 
 
 @pytest.fixture(scope="module")

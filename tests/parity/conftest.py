@@ -11,6 +11,7 @@ import pytest
 
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.native import ISA_NAMES, native_library
+from tests.support.shared_folder import made_once
 
 SOURCES = Path(__file__).parents[2] / "csrc" / "cuda"
 
@@ -27,15 +28,15 @@ def isa(request: pytest.FixtureRequest) -> Iterator[int]:
 
 
 @pytest.fixture(scope="session")
-def emulation(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], KernelLibrary]:
+def emulation() -> Callable[[int], KernelLibrary]:
     """The interface of the CUDA kernels on the processor; the argument says in which order threads run (0 or 1)."""
     compiler = shutil.which("g++") or shutil.which("clang++")
     if compiler is None:
         pytest.skip("no C++ compiler to build the emulation with")
-    built = tmp_path_factory.mktemp("cuda") / "emulation.so"
     flags = ["-std=c++17", "-O2", "-Wall", "-Wextra", "-Werror", "-Wno-psabi", "-shared", "-fPIC"]
-    subprocess.run([compiler, *flags, "-o", built, *sorted(SOURCES.glob("emulate_*.cpp"))], check=True)
-    library = ctypes.CDLL(str(built))
+    command = [compiler, *flags, *sorted(SOURCES.glob("emulate_*.cpp")), "-o"]
+    folder = made_once("emulation", lambda folder: subprocess.run([*command, folder / "built.so"], check=True))
+    library = ctypes.CDLL(str(folder / "built.so"))
     return lambda order: KernelLibrary(library, "cpu", lambda device: order)
 
 

@@ -7,6 +7,7 @@ would decide which branch is taken, and the comparison would measure that instea
 """
 
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
@@ -21,6 +22,7 @@ from tests.support.splats import splats_of, viewport_of
 
 native = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 WIDTH, HEIGHT, NEAR = 75, 53, 0.2  # No multiple of the tile.
+COLOURED = torch.tensor([0.3, 0.6, 0.1])
 NAMES = ("means", "quats", "scales", "opacities", "colors", "screen_offsets")
 
 
@@ -35,7 +37,9 @@ def camera(dtype: torch.dtype = torch.float64, device: str = "cpu") -> Viewport:
     return viewport_of(viewmat, K, width=WIDTH, height=HEIGHT, near=NEAR)
 
 
+@cache
 def gaussians(count: int = 300, *, opaque: float = 0.7) -> tuple[Tensor, ...]:
+    """Not to be changed."""
     g = torch.Generator().manual_seed(7)
     depths = torch.linspace(1.0, 5.0, count, dtype=torch.float64)[torch.randperm(count, generator=g)]
     spread = torch.rand(count, 2, generator=g, dtype=torch.float64) * 2.0 - 1.0
@@ -66,8 +70,9 @@ def run(
     background: Tensor | None = None,
     device: str = "cpu",
     intervals: Tensor | None = None,
+    away: Tensor | None = None,
 ):
-    """Image, alpha and the gradients for fixed cotangents."""
+    """Image, alpha and the gradients for fixed cotangents in the pixels ``away``; None for those that are safe."""
     dtype = inputs[0].dtype
     leaves = [value.to(device).clone().requires_grad_() for value in inputs]
     output = rasterize(
@@ -77,7 +82,7 @@ def run(
         background=None if background is None else background.to(device, dtype),
     )
     g = torch.Generator().manual_seed(11)
-    away = safe_pixels(inputs, intervals)
+    away = safe_pixels(inputs, intervals) if away is None else away
     v_image = torch.randn(HEIGHT, WIDTH, 3, generator=g, dtype=torch.float64) * away[..., None]
     v_alpha = torch.randn(HEIGHT, WIDTH, generator=g, dtype=torch.float64) * away
     total = (output.image * v_image.to(device, dtype)).sum() + (output.alpha * v_alpha.to(device, dtype)).sum()
@@ -105,6 +110,21 @@ def safe_pixels(inputs: tuple[Tensor, ...], intervals: Tensor | None = None) -> 
     return (torch.maximum(*apart) < 1e-7).double()
 
 
+@cache
+def usual_safe_pixels() -> Tensor:
+    return safe_pixels(gaussians())
+
+
+@cache
+def runs_of_reference(exact, background: Tensor | None, share: float | None):
+    """Pixels that are compared, and the results of the reference in float64 and in float32: as good as it gets."""
+    inputs, intervals = gaussians(), None if share is None else intervals_at(share)
+    away = safe_pixels(inputs, intervals)
+    single = tuple(value.float() for value in inputs)
+    options = {"background": background, "intervals": intervals, "away": away}
+    return away, run(exact, inputs, **options), run(exact, single, **options)
+
+
 def relative_errors(got: Tensor, truth: Tensor) -> Tensor:
     """Error of each Gaussian's gradient, relative to its own size plus a thousandth of the typical size."""
     got, truth = got.double().reshape(len(truth), -1), truth.double().reshape(len(truth), -1)
@@ -113,14 +133,14 @@ def relative_errors(got: Tensor, truth: Tensor) -> Tensor:
 
 
 def check_against_reference(
-    rasterize, exact, *, background: Tensor | None, device: str = "cpu", intervals: Tensor | None = None
+    rasterize, exact, *, background: Tensor | None, device: str = "cpu", share: float | None = None
 ) -> None:
-    inputs = gaussians()
-    away = safe_pixels(inputs, intervals).bool()
+    safe, (image, alpha, gradients, radii), (_, _, torch32, _) = runs_of_reference(exact, background, share)
+    away, intervals = safe.bool(), None if share is None else intervals_at(share)
     assert away.float().mean() > 0.5
-    image, alpha, gradients, radii = run(exact, inputs, background=background, intervals=intervals)
+    single = tuple(value.float() for value in gaussians())
     image32, alpha32, gradients32, radii32 = run(
-        rasterize, tuple(v.float() for v in inputs), background=background, device=device, intervals=intervals
+        rasterize, single, background=background, device=device, intervals=intervals, away=safe
     )
     # Float32 sums of some tens of terms of size one: 1e-5 is 80 units in the last place.
     assert (image32 - image).abs()[away].max() < 1e-5
@@ -128,7 +148,6 @@ def check_against_reference(
     # A box may miss the picture by a rounding; gsplat's are whole pixels, so that more of them reach it.
     assert ((radii32 > 0) | (radii == 0)).float().mean() > 0.99
     assert ((radii32 > 0) == (radii > 0)).float().mean() > (0.99 if device == "cpu" else 0.95)
-    _, _, torch32, _ = run(exact, tuple(v.float() for v in inputs), background=background, intervals=intervals)
     for name, got, single, truth in zip(NAMES, gradients32, torch32, gradients):
         errors, autograd = relative_errors(got, truth), relative_errors(single, truth)
         # As good as torch's own float32 autograd on the same input, give or take the order of its sums.
@@ -137,7 +156,7 @@ def check_against_reference(
 
 
 @native
-@pytest.mark.parametrize("background", [None, torch.tensor([0.3, 0.6, 0.1])], ids=["black", "coloured"])
+@pytest.mark.parametrize("background", [None, COLOURED], ids=["black", "coloured"])
 def test_cpu(isa: int, background: Tensor | None) -> None:
     check_against_reference(cpu_raster.rasterize, reference, background=background)
 
@@ -154,9 +173,8 @@ def intervals_at(share: float) -> Tensor:
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0, 3.0])
 def test_the_low_pass_of_the_training_pictures_on_the_cpu(isa: int, share: float) -> None:
     """Pictures without training pixels, much smaller than the training pictures, as large, and three times as large."""
-    background = torch.tensor([0.3, 0.6, 0.1])
     intervals = intervals_at(share)
-    check_against_reference(cpu_raster.rasterize, reference, background=background, intervals=intervals)
+    check_against_reference(cpu_raster.rasterize, reference, background=COLOURED, share=share)
     plain, filtered = (
         cpu_raster.rasterize(
             splats_of(*(v.float() for v in gaussians()[:5]), intervals=given), camera(torch.float32)
@@ -169,9 +187,7 @@ def test_the_low_pass_of_the_training_pictures_on_the_cpu(isa: int, share: float
 @pytest.mark.needs_cuda
 @pytest.mark.parametrize("share", [0.4, 1.0, 3.0])
 def test_the_low_pass_of_the_training_pictures_on_a_gpu(share: float) -> None:
-    check_against_reference(
-        cuda.rasterize, all_gradients, background=None, device="cuda", intervals=intervals_at(share)
-    )
+    check_against_reference(cuda.rasterize, all_gradients, background=None, device="cuda", share=share)
 
 
 @native
@@ -197,7 +213,8 @@ def test_what_hardly_any_light_reaches_is_drawn_without_gradient(isa: int, raste
 def test_no_pixel_of_a_needle_is_skipped(isa: int, faint: bool) -> None:
     """Blocks of pixels are chosen by a splat's ellipse: needles at every angle touch the corners of most."""
     means, quats, scales, opacities, colors, _ = gaussians(400)
-    scales[:, 0], scales[:, 1:] = 0.5, 0.004
+    scales = torch.full_like(scales, 0.004)
+    scales[:, 0] = 0.5
     inputs = (means, quats, scales, opacities * (0.05 if faint else 1.0), colors)
     image = reference(splats_of(*inputs), camera()).image
     drawn = cpu_raster.rasterize(splats_of(*(value.float() for value in inputs)), camera(torch.float32)).image
@@ -219,7 +236,7 @@ def test_repeated_runs_and_thread_counts_give_the_same_bits(isa: int) -> None:
     results = []
     for threads in (1, 2, 2, 3):
         torch.set_num_threads(threads)
-        image, alpha, gradients, radii = run(cpu_raster.rasterize, inputs)
+        image, alpha, gradients, radii = run(cpu_raster.rasterize, inputs, away=torch.ones(HEIGHT, WIDTH))
         results.append([image, alpha, *gradients, radii])
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other))
@@ -297,7 +314,7 @@ def run_tiles(
         splats_of(*leaves[:5]), camera(dtype), screen_offsets=leaves[5], tiles=tiles, onto=onto, trained=trained
     )
     g = torch.Generator().manual_seed(11)
-    v_image = torch.randn(HEIGHT, WIDTH, 3, generator=g, dtype=torch.float64) * safe_pixels(inputs)[..., None]
+    v_image = torch.randn(HEIGHT, WIDTH, 3, generator=g, dtype=torch.float64) * usual_safe_pixels()[..., None]
     gradients = torch.autograd.grad((output.image * v_image.to(dtype)).sum(), leaves)
     return output, gradients
 
@@ -333,7 +350,7 @@ def test_tiles_draw_and_learn_as_the_whole_picture_does_there(isa: int, trained:
 @pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 8, 9])
 def test_blending_weights(isa: int, channels: int) -> None:
     inputs = gaussians()
-    maps = torch.rand(HEIGHT, WIDTH, channels, dtype=torch.float64) * safe_pixels(inputs)[..., None]
+    maps = torch.rand(HEIGHT, WIDTH, channels, dtype=torch.float64) * usual_safe_pixels()[..., None]
     exact = reference_raster.blending_weights(splats_of(*inputs[:5]), camera(), maps)
     single = splats_of(*(value.float() for value in inputs[:5])), camera(torch.float32), maps.float()
     ours = cpu_raster.blending_weights(*single)

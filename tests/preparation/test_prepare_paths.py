@@ -53,7 +53,7 @@ def test_motion_and_structure_without_any_calibration(tmp_path: Path, monkeypatc
     """As where motion alone tells no clocks: the calibration comes from what stands still."""
     monkeypatch.setattr("structgstream.preparation.clocks.SURE_PERIODS", 0.0)
     starts = [0, 7, 3, 12]
-    truth = write_take(tmp_path / "videos", starts=starts, frames=45)
+    truth = write_take(tmp_path / "videos", starts=starts, frames=36)
     made = prepare_capture(tmp_path / "videos", tmp_path / "out", options=PrepareOptions(lens="pinhole", instants=1))
     assert not errors(made)
     assert "clocks" in made.steps

@@ -112,12 +112,12 @@ def test_a_clap_that_agrees_with_another_clap_is_refused() -> None:
 def test_a_room_that_is_louder_than_the_direct_sound_is_uncertain() -> None:
     """Echoes make peaks that all windows agree on; how high others are tells."""
     scores = []
-    for seed in range(6):
+    for seed in range(4):
         lags = lags_of(CLOCKS, seconds=8.0, snr_db=10.0, echo=0.15, seed=seed)
         if len(connected_by(list(CLOCKS), lags)) > 1:
             continue
         solution = solve_by_audio(dict.fromkeys(CLOCKS, (0.0, 8.0)), lags, drift=False)
         errors = np.array([solution.offsets[name] - clock.offset_seconds for name, clock in CLOCKS.items()])
         scores += list((errors - errors.mean()) / np.array(list(solution.sigmas.values())))
-    assert len(scores) >= 9
+    assert len(scores) >= 6
     assert np.abs(scores).max() < 3
