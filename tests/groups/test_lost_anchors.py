@@ -8,16 +8,16 @@ import torch
 
 from structgstream.groups import first_frame
 from structgstream.groups.first_frame import relocate_lost_anchors
-from structgstream.kernels.backend import reference_backend
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig, SpawnRules
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.views import training_views
+from tests.support.backends import quickest_backend
 from tests.support.worlds import moved_since, moving_world
 
 SHIFT = 0.4
 WORLD = moving_world(2, cameras=6, speed=SHIFT, width=96, height=64)
-BACKEND = reference_backend()
+BACKEND = quickest_backend()
 
 
 @pytest.fixture(autouse=True)

@@ -10,17 +10,17 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from structgstream.errors import ConfigError
-from structgstream.kernels.backend import reference_backend
 from structgstream.training.online.config import FlowConfig
 from structgstream.training.online.preprocess import FlowMaps, _parts, flow_map
+from tests.support.backends import quickest_backend
 
 
 def one_box(*given) -> torch.Tensor:
-    return flow_map(*given, config=FlowConfig(), backend=reference_backend()).maps
+    return flow_map(*given, config=FlowConfig(), backend=quickest_backend()).maps
 
 
 def boxes_apart(*given) -> torch.Tensor:
-    return flow_map(*given, config=FlowConfig(apart=True), backend=reference_backend()).maps
+    return flow_map(*given, config=FlowConfig(apart=True), backend=quickest_backend()).maps
 
 
 def textured(height: int = 120, width: int = 160) -> np.ndarray:
@@ -121,9 +121,9 @@ def thrown(width: int, *, far: bool, by: float = 60 / 320, body: bool = False) -
         first[below], second[below] = skin[below, ::-1], np.roll(skin[below, ::-1], width // 100, 1)
     first[ball], second[np.roll(ball, moved, 1)] = skin[ball], skin[ball]
     pictures = torch.from_numpy(first), torch.from_numpy(second)
-    changed = reference_backend().changed_pixels(*pictures, threshold=0.05, reach_pixels=3)
+    changed = quickest_backend().changed_pixels(*pictures, threshold=0.05, reach_pixels=3)
     config = FlowConfig(apart=True, far=far)
-    found = flow_map(*pictures, changed, (height, width), config=config, backend=reference_backend())
+    found = flow_map(*pictures, changed, (height, width), config=config, backend=quickest_backend())
     return found, torch.from_numpy(ball)
 
 
@@ -163,9 +163,9 @@ def test_where_there_is_nothing_to_find_no_far_flow_is_found() -> None:
     second = first.copy()
     cv2.circle(second, (300, 200), 30, (250, 40, 40), -1)
     pictures = torch.from_numpy(first), torch.from_numpy(second)
-    changed = reference_backend().changed_pixels(*pictures, threshold=0.05, reach_pixels=3)
+    changed = quickest_backend().changed_pixels(*pictures, threshold=0.05, reach_pixels=3)
     config = FlowConfig(apart=True, far=True)
-    found = flow_map(*pictures, changed, (480, 640), config=config, backend=reference_backend())
+    found = flow_map(*pictures, changed, (480, 640), config=config, backend=quickest_backend())
     assert found.far_boxes == 1
     far = found.maps[..., 1:].norm(dim=-1) > 8.0
     assert (far & changed).sum() < 0.02 * changed.sum()

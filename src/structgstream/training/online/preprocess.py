@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from structgstream.cameras import CameraRig
-from structgstream.flow import ABSOLUTE, RELATIVE, block_search, dis_refinement, dis_search
+from structgstream.flow import ABSOLUTE, RELATIVE, block_search, dis_refinement, dis_search, same_color
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.training.online.config import USUAL_FLOW, FlowConfig, MotionConfig, SceneFlowConfig
@@ -34,6 +34,8 @@ MIN_SAVING = 0.8
 CELLS, REACH_CELLS = 80, 12
 """The search for large motion matches cells, of which so many make the longer side, and finds what has moved by so many
 of them: 15 per cent of it."""
+COLOR_SHARE = 1 / 640
+"""Radius of the means of colours that flow is checked by, of the picture's longer side."""
 MISSED_CELLS, CONSISTENT_SHARE = 3, 0.5
 """Large motion is searched for around squares of so many cells, in each of which less than this share of the changed
 pixels has consistent flow: what has left its own outline, and not the narrow bands that slower motion occludes. The
@@ -220,10 +222,12 @@ def flow_map(
     where = changed.numpy(force=True)
     longer, level = max(where.shape), config.level_of(where.shape[1])
     context = max(MIN_CONTEXT_PIXELS, round(CONTEXT_SHARE * longer))
+    radius = max(1, round(COLOR_SHARE * longer))
     search = dis_search("capture", refined=False, finest_level=level)
 
     def consistent(box: Box, flow: NDArray[np.float32], back: NDArray[np.float32]) -> Tensor:
-        counts = None if mask is None else mask[box].cpu()
+        alike = torch.from_numpy(same_color(_cut(first, box), _cut(second, box), flow, radius=radius))
+        counts = alike if mask is None else alike & mask[box].cpu()
         forward, backward = torch.from_numpy(flow), torch.from_numpy(back)
         return backend.confident_flow(forward, backward, counts, relative=RELATIVE, absolute=ABSOLUTE)
 
