@@ -92,12 +92,12 @@ def test_between_iterations_the_dashboard_tells_what_is_done(tmp_path: Path) -> 
     assert "frame 6  takes pictures" in lines(shown)
     absent = replace(STATUS, cameras={"cam00": CameraStatus(False)})
     alone = RunMetrics(tmp_path / "y.sgs", fps=30.0, live=lambda: absent)
-    assert "waits for cameras" in lines(Dashboard(alone.values, None, console=console(terminal=True)))
+    assert "waits for cameras" in lines(Dashboard(alone.values, console=console(terminal=True)))
 
 
 def test_the_panel_leaves_room_for_what_a_terminal_shows_of_ctrl_c(tmp_path: Path) -> None:
     out = console(terminal=True)
-    out.print(Dashboard(metrics(tmp_path).values, None, console=out)._drawn())
+    out.print(Dashboard(metrics(tmp_path).values, console=out)._drawn())
     assert max(map(len, text(out).splitlines())) == 148
 
 
