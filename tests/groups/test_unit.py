@@ -85,7 +85,7 @@ def test_another_group_is_not_written_over(tmp_path: Path) -> None:
         fit(path, replace(task(made(), LENGTH), start=replace(task(made(), 0).start, iterations=8)))
     assert path.read_bytes() == made().segments[1].read_bytes()
     assert fit(path, task(made(), 2 * LENGTH), overwrite=True, stop_after=1) == 1
-    assert open_segment(partial_path(path)).identity.first == 2 * LENGTH
+    assert open_segment(partial_path(path)).entries[0][0] == 2 * LENGTH
 
 
 def test_one_process_writes_a_segment(tmp_path: Path) -> None:

@@ -80,9 +80,9 @@ def test_what_another_sweep_has_drawn_is_not_drawn_again() -> None:
 def test_without_room_nothing_is_born_and_with_room_as_much_as_there_is() -> None:
     swept = sweep()
     missing = swept.missing()
-    assert not len(swept.births(missing, first_birth=0, room=0).free)
-    assert len(swept.births(missing, first_birth=0, room=2).free) == 2
-    unsupported = sweep(replace(RULES, min_supports=6)).births(missing, first_birth=0, room=9)
+    assert not len(swept.spawn(missing, first_identity=0, room=0).free)
+    assert len(swept.spawn(missing, first_identity=0, room=2).free) == 2
+    unsupported = sweep(replace(RULES, min_supports=6)).spawn(missing, first_identity=0, room=9)
     assert not len(unsupported.free), "six others of six"
     assert not unsupported.refused_count
 
@@ -107,7 +107,7 @@ def test_what_is_found_lies_in_the_middle_of_a_pixel_of_its_view(monkeypatch: py
         return merge(points, *arguments, **options)
 
     monkeypatch.setattr(spawn, "_merge_points", noted)
-    swept.births(swept.missing(), first_birth=0, room=9)
+    swept.spawn(swept.missing(), first_identity=0, room=9)
     (points,) = found
     beside = []
     for view in swept.views:

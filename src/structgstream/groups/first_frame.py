@@ -57,8 +57,7 @@ def relocate_lost_anchors(
     active_tiles: Mapping[int, ActiveTiles],
     *,
     floor: ResidualFloor | None,
-    min_pixels: float,
-    births: SpawnRules,
+    rules: SpawnRules,
     backend: Backend,
 ) -> tuple[Scene, int]:
     """``dynamic`` with its lost anchors moved to their neighbours, and the number of lost anchors.
@@ -66,7 +65,6 @@ def relocate_lost_anchors(
     Args:
         first: its anchors in frame 0, in the same order.
         active_tiles: by view index, with up-to-date renderings; views without an entry are skipped.
-        min_pixels: views in which an anchor covers fewer pixels do not count.
 
     Raises:
         MissingExtraError: SciPy is not installed.
@@ -75,7 +73,7 @@ def relocate_lost_anchors(
     if pixel is None or len(first) < 2:
         return dynamic, 0
     with torch.no_grad():
-        outliers = _outlier_anchors(dynamic, views, active_tiles, floor, min_pixels, births, backend)
+        outliers = _outlier_anchors(dynamic, views, active_tiles, floor, rules, backend)
         if not outliers.any() or outliers.all():
             return dynamic, 0
         positions = dynamic.anchors.positions
@@ -93,17 +91,16 @@ def _outlier_anchors(
     views: Sequence[View],
     active_tiles: Mapping[int, ActiveTiles],
     floor: ResidualFloor | None,
-    min_pixels: float,
-    births: SpawnRules,
+    rules: SpawnRules,
     backend: Backend,
 ) -> Tensor:
-    """Mask ``[M]`` of the anchors that are outliers in several views (``births.outlier_mask``)."""
+    """Mask ``[M]`` of the anchors that are outliers in several views (``spawn.outlier_mask``)."""
     folded, coverage, wrong = dynamic.with_folded_appearance(), [], []
     for view in views:
         active = active_tiles.get(view.index)
         if active is None:
             continue
-        found = view_residual(active.picture, view, dynamic.camera_color, floor=floor, rules=births, backend=backend)
+        found = view_residual(active.picture, view, dynamic.camera_color, floor=floor, rules=rules, backend=backend)
         small = found.view
         pixels = found.wrong.to(active.picture)
         counting = torch.ones_like(pixels) if small.mask is None else small.mask.to(pixels)
@@ -115,7 +112,7 @@ def _outlier_anchors(
         wrong.append(sums[: len(dynamic.anchors), 1])
     if not coverage:
         return torch.zeros(len(dynamic.anchors), dtype=torch.bool, device=dynamic.anchors.positions.device)
-    return outlier_mask(torch.stack(coverage), torch.stack(wrong), min_pixels=min_pixels, rules=births)
+    return outlier_mask(torch.stack(coverage), torch.stack(wrong), rules=rules)
 
 
 def _displacements_of_neighbours(first: AnchorCloud, displacements: Tensor, rows: Tensor, inliers: Tensor) -> Tensor:
@@ -234,10 +231,9 @@ class _Rounds:
                 displaced,
                 inliers,
                 active_tiles,
-                first_birth=self._first_birth(current.free),
+                first_identity=self._first_identity(current.free),
                 floor=self.floor,
                 room=config.patching.max_free - len(split.static.free),
-                min_pixels=config.motion.MIN_PIXELS,
                 config=config.spawn,
                 backend=backend,
             )
@@ -279,8 +275,7 @@ class _Rounds:
             views,
             find_active_tiles(split, views, config=config.motion, backend=fit.backend),
             floor=self.floor,
-            min_pixels=config.motion.MIN_PIXELS,
-            births=config.spawn.rules,
+            rules=config.spawn.rules,
             backend=fit.backend,
         )
         return replace(split, dynamic=dynamic), count
@@ -302,7 +297,7 @@ class _Rounds:
         )
         return split.displaced(found.displacements), int(found.lifted.sum())
 
-    def _first_birth(self, free: FreeGaussians) -> int:
+    def _first_identity(self, free: FreeGaussians) -> int:
         """The first identity of the frame that no earlier round has used."""
         first = self.fit.frame_index * IDS_PER_FRAME
         return max(first, int(free.births.max()) + 1) if len(free) else first

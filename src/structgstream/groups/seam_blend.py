@@ -228,7 +228,7 @@ TOLERANCE = 3.0 / 255.0
 (lab/notes/groups-measured.md)."""
 MIN_EXCESS = 1.0 / 255.0
 """An anchor is a visible mixture if the mean distance beyond the tolerance, over the pixels it covers, reaches this."""
-MIN_PIXELS = 0.5
+MIN_COVERED_PIXELS = 0.5
 """Anchors that cover fewer pixels of the reduced pictures do not count."""
 _SCALE = 0.5  # relative to pictures of the reference size
 
@@ -256,7 +256,7 @@ def visible_mixtures(mixed: Scene, pictures: BorderPictures, rig: CameraRig, bac
             of_gaussians = accumulate(gaussians, small, maps, backend)
             sums += sum_by_primitive(of_gaussians, primitive_of(gaussians, folded), folded)[:count]
     covered = sums[:, 0]
-    return (covered > MIN_PIXELS) & (sums[:, 1] > MIN_EXCESS * covered)
+    return (covered > MIN_COVERED_PIXELS) & (sums[:, 1] > MIN_EXCESS * covered)
 
 
 def _excess(mixed: Tensor, before: Tensor, first: Tensor) -> Tensor:

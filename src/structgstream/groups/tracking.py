@@ -23,6 +23,7 @@ from structgstream.kernels.values import TileSelection
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import FlowConfig, LiftConfig, MotionConfig
 from structgstream.training.online.measure import (
+    VISIBLE_PIXELS,
     ViewChange,
     accumulate,
     flow_evidence,
@@ -138,7 +139,7 @@ def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tra
         votes = torch.stack([entry.votes for entry in seen]).sum(0)
         # A moving primitive stays dynamic with a single vote, because not all cameras are used in each frame.
         continued = (past.velocities != 0).any(1) & (votes > 0)
-        moving = (votes >= tracker.motion.MIN_VIEWS) | continued
+        moving = (votes >= tracker.motion.MIN_VOTES) | continued
         moving[: len(scene.anchors)] |= _occluded(tracker.motion, scene, seen, moving[: len(scene.anchors)])
         primitives = moving.nonzero()[:, 0]
         views = [entry.view for entry in seen]
@@ -195,7 +196,7 @@ def _measure_view(tracker: Tracker, scene: Scene, view: View, change: PictureCha
     sums *= _pixel_area(view, size)
     moved = sum_by_primitive(sums, primitives, scene)
     total, changed = moved[:, 3], moved[:, 7]
-    votes = (changed > motion.MIN_PIXELS) & (changed > motion.MIN_SHARE * total)
+    votes = (changed > motion.MIN_CHANGED_PIXELS) & (changed > motion.MIN_CHANGED_SHARE * total)
     of_view = ViewChange(float(change.changed.float().mean()), 0.0, repeated=change.repeated)
     return _ViewEvidence(view, tiles, gaussians, primitives, votes, sums[:, 3], moved[:, :7], of_view)
 
@@ -214,10 +215,10 @@ def _occluded(motion: MotionConfig, scene: Scene, seen: Sequence[_ViewEvidence],
         of_view = torch.zeros(len(entry.votes), dtype=torch.bool, device=moving.device)
         of_view[entry.primitives] = True
         drawn += of_view[:anchors]
-        shown += entry.flows[:anchors, 3] > motion.MIN_PIXELS
-    among = ((drawn >= motion.MIN_VIEWS) | (shown >= motion.MIN_VIEWS)).nonzero()[:, 0]
+        shown += entry.flows[:anchors, 3] > VISIBLE_PIXELS
+    among = ((drawn >= motion.MIN_VOTES) | (shown >= motion.MIN_VOTES)).nonzero()[:, 0]
     occluded[among] = occluded_dynamic(
-        scene.anchors.positions[among], moving[among], shown[among] >= motion.MIN_VIEWS, share=motion.occluded_share
+        scene.anchors.positions[among], moving[among], shown[among] >= motion.MIN_VOTES, share=motion.occluded_share
     )
     return occluded
 

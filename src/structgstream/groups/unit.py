@@ -183,7 +183,7 @@ def _older(state: Scene, velocities: Tensor) -> Scene:
     return replace(state.without_free(), anchors=replace(anchors, positions=positions))
 
 
-MIN_PIXELS = 0.5
+MIN_DISPLACED_PIXELS = 0.5
 """A primitive whose tracked displacement is at most this, in pixels of a median camera, counts as not displaced."""
 
 
@@ -268,7 +268,7 @@ def _start(task: SegmentTask, base: GroupBase) -> TrackStart | None:
 def _entry(start: TrackStart, base: GroupBase, source: FrameSource) -> GroupEntry:
     displacements, velocities = dense(base.scene(), start, step=base.position_step)
     # Smaller displacements are within the tracking error; these primitives retain frame 0's exact values.
-    least = MIN_PIXELS / base.config.online.rounding.at_quality("position_pixels") * base.position_step
+    least = MIN_DISPLACED_PIXELS / base.config.online.rounding.at_quality("position_pixels") * base.position_step
     displacements[(displacements.abs() <= least).all(1)] = 0.0
 
     @cache

@@ -101,7 +101,7 @@ def preprocess(
     earlier = training_views(before, rig, backend.device)
     known = {view.index for view in earlier}
     compared = [view for view in views if view.index in known]
-    if len(compared) < min(motion.MIN_VIEWS, len(rig.training)):
+    if len(compared) < min(motion.MIN_VOTES, len(rig.training)):
         return FramePictures(views, None)
     flow_from = flow_views(compared, frame.index, start)
     changes = detect_changes(views, earlier, config=motion, backend=backend, flow_from=flow_from, flow=start.FLOW)
