@@ -55,7 +55,7 @@ def dis_search(extra: str, *, refined: bool = True, finest_level: int = 1) -> Fl
     Raises:
         MissingExtraError: OpenCV is not installed.
     """
-    cv2 = _opencv(extra)
+    cv2 = opencv(extra)
     preset = cv2.DISOPTICAL_FLOW_PRESET_MEDIUM if refined else cv2.DISOPTICAL_FLOW_PRESET_FAST
     search = cv2.DISOpticalFlow.create(preset)
     if not refined:
@@ -76,7 +76,7 @@ def dis_refinement(*, finest_level: int, coarsest_level: int) -> FlowRefinement:
     Raises:
         MissingExtraError: OpenCV is not installed.
     """
-    cv2 = _opencv("capture")
+    cv2 = opencv("capture")
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     search.setFinestScale(finest_level)
     search.setCoarsestScale(coarsest_level)
@@ -108,7 +108,7 @@ def block_search(
     Raises:
         MissingExtraError: OpenCV is not installed.
     """
-    cv2 = _opencv("capture")
+    cv2 = opencv("capture")
     height, width = first.shape[:2]
     columns, rows = -(-width // cell_pixels), -(-height // cell_pixels)
     one, other = (
@@ -140,7 +140,7 @@ def block_search(
 
 def _enlarged(cells: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
     """The median over 3 x 3 cells of a flow ``[h, w, 2]``, interpolated to a width and height."""
-    cv2 = _opencv("capture")
+    cv2 = opencv("capture")
     smooth = [cv2.medianBlur(np.ascontiguousarray(cells[..., axis], np.float32), 3) for axis in (0, 1)]
     return np.asarray(cv2.resize(np.stack(smooth, -1), size), np.float32)
 
@@ -152,7 +152,8 @@ def _displacements(reach: int, columns: int, rows: int) -> list[tuple[int, int]]
     return sorted(found, key=lambda by: by[0] ** 2 + by[1] ** 2)
 
 
-def _opencv(extra: str) -> Any:
+def opencv(extra: str) -> Any:
+    """The module ``cv2``. Raises MissingExtraError, which names the extra, if it is not installed."""
     try:
         import cv2
     except ImportError:
@@ -168,7 +169,7 @@ def picture_shift(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[
     Raises:
         MissingExtraError: OpenCV is not installed.
     """
-    cv2 = _opencv("capture")
+    cv2 = opencv("capture")
     one, other = (cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY).astype(np.float32) for picture in (first, second))
     height, width = one.shape
     if min(height, width) < 2:
@@ -209,7 +210,7 @@ def same_color(
     Raises:
         MissingExtraError: OpenCV is not installed.
     """
-    cv2 = _opencv("capture")
+    cv2 = opencv("capture")
     side = (2 * radius + 1, 2 * radius + 1)
     one, other = (cv2.blur(picture, side) for picture in (first, second))
     height, width = one.shape[:2]

@@ -46,7 +46,7 @@ from structgstream.errors import ConfigError, StorageError, StreamError
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry, read_log
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
-from structgstream.recorder import Storage, log_reports
+from structgstream.recorder import Run, Storage, log_reports
 from structgstream.run_metrics import RunMetrics
 from structgstream.scene.scene import Scene
 from structgstream.session.frame_report import FrameReport
@@ -312,15 +312,6 @@ class QualityReport:
 
 
 @dataclass(frozen=True)
-class QualitiesRun:
-    """A reconstruction into several qualities."""
-
-    done: int  # number of frames that all qualities had at the start
-    # reports of the further frames; each step of the generator fits, stores and logs one frame of one quality
-    reports: Generator[QualityReport, None, None]
-
-
-@dataclass(frozen=True)
 class _Opened:
     """An opened quality: its name, pipeline and sink, and its existing frames."""
 
@@ -356,7 +347,7 @@ def record_qualities(
     metadata: Mapping[str, object] | None = None,
     on_step: StepListener | None = None,
     metrics: RunMetrics | None = None,
-) -> QualitiesRun:
+) -> Run:
     """Reconstructs a capture in several qualities (Note [In step]), with a log of each quality and of the run.
 
     The call checks existing streams, starts the logs and writes the list of qualities; streams are written as the
@@ -392,7 +383,7 @@ def record_qualities(
     rates, least = BitRates(folder, qualities), min(done.values())
     rates.begin(resume=resume)
     begin_log(folder, frames=least)
-    return QualitiesRun(least, _reported(_in_step(reports, done, frames.close), folder, [*done], rates, metrics))
+    return Run(least, _reported(_in_step(reports, done, frames.close), folder, [*done], rates, metrics))
 
 
 def _in_step(

@@ -39,11 +39,11 @@ LogExtras = Callable[[FrameReport], Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class Run:
-    """A reconstruction into a file."""
+    """A reconstruction into a file, or into several qualities."""
 
-    done: int  # number of frames that the file had at the start
-    # reports of the further frames; each step of the generator fits, stores and logs a frame
-    reports: Generator[FrameReport, None, None]
+    done: int  # number of frames that existed at the start
+    # of the further frames; each step of the generator fits, stores and logs a frame (of one quality)
+    reports: Generator[Any, None, None]
 
 
 def record(

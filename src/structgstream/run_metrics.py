@@ -8,7 +8,6 @@ units; unknown values are null. ``docs/live.md`` lists the keys.
 import json
 import math
 import os
-import shutil
 import threading
 import time
 from collections import deque
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from structgstream.atomic_files import atomic_write, side_path
+from structgstream.codec.container.byte_source import free_bytes
 from structgstream.data.live.status import LiveStatus
 from structgstream.errors import StorageError
 from structgstream.memory import resident_bytes
@@ -196,15 +196,6 @@ class RunMetrics:
             thread.join()
             self._state = ended
             self.write()
-
-
-def free_bytes(path: Path) -> int | None:
-    """Free space on the disk of a file that may not exist yet; None if unknown."""
-    for folder in (path, *path.absolute().parents):
-        if folder.exists():
-            with suppress(OSError):
-                return shutil.disk_usage(folder).free
-    return None
 
 
 def _rate(counted: list[tuple[float, int]]) -> float | None:

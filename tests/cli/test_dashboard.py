@@ -7,7 +7,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from structgstream.cli.live_run import Dashboard, LiveLines, live_display
+from structgstream.cli.live_run import Dashboard, live_display
+from structgstream.cli.progress import Lines
 from structgstream.data.live.status import CameraStatus, LiveStatus
 from structgstream.run_metrics import RunMetrics
 from structgstream.training.result import Step
@@ -39,13 +40,13 @@ def metrics(folder: Path) -> RunMetrics:
 
 def test_the_place_decides_how_a_live_run_looks(tmp_path: Path) -> None:
     values = metrics(tmp_path).values
-    assert isinstance(live_display(values, frames=None, console=console(terminal=False)), LiveLines)
-    assert isinstance(live_display(values, frames=None, console=console(terminal=True)), Dashboard)
+    assert isinstance(live_display(values, console=console(terminal=False)), Lines)
+    assert isinstance(live_display(values, console=console(terminal=True)), Dashboard)
 
 
 def test_a_line_has_cameras_and_skipped_sets(tmp_path: Path) -> None:
     out = console(terminal=False)
-    with live_display(metrics(tmp_path).values, frames=None, console=out) as shown:
+    with live_display(metrics(tmp_path).values, console=out) as shown:
         shown.step(Step(1, 100, 0.5, 10, 0))
         shown.frame(REPORT)
     (line,) = text(out).splitlines()
@@ -56,7 +57,7 @@ def test_a_line_has_cameras_and_skipped_sets(tmp_path: Path) -> None:
 
 def test_the_dashboard_names_each_camera_with_its_faults(tmp_path: Path) -> None:
     out = console(terminal=True)
-    with live_display(metrics(tmp_path).values, frames=None, console=out) as shown:
+    with live_display(metrics(tmp_path).values, console=out) as shown:
         shown.step(Step(7, 100, 0.5, 10, 0))
         shown.frame(REPORT)
         shown.step(Step(8, 100, 0.5, 10, 0))
@@ -82,7 +83,7 @@ def test_between_iterations_the_dashboard_tells_what_is_done(tmp_path: Path) -> 
         return text(out)
 
     values = metrics(tmp_path).values
-    shown = live_display(values, frames=None, done=3, console=console(terminal=True))
+    shown = live_display(values, done=3, console=console(terminal=True))
     assert isinstance(shown, Dashboard)
     assert "frame 4  takes pictures" in lines(shown)
     shown.step(Step(7, 100, 0.5, 10, 0))
@@ -91,18 +92,18 @@ def test_between_iterations_the_dashboard_tells_what_is_done(tmp_path: Path) -> 
     assert "frame 6  takes pictures" in lines(shown)
     absent = replace(STATUS, cameras={"cam00": CameraStatus(False)})
     alone = RunMetrics(tmp_path / "y.sgs", fps=30.0, live=lambda: absent)
-    assert "waits for cameras" in lines(Dashboard(alone.values, None, console=console(terminal=True)))
+    assert "waits for cameras" in lines(Dashboard(alone.values, console=console(terminal=True)))
 
 
 def test_the_panel_leaves_room_for_what_a_terminal_shows_of_ctrl_c(tmp_path: Path) -> None:
     out = console(terminal=True)
-    out.print(Dashboard(metrics(tmp_path).values, None, console=out)._drawn())
+    out.print(Dashboard(metrics(tmp_path).values, console=out)._drawn())
     assert max(map(len, text(out).splitlines())) == 148
 
 
 def test_on_a_narrow_terminal_no_value_is_broken(tmp_path: Path) -> None:
     out = Console(file=io.StringIO(), force_terminal=True, width=48, height=40, color_system=None)
-    with live_display(metrics(tmp_path).values, frames=None, console=out) as shown:
+    with live_display(metrics(tmp_path).values, console=out) as shown:
         shown.frame(REPORT)
     lines = text(out).splitlines()
     for part in ("skipped 880", "pictures 0.25 s old", "train 31.20 dB", "10 anchors", "stuck 3"):
@@ -114,7 +115,7 @@ def test_of_many_cameras_on_few_lines_the_last_are_cut_off(tmp_path: Path) -> No
     out = Console(file=io.StringIO(), force_terminal=True, width=100, height=20, color_system=None)
     made = RunMetrics(tmp_path / "x.sgs", fps=30.0, live=lambda: many)
     made.frame(REPORT)
-    with live_display(made.values, frames=None, console=out) as shown:
+    with live_display(made.values, console=out) as shown:
         shown.frame(REPORT)
         out.file.truncate(0)
         shown._live.refresh()  # type: ignore[union-attr]
@@ -129,7 +130,7 @@ def test_each_quality_has_a_row(tmp_path: Path) -> None:
     made = RunMetrics(tmp_path / "x", fps=30.0, live=lambda: STATUS, qualities=("low", "high"))
     made.quality("low", REPORT)
     out = console(terminal=True)
-    with live_display(made.values, frames=None, console=out) as shown:
+    with live_display(made.values, console=out) as shown:
         shown.frame(REPORT, quality="low")
     last = text(out).splitlines()[-30:]
     (row,) = (line for line in last if line.strip("│ ").startswith("low "))
@@ -138,6 +139,6 @@ def test_each_quality_has_a_row(tmp_path: Path) -> None:
     assert row.strip("│ ").split() == ["high", "-", "-", "0", "B", "-", "-"]
     assert any("frame 5  low  train 31.20 dB" in line for line in last)
     lines = console(terminal=False)
-    with live_display(made.values, frames=None, console=lines) as shown:
+    with live_display(made.values, console=lines) as shown:
         shown.frame(REPORT, quality="low")
     assert text(lines).startswith("frame 5  low  train 31.20 dB")

@@ -26,7 +26,7 @@ def packets(count: int, *, key_times: float = 2.0) -> list[Row]:
 
 
 def parts(rows: list[Row]) -> Parts:
-    return {"header": HEADER, **{name: dict(group.sizes) for name, group in groups_of(rows).items()}}
+    return {"header": HEADER, **groups_of(rows)}
 
 
 def test_colours_go_to_the_largest_fields_of_the_delta_packets_first() -> None:

@@ -32,9 +32,9 @@ def begun(*command: str, log: Path | None = None, **variables: str) -> CommandPr
     return CommandProcess(Task("task", command, log=log, environment={"OURS": "task"}), environment=variables)
 
 
-def ending_of(running: CommandProcess, **given: int) -> TaskResult:
+def ending_of(running: CommandProcess) -> TaskResult:
     assert waited_for([running], PATIENCE_SECONDS)
-    ending = running.ended(**given)
+    ending = running.ended()
     assert ending is not None
     return ending
 
@@ -44,8 +44,8 @@ def test_while_it_runs_it_has_no_ending() -> None:
     assert running.ended() is None
     assert not waited_for([running], 0.0)
     os.kill(running.pid, signal.SIGKILL)
-    ending = ending_of(running, attempts=4)
-    assert (ending.name, ending.status, ending.attempts, ending.killed) == ("task", -signal.SIGKILL, 4, True)
+    ending = ending_of(running)
+    assert (ending.name, ending.status, ending.killed) == ("task", -signal.SIGKILL, True)
 
 
 def test_its_ending_says_what_it_took() -> None:

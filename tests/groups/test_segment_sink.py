@@ -32,12 +32,9 @@ def go_on(path: Path) -> int:
     """Writes what is missing of a segment; returns how many packets that were."""
     found = resume_segment(path, base(), IDENTITY)
     if found is not None and found.complete:
-        found.close()
         return 0
     done = 0 if found is None else len(found.entries)
     sink = SegmentSink(path, base(), IDENTITY, found)
-    if found is not None:
-        found.close()
     for packet in encoded()[0][done:]:
         sink.write(packet)
     sink.close()
@@ -80,7 +77,6 @@ def test_the_segment_of_frame_0_begins_with_it(tmp_path: Path) -> None:
     path = write(tmp_path / "g.sgs", encoded(1, FIRST)[0], identity=FROM_FRAME_0)
     found = open_segment(path)
     assert (found.complete, found.record(0)) == (True, base().first)
-    found.close()
 
 
 def test_a_group_has_no_other_period(tmp_path: Path) -> None:
@@ -120,7 +116,6 @@ def test_what_is_whole_but_was_killed_before_it_had_its_name_gets_it(tmp_path: P
     found = resume_segment(path, base(), IDENTITY)
     assert found is not None
     assert found.complete
-    found.close()
     assert path.read_bytes() == whole
     assert not partial_path(path).exists()
 

@@ -23,8 +23,8 @@ from structgstream.data.live.resume_cache import ResumeCache, resume_folder
 from structgstream.errors import ConfigError, StorageError
 from structgstream.evaluation.run_log import read_log
 from structgstream.frames import MultiViewFrame
-from structgstream.qualities import QualitiesRun, QualityReport, configured, qualities_in, record_qualities
-from structgstream.recorder import record, segments_at, segments_folder
+from structgstream.qualities import QualityReport, configured, qualities_in, record_qualities
+from structgstream.recorder import Run, record, segments_at, segments_folder
 from structgstream.run_metrics import RunMetrics
 from structgstream.session import loop, struct_gstream
 from structgstream.session.loop import Session
@@ -93,7 +93,7 @@ def begun(
     *,
     resume: bool = False,
     metrics: RunMetrics | None = None,
-) -> QualitiesRun:
+) -> Run:
     stores = {name: segments_folder(folder / name, may_exist=True) for name in NAMES}
     storages = {name: segments_at(store) for name, store in stores.items()}
     return record_qualities(
@@ -213,7 +213,7 @@ def test_the_list_the_logs_and_the_metrics(tmp_path: Path) -> None:
             assert line["total_seconds"] == own[index]["total_seconds"] <= log[index]["total_seconds"]
 
 
-def left_by_a_kill(run: QualitiesRun, folder: Path, *, after: tuple[str, int]) -> None:
+def left_by_a_kill(run: Run, folder: Path, *, after: tuple[str, int]) -> None:
     """What is on the disk after a kill -9 when a quality has just stored a frame: copied, as nothing is closed."""
     for one in run.reports:
         if (one.quality, one.report.index) == after:

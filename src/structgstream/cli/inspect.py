@@ -298,7 +298,7 @@ def packet_table(rows: "Sequence[Row]", *, every: bool) -> Table:
     lines = [[str(row.index), row.kind, *cells(row.bytes, row.sizes)] for row in rows[::step]]
     groups = groups_of(rows)
     means = [
-        ["mean", name.split()[0], *cells(groups[name].bytes, groups[name].sizes)] for name in groups if name != FIRST
+        ["mean", name.split()[0], *cells(sum(sizes.values()), sizes)] for name, sizes in groups.items() if name != FIRST
     ]
     table = compact_table()
     table.padding = 0

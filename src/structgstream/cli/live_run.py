@@ -107,7 +107,7 @@ def monitored(source: "FrameStream", metrics: "RunMetrics | None", *, done: int)
         if isinstance(source, LiveSource) and metrics is not None:
             stack.enter_context(source)
             stack.enter_context(stop_on_interrupt(lambda: source.stopped, source.stop))
-            yield stack.enter_context(live_display(metrics.values, frames=None, done=done))
+            yield stack.enter_context(live_display(metrics.values, done=done))
         else:
             yield stack.enter_context(display(frame_count(source), done=done))
 
@@ -137,38 +137,19 @@ GAP = "  "
 Values = Callable[[], Mapping[str, Any]]
 
 
-def live_display(
-    values: Values, *, frames: int | None, done: int = 0, console: Console | None = None
-) -> "Dashboard | LiveLines":
-    """A dashboard when ``console`` (default: standard output) is a terminal, else a line a frame.
-
-    Args:
-        frames: number of frames of the stream when it is finished; None where that is unknown.
-    """
+def live_display(values: Values, *, done: int = 0, console: Console | None = None) -> "Dashboard | Lines":
+    """A dashboard when ``console`` (default: standard output) is a terminal, else a line a frame."""
     console = Console() if console is None else console
     if console.is_terminal:
-        return Dashboard(values, frames, done, console=console)
-    return LiveLines(values, frames, done, console=console)
-
-
-class LiveLines(Lines):
-    """Plain lines, each with what the cameras and queues do."""
-
-    def __init__(self, values: Values, frames: int | None, done: int, *, console: Console) -> None:
-        super().__init__(frames, done, console=console)
-        self._values = values
-
-    def frame(self, report: "FrameReport", *, quality: str | None = None) -> None:
-        """Prints the frame's line."""
-        self._current = report.index + 1
-        self._print(f"{summary(report, self._frames, quality=quality)}  {GAP.join(state_parts(self._values()))}")
+        return Dashboard(values, done, console=console)
+    return Lines(None, done, console=console, further=lambda: GAP + GAP.join(state_parts(values())))
 
 
 class Dashboard:
     """Cameras, queues, stages and the last frame, drawn again a few times a second."""
 
-    def __init__(self, values: Values, frames: int | None, done: int = 0, *, console: Console) -> None:
-        self._values, self._frames, self._console = values, frames, console
+    def __init__(self, values: Values, done: int = 0, *, console: Console) -> None:
+        self._values, self._console = values, console
         self._step = self._last = ""
         self._next, self._ended = done + 1, False  # counted from 1, as the lines of frames are
         self._live = Live(
@@ -189,7 +170,7 @@ class Dashboard:
 
     def frame(self, report: "FrameReport", *, quality: str | None = None) -> None:
         """Notes the frame."""
-        self._step, self._last = "", summary(report, self._frames, quality=quality)
+        self._step, self._last = "", summary(report, None, quality=quality)
         self._next = report.index + 2
 
     def _drawn(self) -> Panel:

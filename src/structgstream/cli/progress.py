@@ -144,10 +144,12 @@ def human_bytes(count: float) -> str:
 
 
 class Lines:
-    """Plain lines, for files and pipes."""
+    """Plain lines, for files and pipes; each frame's ends with the text of ``further``."""
 
-    def __init__(self, frames: int | None, done: int, *, console: Console) -> None:
-        self._frames, self._current, self._console = frames, done, console
+    def __init__(
+        self, frames: int | None, done: int, *, console: Console, further: Callable[[], str] = lambda: ""
+    ) -> None:
+        self._frames, self._current, self._console, self._further = frames, done, console, further
         self._spoken = time.monotonic()
 
     def __enter__(self) -> "Lines":
@@ -168,7 +170,7 @@ class Lines:
     def frame(self, report: "FrameReport", *, quality: str | None = None) -> None:
         """Prints the frame's line."""
         self._current = report.index + 1
-        self._print(summary(report, self._frames, quality=quality))
+        self._print(f"{summary(report, self._frames, quality=quality)}{self._further()}")
 
     def _print(self, text: str) -> None:
         print_lines(self._console, text)

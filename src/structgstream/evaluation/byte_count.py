@@ -41,15 +41,6 @@ class Row:
     first: bool = False
 
 
-@dataclass(frozen=True)
-class Group:
-    """Packets of one kind: their number, and their mean bytes in total and by field."""
-
-    count: int
-    bytes: float
-    sizes: Mapping[str, float]
-
-
 def packet_rows(reader: StreamReader) -> list[Row]:
     """The packet of every frame that can be decoded."""
     firsts = {period.first_frame for period in reader.periods}
@@ -82,8 +73,8 @@ def occurring_fields(sizes: Iterable[Mapping[str, float]]) -> list[str]:
     return sorted(sums, key=lambda name: (name == REST, -sums[name]))
 
 
-def groups_of(rows: Sequence[Row]) -> dict[str, Group]:
-    """The first packet of each period, and the means of each kind of the others.
+def groups_of(rows: Sequence[Row]) -> Parts:
+    """Mean bytes by field of the first packet of each period, and of each kind of the others.
 
     First packets are a group of their own: with the codec ``compact`` they are nearly empty, because headers contain
     their frames.
@@ -93,23 +84,22 @@ def groups_of(rows: Sequence[Row]) -> dict[str, Group]:
         "key packets": [row for row in rows if row.kind == "key" and not row.first],
         "delta packets": [row for row in rows if row.kind == "delta"],
     }
-    return {name: mean_of(some) for name, some in chosen.items() if some}
-
-
-def mean_of(rows: Sequence[Row]) -> Group:
-    """The mean of at least one packet."""
-    names = occurring_fields(row.sizes for row in rows)
-    sizes = {name: sum(row.sizes.get(name, 0) for row in rows) / len(rows) for name in names}
-    return Group(len(rows), sum(row.bytes for row in rows) / len(rows), sizes)
+    return {
+        group: {
+            name: sum(row.sizes.get(name, 0) for row in some) / len(some)
+            for name in occurring_fields(row.sizes for row in some)
+        }
+        for group, some in chosen.items()
+        if some
+    }
 
 
 def parts_of(reader: StreamReader, rows: Sequence[Row]) -> Parts:
-    """Bytes by field of the headers, and mean bytes of each kind of packet; a nearly empty first packet is left out."""
-    parts: Parts = {"header": dict(with_rest(reader.header_field_bytes, reader.header_bytes))}
-    for name, group in groups_of(rows).items():
-        if name != FIRST or group.bytes > NOTHING * reader.header_bytes:
-            parts[name] = dict(group.sizes)
-    return parts
+    """Bytes by field of the headers, and of :func:`groups_of`; a nearly empty first packet is left out."""
+    groups = groups_of(rows)
+    if sum(groups.get(FIRST, {}).values()) <= NOTHING * reader.header_bytes:
+        groups.pop(FIRST, None)
+    return {"header": dict(with_rest(reader.header_field_bytes, reader.header_bytes)), **groups}
 
 
 SMALL = 0.01  # fields below this share of every part are combined

@@ -14,7 +14,7 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.errors import MissingExtraError
+from structgstream.flow import opencv
 
 PIXELS_PER_DEGREE = 0.7 * (3840 / 0.7) * np.pi / 180  # seen from 0.7 m, a display 0.7 m wide with 3840 pixels across
 
@@ -46,15 +46,6 @@ class FlipFeatures:
     points: Plane  # point and line strength at each pixel
 
 
-def opencv() -> ModuleType:
-    """The module OpenCV, which filters pictures. Raises MissingExtraError if it is not installed."""
-    try:
-        import cv2
-    except ImportError:
-        raise MissingExtraError("cv2", "eval") from None
-    return cv2
-
-
 def features_of(picture: NDArray[np.uint8]) -> FlipFeatures:
     """FLIP's features of an 8-bit sRGB picture ``[H, W, 3]`` at the default viewing conditions.
 
@@ -63,7 +54,7 @@ def features_of(picture: NDArray[np.uint8]) -> FlipFeatures:
     Raises:
         MissingExtraError: OpenCV is not installed.
     """
-    cv2 = opencv()
+    cv2 = opencv("eval")
     linear = cv2.LUT(np.ascontiguousarray(picture), _linear_levels())
     opponent = cv2.split(cv2.transform(linear, TO_OPPONENT.astype(np.float32)))
     return FlipFeatures(_seen_color(cv2, opponent), *_edges_and_points(cv2, opponent[0]))
@@ -71,7 +62,7 @@ def features_of(picture: NDArray[np.uint8]) -> FlipFeatures:
 
 def flip_map(one: FlipFeatures, other: FlipFeatures) -> Plane:
     """FLIP of every pixel ``[H, W]``, in [0, 1], of two pictures of the same size; symmetric."""
-    cv2 = opencv()
+    cv2 = opencv("eval")
     light, *hues = (cv2.absdiff(a, b) for a, b in zip(one.color, other.color, strict=True))
     light += _length(hues[0], hues[1])
     color = cv2.pow(light, COLOR_EXPONENT, dst=light)

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.errors import MissingExtraError
-from structgstream.evaluation.flip import FlipFeatures, features_of, flip_of, opencv
+from structgstream.evaluation.flip import FlipFeatures, features_of, flip_of
 from structgstream.evaluation.lpips import ALEX, TRUNKS, VGG, Features, Lpips, how_to_get, load_lpips, weights_file
 from structgstream.evaluation.metrics import SMALLEST_OF_SCALES, Mask, Picture, both, changed_pixels, ms_ssim
-from structgstream.flow import consistency_mask, dis_search, sampled
+from structgstream.flow import consistency_mask, dis_search, opencv, sampled
 
 
 @dataclass(frozen=True)
@@ -64,14 +64,6 @@ def warping_error(now: Picture, before: Picture, field: FlowField) -> float | No
     carried = sampled(before.astype(np.float32), field.offsets)
     squares = np.square(carried - now)[field.seen]
     return float(squares.mean(dtype=np.float64)) / 255.0**2
-
-
-def difference_of_change(rendered: float, true: float) -> float:
-    """Difference between the frame-to-frame change of rendering and truth, both by the same picture distance.
-
-    With LPIPS this is tLP (Chu et al., 2020): ``|LPIPS(r_t, r_{t-1}) - LPIPS(g_t, g_{t-1})|``.
-    """
-    return abs(rendered - true)
 
 
 def flicker(now: Picture, before: Picture, still: Mask) -> float | None:
@@ -134,7 +126,7 @@ def load_optional_metrics(
     missing: dict[str, str] = {}
     measure = None
     try:
-        opencv()
+        opencv("eval")
         measure = features_of
     except MissingExtraError as error:
         missing |= dict.fromkeys(("flip", "temporal_flip"), str(error))
@@ -200,10 +192,10 @@ def optional_scores(
             scores["e_warp"] = warping_error(picture, before.picture, field)
         if seen is not None and before.flip is not None and counting is None:
             true, rendered = (flip_of(*pair) for pair in zip(seen, before.flip, strict=True))
-            scores["temporal_flip"] = difference_of_change(rendered, true)
+            scores["temporal_flip"] = abs(rendered - true)
         if alex is not None and features is not None and before.lpips is not None:
             true, rendered = (alex.distance(*pair) for pair in zip(features, before.lpips, strict=True))
-            scores["t_lpips"] = difference_of_change(rendered, true)
+            scores["t_lpips"] = abs(rendered - true)  # tLP of Chu et al., 2020
     return scores, ComparedFrame(truth, picture, seen, features, mask)
 
 

@@ -5,7 +5,7 @@ A frame is bad by its PSNR on changed pixels, or by its ghosts (``ghosts.py``). 
 both, because moving content is a small part of it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
@@ -64,29 +64,14 @@ def shown(scores: Scores, reason: Reason) -> dict[str, float | None]:
 
 
 @dataclass(frozen=True)
-class Window:
-    """A square part of a picture, pixels."""
-
-    x: int  # first column
-    y: int  # first row
-    width: int  # number of columns
-    height: int  # number of rows
-
-    def of(self, picture: Picture) -> Picture:
-        """That part of a picture ``[H, W, 3]``."""
-        return picture[self.y : self.y + self.height, self.x : self.x + self.width]
-
-
-@dataclass(frozen=True)
 class Crop:
-    """A bad window of a bad frame."""
+    """A bad window of a bad frame: truth, rendering and their difference times four, side by side."""
 
-    reason: Reason  # why it was chosen
-    frame: int  # number of the frame
-    camera: str  # name of the camera
-    scores: Mapping[str, float | None]  # scores of the whole picture
-    window: Window  # position in the picture
-    picture: Picture  # truth, rendering and their difference times four, side by side
+    reason: Reason
+    frame: int
+    camera: str
+    caption: str
+    picture: Picture
 
 
 @dataclass
@@ -115,9 +100,19 @@ class WorstPictures:
 
 
 def _crop(reason: Reason, index: int, compared: "Compared") -> Crop:
-    window = worst_window(_error_map(reason, compared))
-    picture = side_by_side(window.of(compared.truth), window.of(compared.picture))
-    return Crop(reason, index, compared.camera, shown(compared.scores, reason), window, picture)
+    rows, columns = worst_window(_error_map(reason, compared))
+    scores = compared.scores
+    if reason == "changed":
+        why = f"{scores.psnr_changed:.2f} dB on changed pixels"
+    else:
+        why = (
+            f"{scores.ghost_share:.1%} of the disoccluded pixels, which are {scores.disoccluded_share:.1%} of the "
+            "picture"
+        )
+    size = f"{columns.stop - columns.start}x{rows.stop - rows.start}"
+    caption = f"Frame {index}, camera {compared.camera}: {why}; {size} pixels at ({columns.start}, {rows.start})"
+    picture = side_by_side(compared.truth[rows, columns], compared.picture[rows, columns])
+    return Crop(reason, index, compared.camera, caption, picture)
 
 
 def _error_map(reason: Reason, compared: "Compared") -> NDArray[np.int64]:
@@ -131,15 +126,15 @@ def _error_map(reason: Reason, compared: "Compared") -> NDArray[np.int64]:
     return errors * np.pad(ghosts, ((0, height - ghosts.shape[0]), (0, width - ghosts.shape[1])))
 
 
-def worst_window(errors: NDArray[np.int64]) -> Window:
-    """The window with the largest sum of ``errors`` ``[H, W]``, the first of equal ones."""
+def worst_window(errors: NDArray[np.int64]) -> tuple[slice, slice]:
+    """Rows and columns of the window with the largest sum of ``errors`` ``[H, W]``, the first of equal ones."""
     height, width = errors.shape
     side = max(1, round(WINDOW_SHARE * max(height, width)))
     high, wide = min(side, height), min(side, width)
     total = np.pad(errors.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
     sums = total[high:, wide:] - total[:-high, wide:] - total[high:, :-wide] + total[:-high, :-wide]
     y, x = divmod(int(sums.argmax()), sums.shape[1])
-    return Window(x, y, wide, high)
+    return slice(y, y + high), slice(x, x + wide)
 
 
 PAGE, FOLDER = "index.html", "worst"
@@ -152,33 +147,18 @@ img.wide { max-width: 100%; }
 """
 
 
-def write_worst(folder: Path, crops: Sequence[Crop]) -> list[str]:
-    """Writes each crop at full size as a PNG file below ``folder``; returns their names relative to it.
-
-    Raises:
-        StorageError: a file cannot be written.
-    """
-    names = []
-    for crop in crops:
-        safe = "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in crop.camera)
-        names.append(f"{FOLDER}/{crop.reason}-{crop.frame:06d}-{safe}.png")
-        write_png(folder / names[-1], crop.picture)
-    return names
-
-
 def write_page(folder: Path, crops: Sequence[Crop], *, title: str, pictures: Sequence[str]) -> None:
-    """Writes ``index.html`` and the crops into the folder of a report.
+    """Writes ``index.html``, and each crop at full size as a PNG file, into the folder of a report.
 
     Raises:
         StorageError: a file cannot be written.
     """
-    names = write_worst(folder, crops)
     parts = [
         f"<!doctype html>\n<html lang=en><meta charset=utf-8><title>{escape(title)}</title>",
         f"<meta name=viewport content='width=device-width'><style>{STYLE}</style><h1>{escape(title)}</h1>",
     ]
     for reason, heading in HEADINGS.items():
-        figures = [_figure(name, crop) for name, crop in zip(names, crops, strict=True) if crop.reason == reason]
+        figures = [_figure(folder, crop) for crop in crops if crop.reason == reason]
         if figures:
             parts += [f"<h2>{heading}</h2><p>Truth, rendering, difference times four.</p>", *figures]
     parts += [f"<p><img class=wide src='{quote(name)}' alt='{escape(name)}'>" for name in pictures]
@@ -186,19 +166,11 @@ def write_page(folder: Path, crops: Sequence[Crop], *, title: str, pictures: Seq
     atomic_write(folder / PAGE, "\n".join(parts).encode(), called="The page", new_folder=True, sync=False)
 
 
-def _figure(name: str, crop: Crop) -> str:
-    window, height = crop.window, crop.picture.shape[0]
-    where = f"{window.width}x{window.height} pixels at ({window.x}, {window.y})"
-    caption = f"Frame {crop.frame}, camera {crop.camera}: {_caption(crop)}; {where}"
-    shown = height * (2 if height < 200 else 1)
-    image = f"<img src='{quote(name)}' height={shown} alt='{escape(caption)}'>"
-    return f"<figure>{image}<figcaption>{escape(caption)}</figcaption></figure>"
-
-
-def _caption(crop: Crop) -> str:
-    if crop.reason == "changed":
-        return f"{crop.scores['psnr_changed']:.2f} dB on changed pixels"
-    return (
-        f"{crop.scores['ghost_share']:.1%} of the disoccluded pixels, which are "
-        f"{crop.scores['disoccluded_share']:.1%} of the picture"
-    )
+def _figure(folder: Path, crop: Crop) -> str:
+    """Writes the picture; returns its element of the page."""
+    safe = "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in crop.camera)
+    name = f"{FOLDER}/{crop.reason}-{crop.frame:06d}-{safe}.png"
+    write_png(folder / name, crop.picture)
+    height, caption = crop.picture.shape[0], escape(crop.caption)
+    image = f"<img src='{quote(name)}' height={height * (2 if height < 200 else 1)} alt='{caption}'>"
+    return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"

@@ -142,7 +142,7 @@ class CommandProcess:
         """Process id of the command."""
         return self._process.pid
 
-    def ended(self, *, attempts: int = 1) -> TaskResult | None:
+    def ended(self) -> TaskResult | None:
         """Its result; None while it runs. Must not be called again after it has returned a result."""
         if os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
             return None
@@ -153,7 +153,7 @@ class CommandProcess:
         seconds = time.monotonic() - self._started
         with self._log:
             output = tail_of(self._log, self._began_at)
-        return TaskResult(self.name, code, seconds, attempts, usage.ru_maxrss * 1024, output)
+        return TaskResult(self.name, code, seconds, peak_bytes=usage.ru_maxrss * 1024, output=output)
 
     def ask(self) -> None:
         """Sends SIGTERM to the process group."""

@@ -78,7 +78,15 @@ def open_output(output: Path, format: Format, *, fps: float, options: FrameOptio
     elif output.suffix.lower() == ".zip" and not folder:
         output.parent.mkdir(parents=True, exist_ok=True)
         with atomic_file(output) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-            yield lambda number, gaussians: _into_zip(archive, output, number, gaussians, format, options)
+
+            def add(number: int, gaussians: BakedGaussians) -> Path:
+                check_finite(gaussians)
+                entry = zipfile.ZipInfo(frame_name(number, format))  # with a fixed date
+                entry.compress_type = zipfile.ZIP_DEFLATED
+                archive.writestr(entry, FORMAT_BYTES[format](gaussians, options))
+                return output
+
+            yield add
     else:
         single = is_one_file(output)
         yield lambda number, gaussians: write_gaussians(
@@ -114,21 +122,6 @@ def write_gaussians(
     check_finite(gaussians)
     atomic_write(path, FORMAT_BYTES[format](gaussians, options or FrameOptions()), new_folder=True)
     return path
-
-
-def _into_zip(
-    archive: zipfile.ZipFile,
-    output: Path,
-    number: int,
-    gaussians: BakedGaussians,
-    format: Format,
-    options: FrameOptions,
-) -> Path:
-    check_finite(gaussians)
-    entry = zipfile.ZipInfo(frame_name(number, format))  # with a fixed date
-    entry.compress_type = zipfile.ZIP_DEFLATED
-    archive.writestr(entry, FORMAT_BYTES[format](gaussians, options))
-    return output
 
 
 def _save(collected: FramesFile, output: Path) -> None:

@@ -11,7 +11,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import accumulate
 from pathlib import Path
 from typing import cast
@@ -24,7 +24,7 @@ from structgstream.codec.reader import open_stream
 from structgstream.errors import ConfigError, StreamError, TaskError
 from structgstream.executors.tasks import PYTHON, LocalEngine, Task, TaskQueue, allocate_slots
 from structgstream.groups.seam_blend import OWN_FRAMES, Border, GroupBlender
-from structgstream.groups.segment_file import Segment, open_segment
+from structgstream.groups.segment_file import open_segment
 from structgstream.kernels.backend import Backend, BackendName, select_backend
 from structgstream.owned_folders import own_folder, remove_own
 from structgstream.training.online.patching import IDS_PER_FRAME
@@ -48,8 +48,8 @@ def join_segments(
 ) -> int:
     """Writes the stream of these segments, in order of their frames, and returns its number of frames.
 
-    ``output`` is replaced only by a complete stream. Memory: one packet; with several workers also the packets of
-    about eight groups per worker. The bytes do not depend on the number of workers. With a back-end, static content is
+    ``output`` is replaced only by a complete stream. Memory: one group; with several workers also the packets of about
+    eight groups per worker. The bytes do not depend on the number of workers. With a back-end, static content is
     blended at borders (``seam_blend``) and packets are coded again; otherwise packets are copied.
 
     Args:
@@ -89,8 +89,8 @@ def join_segments(
 def _records(paths: Sequence[Path], blender: GroupBlender | None) -> Iterator[bytes]:
     """The records of the packets of all segments, copied or blended."""
     for path in paths:
-        with open_segment(path) as segment:
-            yield from segment.records() if blender is None else blender.records(segment)
+        segment = open_segment(path)
+        yield from segment.records() if blender is None else blender.records(segment)
 
 
 def runs_of(lengths: Sequence[int], *, workers: int) -> list[range]:
@@ -155,12 +155,9 @@ def run_task(paths: Sequence[Path], output: Path, *, device: str) -> Task:
 def main(arguments: list[str]) -> None:
     """Blends a run; writes its borders as a line of JSON, followed by the records of its packets."""
     device, output, previous, *paths = arguments
-    borders = list[Border]()
-    with open_segment(Path(previous)) as before:
-        blender = GroupBlender(
-            header_of(before.init), select_backend(cast(BackendName, device)), on_border=borders.append
-        )
-        blender.follow(before)
+    before, borders = open_segment(Path(previous)), list[Border]()
+    blender = GroupBlender(header_of(before.init), select_backend(cast(BackendName, device)), on_border=borders.append)
+    blender.follow(before)
     records = b"".join(_records([Path(path) for path in paths], blender))
     atomic_write(Path(output), json.dumps([asdict(border) for border in borders]).encode() + b"\n" + records)
 
@@ -189,10 +186,7 @@ def _in_order(paths: Sequence[Path]) -> tuple[bytes, list[Path], list[int]]:
     """Prefix with init record, and paths and numbers of frames of the segments in order, which form one stream."""
     if not paths:
         raise ConfigError("There is nothing to join; give the segments of one stream.")
-    found: list[tuple[Path, Segment]] = []
-    for path in paths:
-        with open_segment(path) as segment:
-            found.append((path, segment))
+    found = [(path, replace(open_segment(path), data=b"")) for path in paths]
     found.sort(key=lambda entry: entry[1].identity.first)
     first_path, first = found[0]
     expected = 0

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from structgstream.atomic_files import GrowingFile, name_finished, partial_path
-from structgstream.codec.container.byte_source import ByteSource, FileBytes, check_room, free_bytes
+from structgstream.codec.container.byte_source import FileBytes, check_room, free_bytes
 from structgstream.codec.container.records import (
     FRAME,
     INDEX_ENTRY,
@@ -70,7 +70,7 @@ class Segment:
     """The complete records of a segment file, up to the first that is missing or damaged."""
 
     name: str  # name of the file, for messages
-    data: ByteSource  # bytes of the file
+    data: bytes  # of the file
     identity: SegmentIdentity  # what the segment was fitted from
     init: bytes  # bytes of prefix and init record
     entries: list[tuple[int, int, int]]  # frame, type and offset of each packet
@@ -78,43 +78,25 @@ class Segment:
     complete: bool  # whether every frame is present, index and footer are valid, and nothing follows
     reason: str | None  # why the segment is not complete; None if it is
 
-    def __enter__(self) -> "Segment":
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        self.close()
-
     def record(self, number: int) -> bytes:
         """The record of the segment's packet ``number``, framing included."""
         start = self.entries[number][2]
         stop = self.entries[number + 1][2] if number + 1 < len(self.entries) else self.end
-        return bytes(self.data[start:stop])
+        return self.data[start:stop]
 
     def records(self) -> Iterator[bytes]:
         """The records of all its packets."""
         return map(self.record, range(len(self.entries)))
 
-    def close(self) -> None:
-        """Closes the file."""
-        if isinstance(self.data, FileBytes):
-            self.data.close()
-
 
 def open_segment(path: Path) -> Segment:
-    """Opens the segment file ``path``; every byte is verified.
+    """Reads the segment file ``path`` whole; every byte is verified.
 
     Raises:
         StreamError: the file is not a segment, or is damaged before its first packet.
     """
-    data = FileBytes(path)
-    try:
-        return _read(data, str(path))
-    except BaseException:
-        data.close()
-        raise
-
-
-def _read(data: ByteSource, name: str) -> Segment:
+    with FileBytes(path) as file:
+        data, name = file[:], str(path)
     check_prefix(data, name)
     init = read_record(data, PREFIX.size)
     note = None if init is None else read_record(data, init.end)
@@ -135,12 +117,12 @@ def _read(data: ByteSource, name: str) -> Segment:
         end = record.end
     frames = identity.end - identity.first
     closing = pack_index(entries, end)
-    complete = len(entries) == frames and bytes(data[end:]) == closing
+    complete = len(entries) == frames and data[end:] == closing
     reason = None
     if not complete:
         cut = "its index is damaged" if len(entries) == frames else incomplete_reason(data, end)
         reason = f"it has {len(entries)} of {frames} frames; {cut}"
-    return Segment(name, data, identity, bytes(data[: init.end]), entries, end, complete, reason)
+    return Segment(name, data, identity, data[: init.end], entries, end, complete, reason)
 
 
 def _identity(note: Record, name: str) -> SegmentIdentity:
@@ -296,15 +278,11 @@ def resume_segment(path: Path, base: GroupBase, identity: SegmentIdentity) -> Se
         found = _matching(path, base, identity)
         if found is not None and found.complete:
             return found
-        if found is not None:
-            found.close()
         path.replace(partial_path(path))
     found = _matching(partial_path(path), base, identity) if partial_path(path).exists() else None
-    if found is None or not found.complete:
-        return found
-    found.close()
-    name_finished(path)
-    return open_segment(path)
+    if found is not None and found.complete:
+        name_finished(path)
+    return found
 
 
 def _matching(path: Path, base: GroupBase, identity: SegmentIdentity) -> Segment | None:
@@ -316,7 +294,6 @@ def _matching(path: Path, base: GroupBase, identity: SegmentIdentity) -> Segment
         return None
     if found.identity == identity and found.init == base.init and (identity.first or found.entries):
         return found
-    found.close()
     if found.identity == identity:
         return None
     names = [name for name in vars(identity) if getattr(found.identity, name) != getattr(identity, name)]

@@ -99,7 +99,6 @@ class TrackFile:
         head: what the track was made from.
         starts: the frames at which groups may begin, frame 0 not included.
         groups: ``(first frame, end)`` of the groups that the pass chose; None if it is not finished.
-        frames: number of tracked frames; None if the pass is not finished.
         end: offset after the last complete start record.
 
     Raises:
@@ -109,7 +108,6 @@ class TrackFile:
     def __init__(self, data: ByteSource, name: str) -> None:
         self._data, self._name, self._offsets = data, name, dict[int, int]()
         self.groups: list[tuple[int, int]] | None = None
-        self.frames: int | None = None
         if len(data) < PREFIX.size or not bytes(data[: PREFIX.size]).startswith(SIGNATURE):
             raise StreamError(f"{name} is no track; make one with: structgstream track CAPTURE --init HEADER -o {name}")
         if (major := PREFIX.unpack(data[: PREFIX.size])[1]) != MAJOR:
@@ -136,9 +134,7 @@ class TrackFile:
                 frame = START.unpack(self._data[offset + RECORD.size : offset + RECORD.size + START.size])[0]
                 self._offsets[frame] = offset
             elif kind == TrackRecord.END and (record := read_record(self._data, offset)) is not None:
-                facts = json.loads(record.payload)
-                self.frames = facts["frames"]
-                self.groups = [(first, end) for first, end in facts["groups"]]
+                self.groups = [(first, end) for first, end in json.loads(record.payload)["groups"]]
                 break
             else:
                 break

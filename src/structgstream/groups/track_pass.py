@@ -61,11 +61,7 @@ class TrackProgress:
     """Report of one tracked frame."""
 
     frame: int  # its index
-    moved: int  # number of primitives that were displaced
-    changed: float  # share of changed pixels
     cpu_seconds: float  # processor time of all threads
-    seconds: Mapping[str, float]  # wall-clock seconds by stage
-    stored_bytes: int = 0  # size of its start record; 0 if it has none
 
 
 def track_capture(
@@ -237,14 +233,13 @@ def _frames(
         for pictures in prepared:
             past.tracked = track_frame(past.tracker, past.tracked, pictures)
             past.index = index = pictures.index
-            seconds = past.tracked.seconds
-            moved, stored = past.tracked.moved, 0
             shares.append(pictures.changed_share)
             if index >= first and (index - first) % every == 0:
                 start = past.start(shares)
-                stored, changed[index], shares = writer.write(start), float(start.changed[-1]), []
-            share, now = pictures.changed_share, time.process_time()
-            yield TrackProgress(index, moved, share, now - began, seconds, stored)
+                writer.write(start)
+                changed[index], shares = float(start.changed[-1]), []
+            now = time.process_time()
+            yield TrackProgress(index, now - began)
             began = now
 
 

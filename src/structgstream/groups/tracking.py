@@ -37,7 +37,6 @@ from structgstream.training.online.scene_flow import lift_flow
 from structgstream.training.online.select import inlier_views, occluded_dynamic
 from structgstream.training.online.split import with_displacements
 from structgstream.training.residuals import apply_camera_color
-from structgstream.training.result import Stopwatch
 from structgstream.training.views import View, area_mean, as_picture, blackened, training_views
 
 FEWEST_HALVED, MAX_CAMERAS = 6, 14
@@ -119,7 +118,6 @@ class Tracked:
 
     scene: Scene  # the displaced scene
     velocities: Tensor  # [M + F, 3] displacements by the last frame
-    seconds: Mapping[str, float] = field(default_factory=dict)  # wall-clock seconds by stage of the last frame
     moved: int = 0  # number of primitives that the last frame displaced
 
     @classmethod
@@ -130,43 +128,40 @@ class Tracked:
 
 def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tracked:
     """Displace the primitives of ``past`` to the next frame."""
-    watch, velocities = Stopwatch(), torch.zeros_like(past.velocities)
+    velocities = torch.zeros_like(past.velocities)
     scene = past.scene.with_folded_appearance()
     with torch.no_grad():
-        with watch.stage("gate"):
-            seen = [_measure_view(tracker, scene, pictures.views[n], change) for n, change in pictures.changes.items()]
-            inliers = inlier_views([entry.change for entry in seen]) if seen else []
-            seen = [entry for entry, good in zip(seen, inliers, strict=True) if good]
-            if not seen:
-                return Tracked(past.scene, velocities, watch.seconds)
-            votes = torch.stack([entry.votes for entry in seen]).sum(0)
-            # A moving primitive stays dynamic with a single vote, because not all cameras are used in each frame.
-            continued = (past.velocities != 0).any(1) & (votes > 0)
-            moving = (votes >= tracker.motion.MIN_VOTES) | continued
-            moving[: len(scene.anchors)] |= _occluded(tracker.motion, scene, seen, moving[: len(scene.anchors)])
-            primitives = moving.nonzero()[:, 0]
-        with watch.stage("flow between pictures"):
-            views = [entry.view for entry in seen]
-            evidence = flow_evidence([entry.flows[primitives] for entry in seen])
-            centers = primitive_centers(scene, _coverage(seen, scene))
-            priors, lift = PRIOR * past.velocities[primitives], tracker.lift
-            found = lift_flow(evidence, centers[primitives], priors, views, config=lift, backend=tracker.backend)
-            velocities[primitives] = found.displacements
+        seen = [_measure_view(tracker, scene, pictures.views[n], change) for n, change in pictures.changes.items()]
+        inliers = inlier_views([entry.change for entry in seen]) if seen else []
+        seen = [entry for entry, good in zip(seen, inliers, strict=True) if good]
+        if not seen:
+            return Tracked(past.scene, velocities)
+        votes = torch.stack([entry.votes for entry in seen]).sum(0)
+        # A moving primitive stays dynamic with a single vote, because not all cameras are used in each frame.
+        continued = (past.velocities != 0).any(1) & (votes > 0)
+        moving = (votes >= tracker.motion.MIN_VOTES) | continued
+        moving[: len(scene.anchors)] |= _occluded(tracker.motion, scene, seen, moving[: len(scene.anchors)])
+        primitives = moving.nonzero()[:, 0]
+        views = [entry.view for entry in seen]
+        evidence = flow_evidence([entry.flows[primitives] for entry in seen])
+        centers = primitive_centers(scene, _coverage(seen, scene))
+        priors, lift = PRIOR * past.velocities[primitives], tracker.lift
+        found = lift_flow(evidence, centers[primitives], priors, views, config=lift, backend=tracker.backend)
+        velocities[primitives] = found.displacements
         if len(primitives):
-            with watch.stage("flow from the rendering"):
-                turn = pictures.index // tracker.stride(len(pictures.views))
-                part = [entry for n, entry in enumerate(seen) if (n + turn) % RENDERED_EVERY == 0] or seen
-                flows = [_rendered_flow(tracker, scene, entry, velocities)[primitives] for entry in part]
-                again = lift_flow(
-                    flow_evidence(flows),
-                    (centers + velocities)[primitives],
-                    torch.zeros_like(priors),
-                    [entry.view for entry in part],
-                    config=lift,
-                    backend=tracker.backend,
-                )
-                velocities[primitives] += again.displacements
-    return Tracked(with_displacements(past.scene, velocities), velocities, watch.seconds, len(primitives))
+            turn = pictures.index // tracker.stride(len(pictures.views))
+            part = [entry for n, entry in enumerate(seen) if (n + turn) % RENDERED_EVERY == 0] or seen
+            flows = [_rendered_flow(tracker, scene, entry, velocities)[primitives] for entry in part]
+            again = lift_flow(
+                flow_evidence(flows),
+                (centers + velocities)[primitives],
+                torch.zeros_like(priors),
+                [entry.view for entry in part],
+                config=lift,
+                backend=tracker.backend,
+            )
+            velocities[primitives] += again.displacements
+    return Tracked(with_displacements(past.scene, velocities), velocities, len(primitives))
 
 
 @dataclass(frozen=True)

@@ -233,13 +233,9 @@ def fit_segment(
         _remove(path)
     found = resume_segment(path, base, identity)
     if found is not None and found.complete:
-        found.close()
         return None
     path.parent.mkdir(parents=True, exist_ok=True)
-    records = [base.first] if found is None and not identity.first else []
-    if found is not None:
-        records = [*found.records()]
-        found.close()
+    records = [*found.records()] if found is not None else [] if identity.first else [base.first]
     sink, so_far = SegmentSink(path, base, identity, found), GroupSoFar(base, identity.first, records)
     method = GroupMethod(base.config, task.start, None if start is None else _entry(start, base, source))
     return record(

@@ -158,7 +158,7 @@ class StreamKind(Enum):
 
 @dataclass(frozen=True)
 class ServedStream:
-    """A stream in the folder ``root``."""
+    """A stream in the folder ``root``. What opens files blocks, and raises OSError if the system cannot open any."""
 
     root: Path  # the folder
     # of the folder of segments, of the folder of renditions (qualities), or of the file with its suffix; a rendition is
@@ -175,23 +175,15 @@ class ServedStream:
         return tuple(ServedStream(self.root, f"{self.name}/{one}", StreamKind.SEGMENTS) for one in self.renditions)
 
     def open(self, file: str) -> OpenedFile | None:
-        """A file of its folder; None if there is none. Blocks. Raises OSError if the system cannot open files now."""
+        """A file of its folder; None if there is none."""
         return open_below(self.root, *self.name.split("/"), file)
 
     def open_whole(self) -> OpenedFile | None:
-        """The file of a stream that is one file; None if it has been removed. Blocks.
-
-        Raises:
-            OSError: the system cannot open files now.
-        """
+        """The file of a stream that is one file; None if it has been removed."""
         return open_below(self.root, self.name)
 
     def open_beside(self, suffix: str) -> OpenedFile | None:
-        """The side file of the stream with this suffix; None if there is none. Blocks.
-
-        Raises:
-            OSError: the system cannot open files now.
-        """
+        """The side file of the stream with this suffix; None if there is none."""
         *folders, own = self.name.split("/")
         return open_below(self.root, *folders, side_path(Path(own), suffix).name)
 

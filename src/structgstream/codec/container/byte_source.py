@@ -98,9 +98,9 @@ MARGIN_PACKETS = 3
 
 
 def free_bytes(path: Path) -> int | None:
-    """What an ordinary user may still write to the disk of ``path``; None if that is not known."""
+    """What an ordinary user may still write to the disk of ``path``, which may not exist yet; None if not known."""
     try:
-        return shutil.disk_usage(path).free
+        return shutil.disk_usage(next(each for each in (path, *path.absolute().parents) if each.exists())).free
     except OSError:
         return None
 
