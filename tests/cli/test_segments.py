@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.cli import main, segment_options
+from structgstream.cli import main
+from structgstream.cli import options as cli_options
 from structgstream.cli.progress import Lines
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.recovery import stale_files
@@ -114,12 +115,12 @@ def test_publishing_to_s3(
         monkeypatch.setenv("AWS_ENDPOINT_URL", options["endpoint_url"])
         monkeypatch.setenv("AWS_ACCESS_KEY_ID", options["key"])
         monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", options["secret"])
-        monkeypatch.setattr(segment_options, "FINISH_SECONDS", 0.0)
+        monkeypatch.setattr(cli_options, "FINISH_SECONDS", 0.0)
         url = f"s3://{BUCKET}/out"
         command = ["reconstruct", CLIP, "-o", str(out), "--frames", "3", *QUARTER]
         command += ["--sink", "segments", "--publish", url]
         assert main([*command, "--resume"]) == 0
-        monkeypatch.setattr(segment_options, "FINISH_SECONDS", 120.0)
+        monkeypatch.setattr(cli_options, "FINISH_SECONDS", 120.0)
         assert main([*command, "--resume"]) == 0
         remote = CloudStore(url, **options)
         here = FolderStore(out)

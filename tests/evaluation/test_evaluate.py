@@ -16,10 +16,9 @@ from structgstream.data.images import ImageSource
 from structgstream.data.wrappers import section
 from structgstream.errors import BackendError, CaptureError, ConfigError
 from structgstream.evaluation.evaluate import compared_frames, evaluate
-from structgstream.evaluation.facts import numbers_of
 from structgstream.evaluation.lpips import ENVIRONMENT
 from structgstream.evaluation.metrics import PSNR_OF_EQUALS
-from structgstream.evaluation.recording import to_device
+from structgstream.evaluation.recording import numbers_of, to_device
 from structgstream.evaluation.report import as_json
 from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.executors.task import Task
+from structgstream.executors.tasks import Task
 from structgstream.parallel import exchange
 from structgstream.parallel.driver import drive
 from structgstream.parallel.exchange import ObjectFolder, ObjectStore, SharedFolder

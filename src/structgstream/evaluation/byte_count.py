@@ -126,7 +126,6 @@ def write_byte_plot(path: Path, rows: Sequence[Row], parts: Parts, *, title: str
         path: the picture; its suffix is a format that matplotlib writes.
         rows: all packets of the stream, at least one.
         parts: bytes by field of its parts; the last ones determine the order of the fields.
-        title: a line above.
 
     Raises:
         MissingExtraError: matplotlib is not installed.

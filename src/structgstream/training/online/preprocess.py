@@ -124,7 +124,6 @@ def detect_changes(
     backend: Backend,
     flow_from: Collection[int] = (),
     flow: FlowConfig = USUAL_FLOW,
-    reach_pixels: int | None = None,
 ) -> list[PictureChange | None]:
     """Change of each of ``views`` since the picture of the same camera in ``before``; None if that has none.
 
@@ -138,7 +137,6 @@ def detect_changes(
         backend: the compute back-end.
         flow_from: indices of the views in which flow is estimated.
         flow: how it is searched.
-        reach_pixels: dilation in other pictures than a frame's; None for ``config``'s.
     """
     changes: list[PictureChange | None] = []
     earlier = {last.index: last for last in before}
@@ -150,7 +148,7 @@ def detect_changes(
                 continue
             both = _both(view.mask, last.mask)
             then, now = blackened(last.image, both), blackened(view.image, both)
-            reach = round((config.REACH_PIXELS if reach_pixels is None else reach_pixels) * view.enlargement)
+            reach = round(config.REACH_PIXELS * view.enlargement)
             changed = backend.changed_pixels(then, now, threshold=config.CHANGE_THRESHOLD, reach_pixels=reach)
             changed = changed if both is None else changed & both
             small, found, far_boxes = view.evidence(config.picture_scale).camera, None, 0

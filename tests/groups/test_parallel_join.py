@@ -10,11 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.errors import ConfigError, TaskError
-from structgstream.executors.task import PYTHON, Task
-from structgstream.groups import blending_run, join, seam_blend
+from structgstream.executors.tasks import PYTHON, Task
+from structgstream.groups import join, seam_blend
 from structgstream.groups.base import GroupBase, open_for
-from structgstream.groups.blending_run import MAX_GROUPS, BlendedRun, main, runs_of
-from structgstream.groups.join import PURPOSE, join_segments
+from structgstream.groups.join import MAX_GROUPS, PURPOSE, join_segments, main, read_run, runs_of
 from structgstream.groups.seam_blend import FADE_FRAMES, OWN_FRAMES, Border
 from structgstream.groups.track_pass import track_capture
 from structgstream.owned_folders import own_folder
@@ -51,7 +50,7 @@ def _make_long_groups(folder: Path) -> None:
 @pytest.fixture
 def fading_in_one_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(seam_blend, "FADE_FRAMES", 1)
-    monkeypatch.setattr(blending_run, "OWN_FRAMES", LONG)
+    monkeypatch.setattr(join, "OWN_FRAMES", LONG)
 
 
 @pytest.mark.usefixtures("fading_in_one_frame")
@@ -76,12 +75,12 @@ def test_workers_give_the_bytes_of_one(tmp_path: Path, monkeypatch: pytest.Monke
 def test_a_run_tells_its_borders_and_records(tmp_path: Path) -> None:
     paths, output = made().segments, tmp_path / "run"
     main([quickest_backend().name, str(output), *map(str, paths)])
-    run = BlendedRun.read(output)
-    assert [border.frame for border in run.borders] == [2, 4]
+    borders, records = read_run(output)
+    assert [border.frame for border in borders] == [2, 4]
     whole = tmp_path / "whole.sgs"
     join_segments(paths, whole, backend=quickest_backend())
-    assert all(record in whole.read_bytes() for record in run.records)
-    assert len(run.records) == 4
+    assert all(record in whole.read_bytes() for record in records)
+    assert len(records) == 4
 
 
 @pytest.mark.usefixtures("fading_in_one_frame")
