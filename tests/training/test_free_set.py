@@ -82,7 +82,7 @@ def test_who_dies_has_no_children() -> None:
     assert len(population) == 4
 
 
-def test_no_more_are_born_than_there_is_room_for_and_the_largest_gradient_comes_first() -> None:
+def test_no_more_are_spawned_than_there_is_room_for_and_the_largest_gradient_comes_first() -> None:
     assert len(patch(room=10)[0]) == 4
     population, keep = patch(room=3)
     assert population.spawned == 1

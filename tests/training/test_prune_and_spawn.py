@@ -65,7 +65,7 @@ def test_an_emerging_ball_is_spawned_where_it_is(backend) -> None:
     torch.testing.assert_close(spawned.logit_opacities.sigmoid(), torch.full((len(spawned),), 0.7))
 
 
-def test_what_emerges_before_something_that_frame_0_drew_badly_is_born_if_the_floor_is_eased() -> None:
+def test_what_emerges_before_something_that_frame_0_drew_badly_is_spawned_if_the_floor_is_eased() -> None:
     scene, backend = WORLD.scene, quickest_backend()
     first = training_views(WORLD.frames[0], WORLD.rig, CPU)
     floor = residual_floor(scene, first, scale=1.0, backend=backend)
@@ -106,13 +106,13 @@ def test_spawning_keeps_to_the_room_there_is() -> None:
     assert len(everything.new_free) > 2
 
 
-def test_off_nothing_is_born() -> None:
+def test_off_nothing_is_spawned() -> None:
     found = renewed(quickest_backend(), config=replace(CONFIG, enabled=False))
     assert len(found.new_free) == 0
     assert found.kept.all()
 
 
-def test_when_everything_is_missing_nothing_is_born_and_that_is_reported() -> None:
+def test_when_everything_is_missing_nothing_is_spawned_and_that_is_reported() -> None:
     found = renewed(quickest_backend(), config=varied(CONFIG, RULES=replace(CONFIG.RULES, max_missing_share=1e-4)))
     assert found.refused
     assert len(found.new_free) == 0

@@ -31,7 +31,7 @@ def test_leaving_a_bin_has_a_price() -> None:
     assert (gradient > 0).all(), "it pulls back"
 
 
-def test_what_was_there_is_charged_and_what_is_born_is_not() -> None:
+def test_what_was_there_is_charged_and_what_is_spawned_is_not() -> None:
     scene = random_scene(10, free=6)
     parameters = Parameters.of(scene, trained=parameters_of_fields({"free"}))
     steps: dict = {"free_means": 0.5, "free_colors": 0.1}

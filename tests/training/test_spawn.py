@@ -66,7 +66,7 @@ def test_pictures_are_looked_at_in_the_width_that_is_asked_for() -> None:
     assert found.missing_share.shape == (32, 48)
 
 
-def test_without_anything_missing_nothing_is_born() -> None:
+def test_without_anything_missing_nothing_is_spawned() -> None:
     views = [ViewResidual(v, torch.zeros(64, 96, dtype=torch.bool), torch.zeros(64, 96)) for v in VIEWS]
     depths = {v.index: torch.full((64, 96), 5.0) for v in VIEWS}
     color = CameraColor.identity(len(VIEWS))
@@ -116,7 +116,7 @@ def lines(*lengths: int) -> torch.Tensor:
         ("small-clusters", 15, [0, 1, 2], 0),
     ],
 )
-def test_where_there_are_too_many_whole_clusters_are_born_or_none(
+def test_where_there_are_too_many_whole_clusters_are_spawned_or_none(
     overflow: str, most: int, rows: list[int], refused: int
 ) -> None:
     points = lines(4, 8, 3)

@@ -77,7 +77,7 @@ def test_what_another_sweep_has_drawn_is_not_drawn_again() -> None:
     assert drawings, "without what is known"
 
 
-def test_without_room_nothing_is_born_and_with_room_as_much_as_there_is() -> None:
+def test_without_room_nothing_is_spawned_and_with_room_as_much_as_there_is() -> None:
     swept = sweep()
     missing = swept.missing()
     assert not len(swept.spawn(missing, first_identity=0, room=0).free)

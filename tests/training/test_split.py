@@ -53,11 +53,11 @@ def test_the_parts_make_the_whole_again() -> None:
 def test_what_moved_moves_and_births_stay_in_order() -> None:
     split = some()
     moving = split.dynamic
-    born = FreeGaussians(**{**vars(moving.free), "births": torch.tensor([77])})
+    spawned = FreeGaussians(**{**vars(moving.free), "births": torch.tensor([77])})
     moved = replace(
         moving,
         anchors=replace(moving.anchors, positions=moving.anchors.positions + 1.0),
-        free=moving.free.append(born),
+        free=moving.free.append(spawned),
     )
     whole = split.merge(moved)
     difference = (whole.anchors.positions - SCENE.anchors.positions).abs().sum(1)

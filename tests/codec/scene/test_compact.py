@@ -43,7 +43,7 @@ DYNAMICS: list[frozenset[FieldName]] = [
 
 
 def next_scene(scene: Scene, frame: int, *, dynamic: frozenset[FieldName], g: torch.Generator) -> Scene:
-    """A third of the rows of everything dynamic moves; of free Gaussians a fifth dies and up to three are born."""
+    """A third of the rows of everything dynamic moves; of free Gaussians a fifth dies and up to three are spawned."""
     state = dict(state_of(scene))
     for name in dynamic - FREE:
         value = state[name]
@@ -52,12 +52,12 @@ def next_scene(scene: Scene, frame: int, *, dynamic: frozenset[FieldName], g: to
         state[name] = torch.where(which.reshape(-1, *[1] * (value.dim() - 1)), value + step, value)
     if "free" in dynamic:
         alive = torch.rand(len(scene.free), generator=g) > 0.2
-        born = int(torch.randint(0, 4, (), generator=g))
+        spawned = int(torch.randint(0, 4, (), generator=g))
         moved = state["free"] + (torch.rand(len(alive), 1, generator=g) < 0.3) * torch.randn(
             len(alive), 14, generator=g
         )
-        state["free"] = torch.cat([moved[alive], torch.randn(born, 14, generator=g)])
-        state["free_births"] = torch.cat([state["free_births"][alive], (frame + 2**10) * 2**32 + torch.arange(born)])
+        state["free"] = torch.cat([moved[alive], torch.randn(spawned, 14, generator=g)])
+        state["free_births"] = torch.cat([state["free_births"][alive], (frame + 2**10) * 2**32 + torch.arange(spawned)])
     return scene_of(state, distance_input=scene.distance_input)
 
 

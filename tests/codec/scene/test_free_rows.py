@@ -51,15 +51,15 @@ def exchange(after: FreeBins, before: FreeBins, models: tuple[Models, Models] | 
 @examples(25)
 @given(st.integers(0, 2**32 - 1), st.lists(st.tuples(st.integers(0, 4), st.sampled_from([0.0, 0.5, 1.0])), max_size=6))
 def test_a_life_comes_back(seed: int, frames: list[tuple[int, float]]) -> None:
-    """In every frame some die, some change and some are born, several at once, with gaps in their numbers."""
+    """In every frame some die, some change and some are spawned, several at once, with gaps in their numbers."""
     g = np.random.default_rng(seed)
     now, models = FreeBins.none(), (Models(), Models())
-    for frame, (born, survive) in enumerate(frames):
+    for frame, (spawned, survive) in enumerate(frames):
         stay = g.random(len(now.births)) < survive
         bins = now.bins[stay] + np.where(g.random((stay.sum(), 1)) < 0.5, g.integers(-9, 10, (stay.sum(), 14)), 0)
-        numbers = np.sort(g.choice([0, 1, 2, 7, 1000, 2**31 - 1], born, replace=False))
+        numbers = np.sort(g.choice([0, 1, 2, 7, 1000, 2**31 - 1], spawned, replace=False))
         births = np.concatenate([now.births[stay], frame * 2**32 + numbers])
-        bins = np.concatenate([bins, g.integers(-(2**22), 2**22 + 1, (born, 14))]).astype(np.int32)
+        bins = np.concatenate([bins, g.integers(-(2**22), 2**22 + 1, (spawned, 14))]).astype(np.int32)
         now = exchange(FreeBins(births, bins, Change.none(len(births), 14)), now, models)
 
 
@@ -69,7 +69,7 @@ def test_births_of_several_frames_at_once() -> None:
         assert exchange(free(births), FreeBins.none()).births.tolist() == births
 
 
-def test_what_changed_is_remembered_and_what_is_born_did_not_change() -> None:
+def test_what_changed_is_remembered_and_what_is_spawned_did_not_change() -> None:
     before = free([1, 2, 3])
     bins = before.bins[1:].copy()
     bins[0, 4] += 3

@@ -225,8 +225,14 @@ def flow_map(
     radius = max(1, round(COLOR_SHARE * longer))
     search = dis_search("capture", refined=False, finest_level=level)
 
-    def consistent(box: Box, flow: NDArray[np.float32], back: NDArray[np.float32]) -> Tensor:
-        alike = torch.from_numpy(same_color(_cut(first, box), _cut(second, box), flow, radius=radius))
+    def consistent(
+        box: Box,
+        earlier: NDArray[np.uint8],
+        later: NDArray[np.uint8],
+        flow: NDArray[np.float32],
+        back: NDArray[np.float32],
+    ) -> Tensor:
+        alike = torch.from_numpy(same_color(earlier, later, flow, radius=radius))
         counts = alike if mask is None else alike & mask[box].cpu()
         forward, backward = torch.from_numpy(flow), torch.from_numpy(back)
         return backend.confident_flow(forward, backward, counts, relative=RELATIVE, absolute=ABSOLUTE)
@@ -234,13 +240,13 @@ def flow_map(
     cell = max(1, round(longer / CELLS))
     for box in _boxes(where, context) if config.apart else _box(where, context):
         earlier, later = _cut(first, box), _cut(second, box)
-        maps[:, *box] = consistent(box, search(earlier, later), search(later, earlier))
+        maps[:, *box] = consistent(box, earlier, later, search(earlier, later), search(later, earlier))
     far = _far_boxes(where, maps[0].numpy() > 0.0, cell) if config.far else []
     for box in far:
         earlier, later = _cut(first, box), _cut(second, box)
         flows = block_search(earlier, later, cell_pixels=cell, reach_cells=REACH_CELLS)
         refine = dis_refinement(finest_level=level, coarsest_level=max(level, floor(log2(cell)) - 1))
-        found = consistent(box, refine(earlier, later, flows[0]), refine(later, earlier, flows[1]))
+        found = consistent(box, earlier, later, refine(earlier, later, flows[0]), refine(later, earlier, flows[1]))
         missing = torch.from_numpy(where[box]) & (maps[0][box] == 0.0)
         maps[:, *box] = torch.where(missing, found, maps[:, *box])
     return FlowMaps(area_mean(maps[None], size)[0].permute(1, 2, 0).to(first.device), len(far))
