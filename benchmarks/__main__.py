@@ -51,7 +51,7 @@ def parsed(arguments: list[str] | None = None) -> argparse.Namespace:
 
 
 def measured(options: argparse.Namespace) -> dict[str, Any]:
-    """Run the benchmarks that were asked for, telling each result as it comes."""
+    """Run the chosen benchmarks and report each result when it is there."""
     from benchmarks.benchmark import Benchmark, run_variant
     from benchmarks.growth import plot, run_growth
     from benchmarks.machine import load_average, machine

@@ -113,7 +113,7 @@ def run_variant(
 
 
 def judged(target: Target, entry: Mapping[str, Any]) -> dict[str, Any]:
-    """A target beside what was measured."""
+    """A target and what was measured."""
     if target.at_least_times is not None:
         got = entry["times_faster"]["median"]
         return {

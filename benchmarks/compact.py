@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A delta packet of the compact codec: encoding and decoding, beside the same frame as float32."""
+"""A delta packet of the compact codec: encoding and decoding, compared with the same frame as float32."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -94,14 +94,14 @@ def _moved(state: State, active: Tensor, frame: int, g: torch.Generator) -> Stat
         return torch.randn(count, 3, generator=g) * size
 
     count, free = len(active), len(state["free"])
-    births = max(free * 3 // 100, 1)
+    spawned = max(free * 3 // 100, 1)
     changed = (torch.rand(free, 1, generator=g) < 0.2) & (torch.rand(free, 14, generator=g) < 0.7)
     moved = state["free"] + changed * torch.randn(free, 14, generator=g) * 0.02
     return {
         "anchor_positions": state["anchor_positions"] + now[:, None] * step(count, size=1.5 / 512),
         "offset_scales": state["offset_scales"] + now[:, None] * step(count, size=0.7 / 64),
-        "free": torch.cat([moved, torch.randn(births, 14, generator=g) * 0.3]),
-        "free_births": torch.cat([state["free_births"], frame * 2**32 + torch.arange(births)]),
+        "free": torch.cat([moved, torch.randn(spawned, 14, generator=g) * 0.3]),
+        "free_births": torch.cat([state["free_births"], frame * 2**32 + torch.arange(spawned)]),
     }
 
 
@@ -110,7 +110,7 @@ def _rounded(state: State, names: frozenset[FieldName]) -> State:
     return dequantize_state(quantize_state(state, names, STEPS), names, STEPS)
 
 
-def _told(state: State) -> Results:
+def _values(state: State) -> Results:
     return [state[name] for name in sorted(DYNAMIC)]
 
 
@@ -122,12 +122,12 @@ def contestants(*, anchors: int) -> list[Contestant]:
 
     def decode() -> Results:
         decoder.state = work.before
-        return _told(decoder.decode(work.coded, kind=PacketKind.DELTA, index=2))
+        return _values(decoder.decode(work.coded, kind=PacketKind.DELTA, index=2))
 
     def encode() -> Results:
         encoder.replay(work.before)
         encoder.encode(work.frame, kind=PacketKind.DELTA, index=2)
-        return _told(_rounded(work.frame, DYNAMIC))
+        return _values(_rounded(work.frame, DYNAMIC))
 
     def facts(name: str) -> Callable[[], Mapping[str, float]]:
         return lambda: {"bytes": sizes[name]}
@@ -135,7 +135,7 @@ def contestants(*, anchors: int) -> list[Contestant]:
     return [
         Contestant(
             "raw, decode, 1 thread",
-            lambda: _told(unpack_raw_blocks(work.raw, 0, where="The frame")),
+            lambda: _values(unpack_raw_blocks(work.raw, 0, where="The frame")),
             1,
             facts=facts("raw"),
         ),
@@ -147,7 +147,7 @@ def contestants(*, anchors: int) -> list[Contestant]:
 BENCHMARK = Benchmark(
     name="compact",
     work="a delta packet of 100,000 anchors, of which 5 % move, and 5,000 free Gaussians, of which 1,000 change, "
-    "with 150 births (sizes are told beside)",
+    "with 150 spawned (sizes are reported too)",
     contestants=contestants,
     quantities=[Quantity(name, 0.0, "largest") for name in sorted(DYNAMIC)],
     variants=[Variant("100,000 anchors", {"anchors": 100_000}, {"anchors": 2_000})],

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks contestants against each other, times them in turns, and tells their ratios."""
+"""Checks contestants against each other, times them in turns, and reports their ratios."""
 
 import statistics
 import time
@@ -22,8 +22,8 @@ class Contestant:
         name: how tables call it.
         run: does the work once and returns what is checked.
         threads: how many it may use.
-        units: pieces of work in one run (iterations, say); seconds are told for one piece.
-        facts: other numbers about it, asked for once after timing (quality, shares of stages).
+        units: pieces of work in one run, such as iterations; seconds are reported per piece.
+        facts: other numbers about it, computed once after timing (quality, shares of stages).
     """
 
     name: str

@@ -34,7 +34,7 @@ def defaults() -> FrequencyTables:
     return geometric(np.full(CONTEXTS, 100), alphabet=ALPHABET)
 
 
-def _told(symbols: np.ndarray) -> Results:
+def _symbols(symbols: np.ndarray) -> Results:
     return [torch.from_numpy(symbols.astype(np.int32))]
 
 
@@ -44,7 +44,7 @@ def _ours(work: Symbols, *, native: bool, lanes: int | None = None) -> Contestan
     section = rans.encode(values, contexts, tables, lanes=lanes)
 
     def decode() -> Results:
-        return _told(rans.decode(section, contexts, decode_tables(bits, defaults()), native=native))
+        return _symbols(rans.decode(section, contexts, decode_tables(bits, defaults()), native=native))
 
     name = ("cpu" if native else "NumPy reference") + (f", lanes: {lanes}" if lanes else "") + ", 1 thread"
     return _contestant(name, decode, len(bits) + len(section), work)
@@ -55,7 +55,7 @@ def _zstd(work: Symbols) -> Contestant:
     decoder = zstandard.ZstdDecompressor()
     return _contestant(
         "zstd -19 of a byte a symbol, 1 thread",
-        lambda: _told(np.frombuffer(decoder.decompress(packed), np.uint8)),
+        lambda: _symbols(np.frombuffer(decoder.decompress(packed), np.uint8)),
         len(packed),
         work,
     )
@@ -73,7 +73,7 @@ def _constriction(work: Symbols) -> Contestant:
     packed = coder.get_compressed()
     return _contestant(
         "constriction, its tables free, 1 thread",
-        lambda: _told(stream.stack.AnsCoder(packed).decode(model, probabilities)),
+        lambda: _symbols(stream.stack.AnsCoder(packed).decode(model, probabilities)),
         4 * len(packed),
         work,
     )

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What there is to know on a machine with a GPU, in under six minutes: ``python -m benchmarks.gpu OUT.json``.
 
-Each part prints its figures beside what was predicted without a GPU, and writes all figures so far; a part that fails
+Each part prints its figures and what was predicted without a GPU, and writes all figures so far; a part that fails
 is reported and the next one begins. The kernels of iterations and pictures, which are measured here, are not the
 default yet (``cuda_backend(native=True)``). Frames need gsplat, which draws the tiles around what moves.
 """
@@ -129,7 +129,7 @@ class Measurement:
         return time.perf_counter() - started
 
     def correctness(self) -> dict[str, Any]:
-        """An iteration of some views beside the processor's; all iterations twice."""
+        """An iteration of some views on the GPU and on the processor; all iterations twice."""
         device, here, found = self.backend.device, torch.device("cpu"), {}
         for title, world in self.worlds.items():
             frame, errors = fit_frame(world, self.backend), []
@@ -253,7 +253,7 @@ def machine() -> dict[str, Any]:
 
 
 def show(name: str, figures: Mapping[str, Any]) -> None:
-    """Print figures beside their predictions."""
+    """Print figures and their predictions."""
     for key, value in figures.items():
         if isinstance(value, Mapping) and not key.endswith(("stages", "in an iteration")):
             show(f"{name}, {key}", value)

@@ -18,7 +18,7 @@ def machine() -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Instant:
-    """Wall-clock, this process's and the machine's busy seconds (None where the system does not tell)."""
+    """Wall-clock, this process's and the machine's busy seconds (None where the system does not report it)."""
 
     wall_seconds: float
     own_seconds: float
@@ -51,5 +51,5 @@ def others_share(before: Instant, after: Instant) -> float | None:
 
 
 def load_average() -> list[float] | None:
-    """Mean number of running processes over 1, 5 and 15 minutes; None where the system does not tell."""
+    """Mean number of running processes over 1, 5 and 15 minutes; None where the system does not report it."""
     return [round(value, 2) for value in os.getloadavg()] if hasattr(os, "getloadavg") else None

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A whole online frame of the paper's method, patching included, on a wall of which a part has moved.
 
-It starts from the true scene of the frame before; quality is told at a camera that training does not see, beside the
+It starts from the true scene of the frame before; quality is measured at a held-out camera, and compared with the
 quality without any fit. Following motion is as in the preset ``motion``.
 """
 

@@ -120,7 +120,7 @@ def count(*, width: int, height: int) -> Work:
     formula about 20. Its gradient: the three derivatives about 25, three blurs 132, combining 6. L1 with its gradient:
     4. (The window's symmetry halves the products but leaves as many instructions, a multiply-add being one.)
     Bytes: the picture read by both passes, the target by both, the gradient of SSIM written and read, the result
-    written: 7 floats; what the blurs hand on stays in caches when rows are worked off in bands.
+    written: 7 floats; results of the blurs stay in caches when rows are processed in bands.
     """
     values = 3.0 * width * height
     return Work(values * (3 + 220 + 20 + 25 + 132 + 6 + 4), values * 7 * 4)

@@ -46,7 +46,10 @@ def quiet_randomness() -> Iterator[None]:
     import torch
 
     state, threads = torch.get_rng_state(), torch.get_num_threads()
-    torch.manual_seed(0)
+    # torch.manual_seed formats the stack for GPUs that nothing has used yet: a millisecond a test.
+    torch.default_generator.manual_seed(0)
+    if torch.cuda.is_initialized():
+        torch.cuda.manual_seed_all(0)
     yield
     torch.set_rng_state(state)
     torch.set_num_threads(threads)

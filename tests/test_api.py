@@ -11,16 +11,16 @@ import torch
 
 import structgstream
 from structgstream.cli import main
-from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.errors import CaptureError, ConfigError, StorageError, StreamError
 from structgstream.evaluation.evaluate import rendered
 from structgstream.evaluation.report import as_json
 from structgstream.evaluation.run_log import log_path, read_log
 from structgstream.kernels.backend import select_backend
 from tests.support.backends import QUICKEST
+from tests.support.small_clip import small_clip_path
 from tests.support.small_presets import QUICK
 
-CLIP = bundled_clip_path()
+CLIP = small_clip_path()
 PART: dict[str, Any] = {"frames": 2, "scale": 0.25, "backend": QUICKEST}
 
 

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from structgstream.flow import consistency_mask, inside, picture_shift, sampled
+from structgstream.flow import consistency_mask, inside, picture_shift, same_color, sampled
 
 
 def constant(dx: float, dy: float, height: int = 6, width: int = 8) -> np.ndarray:
@@ -58,3 +58,25 @@ def test_pictures_of_different_things_have_no_clear_shift() -> None:
     first, second = np.random.default_rng(4).integers(0, 255, (2, 90, 120, 3), dtype=np.uint8)
     assert picture_shift(first, second)[1] < 0.3
     assert picture_shift(first[:1], second[:1]) == (0.0, 0.0)
+
+
+def thrown(light: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A plain square that moves by 12 pixels in front of a still ground, in light that changes, and its pixels."""
+    ground = np.kron(np.random.default_rng(0).integers(40, 120, (20, 30, 3)), np.ones((4, 4, 1))).astype(np.uint8)
+    first, second = ground.copy(), ground + np.uint8(light)
+    square = np.zeros(first.shape[:2], bool)
+    square[30:50, 30:50] = True
+    first[square], second[np.roll(square, 12, 1)] = (220, 120, 30), (220 + light, 120 + light, 30 + light)
+    return first, second, square
+
+
+@pytest.mark.parametrize("light", [0, 35])
+def test_consistent_flow_that_leads_to_another_color_is_wrong(light: int) -> None:
+    first, second, square = thrown(light)
+    flow = constant(0, 0, *square.shape)
+    assert consistency_mask(flow, flow).all()
+    still = same_color(first, second, flow, radius=1)
+    assert not still[32:48, 32:40].any(), "the ground is there now"
+    assert still[~(square | np.roll(square, 12, 1))].mean() > 0.95
+    flow[square] = 12, 0
+    assert same_color(first, second, flow, radius=1)[32:48, 32:48].all()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.cli.signals import Terminated
+from structgstream.cli.app import Terminated
 from structgstream.data.live.status import CameraStatus, LiveStatus
 from structgstream.run_metrics import RunMetrics, free_bytes, metrics_path
 from tests.support.reports import frame_report

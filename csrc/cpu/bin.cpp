@@ -2,6 +2,7 @@
 // Depth order and tile lists: one radix sort by depth, then binning in that order, so each tile's list is front to back
 // without a separate sort.
 
+#include <algorithm>
 #include <cstring>
 #include <limits>
 #include <new>
@@ -26,6 +27,16 @@ Tiles tiles_of(const Splat& s) {
     return {tile(s.box[0]), tile(s.box[1]), tile(s.box[2] - 1), tile(s.box[3] - 1)};
 }
 
+// Visits the tiles that are drawn.
+template <typename Visit>
+inline void for_tiles(const Raster& raster, const Tiles& t, Visit visit) {
+    const uint8_t* drawn = raster.drawn_tiles.empty() ? nullptr : raster.drawn_tiles.data();
+    for (int y = t.y0; y <= t.y1; ++y)
+        for (int tile = y * raster.tiles_x + t.x0, end = y * raster.tiles_x + t.x1; tile <= end; ++tile)
+            if (!drawn || drawn[tile]) visit(tile);
+}
+
+constexpr size_t kAhead = 8;
 constexpr int kDigit = 11, kBuckets = 1 << kDigit, kPasses = 3;
 
 // Sorts keys by their upper halves, which are bits of positive floats and so have their order; the lower ones break ties.
@@ -62,11 +73,8 @@ void bin(Raster& raster) {
             std::memcpy(&depth, &s.depth, sizeof depth);
             keys.push_back(static_cast<uint64_t>(depth) << 32 | entries.size());
             entries.push_back({static_cast<int32_t>(i), static_cast<int32_t>(total), t});
-            for (int y = t.y0; y <= t.y1; ++y)
-                for (int x = t.x0; x <= t.x1; ++x) {
-                    const int tile = y * raster.tiles_x + x;
-                    if (raster.draws(tile)) ++total, ++raster.starts[tile + 1];
-                }
+            int32_t* counts = raster.starts.data() + 1;
+            for_tiles(raster, t, [&](int tile) { ++total, ++counts[tile]; });
             if (total > std::numeric_limits<int32_t>::max()) throw std::bad_alloc();  // gradients would need 80 GB
         }
         raster.slots[i + 1] = static_cast<int32_t>(total);
@@ -74,19 +82,14 @@ void bin(Raster& raster) {
     for (int t = 0; t < tiles; ++t) raster.starts[t + 1] += raster.starts[t];
     sort_by_depth(keys);
     raster.pairs.resize(raster.starts[tiles]);
-    raster.pair_slots.resize(raster.starts[tiles]);
     std::vector<int32_t> next(raster.starts.begin(), raster.starts.end() - 1);
-    for (uint64_t key : keys) {
-        const Entry& e = entries[key & 0xffffffffu];
+    Pair* pairs = raster.pairs.data();
+    int32_t* places = next.data();
+    for (size_t i = 0; i < keys.size(); ++i) {
+        __builtin_prefetch(&entries[keys[std::min(i + kAhead, keys.size() - 1)] & 0xffffffffu]);
+        const Entry& e = entries[keys[i] & 0xffffffffu];
         int32_t slot = e.slot;
-        for (int y = e.tiles.y0; y <= e.tiles.y1; ++y)
-            for (int x = e.tiles.x0; x <= e.tiles.x1; ++x) {
-                const int tile = y * raster.tiles_x + x;
-                if (!raster.draws(tile)) continue;
-                const int32_t at = next[tile]++;
-                raster.pairs[at] = e.splat;
-                raster.pair_slots[at] = slot++;
-            }
+        for_tiles(raster, e.tiles, [&](int tile) { pairs[places[tile]++] = {e.splat, slot++}; });
     }
 }
 

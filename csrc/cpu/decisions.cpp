@@ -25,7 +25,6 @@ constexpr int kLengths = 30;
 constexpr int kNodes = 2 + kNearSizes + kLengthNodes;
 constexpr int64_t kLargestNumber = (int64_t{1} << 31) - 1;
 constexpr int32_t kLargestResidual = 1 << 23;
-constexpr int kTop = 16;  // distance of rows in the first pass
 constexpr int kBlock = 32;
 
 // 65536 / (1 + exp(-j / 4)), rounded.
@@ -231,9 +230,9 @@ Result code_activity(sgs_arithmetic* arithmetic, const sgs_model* block_model, c
             const Pass pass = kPasses[level];
             for (int64_t b = pass.first; b < blocks; b += pass.step) {
                 // Neighbours that a decoder has not decoded yet are not used as context.
-                const int beside = level ? has[b - pass.first] + (b + pass.first < blocks ? has[b + pass.first] : 0) : 0;
-                const int32_t contexts[2] = {(last[b + 1] * 3 + beside) * 5 + level,
-                                             (bit_length(ever[b], 5) * 11 + last[b] + last[b + 2]) * 3 + beside};
+                const int adjacent = level ? has[b - pass.first] + (b + pass.first < blocks ? has[b + pass.first] : 0) : 0;
+                const int32_t contexts[2] = {(last[b + 1] * 3 + adjacent) * 5 + level,
+                                             (bit_length(ever[b], 5) * 11 + last[b] + last[b + 2]) * 3 + adjacent};
                 coder.at(contexts);
                 has[b] = coder.decide(has[b], 0);
             }
@@ -245,13 +244,13 @@ Result code_activity(sgs_arithmetic* arithmetic, const sgs_model* block_model, c
         const int64_t near = pass.first, far = 3 * pass.first;
         for (int64_t i = pass.first; i < count; i += pass.step) {
             if (!has[i / kBlock]) continue;
-            const int beside = level ? found[i - near] + found[i + near] : 0;
-            const int beyond = level ? found[i - far] + found[i + far] : 0;
+            const int adjacent = level ? found[i - near] + found[i + near] : 0;
+            const int farther = level ? found[i - far] + found[i + far] : 0;
             const int wide = before[std::min(i + 9, count)] - before[std::max<int64_t>(i - 8, 0)] - (history[i] & 1);
             const int32_t around = moved[i] + moved[i + 1] + moved[i + 3] + moved[i + 4];
-            const int32_t contexts[3] = {(wide * 3 + beside) * 5 + level,
-                                         (bit_length(sizes[i], 5) * 3 + beside) * 6 + bit_length(around, 5),
-                                         ((level * 3 + beyond) * 3 + beside) * 8 + (history[i] & 7)};
+            const int32_t contexts[3] = {(wide * 3 + adjacent) * 5 + level,
+                                         (bit_length(sizes[i], 5) * 3 + adjacent) * 6 + bit_length(around, 5),
+                                         ((level * 3 + farther) * 3 + adjacent) * 8 + (history[i] & 7)};
             coder.at(contexts);
             found[i] = coder.decide(active[i], 0);
         }
@@ -264,7 +263,7 @@ template <bool kEncodes>
 Result code_residuals(sgs_arithmetic* arithmetic, const sgs_model* model, int64_t count, int columns, const int32_t* last,
                       const int32_t* others, int32_t* residuals) {
     Coder<kEncodes, kResidualInputs> coder(arithmetic, model);
-    std::vector<int32_t> told(static_cast<size_t>(count), 0);  // sizes in earlier columns
+    std::vector<int32_t> earlier(static_cast<size_t>(count), 0);  // sizes in earlier columns
     std::vector<uint8_t> moved(static_cast<size_t>(count), 0);
     for (int64_t a = 0; a < count; ++a)
         for (int column = 0; column < columns; ++column) moved[a] |= last[a * columns + column] != 0;
@@ -276,18 +275,18 @@ Result code_residuals(sgs_arithmetic* arithmetic, const sgs_model* model, int64_
                 const int32_t own = last[at];
                 const int32_t above = level ? residuals[at - pass.first * columns] : 0;
                 const int32_t below = level && a + pass.first < count ? residuals[at + pass.first * columns] : 0;
-                const int32_t beside = std::abs(above) + std::abs(below);
+                const int32_t adjacent = std::abs(above) + std::abs(below);
                 const int32_t first = column ? residuals[at - 1] : 0;
                 const int32_t off = column ? first - last[at - 1] : 0;
                 // Sixteenths of a quantization step.
-                const int32_t led = moved[a] ? (level ? 10 * own + 3 * (above + below) : 16 * own) : 8 * (above + below);
-                const int32_t expected = size_class((std::abs(led) + 4) >> 3);
+                const int32_t predicted = moved[a] ? (level ? 10 * own + 3 * (above + below) : 16 * own) : 8 * (above + below);
+                const int32_t expected = size_class((std::abs(predicted) + 4) >> 3);
                 const int32_t contexts[kResidualInputs] = {
                     (limited(own, 8) + 8) * columns + column,
                     (limited(above, 4) + 4) * 9 + limited(below, 4) + 4,
-                    ((led < 0 ? -expected : expected) + 15) * 5 + level,
-                    (std::min(told[a], 9) * 6 + std::min(beside, 5)) * columns + column,
-                    (bit_length(others[a], 5) * columns + column) * 16 + size_class(2 * std::abs(own) + beside),
+                    ((predicted < 0 ? -expected : expected) + 15) * 5 + level,
+                    (std::min(earlier[a], 9) * 6 + std::min(adjacent, 5)) * columns + column,
+                    (bit_length(others[a], 5) * columns + column) * 16 + size_class(2 * std::abs(own) + adjacent),
                     ((limited(first, 3) + 3) * 7 + limited(off, 3) + 3) * 7 + limited(own, 3) + 3,
                 };
                 int64_t value = residuals[at];
@@ -297,7 +296,7 @@ Result code_residuals(sgs_arithmetic* arithmetic, const sgs_model* model, int64_
                 residuals[at] = static_cast<int32_t>(value);
             }
         }
-        for (int64_t a = 0; a < count; ++a) told[a] += std::min(std::abs(residuals[a * columns + column]), 9);
+        for (int64_t a = 0; a < count; ++a) earlier[a] += std::min(std::abs(residuals[a * columns + column]), 9);
     }
     return kDone;
 }

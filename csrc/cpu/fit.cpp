@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // The iterations of a later frame, as training/online/iterations.py has them in torch: generate, project, bin, draw, compare, and
-// back; prices of changes and of incoherent motion; Adam; sums for the mean of the last ones. Their order and the order of
+// back; the rate term and motion smoothness; Adam; sums for the mean of the last ones. Their order and the order of
 // all sums is that of the torch loop.
 
 #include <algorithm>
@@ -80,7 +80,7 @@ class Fit {
         if (i >= f_.errors_from) f_.squared_errors[i] = squared_error();
         draw_backward();
         generate_backward();
-        add_prices();
+        add_regularizers();
         update(i);
     }
 
@@ -282,7 +282,7 @@ class Fit {
             }
     }
 
-    void add_prices() {
+    void add_regularizers() {
         const bool smooth = f_.neighbour_count > 0;
         const float* positions = f_.leaves[kPositions].values;
         if (smooth) {
@@ -300,14 +300,14 @@ class Fit {
         for (int n = 0; n < SGS_LEAVES; ++n) {
             const sgs_leaf& leaf = f_.leaves[n];
             if (!leaf.first) continue;
-            price_.assign(leaf.count, 0.0f);
+            regularizer_.assign(leaf.count, 0.0f);
             if (leaf.before) {
-                bits += sgs_change_bits(leaf.values, leaf.before, leaf.before_count, leaf.step, price_.data());
-                for (int64_t i = 0; i < leaf.before_count; ++i) price_[i] *= f_.rate;
+                bits += sgs_change_bits(leaf.values, leaf.before, leaf.before_count, leaf.step, regularizer_.data());
+                for (int64_t i = 0; i < leaf.before_count; ++i) regularizer_[i] *= f_.rate;
             }
             if (n == kPositions && smooth)
-                for (int64_t i = 0; i < leaf.count; ++i) price_[i] += to_moved_[i];
-            for (int64_t i = 0; i < leaf.count; ++i) gradients_[n][i] += price_[i];
+                for (int64_t i = 0; i < leaf.count; ++i) regularizer_[i] += to_moved_[i];
+            for (int64_t i = 0; i < leaf.count; ++i) gradients_[n][i] += regularizer_[i];
         }
         terms_[4] += f_.rate * static_cast<float>(bits);
     }
@@ -344,7 +344,7 @@ class Fit {
     Floats rounded_[SGS_LEAVES], gradients_[SGS_LEAVES];
     Columns drawn_, to_drawn_;
     Floats folded_, to_folded_, intervals_, radii_, norms_, raw_, alpha_, ssim_gradient_, to_image_, corrected_, moments_, moved_,
-        to_moved_, price_;
+        to_moved_, regularizer_;
     std::vector<double> rows_;
     std::vector<int32_t> bits_, active_;
     std::vector<int64_t> ids_, visible_, starts_;

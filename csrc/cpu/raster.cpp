@@ -38,18 +38,14 @@ inline void store_sums(const vf (&m)[Count], float* out) {
     std::memcpy(out, sums, sizeof(float) * Count);
 }
 
-// 2^x for x in [-8, 0.1]: integer part by rounding, fraction by a polynomial fitted around zero.
+// 2^x for x in [-8, 0.1]: integer part by rounding, fraction by a polynomial (error 9e-8) whose terms do not wait for
+// each other.
 inline vf power_of_two(vf x) {
     const vf magic = splat(12582912.0f);
     const vf rounded = x + magic;
-    const vf f = x - (rounded - magic);
-    vf p = splat(1.54035304e-4f);
-    p = p * f + 1.33335581e-3f;
-    p = p * f + 9.61812911e-3f;
-    p = p * f + 5.55041087e-2f;
-    p = p * f + 2.40226507e-1f;
-    p = p * f + 6.93147181e-1f;
-    p = p * f + 1.0f;
+    const vf f = x - (rounded - magic), ff = f * f;
+    const vf high = splat(9.67151299e-3f) + f * 1.32647273e-3f, middle = splat(0.240222424f) + f * 5.55073359e-2f, low = splat(1.0f) + f * 0.693147004f;
+    const vf p = low + ff * (middle + ff * high);
     return (vf)((vi)p + ((vi)rounded << 23));
 }
 
@@ -97,27 +93,28 @@ inline uint64_t near_blocks(const Splat& s, const BlockCentres& centres, const T
     return found;
 }
 
-// One splat over one block of pixels at a distance of dx and dy, whose transmittance is T. T above `least`, zero or more,
-// is live; a pixel that has stopped stores its transmittance with a minus sign.
+// Opacity of a splat at pixels at a distance of dx and dy, 0 below 1/255.
+[[gnu::always_inline]] inline vf opacity_at(const Splat& s, vf dx, vf dy) {
+    const vf power = (s.log2_opacity - dy * (dy * s.yy)) - dx * (dx * s.xx + dy * s.xy);
+    return keep(at_least(power, splat(kLog2MinAlpha)), smallest(power_of_two(power), splat(kMaxAlpha)));
+}
+
+// One splat over one block of pixels whose transmittance is T. T above `least`, zero or more, is live; a pixel that has
+// stopped stores its transmittance with a minus sign.
 struct Coverage {
-    vf dx, dy, alpha, after;  // after: the transmittance behind the splat, valid for live pixels
-    mask used, stopped;
+    vf alpha, after;  // after: the transmittance behind the splat, valid for live pixels
     bool any_stopped;
 
-    [[gnu::always_inline]] bool of(const Splat& s, vf to_x, vf to_y, vf T, float least) {
-        dx = to_x, dy = to_y;
-        const vf power = s.log2_opacity - (dx * (dx * s.xx + dy * s.xy) + dy * dy * s.yy);
-        used = both(at_least(power, splat(kLog2MinAlpha)), above(T, splat(least)));
-        if (!any(used)) return false;
-        alpha = keep(used, smallest(power_of_two(power), splat(kMaxAlpha)));
+    [[gnu::always_inline]] Coverage(vf opacity, vf T, float least) {
+        const mask live = above(T, splat(least));
+        alpha = keep(live, opacity);
         after = T * (1.0f - alpha);
-        stopped = both(used, at_least(splat(kMinTransmittance), after));
+        const mask stopped = both(live, at_least(splat(kMinTransmittance), after));
         any_stopped = any(stopped);
         if (any_stopped) {
-            alpha = keep(without(used, stopped), alpha);
+            alpha = keep(without(live, stopped), alpha);
             after = choose(stopped, -T, after);
         }
-        return true;
     }
 };
 
@@ -182,26 +179,52 @@ void scatter_color(const Blocks<Count, kTrains>& blocks, int width, const Tile& 
 
 // The splat of pair `n` < `end`. A later one is prefetched, because neighbours in depth are distant in memory.
 [[gnu::always_inline]] inline const Splat& splat_of(const Raster& raster, int n, int end) {
-    __builtin_prefetch(&raster.splats[raster.pairs[std::min(n + kAhead, end - 1)]]);
-    return raster.splats[raster.pairs[n]];
+    __builtin_prefetch(&raster.splats[raster.pairs[std::min(n + kAhead, end - 1)].splat]);
+    return raster.splats[raster.pairs[n].splat];
+}
+
+// Visits the pairs n ... end - 1 of a tile until all blocks are hidden: visit(splat, pair, blocks that it may cover). The
+// blocks of the next splat are found ahead, so that a processor that did not foresee the end of a visit has them at once.
+// Returns the first pair that was not visited.
+template <int Count, bool kTrains, typename Visit>
+[[gnu::always_inline]] inline int for_splats(
+    const Raster& raster, const Tile& tile, int n, int end, const Blocks<Count, kTrains>& blocks, Visit visit) {
+    const BlockCentres centres;
+    const auto near = [&](int pair) { return near_blocks(splat_of(raster, pair, end), centres, tile); };
+    for (uint64_t ahead = n < end ? near(n) : 0; n < end && blocks.live != 0; ++n) {
+        const uint64_t here = ahead;
+        ahead = near(std::min(n + 1, end - 1));
+        visit(raster.splats[raster.pairs[n].splat], n, here);
+    }
+    return n;
 }
 
 // Visits the blocks of pixels of a tile that a splat covers, and updates their transmittance: visit(block, transmittance
-// before, coverage).
+// before, coverage). The opacity of the next block is computed ahead: processors then overlap its long chain of dependent
+// instructions with that of the visit. Returns whether there are any.
 template <int Count, bool kTrains, typename Visit>
-[[gnu::always_inline]] inline void for_covered(
-    const Splat& s, const Tile& tile, const BlockCentres& centres, Blocks<Count, kTrains>& blocks, Visit visit) {
+[[gnu::always_inline]] inline bool for_covered(
+    const Splat& s, uint64_t near, const Tile& tile, Blocks<Count, kTrains>& blocks, Visit visit) {
     constexpr float kLeast = Blocks<Count, kTrains>::kLeast;
     const float x = s.x - tile.left, y = s.y - tile.top;
-    for (uint64_t rest = blocks.live & near_blocks(s, centres, tile); rest != 0; rest &= rest - 1) {
-        const int n = __builtin_ctzll(rest);
+    const auto opacity_of = [&](const Block<Count>& block) { return opacity_at(s, load(block.x) - x, load(block.y) - y); };
+    uint64_t rest = blocks.live & near;
+    if (rest == 0) return false;
+    int next = __builtin_ctzll(rest);
+    vf opacity = opacity_of(blocks.at[next]);
+    while (true) {
+        const int n = next;
         Block<Count>& block = blocks.at[n];
         const vf before = load(block.T);
-        Coverage c;
-        if (!c.of(s, load(block.x) - x, load(block.y) - y, before, kLeast)) continue;
+        const vf here = opacity;
+        rest &= rest - 1;
+        next = rest != 0 ? __builtin_ctzll(rest) : n;
+        opacity = opacity_of(blocks.at[next]);
+        const Coverage c(here, before, kLeast);
         visit(block, before, c);
         store(block.T, c.after);
         if ((c.any_stopped || kTrains) && !any(above(c.after, splat(kLeast)))) blocks.live &= ~(uint64_t{1} << n);
+        if (rest == 0) return true;
     }
 }
 
@@ -215,16 +238,13 @@ void add_background(const float* background, Blocks<Count, kTrains>& blocks) {
 
 void blend(const Raster& raster, int index, const float* background, float* image, float* alpha_out) {
     const Tile tile(raster, index);
-    const BlockCentres centres;
     Blocks<3, false> blocks;  // color
-    const int end = raster.starts[index + 1];
-    for (int n = raster.starts[index]; n < end && blocks.live != 0; ++n) {
-        const Splat& s = splat_of(raster, n, end);
-        for_covered(s, tile, centres, blocks, [&](Block<3>& block, vf before, const Coverage& c) {
+    for_splats(raster, tile, raster.starts[index], raster.starts[index + 1], blocks, [&](const Splat& s, int, uint64_t near) {
+        for_covered(s, near, tile, blocks, [&](Block<3>& block, vf before, const Coverage& c) {
             const vf weight = c.alpha * before;
             for (int k = 0; k < 3; ++k) store(block.values[k], load(block.values[k]) + weight * s.color[k]);
         });
-    }
+    });
     if (background) add_background(background, blocks);
     scatter_color(blocks, raster.camera.width, tile, image);
     for_pixels(tile, raster.camera.width, [&](size_t pixel, int block, int lane) {
@@ -236,7 +256,6 @@ void blend_backward(
     const Raster& raster, int index, const float* background, const float* image, const float* alpha,
     const float* grad_image, const float* grad_alpha, float* moments) {
     const Tile tile(raster, index);
-    const BlockCentres centres;
     const int width = raster.camera.width;
     Blocks<8, true> blocks;  // color, then the remaining colour; its gradient; gradient of coverage; coverage
     enum { kColor, kRest = kColor, kGradient = 3, kCoverageGradient = 6, kCoverage };
@@ -259,16 +278,14 @@ void blend_backward(
         }
     }
     int n = raster.starts[index], end = raster.starts[index + 1];
-    while (end > n && raster.pairs[end - 1] >= raster.trained) --end;  // Their state is not read any more.
-    for (; n < end && blocks.live != 0; ++n) {
-        const Splat& s = splat_of(raster, n, end);
-        const bool trained = raster.pairs[n] < raster.trained;
-        float* out = moments + static_cast<size_t>(raster.pair_slots[n]) * kMomentCount;
+    while (end > n && raster.pairs[end - 1].splat >= raster.trained) --end;  // Their state is not read any more.
+    n = for_splats(raster, tile, n, end, blocks, [&](const Splat& s, int n, uint64_t near) {
+        const bool trained = raster.pairs[n].splat < raster.trained;
+        float* out = moments + static_cast<size_t>(raster.pairs[n].slot) * kMomentCount;
         vf m[kMomentCount];
         for (vf& v : m) v = splat(0.0f);
-        bool hit = false;
-        for_covered(s, tile, centres, blocks, [&](Block<8>& block, vf before, const Coverage& c) {
-            hit = true;
+        const float x = s.x - tile.left, y = s.y - tile.top;
+        const bool hit = for_covered(s, near, tile, blocks, [&](Block<8>& block, vf before, const Coverage& c) {
             const auto& v = block.values;
             const vf weight = c.alpha * before;
             const vf g0 = load(v[kGradient]), g1 = load(v[kGradient + 1]), g2 = load(v[kGradient + 2]);
@@ -278,21 +295,22 @@ void blend_backward(
             if (!trained) return;
             const vf slope = before * q - to_come * reciprocal(1.0f - c.alpha);
             const vf d = keep(above(splat(kMaxAlpha), c.alpha), slope * c.alpha);  // a clamped alpha has no gradient
-            const vf dx = d * c.dx, dy = d * c.dy;
+            const vf to_x = load(block.x) - x, to_y = load(block.y) - y;
+            const vf dx = d * to_x, dy = d * to_y;
             m[0] += d, m[1] += dx, m[2] += dy;
-            m[3] += dx * c.dx, m[4] += dx * c.dy, m[5] += dy * c.dy;
+            m[3] += dx * to_x, m[4] += dx * to_y, m[5] += dy * to_y;
             m[6] += weight * g0, m[7] += weight * g1, m[8] += weight * g2;
         });
-        if (!trained) continue;
+        if (!trained) return;
         if (hit) {
             store_sums(m, out);
         } else {
             std::memset(out, 0, sizeof(float) * kMomentCount);
         }
-    }
+    });
     for (; n < end; ++n)  // hidden
-        if (raster.pairs[n] < raster.trained)
-            std::memset(moments + static_cast<size_t>(raster.pair_slots[n]) * kMomentCount, 0, sizeof(float) * kMomentCount);
+        if (raster.pairs[n].splat < raster.trained)
+            std::memset(moments + static_cast<size_t>(raster.pairs[n].slot) * kMomentCount, 0, sizeof(float) * kMomentCount);
 }
 
 // The blocks of a tile in which one of the numbers is not zero.
@@ -314,7 +332,6 @@ void weigh(const Raster& raster, int index, const float* maps, int stride, float
            float* image) {
     constexpr int kFirst = kDraws ? 3 : 0;  // the first map, after the colour
     const Tile tile(raster, index);
-    const BlockCentres centres;
     Blocks<kFirst + Maps, !kDraws> blocks;
     for_pixels(tile, raster.camera.width, [&](size_t pixel, int block, int lane) {
 #pragma GCC unroll 8
@@ -322,15 +339,11 @@ void weigh(const Raster& raster, int index, const float* maps, int stride, float
     });
     if (!kDraws) blocks.live = blocks_with_values(blocks);
     const int end = raster.starts[index + 1];
-    int n = raster.starts[index];
-    for (; n < end && blocks.live != 0; ++n) {
-        const Splat& s = splat_of(raster, n, end);
-        float* out = sums + static_cast<size_t>(raster.pair_slots[n]) * stride;
+    int n = for_splats(raster, tile, raster.starts[index], end, blocks, [&](const Splat& s, int n, uint64_t near) {
+        float* out = sums + static_cast<size_t>(raster.pairs[n].slot) * stride;
         vf m[Maps];
         for (vf& v : m) v = splat(0.0f);
-        bool hit = false;
-        for_covered(s, tile, centres, blocks, [&](Block<kFirst + Maps>& block, vf before, const Coverage& c) {
-            hit = true;
+        const bool hit = for_covered(s, near, tile, blocks, [&](Block<kFirst + Maps>& block, vf before, const Coverage& c) {
             const vf weight = c.alpha * before;
             const vf lit = kDraws ? keep(above(before, splat(kMinGradientTransmittance)), weight) : weight;
 #pragma GCC unroll 8
@@ -342,8 +355,8 @@ void weigh(const Raster& raster, int index, const float* maps, int stride, float
         } else {
             std::fill_n(out, Maps, 0.0f);
         }
-    }
-    for (; n < end; ++n) std::fill_n(sums + static_cast<size_t>(raster.pair_slots[n]) * stride, Maps, 0.0f);  // hidden
+    });
+    for (; n < end; ++n) std::fill_n(sums + static_cast<size_t>(raster.pairs[n].slot) * stride, Maps, 0.0f);  // hidden
     if (!kDraws) return;
     if (background) add_background(background, blocks);
     scatter_color(blocks, raster.camera.width, tile, image);

@@ -9,7 +9,6 @@
 namespace structgstream {
 
 constexpr int kTile = 16;                          // pixels
-constexpr int kTilePixels = kTile * kTile;
 constexpr float kLowPass = 0.3f;                   // square pixels: reference_raster.LOW_PASS_PIXELS
 constexpr float kScreenLowPass = 0.15f;            // reference_raster.SCREEN_LOW_PASS_PIXELS
 constexpr float kMinAlpha = 1.0f / 255.0f;
@@ -37,6 +36,13 @@ struct alignas(64) Splat {
     int32_t box[4];            // pixels x0, y0, x1, y1 (half open) that can reach alpha = 1/255
 };
 
+// A splat and a tile that it may cover. A slot depends only on the two, so gradients are summed in the same order for any
+// number of threads.
+struct Pair {
+    int32_t splat;
+    int32_t slot;
+};
+
 struct Raster {
     Pinhole camera;
     int tiles_x, tiles_y;
@@ -44,9 +50,8 @@ struct Raster {
     int64_t trained;                  // splats from here on get no gradient
     std::vector<Splat> splats;        // [N]; box empty where not drawn
     std::vector<int32_t> starts;      // [tiles + 1] into pairs
-    std::vector<int32_t> pairs;       // splat of each (tile, splat) pair, front to back within a tile
+    std::vector<Pair> pairs;          // by tile, front to back
     std::vector<int32_t> slots;       // [N + 1] first pair slot of each splat, for the fixed order of sums
-    std::vector<int32_t> pair_slots;  // slot of each pair
 
     // Always inlined: a copy shared between instruction sets could contain instructions that a processor lacks.
     [[gnu::always_inline]] bool draws(int tile) const { return drawn_tiles.empty() || drawn_tiles[tile] != 0; }

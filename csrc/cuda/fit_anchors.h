@@ -133,7 +133,7 @@ struct AnchorHeadBackward {
 };
 
 // A dynamic Gaussian and its splat. A thread is a row.
-struct Dress {
+struct DecodeGaussians {
     Model m;
     Camera camera;
     const uint8_t* drawn;
@@ -200,7 +200,7 @@ struct Dress {
 };
 
 // From the moments of a row's slots to gradients of the MLPs' outputs or of a free Gaussian.
-struct DressBackward {
+struct DecodeGaussiansBackward {
     Model m;
     Camera camera;
     const State* state;

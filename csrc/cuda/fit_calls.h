@@ -93,7 +93,8 @@ class Fit {
             if (const int error = to_host(&found, state_, sizeof found, stream_)) return error;
             if (const int error = wait(stream_)) return error;
             if (found.stopped < 0) break;
-            first = found.stopped, capacity_ = found.slots + found.slots / 2;
+            if (found.slots > kMostPairs) return kNoMemory;
+            first = found.stopped, capacity_ = std::min(found.slots + found.slots / 2, kMostPairs);
             if (const int error = release(pair_memory_, stream_)) return error;
             pair_memory_ = nullptr;
             if (const int error = reset()) return error;
@@ -259,7 +260,7 @@ class Fit {
             m.k, v.viewmat, v.K, {v.width, v.height}, v.near_plane, drawn, m.seen};
         if (const int error = for_each<kAnchorThreads>(AnchorInputs{m, seen, v.center}, m.anchors, stream_)) return error;
         if (const int error = for_each<kAnchorThreads>(AnchorHead{m}, kHeads * m.anchors, stream_)) return error;
-        if (const int error = for_each<kAnchorThreads>(Dress{m, camera, drawn, counts_}, m.rows(), stream_)) return error;
+        if (const int error = for_each<kAnchorThreads>(DecodeGaussians{m, camera, drawn, counts_}, m.rows(), stream_)) return error;
         const Starts starts = {counts_, camera.tiles(), starts_, cursors_, m.rows(), slots_,
                                f_.volume == 0.0f ? nullptr : m.scales, m.opacities, i, capacity_, state_, nullptr, nullptr};
         return for_blocks(starts, 1, stream_);
@@ -286,8 +287,8 @@ class Fit {
 
     int generate_backward(const Camera& camera, const uint8_t* drawn) {
         const Model& m = model_;
-        const DressBackward dress = {m, camera, state_, drawn, slots_, moments_, f_.volume, f_.mean_volume != 0};
-        if (const int error = for_each<kAnchorThreads>(dress, m.rows(), stream_)) return error;
+        const DecodeGaussiansBackward decode = {m, camera, state_, drawn, slots_, moments_, f_.volume, f_.mean_volume != 0};
+        if (const int error = for_each<kAnchorThreads>(decode, m.rows(), stream_)) return error;
         if (m.trains_inputs())
             if (const int error = for_each<kAnchorThreads>(AnchorHeadBackward{m, state_}, kHeads * m.anchors, stream_))
                 return error;
@@ -366,14 +367,13 @@ extern "C" {
 
 int sgs_cuda_fit_new(const sgs_fit_frame* frame, int64_t slots, void* stream, void** fit) {
     using structgstream::cuda::fit::Fit;
-    constexpr int kNoMemory = 2;  // cudaErrorMemoryAllocation
     *fit = nullptr;
     try {
         Fit* made = new Fit(*frame, slots, stream);
         *fit = made;
         return made->begin();
     } catch (const std::bad_alloc&) {
-        return kNoMemory;
+        return structgstream::cuda::fit::kNoMemory;
     }
 }
 

@@ -3,6 +3,7 @@
 // CUDA's error number.
 #pragma once
 
+#include <climits>
 #include <cstddef>
 #include <cstdint>
 #include <cstdlib>
@@ -11,6 +12,9 @@
 namespace structgstream {
 namespace cuda {
 namespace fit {
+
+constexpr int kNoMemory = 2;  // cudaErrorMemoryAllocation
+constexpr int64_t kMostPairs = INT32_MAX;  // lists and slots have 32-bit indices
 
 #ifdef __CUDACC__
 
@@ -37,7 +41,7 @@ inline int wait(void* stream) { return static_cast<int>(cudaStreamSynchronize(st
 inline int allocate(void** memory, size_t bytes, void*) {
     *memory = std::malloc(bytes ? bytes : 1);
     if (*memory != nullptr) std::memset(*memory, 0xff, bytes);
-    return *memory == nullptr ? 2 : 0;
+    return *memory == nullptr ? kNoMemory : 0;
 }
 inline int release(void* memory, void*) {
     std::free(memory);

@@ -154,14 +154,62 @@ struct Draw {
     }
 };
 
+// Sums over the pixels of a pair of a splat and a tile: shared memory of a tile.
+template <int kCount>
+struct PairShared {
+    Splat batch[kBatch];
+    int32_t slots[kBatch];  // -1 for a static splat
+    float sums[kWarps][kBatch * kCount];
+};
+
+// For each splat that covers pixels of a warp above the least transmittance with a gradient, front to back,
+// values(warp, splat, coverage, transmittance before it, m) sets m[kCount] of the lanes; store(slot, k, total) gets their sums
+// over the tile for each dynamic splat. slots: of each row, the first one.
+template <int kCount, typename Warp, typename Values, typename Store>
+SGS_LANES_FN void sum_pairs(
+    const Tiles& tiles, const int32_t* slots, int tile, PairShared<kCount>& s, const Threads& threads,
+    OfWarp<Warp, kWarps>& warps, const Values& values, const Store& store) {
+    const int end = tiles.begin(tile + 1);
+    for (int at = tiles.begin(tile); at < end; at += kBatch) {
+        const bool live = threads.any_warp([&](int w) { return warps[w].front.live; });
+        const int count = end - at < kBatch ? end - at : kBatch;
+        threads.each([&](int t) {
+            tiles.read(at, count, s.batch, t);
+            for (int i = t; i < count; i += kRasterThreads) {
+                const int32_t row = tiles.merged[at + i];
+                s.slots[i] = row < tiles.rows ? slots[row] + slot_in(tiles.splats[row], tile, tiles.columns) : -1;
+            }
+            for (int i = t; i < kWarps * kBatch * kCount; i += kRasterThreads) (&s.sums[0][0])[i] = 0.0f;
+        });
+        if (live) threads.warps([&](int w) {
+            Warp& warp = warps[w];
+            const float left = tiles.left(tile, w), top = tiles.top(tile, w);
+            const vf px = lanes_x() + splat(left), py = lanes_y() + splat(top);
+            each_near(s.batch, count, left, top, warp.front, [&](int n, const Splat& splatted) {
+                const vf before = warp.front.T;
+                Coverage c;
+                if (!cover(splatted, px, py, warp.front, kMinGradientTransmittance, c)) return;
+                warp.front.live = any(above(warp.front.T, splat(kMinGradientTransmittance)));
+                vf m[kCount];
+                values(warp, splatted, c, before, m);
+                if (s.slots[n] >= 0) store_sums<kCount>(m, s.sums[w] + n * kCount);
+            });
+        });
+        threads.each([&](int t) {
+            for (int i = t; i < count * kCount; i += kRasterThreads) {
+                if (s.slots[i / kCount] < 0) continue;
+                float total = 0.0f;
+                for (int w = 0; w < kWarps; ++w) total += s.sums[w][i];
+                store(static_cast<int64_t>(s.slots[i / kCount]), i % kCount, total);
+            }
+        });
+    }
+}
+
 // Moments of each pair of a dynamic splat and a tile, in the splat's slot of the tile.
 struct DrawBackward {
     static constexpr int kThreads = kRasterThreads;
-    struct Shared {
-        Splat batch[kBatch];
-        int32_t slots[kBatch];  // -1 for a static splat
-        float sums[kWarps][kBatch * kMoments];
-    };
+    using Shared = PairShared<kMoments>;
     struct Warp {
         Front front;
         vf gradient[3], coverage_gradient, rest;
@@ -196,58 +244,20 @@ struct DrawBackward {
         if (tiles.skips(tile)) return;
         OfWarp<Warp, kWarps> warps;
         threads.warps([&](int w) { begin(tile, w, warps[w]); });
-        const int end = tiles.begin(tile + 1);
-        for (int at = tiles.begin(tile); at < end; at += kBatch) {
-            const bool live = threads.any_warp([&](int w) { return warps[w].front.live; });
-            const int count = end - at < kBatch ? end - at : kBatch;
-            threads.each([&](int t) {
-                tiles.read(at, count, s.batch, t);
-                for (int i = t; i < count; i += kThreads) {
-                    const int32_t row = tiles.merged[at + i];
-                    s.slots[i] = row < tiles.rows ? slots[row] + slot_in(tiles.splats[row], tile, tiles.columns) : -1;
-                }
-                for (int i = t; i < kWarps * kBatch * kMoments; i += kThreads) (&s.sums[0][0])[i] = 0.0f;
-            });
-            if (live) threads.warps([&](int w) { add(tile, w, count, s, warps[w]); });
-            threads.each([&](int t) {
-                for (int i = t; i < count * kMoments; i += kThreads) {
-                    const int32_t slot = s.slots[i / kMoments];
-                    if (slot < 0) continue;
-                    float total = 0.0f;
-                    for (int w = 0; w < kWarps; ++w) total += s.sums[w][i];
-                    moments[static_cast<int64_t>(slot) * kMoments + i % kMoments] = total;
-                }
-            });
-        }
-    }
-
-    SGS_LANES_FN void add(int tile, int w, int count, Shared& s, Warp& warp) const {
-        const float left = tiles.left(tile, w), top = tiles.top(tile, w);
-        const vf px = lanes_x() + splat(left), py = lanes_y() + splat(top);
-        each_near(s.batch, count, left, top, warp.front, [&](int n, const Splat& splatted) {
-            const vf before = warp.front.T;
-            Coverage c;
-            if (!cover(splatted, px, py, warp.front, kMinGradientTransmittance, c)) return;
-            warp.front.live = any(above(warp.front.T, splat(kMinGradientTransmittance)));
+        const auto values = [](Warp& warp, const Splat& splatted, const Coverage& c, vf before, vf(&m)[kMoments]) {
             const vf weight = c.alpha * before;
             vf q = warp.coverage_gradient;
             for (int k = 0; k < 3; ++k) q += warp.gradient[k] * splat(splatted.color[k]);
             warp.rest = warp.rest - weight * q;
-            if (s.slots[n] < 0) return;
             const vf slope = before * q - warp.rest * reciprocal(splat(1.0f) - c.alpha);
             // A clamped alpha has no gradient.
             const vf d = keep(above(splat(kMaxAlpha), c.alpha), slope * c.alpha);
             const vf dx = d * c.dx, dy = d * c.dy;
-            const vf m[kMoments] = {d,
-                                    dx,
-                                    dy,
-                                    dx * c.dx,
-                                    dx * c.dy,
-                                    dy * c.dy,
-                                    weight * warp.gradient[0],
-                                    weight * warp.gradient[1],
-                                    weight * warp.gradient[2]};
-            store_sums<kMoments>(m, s.sums[w] + n * kMoments);
+            m[0] = d, m[1] = dx, m[2] = dy, m[3] = dx * c.dx, m[4] = dx * c.dy, m[5] = dy * c.dy;
+            for (int k = 0; k < 3; ++k) m[6 + k] = weight * warp.gradient[k];
+        };
+        sum_pairs<kMoments>(tiles, slots, tile, s, threads, warps, values, [&](int64_t slot, int k, float total) {
+            moments[slot * kMoments + k] = total;
         });
     }
 };

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What an iteration adds to the pictures' gradient, and the step: smoothness, the price of changes, Adam, sums for the
+// What an iteration adds to the pictures' gradient, and the step: smoothness, the rate term, Adam, sums for the
 // mean; and the numbers that it reports. Sums have a fixed order, or are sums of integers.
 #pragma once
 
@@ -95,7 +95,7 @@ struct Smooth {
 
 constexpr int kUpdateThreads = 256;
 
-// Price, Adam and mean of a number of a leaf. A thread is a number.
+// Regularisers, Adam and mean of a number of a leaf. A thread is a number.
 struct Update {
     static constexpr int kThreads = kUpdateThreads;
     struct Shared {
@@ -141,15 +141,15 @@ struct Update {
 
     SGS_LANES_FN float step_of(const Part& part, int64_t i) const {
         const sgs_leaf& leaf = part.leaf;
-        float g = part.gradient[i], value = leaf.values[i], found = 0.0f, price = 0.0f;
+        float g = part.gradient[i], value = leaf.values[i], found = 0.0f, regularizer = 0.0f;
         if (leaf.before != nullptr && i < leaf.before_count) {
             const float difference = value - leaf.before[i], inverse = 1.0f / leaf.step;
             const float ratio = 1.0f + fabsf(difference) * inverse;
             found = log2f(ratio);
-            price = difference == 0.0f ? 0.0f : copysignf(1.44269504f * inverse, difference) / ratio * rate;
+            regularizer = difference == 0.0f ? 0.0f : copysignf(1.44269504f * inverse, difference) / ratio * rate;
         }
-        if (part.smooth) price += static_cast<float>(static_cast<double>(smoothness[i]) / kFixed) * smooth_factor;
-        g += price;
+        if (part.smooth) regularizer += static_cast<float>(static_cast<double>(smoothness[i]) / kFixed) * smooth_factor;
+        g += regularizer;
         if (part.steps) {
             const float m = beta1 * leaf.first[i] + rest1 * g, v = beta2 * leaf.second[i] + rest2 * g * g;
             leaf.first[i] = m, leaf.second[i] = v;

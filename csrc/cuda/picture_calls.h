@@ -34,11 +34,7 @@ struct Project {
 // Sums over a pair's pixels of its blending weight times each of some maps, in the splat's slot of the tile.
 struct Weigh {
     static constexpr int kThreads = kRasterThreads;
-    struct Shared {
-        Splat batch[kBatch];
-        int32_t slots[kBatch];
-        float sums[kWarps][kBatch * kMapsAtOnce];
-    };
+    using Shared = PairShared<kMapsAtOnce>;
     struct Warp {
         Front front;
         vf values[kMapsAtOnce];
@@ -62,41 +58,11 @@ struct Weigh {
             });
             warp.front.live = any(above(warp.front.T, splat(kMinGradientTransmittance)));
         });
-        const int end = tiles.begin(tile + 1);
-        for (int at = tiles.begin(tile); at < end; at += kBatch) {
-            const bool live = threads.any_warp([&](int w) { return warps[w].front.live; });
-            const int entries = end - at < kBatch ? end - at : kBatch;
-            threads.each([&](int t) {
-                tiles.read(at, entries, s.batch, t);
-                for (int i = t; i < entries; i += kThreads) {
-                    const int32_t row = tiles.merged[at + i];
-                    s.slots[i] = slots[row] + slot_in(tiles.splats[row], tile, tiles.columns);
-                }
-                for (int i = t; i < kWarps * kBatch * kMapsAtOnce; i += kThreads) (&s.sums[0][0])[i] = 0.0f;
-            });
-            if (live) threads.warps([&](int w) { add(tile, w, entries, s, warps[w]); });
-            threads.each([&](int t) {
-                for (int i = t; i < entries * kMapsAtOnce; i += kThreads) {
-                    if (i % kMapsAtOnce >= count) continue;
-                    float total = 0.0f;
-                    for (int w = 0; w < kWarps; ++w) total += s.sums[w][i];
-                    sums[static_cast<int64_t>(s.slots[i / kMapsAtOnce]) * channels + first + i % kMapsAtOnce] = total;
-                }
-            });
-        }
-    }
-
-    SGS_LANES_FN void add(int tile, int w, int entries, Shared& s, Warp& warp) const {
-        const float left = tiles.left(tile, w), top = tiles.top(tile, w);
-        const vf px = lanes_x() + splat(left), py = lanes_y() + splat(top);
-        each_near(s.batch, entries, left, top, warp.front, [&](int n, const Splat& splatted) {
-            const vf before = warp.front.T;
-            Coverage c;
-            if (!cover(splatted, px, py, warp.front, kMinGradientTransmittance, c)) return;
-            warp.front.live = any(above(warp.front.T, splat(kMinGradientTransmittance)));
-            vf m[kMapsAtOnce];
+        const auto values = [](Warp& warp, const Splat&, const Coverage& c, vf before, vf(&m)[kMapsAtOnce]) {
             for (int k = 0; k < kMapsAtOnce; ++k) m[k] = c.alpha * before * warp.values[k];
-            store_sums<kMapsAtOnce>(m, s.sums[w] + n * kMapsAtOnce);
+        };
+        sum_pairs<kMapsAtOnce>(tiles, slots, tile, s, threads, warps, values, [&](int64_t slot, int k, float total) {
+            if (k < count) sums[slot * channels + first + k] = total;
         });
     }
 };
@@ -146,11 +112,12 @@ class Picture {
         project.splats = splats_, project.counts = counts_, project.slots = slots_;
         if (const int error = for_each(project, count, stream_)) return error;
         const Starts starts = {counts_, camera_.tiles(), starts_, cursors_, count, slots_, nullptr, nullptr, 0,
-                               INT32_MAX, nullptr, totals_, totals_ + 1};
+                               kMostPairs, nullptr, totals_, totals_ + 1};
         if (const int error = for_blocks(starts, 1, stream_)) return error;
         int64_t totals[2];
         if (const int error = to_host(totals, totals_, sizeof totals, stream_)) return error;
         if (const int error = wait(stream_)) return error;
+        if (totals[0] > kMostPairs || totals[1] > kMostPairs) return kNoMemory;
         Arena pair_sizes(nullptr);
         lay_out_pairs(pair_sizes, totals, channels);
         if (const int error = allocate(&pair_memory_, pair_sizes.size(), stream_)) return error;

@@ -3,8 +3,8 @@
 //
 // A block is one tile of 16 x 16 pixels with its three channels, so selected tiles are blocks. A row of the picture is a
 // row of 3 W numbers, and a horizontal blur reads every third of them. The work of a block is divided at its barriers into
-// phases: functions of one thread that read what earlier phases wrote. ssim.cu runs them on a GPU. emulate_ssim.cpp runs
-// the same functions thread by thread on a CPU, for tests without a GPU.
+// phases: functions of one thread that read what earlier phases wrote. ssim_calls.h has their order, for a GPU and, thread
+// by thread, for a CPU.
 //
 // SSIM needs only the sum of the two second moments, so four blurs are sufficient instead of five. Sums are computed in a
 // fixed order without atomics, so results repeat bit for bit.

@@ -164,8 +164,8 @@ void sgs_adam_step(
 /* Iterations of a later frame in which only anchors and free Gaussians are trained (training/online/iterations.py).
  *
  * A tensor of `count` numbers. values, the moments of Adam, and the sums (null: no mean) are updated in place; all but values
- * are null if it is not trained. step: quantization step, 0 for none. before [before_count]: values from which changes of the
- * first numbers are priced, or null. */
+ * are null if it is not trained. step: quantization step, 0 for none. before [before_count]: values from which the rate
+ * term counts changes of the first numbers, or null. */
 struct sgs_leaf {
     float *values, *first, *second, *sums;
     const float* before;

@@ -29,9 +29,7 @@ from pathlib import Path
 
 from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.errors import StorageError, TaskError
-from structgstream.executors.executor import TaskQueue
-from structgstream.executors.local import LocalEngine
-from structgstream.executors.task import PYTHON, WorkerSlot
+from structgstream.executors.tasks import PYTHON, LocalEngine, TaskQueue, WorkerSlot
 from structgstream.parallel.driver import Job, Unit, drive
 from structgstream.parallel.exchange import ObjectFolder, ObjectStore
 from structgstream.parallel.parts import Parts

@@ -22,9 +22,8 @@ from collections import defaultdict
 from pathlib import Path
 
 from structgstream.data.dataset_layouts import bundled_clip_path
-from structgstream.executors.executor import ExecutorName, ExecutorOptions, open_executor
-from structgstream.executors.task import PYTHON, Task
-from structgstream.parallel.driver import Job, Status, Unit, drive
+from structgstream.executors.tasks import PYTHON, ExecutorName, ExecutorOptions, Task, open_executor
+from structgstream.parallel.driver import Job, State, Status, Unit, drive
 from structgstream.parallel.parts import Parts
 from tests.support import stand_in
 
@@ -160,7 +159,7 @@ def planned(row: str, folder: Path) -> dict[str, object]:
     parts, begun, seen = Parts(folder / "parts"), time.monotonic(), list[float]()
 
     def tell(status: Status) -> None:
-        if status.tracked == PLANNED:
+        if len(status.states) == PLANNED and State.UNTRACKED not in status.states:
             seen.append(time.monotonic() - begun)
             if sum(state == "done" for state in status.states) >= ENOUGH:
                 raise Enough

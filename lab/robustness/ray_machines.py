@@ -22,9 +22,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from lab.robustness.parallel_faults import driven, engine, job_in
-from structgstream.executors.executor import TaskQueue
-from structgstream.executors.ray_cluster import RayEngine, RayOptions
-from structgstream.executors.task import Task
+from structgstream.executors.ray_cluster import RayEngine
+from structgstream.executors.tasks import Task, TaskQueue
 from structgstream.parallel.driver import drive
 from structgstream.parallel.parts import Parts
 
@@ -97,7 +96,7 @@ def ray_node(name: str, *options: str, token: Path, folder: Path) -> Iterator[No
 def in_the_cluster(folder: Path) -> dict[str, object]:
     """What a driver on ``head`` does: a parallel run, and a count of the machines that tasks ran on."""
     begun = time.monotonic()
-    joined = RayEngine(RayOptions(f"{address('head')}:{PORT}"))
+    joined = RayEngine(f"{address('head')}:{PORT}")
     result: dict[str, object] = {"seconds to join": round(time.monotonic() - begun, 2)}
     end = time.monotonic() + PATIENCE_SECONDS
     while joined.workers() < 2 and time.monotonic() < end:

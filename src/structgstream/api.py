@@ -46,11 +46,7 @@ def example_clip() -> Path:
 
 
 def prepare(
-    videos: Path | str,
-    capture: Path | str,
-    *,
-    options: PrepareOptions | None = None,
-    listener: Listener | None = None,
+    videos: Path | str, capture: Path | str, *, options: PrepareOptions | None = None, listener: Listener | None = None
 ) -> Preparation:
     """Turns videos of static cameras into a calibrated capture, and checks it.
 

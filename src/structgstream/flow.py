@@ -34,6 +34,14 @@ BLOCK_COST_PER_CELL = 0.6
 """Cost of a displacement by one cell, in the same levels, which decides in untextured regions."""
 
 
+COLOR_DIFFERENCE = 20
+"""Mean difference of colours, in levels of 255, that inexact flow leaves at edges."""
+UNEXPLAINED_SHARE = 0.8
+"""Share of the difference without flow that flow may leave: of reflections, and of what turns."""
+LIGHT_STRIDE = 4
+"""Every so many rows and columns a pixel is taken for the median change of light."""
+
+
 def dis_search(extra: str, *, refined: bool = True, finest_level: int = 1) -> FlowSearch:
     """Flow by dense inverse search (Kroeger et al., 2016) on grey pictures.
 
@@ -181,6 +189,39 @@ def consistency_mask(flow: NDArray[np.float32], back: NDArray[np.float32]) -> ND
     rest = _squared_lengths(flow + returned)
     lengths = _squared_lengths(flow) + _squared_lengths(returned)
     return (rest <= RELATIVE * lengths + ABSOLUTE) & inside(flow)
+
+
+def same_color(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], flow: NDArray[np.float32], *, radius: int
+) -> NDArray[np.bool_]:
+    """Mask ``[H, W]`` of the pixels of ``first`` that have the colour of the pixel of ``second`` to which flow leads.
+
+    A plain object in front of a still background can have flow 0 both ways, which is consistent but wrong: what is
+    there next has another colour. Colours are means over squares, and may differ by :data:`COLOR_DIFFERENCE` or by
+    :data:`UNEXPLAINED_SHARE` of the difference without flow; a change of all the light is subtracted.
+
+    Args:
+        first: ``[H, W, 3]``.
+        second: ``[H, W, 3]``.
+        flow: ``[H, W, 2]`` from ``first`` to ``second``, pixels.
+        radius: from the middle of a square to its sides, pixels.
+
+    Raises:
+        MissingExtraError: OpenCV is not installed.
+    """
+    cv2 = _opencv("capture")
+    side = (2 * radius + 1, 2 * radius + 1)
+    one, other = (cv2.blur(picture, side) for picture in (first, second))
+    height, width = one.shape[:2]
+    x = flow[..., 0] + np.arange(width, dtype=np.float32)
+    y = flow[..., 1] + np.arange(height, dtype=np.float32)[:, None]
+    reached = cv2.remap(other, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    samples = slice(None, None, LIGHT_STRIDE)
+    light = np.median(one[samples, samples].astype(np.int16) - reached[samples, samples], axis=(0, 1))
+    unlit = np.clip(one - light, 0.0, 255.0).astype(np.uint8) if light.any() else one
+    mean = np.full((1, 3), 1 / 3, np.float32)
+    remaining, before = (cv2.transform(cv2.absdiff(unlit, to), mean) for to in (reached, other))
+    return np.asarray(remaining <= np.maximum(COLOR_DIFFERENCE, np.float32(UNEXPLAINED_SHARE) * before))
 
 
 def _squared_lengths(vectors: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -39,14 +39,10 @@ LogExtras = Callable[[FrameReport], Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class Run:
-    """A reconstruction into a file.
+    """A reconstruction into a file."""
 
-    Args:
-        done: number of frames that the file had at the start.
-        reports: reports of the further frames; each step of the generator fits, stores and logs a frame.
-    """
-
-    done: int
+    done: int  # number of frames that the file had at the start
+    # reports of the further frames; each step of the generator fits, stores and logs a frame
     reports: Generator[FrameReport, None, None]
 
 
@@ -69,13 +65,8 @@ def record(
     Args:
         path: the file; an existing one is replaced unless it is resumed.
         source: the capture; frames of a recording are read ahead.
-        pipeline: fits and stores frames.
-        backend: the compute back-end.
-        resume: continue after the last complete frame of an existing file.
         storage: opens another sink than a file at ``path``, such as :func:`segments_at`.
         metadata: plain JSON values for the header, equal in all runs of a stream.
-        on_step: called after every optimisation step.
-        remarks: see :data:`LogExtras`.
 
     Raises:
         ConfigError: the file to resume was made with another configuration or from another capture.
@@ -97,10 +88,7 @@ def log_reports(
     """The reports of a session, each written to the log next to ``path`` before it is yielded.
 
     Args:
-        reports: the reports; closed with the result.
-        path: the file that the session writes.
         done: number of existing frames, whose lines of the log are retained.
-        remarks: see :data:`LogExtras`.
 
     Raises:
         StorageError: the log cannot be written.
@@ -162,7 +150,6 @@ def check_output(path: Path, *, may_exist: bool, resume: bool = True) -> None:
     """Check that the stream can be written; called before the fit of frame 0, which takes minutes.
 
     Args:
-        path: the file.
         may_exist: whether an existing file is replaced or continued.
         resume: whether the message names ``--resume``.
 
@@ -193,10 +180,6 @@ class PreviewSink:
 
     The picture is rendered on the CPU from the decoded packet, so that the run's GPU memory and random numbers do not
     change. A preview that cannot be written is skipped.
-
-    Args:
-        sink: receives the stream.
-        store: receives the picture.
     """
 
     def __init__(self, sink: PacketSink, store: Store) -> None:
@@ -224,12 +207,7 @@ class PreviewSink:
 
 
 def preview(header: StreamHeader, packet: Packet) -> NDArray[np.uint8]:
-    """A key frame ``[H, W, 3]`` (8-bit sRGB) from the middle training camera, at most 320 pixels wide.
-
-    Args:
-        header: header of the packet's period.
-        packet: a key packet.
-    """
+    """A key frame ``[H, W, 3]`` (8-bit sRGB) from the middle training camera, at most 320 pixels wide."""
     name = header.rig.training[len(header.rig.training) // 2]
     camera = header.rig[name]
     width = min(WIDTH, camera.width)

@@ -46,11 +46,7 @@ def metrics_path(stream: Path) -> Path:
 
 
 class Figures:
-    """Statistics of the last frames of a stream, or of all its qualities.
-
-    Args:
-        fps: frames per second of the media.
-    """
+    """Statistics of the last frames of a stream, or of all its qualities."""
 
     def __init__(self, fps: float) -> None:
         self._fps = fps
@@ -85,15 +81,8 @@ class RunMetrics:
     """Collects and writes the metrics of a run.
 
     Args:
-        stream: the file or folder that the run writes.
-        fps: frames per second of the media.
-        total: number of frames; None if unknown.
-        done: number of frames that existed at the start.
-        live: returns the state of live cameras; None for a recording.
         captured: returns the time of capture of a frame by its index, Unix time; None if unknown.
         qualities: names of the qualities of each frame; empty for a single stream.
-        now: returns monotonic seconds.
-        unix: returns Unix time.
     """
 
     def __init__(

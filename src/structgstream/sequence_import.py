@@ -27,6 +27,7 @@ from structgstream.codec.fields.static_fields import UNCODED_FIELDS
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.codec.sinks import FileSink
 from structgstream.errors import CaptureError
+from structgstream.evaluation.camera_path import look_at
 from structgstream.exporters.bake import BakedGaussians
 from structgstream.exporters.ply import MIN_OPACITY, read_header, read_ply
 from structgstream.exporters.write import pictures_psnr
@@ -56,23 +57,14 @@ _FRAME_BITS = 32
 
 @dataclass(frozen=True)
 class ImportedSequence:
-    """What became of a sequence.
+    """What became of a sequence."""
 
-    Args:
-        frames: number of frames.
-        counts: fewest and most Gaussians of a frame.
-        linked: whether Gaussians live on from frame to frame; else each frame is stored by itself.
-        degree: degree of the spherical harmonics of the files.
-        color_psnr: PSNR, dB, of pictures of frame 0 with one colour for each Gaussian, against the files.
-        psnr: the same of the stream, which is quantized, too.
-    """
-
-    frames: int
-    counts: tuple[int, int]
-    linked: bool
-    degree: int
-    color_psnr: float
-    psnr: float
+    frames: int  # number of frames
+    counts: tuple[int, int]  # fewest and most Gaussians of a frame
+    linked: bool  # whether Gaussians live on from frame to frame; else each frame is stored by itself
+    degree: int  # degree of the spherical harmonics of the files
+    color_psnr: float  # PSNR, dB, of pictures of frame 0 with one colour for each Gaussian, against the files
+    psnr: float  # the same of the stream, which is quantized, too
 
 
 def import_sequence(
@@ -89,14 +81,9 @@ def import_sequence(
     """Writes a stream of ``.ply`` files, one for each frame (Note [Imported sequences]).
 
     Args:
-        files: the files, in order (``ply.find_sequence``).
-        output: the stream file; replaced if it exists.
-        fps: frames per second.
-        backend: draws the pictures that are compared.
         rig: cameras in the units of the files; None for a ring around the Gaussians of the first file.
         down: direction of gravity, for the ring.
         max_splats: largest number of Gaussians of a frame; the smallest and most transparent are left out.
-        on_frame: called after each frame.
 
     Raises:
         CaptureError: a file is not a ``.ply`` of Gaussians, is damaged or has too many Gaussians.
@@ -186,11 +173,8 @@ def ring_around(gaussians: BakedGaussians, down: tuple[float, float, float]) -> 
     for number in range(RING_CAMERAS):
         angle = 2.0 * math.pi * number / RING_CAMERAS
         level = math.cos(angle) * side + math.sin(angle) * depth
-        forward = math.sin(up) * vertical - math.cos(up) * level
-        right = torch.nn.functional.normalize(torch.linalg.cross(vertical, forward), dim=0)
-        viewmat = torch.eye(4, dtype=torch.float64)
-        viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
-        viewmat[:3, 3] = -viewmat[:3, :3] @ (middle - RING_DISTANCE * radius * forward)
+        eye = middle - RING_DISTANCE * radius * (math.sin(up) * vertical - math.cos(up) * level)
+        viewmat = look_at(eye, middle, vertical)
         cameras[f"view{number}"] = Camera(viewmat, K, width, height, near=radius / 100.0)
     return CameraRig(cameras)
 

@@ -10,7 +10,7 @@ from contextlib import suppress
 
 import pytest
 
-from structgstream.cli.signals import interruptible
+from structgstream.cli.app import interruptible
 
 LONG = 60.0
 

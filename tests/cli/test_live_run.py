@@ -5,6 +5,7 @@ import json
 import os
 import signal
 from pathlib import Path
+from threading import Event
 
 import pytest
 
@@ -63,16 +64,10 @@ def test_options_of_live_cameras_need_the_word(tmp_path: Path, capsys) -> None:
 
 
 def test_ctrl_c_ends_after_the_frame_and_twice_at_once(capsys) -> None:
-    class Source:
-        stopped = False
-
-        def stop(self) -> None:
-            self.stopped = True
-
-    source, before = Source(), signal.getsignal(signal.SIGINT)
-    with stop_on_interrupt(source):  # type: ignore[arg-type]
+    pressed, before = Event(), signal.getsignal(signal.SIGINT)
+    with stop_on_interrupt(pressed.is_set, pressed.set):
         os.kill(os.getpid(), signal.SIGINT)
-        assert source.stopped
+        assert pressed.is_set()
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is before

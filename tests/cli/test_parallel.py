@@ -11,8 +11,7 @@ from structgstream.cli.options import CaptureOptions
 from structgstream.cli.parallel import Parallel, WorkerOptions, _job, join_arguments
 from structgstream.codec.reader import open_stream
 from structgstream.evaluation.environment import usable_cores
-from structgstream.executors.executor import ExecutorOptions, TaskQueue, open_executor
-from structgstream.executors.task import TaskResult
+from structgstream.executors.tasks import ExecutorOptions, TaskQueue, TaskResult, open_executor
 from structgstream.owned_folders import MARKER, Owner
 from structgstream.parallel.exchange import ObjectFolder
 from structgstream.parallel.parts import PURPOSE, Parts

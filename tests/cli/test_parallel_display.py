@@ -15,7 +15,6 @@ STATUS = Status(
     "groups",
     [(0, 30), (30, 60), (60, 90), (90, 100)],
     (State.DONE, State.RUNNING, State.READY, State.UNTRACKED),
-    tracked=3,
 )
 
 

@@ -6,8 +6,7 @@ import io
 import pytest
 from rich.console import Console
 
-from structgstream.cli.progress import print_lines, printable
-from structgstream.cli.tables import literal_cells
+from structgstream.cli.progress import literal_cells, print_lines, printable
 
 
 def test_names_with_brackets_and_long_paths_stay_as_they_are() -> None:

@@ -20,7 +20,6 @@ import pytest
 from structgstream.cli import main
 from structgstream.codec.sinks import FileSink
 from structgstream.data.dataset_layouts import bundled_clip_path
-from structgstream.serve import listening
 from tests.support.rigs import random_scene
 from tests.support.streams import header_for, small_stream, write_stream
 
@@ -178,13 +177,3 @@ def test_a_missing_extra_is_reported(
     monkeypatch.setitem(sys.modules, missing, None)  # type: ignore[arg-type]
     error = error_of([str(tmp_path / "s.sgs")], capsys, status=1)
     assert "pip install 'structgstream[serve]'" in error
-
-
-def test_a_browser_is_opened_only_where_there_is_a_screen(monkeypatch: pytest.MonkeyPatch) -> None:
-    opened: list[str] = []
-    monkeypatch.setattr(listening.webbrowser, "open", lambda address: not opened.append(address))
-    assert not listening.open_browser("http://127.0.0.1:1/", environ={"DISPLAY": ""})
-    assert opened == []
-    for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
-        assert listening.open_browser("http://127.0.0.1:1/", environ={name: "x"})
-    assert len(opened) == 3

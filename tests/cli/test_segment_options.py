@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.cli.app import UsageError
-from structgstream.cli.segment_options import SegmentOptions
+from structgstream.cli.options import SegmentOptions
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.quality_list import ListedQuality, write_list
 from structgstream.codec.segments.store import FolderStore

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.cli import main, segment_options
+from structgstream.cli import main
+from structgstream.cli import options as cli_options
 from structgstream.cli.progress import Lines
 from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.recovery import stale_files
@@ -63,22 +64,6 @@ def test_inspect_evaluate_render_and_export_give_the_same(made: Path, tmp_path: 
     assert outputs[0] == outputs[1]
 
 
-def test_a_folder_is_continued_without_saying_what_it_is(
-    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    common = ["reconstruct", CLIP, "-o", str(out), *QUARTER]
-    assert main([*common, "--sink", "segments", "--frames", "2"]) == 0
-    assert main([*common, "--frames", "3"]) == 1
-    assert "out contains a stream; continue it with --resume" in capsys.readouterr().err
-    assert main([*common, "--frames", "3", "--resume"]) == 0
-    with open_stream(out) as reader:
-        assert reader.total_bytes == (made / "file.sgs").stat().st_size
-    assert main(["archive", str(out), "-o", str(tmp_path / "a.sgs")]) == 0
-    assert (tmp_path / "a.sgs").read_bytes() == (made / "file.sgs").read_bytes()
-    assert (tmp_path / "out.log.jsonl").is_file()
-
-
 def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, status, message in (
         (["-o", str(tmp_path / "a.sgs"), "--window", "9"], 2, "--window is for --sink segments"),
@@ -92,22 +77,31 @@ def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert "cannot be made" in capsys.readouterr().err
 
 
-def test_sigterm_finishes_the_frame_and_closes_the_stream(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_sigterm_finishes_the_frame_and_closes_the_stream_which_is_continued_without_saying_what_it_is(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Status 143; with --resume it goes on."""
+    """Status 143; with --resume it goes on to the same bytes."""
 
     def terminated(self: Lines, report: FrameReport) -> None:
         if report.index == 1:
             os.kill(os.getpid(), signal.SIGTERM)
 
     out = tmp_path / "out"
-    monkeypatch.setattr(Lines, "frame", terminated)
-    asked = ["reconstruct", CLIP, *QUARTER, "-o", str(out), "--sink", "segments", "--frames", "12"]
-    error = " ".join(error_of(asked, capsys, status=143).split())
+    common = ["reconstruct", CLIP, "-o", str(out), *QUARTER]
+    with monkeypatch.context() as patch:
+        patch.setattr(Lines, "frame", terminated)
+        asked = [*common, "--sink", "segments", "--frames", "12"]
+        error = " ".join(error_of(asked, capsys, status=143).split())
     manifest = read_manifest(FolderStore(out))
     assert (manifest.live, manifest.parts, manifest.edge.frame) == (False, (), 1)
     assert f"{out} has 2 of 12 frames; continue with the same command and --resume." in error
+    assert "out contains a stream; continue it with --resume" in error_of([*common, "--frames", "3"], capsys, status=1)
+    assert main([*common, "--frames", "3", "--resume"]) == 0
+    with open_stream(out) as reader:
+        assert reader.total_bytes == (made / "file.sgs").stat().st_size
+    assert main(["archive", str(out), "-o", str(tmp_path / "a.sgs")]) == 0
+    assert (tmp_path / "a.sgs").read_bytes() == (made / "file.sgs").read_bytes()
+    assert (tmp_path / "out.log.jsonl").is_file()
 
 
 def test_publishing_to_s3(
@@ -121,12 +115,12 @@ def test_publishing_to_s3(
         monkeypatch.setenv("AWS_ENDPOINT_URL", options["endpoint_url"])
         monkeypatch.setenv("AWS_ACCESS_KEY_ID", options["key"])
         monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", options["secret"])
-        monkeypatch.setattr(segment_options, "FINISH_SECONDS", 0.0)
+        monkeypatch.setattr(cli_options, "FINISH_SECONDS", 0.0)
         url = f"s3://{BUCKET}/out"
         command = ["reconstruct", CLIP, "-o", str(out), "--frames", "3", *QUARTER]
         command += ["--sink", "segments", "--publish", url]
         assert main([*command, "--resume"]) == 0
-        monkeypatch.setattr(segment_options, "FINISH_SECONDS", 120.0)
+        monkeypatch.setattr(cli_options, "FINISH_SECONDS", 120.0)
         assert main([*command, "--resume"]) == 0
         remote = CloudStore(url, **options)
         here = FolderStore(out)

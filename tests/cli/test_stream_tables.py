@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from structgstream.cli.inspect import bit_rate_text, facts_table, header_table, packet_table, period_table
-from structgstream.cli.tables import SHOWN_FRAMES
+from structgstream.cli.progress import SHOWN_FRAMES
 from structgstream.evaluation.byte_count import Row
 
 HEADER: dict[str, Any] = {

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from structgstream.cli.tables import SHOWN_FRAMES, quality_text, report_tables
+from structgstream.cli.evaluate import quality_text, report_tables
+from structgstream.cli.progress import SHOWN_FRAMES
 from structgstream.evaluation.report import FrameScores, Report, Scores
 
 FACTS: dict[str, Any] = {

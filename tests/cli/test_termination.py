@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from structgstream.cli.signals import Terminated, Termination
+from structgstream.cli.app import Terminated, Termination
 
 
 def send() -> None:

@@ -15,8 +15,7 @@ from structgstream.atomic_files import partial_path
 from structgstream.cli import main
 from structgstream.codec.sinks import FileSink
 from structgstream.groups import base, track_pass
-from structgstream.groups.boundaries import groups_path
-from structgstream.groups.track_file import TrackHead, TrackWriter
+from structgstream.groups.track_file import TrackHead, TrackWriter, groups_path
 from structgstream.session.presets import TINY, to_json
 from tests.support.quick_streams import CLIP, error_of
 from tests.support.streams import header_for, small_scene, write_stream

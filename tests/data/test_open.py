@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from structgstream.cameras import CameraRig
-from structgstream.data.open import LAYOUTS, open_capture
+from structgstream.data.open import LAYOUTS_HELP, open_capture
 from structgstream.errors import CalibrationError, CaptureError, ConfigError
 from tests.support.captures import (
     all_numbers,
@@ -91,11 +91,11 @@ def test_folders_that_hold_no_capture(tmp_path: Path) -> None:
         open_capture(tmp_path / "nowhere")
     with pytest.raises(CaptureError, match="is an empty folder") as caught:
         open_capture(tmp_path)
-    assert LAYOUTS in str(caught.value)
+    assert LAYOUTS_HELP in str(caught.value)
     (tmp_path / "holiday.jpg").write_bytes(b"")
     with pytest.raises(CaptureError, match=r"no supported layout; it holds holiday\.jpg") as caught:
         open_capture(tmp_path)
-    assert LAYOUTS in str(caught.value)
+    assert LAYOUTS_HELP in str(caught.value)
     with pytest.raises(CaptureError, match="is a file"):
         open_capture(tmp_path / "holiday.jpg")
 

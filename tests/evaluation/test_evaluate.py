@@ -16,18 +16,17 @@ from structgstream.data.images import ImageSource
 from structgstream.data.wrappers import section
 from structgstream.errors import BackendError, CaptureError, ConfigError
 from structgstream.evaluation.evaluate import compared_frames, evaluate
-from structgstream.evaluation.facts import numbers_of
 from structgstream.evaluation.lpips import ENVIRONMENT
 from structgstream.evaluation.metrics import PSNR_OF_EQUALS
-from structgstream.evaluation.recording import to_device
+from structgstream.evaluation.recording import numbers_of, to_device
 from structgstream.evaluation.report import as_json
 from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians
-from structgstream.kernels.backend import reference_backend
 from structgstream.memory import resident_bytes
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC
 from structgstream.similarity import Similarity
+from tests.support.backends import quickest_backend
 from tests.support.memory_captures import MemoryCapture
 from tests.support.reports import mean_of
 from tests.support.worlds import World, emerging_ball, moving_world
@@ -114,7 +113,7 @@ def world() -> World:
 
 
 def run(reader: Any, source: Any, **options: Any):
-    return evaluate(reader, source, backend=reference_backend(), **options)
+    return evaluate(reader, source, backend=quickest_backend(), **options)
 
 
 def test_a_perfect_stream_scores_as_equal(world: World) -> None:
@@ -237,7 +236,7 @@ def test_the_observer_sees_every_picture(world: World) -> None:
 def test_compared_frames_are_truth_and_rendering(world: World) -> None:
     reader: Any = in_the_stream(world, similarity=Similarity(), follow=True)
     source: Any = MemoryCapture(world.rig, world.frames)
-    pairs = list(compared_frames(reader, source, backend=reference_backend(), camera="cam00"))
+    pairs = list(compared_frames(reader, source, backend=quickest_backend(), camera="cam00"))
     assert len(pairs) == 4
     for truth, picture in pairs:
         np.testing.assert_array_equal(truth, picture)

@@ -13,7 +13,8 @@ from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.data.wrappers import section
 from structgstream.errors import CaptureError, ConfigError
-from structgstream.evaluation.facts import (
+from structgstream.evaluation.recording import (
+    Recording,
     check_same_frames,
     check_same_rig,
     numbers_of,
@@ -21,7 +22,6 @@ from structgstream.evaluation.facts import (
     stream_facts,
     training_facts,
 )
-from structgstream.evaluation.recording import Recording
 from structgstream.frames import MultiViewFrame
 from tests.support.rigs import arc_rig
 from tests.support.streams import header_for, small_scene

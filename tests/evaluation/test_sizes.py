@@ -6,10 +6,11 @@ import pytest
 import torch
 
 from structgstream.evaluation.metrics import PSNR_OF_EQUALS
-from structgstream.evaluation.sizes import block_mask, block_means, half_scores, halved, stored_size
+from structgstream.evaluation.pictures import block_mask, block_means
+from structgstream.evaluation.sizes import half_scores, halved, stored_size
 from structgstream.frames import MultiViewFrame
-from structgstream.kernels.backend import reference_backend
 from structgstream.scene.render import render, to_8bit_image
+from tests.support.backends import quickest_backend
 from tests.support.memory_captures import MemoryCapture
 from tests.support.rigs import arc_rig
 from tests.support.worlds import World, moving_world
@@ -44,7 +45,7 @@ def test_half_of_an_odd_picture_shows_the_same_places() -> None:
 
 def test_half_size_compares_with_the_mean_of_the_truth(world: World) -> None:
     """A truth whose area mean is the small rendering scores as equal; one that is brighter as its offset says."""
-    backend, camera = reference_backend(), world.rig["cam00"]
+    backend, camera = quickest_backend(), world.rig["cam00"]
     small = to_8bit_image(render(world.scene, halved(camera), backend).image)
     truth = small.repeat(2, 0).repeat(2, 1)
     scores = half_scores(world.scene, halved(camera), truth, backend=backend)
@@ -59,7 +60,7 @@ def test_half_size_compares_with_the_mean_of_the_truth(world: World) -> None:
 
 
 def test_the_stored_size_is_scored_in_few_spread_frames(world: World) -> None:
-    backend = reference_backend()
+    backend = quickest_backend()
     rig = world.rig.mapped({name: world.rig[name].resized(96, 64) for name in world.rig})
     picture = to_8bit_image(render(world.scene, rig["cam00"], backend).image)
     frames = [MultiViewFrame(i, i / 30, {"cam00": picture}) for i in range(20)]

@@ -11,9 +11,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.errors import ConfigError
-from structgstream.executors.executor import TaskQueue
-from structgstream.executors.local import LocalEngine
-from structgstream.executors.task import Task, WorkerSlot
+from structgstream.executors.tasks import LocalEngine, Task, TaskQueue, WorkerSlot
 from tests.support.sleepers import PATIENCE_SECONDS, all_endings, begun, module, writes
 
 

@@ -7,11 +7,9 @@ from typing import Any
 import pytest
 
 from structgstream.errors import ConfigError, MissingExtraError
-from structgstream.executors import executor as opening
 from structgstream.executors import ray_cluster
-from structgstream.executors.executor import ExecutorName, ExecutorOptions, open_executor
-from structgstream.executors.ray_cluster import RayOptions
-from structgstream.executors.task import Task, WorkerSlot
+from structgstream.executors import tasks as opening
+from structgstream.executors.tasks import ExecutorName, ExecutorOptions, Task, WorkerSlot, open_executor
 from tests.support.sleepers import all_endings
 
 
@@ -56,7 +54,7 @@ def test_a_cluster_of_this_machine_has_its_share_and_one_that_is_joined_one_thre
     open_and_close(ExecutorOptions("ray", workers=2), cores=8)
     open_and_close(ExecutorOptions("ray", workers=2, address="head:1"), cores=8)
     open_and_close(ExecutorOptions("ray", workers=2, threads=3, address="head:1"), cores=8)
-    assert opened == [RayOptions(None, 2, 4), RayOptions("head:1", 2, 1), RayOptions("head:1", 2, 3)]
+    assert opened == [None, 2, 4, "head:1", 2, 1, "head:1", 2, 3]
 
 
 @pytest.mark.parametrize("name", ["local", "ray"])

@@ -12,9 +12,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.executors import local as process
-from structgstream.executors.local import CommandProcess, opened_log, tail_of, waited_for
-from structgstream.executors.task import PYTHON, TAIL_BYTES, Task, TaskResult
+from structgstream.executors import tasks as process
+from structgstream.executors.tasks import (
+    PYTHON,
+    TAIL_BYTES,
+    CommandProcess,
+    Task,
+    TaskResult,
+    opened_log,
+    tail_of,
+    waited_for,
+)
 from tests.support.properties import examples
 from tests.support.sleepers import PATIENCE_SECONDS
 

@@ -13,9 +13,8 @@ from typing import Any
 import pytest
 
 from structgstream.errors import ConfigError, MissingExtraError
-from structgstream.executors.executor import TaskQueue
-from structgstream.executors.ray_cluster import CommandKilled, RayEngine, RayOptions, run_task
-from structgstream.executors.task import Task
+from structgstream.executors.ray_cluster import CommandKilled, RayEngine, run_task
+from structgstream.executors.tasks import Task, TaskQueue
 from tests.support.sleepers import all_endings
 
 
@@ -84,7 +83,7 @@ def ray(monkeypatch: pytest.MonkeyPatch) -> FakeRay:
 
 
 def test_a_cluster_that_is_begun_here_has_a_token_and_nothing_that_tells_or_listens(ray: FakeRay) -> None:
-    begun = RayEngine(RayOptions(None, workers=2, cores=3))
+    begun = RayEngine(None, workers=2, cores=3)
     assert os.environ["RAY_AUTH_MODE"] == "token"
     assert len(os.environ["RAY_AUTH_TOKEN"]) == 64
     assert os.environ["RAY_USAGE_STATS_ENABLED"] == "0"
@@ -96,7 +95,7 @@ def test_a_cluster_that_is_begun_here_has_a_token_and_nothing_that_tells_or_list
 
 
 def test_tasks_are_repeated_by_ray_when_killed_and_few_are_in_flight(ray: FakeRay) -> None:
-    with TaskQueue(RayEngine(RayOptions(None, workers=2, cores=2))) as executor:
+    with TaskQueue(RayEngine(None, workers=2, cores=2)) as executor:
         for i in range(20):
             executor.submit(Task(f"{i}", ("true",), log=Path("log.txt"), retries=3))
         endings = all_endings(executor)
@@ -112,7 +111,7 @@ def test_tasks_are_repeated_by_ray_when_killed_and_few_are_in_flight(ray: FakeRa
 
 def test_what_ray_gives_up_counts_as_killed_and_says_why(ray: FakeRay) -> None:
     ray.fails = {"bad"}
-    with TaskQueue(RayEngine(RayOptions())) as executor:
+    with TaskQueue(RayEngine()) as executor:
         executor.submit(Task("bad", ("true",)))
         ending = all_endings(executor)["bad"]
     assert ending.killed
@@ -121,7 +120,7 @@ def test_what_ray_gives_up_counts_as_killed_and_says_why(ray: FakeRay) -> None:
 
 
 def test_closing_cancels_what_runs(ray: FakeRay) -> None:
-    executor = TaskQueue(RayEngine(RayOptions()))
+    executor = TaskQueue(RayEngine())
     executor.submit(Task("a", ("true",)))
     executor._begin()
     executor.close()
@@ -132,12 +131,12 @@ def test_closing_cancels_what_runs(ray: FakeRay) -> None:
 def test_a_cluster_without_a_token_is_not_joined(ray: FakeRay, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(Path, "home", lambda: tmp_path)
     with pytest.raises(ConfigError, match="no token for the Ray cluster"):
-        RayEngine(RayOptions("head:6379"))
+        RayEngine("head:6379")
     os.environ["RAY_AUTH_MODE"] = "disabled"
     with pytest.raises(ConfigError, match="RAY_AUTH_MODE is 'disabled'"):
-        RayEngine(RayOptions("head:6379"))
+        RayEngine("head:6379")
     os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(tmp_path)}
-    joined = RayEngine(RayOptions("head:6379"))
+    joined = RayEngine("head:6379")
     assert ray.given["address"] == "head:6379"
     joined.stop()
 
@@ -149,29 +148,28 @@ def test_a_cluster_that_refuses_is_reported(ray: FakeRay, monkeypatch: pytest.Mo
     os.environ["RAY_AUTH_TOKEN"] = "word"
     monkeypatch.setattr(ray, "init", refused)
     with pytest.raises(ConfigError, match=r"head:6379 cannot be joined \(Failed to connect\)"):
-        RayEngine(RayOptions("head:6379"))
+        RayEngine("head:6379")
     with pytest.raises(ConfigError, match=r"cannot be started here \(Failed to connect\)"):
-        RayEngine(RayOptions())
+        RayEngine()
 
 
 def test_an_old_ray_or_none_is_reported(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ray, "__version__", "2.51.2", raising=False)
     with pytest.raises(ConfigError, match="Ray 2.51.2 has no token authentication; 2.52 is the first"):
-        RayEngine(RayOptions())
+        RayEngine()
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingExtraError, match="cluster"):
-        RayEngine(RayOptions())
+        RayEngine()
 
 
 REAL = """
 import json, os
-from structgstream.executors.executor import TaskQueue
-from structgstream.executors.ray_cluster import RayEngine, RayOptions
-from structgstream.executors.task import PYTHON, Task
+from structgstream.executors.ray_cluster import RayEngine
+from structgstream.executors.tasks import PYTHON, Task, TaskQueue
 from tests.support.sleepers import all_endings
-with TaskQueue(RayEngine(RayOptions(None, workers=2))) as executor:
+with TaskQueue(RayEngine(None, workers=2)) as executor:
     executor.submit(Task("first", ("sh", "-c", "echo $OMP_NUM_THREADS")))
-    executor.submit(Task("python", (PYTHON, "-m", "this")), after=["first"])
+    executor.submit(Task("python", (PYTHON, "-m", "this")))
     executor.submit(Task("bad", ("sh", "-c", "echo no power; exit 3")))
     executor.submit(Task("once", ("sh", "-c", "test -e {0}/once || {{ touch {0}/once; kill -9 $$; }}".format({1!r}))))
     executor.submit(Task("always", ("sh", "-c", "echo x >> {0}/always; kill -9 $$".format({1!r})), retries=2))

@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 
 from structgstream.executors import ray_cluster as ray_worker
-from structgstream.executors.local import CommandProcess
 from structgstream.executors.ray_cluster import CommandKilled, run_task
-from structgstream.executors.task import Task, TaskResult
+from structgstream.executors.tasks import CommandProcess, Task, TaskResult
 
 
 def test_an_ending_comes_back_also_of_one_that_fails() -> None:

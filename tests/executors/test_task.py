@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from structgstream.executors.task import PYTHON, Task, TaskResult, argv_of
+from structgstream.executors.tasks import PYTHON, Task, TaskResult, argv_of
 
 
 def test_only_the_first_word_is_the_interpreter() -> None:

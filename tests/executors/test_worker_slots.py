@@ -4,7 +4,7 @@
 import pytest
 
 from structgstream.errors import ConfigError
-from structgstream.executors.task import WorkerSlot, allocate_slots
+from structgstream.executors.tasks import WorkerSlot, allocate_slots
 
 
 @pytest.mark.parametrize(("workers", "threads"), [(None, [1] * 8), (3, [2] * 3), (1, [8]), (12, [1] * 12)])

@@ -10,17 +10,17 @@ import torch
 from structgstream.errors import StreamError
 from structgstream.exporters.bake import BakedGaussians, bake, with_low_pass
 from structgstream.geometry import quaternion_matrices
-from structgstream.kernels.backend import reference_backend
 from structgstream.scene.harmonics import MAX_DEGREE, sh_basis
 from structgstream.scene.render import Drawable, render
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
 from structgstream.similarity import Similarity
+from tests.support.backends import quickest_backend
 from tests.support.rigs import arc_rig, random_scene
 
 RIG = arc_rig(6, width=64, height=48)
 CAMERAS = [RIG[name] for name in RIG.training]
-BACKEND = reference_backend()
+BACKEND = quickest_backend()
 
 
 def distance(one: Drawable, other: Drawable, names: tuple[str, ...] = RIG.training) -> float:

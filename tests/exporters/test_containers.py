@@ -14,7 +14,7 @@ import torch
 from structgstream.errors import StreamError
 from structgstream.exporters.bake import BakedGaussians
 from structgstream.exporters.formats import Format, FrameOptions
-from structgstream.exporters.glb import glb_bytes
+from structgstream.exporters.web import glb_bytes
 from structgstream.exporters.write import open_output
 from structgstream.scene.harmonics import Y0
 from tests.support.plain import RIG, picture, psnr, some

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.errors import ConfigError
-from structgstream.groups.boundaries import check_length, equal_groups, quiet_groups
+from structgstream.groups.track_file import check_length, equal_groups, quiet_groups
 
 
 @given(st.integers(1, 200), st.integers(1, 40))

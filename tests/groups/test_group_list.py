@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.errors import StreamError
-from structgstream.groups.boundaries import groups_path, read_groups, write_groups
+from structgstream.groups.track_file import groups_path, read_groups, write_groups
 from tests.support.properties import examples
 
 

@@ -3,20 +3,27 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
-from structgstream.groups.first_frame import LostAnchorConfig, relocate_lost_anchors
-from structgstream.kernels.backend import reference_backend
+from structgstream.groups import first_frame
+from structgstream.groups.first_frame import relocate_lost_anchors
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig, SpawnRules
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.views import training_views
+from tests.support.backends import quickest_backend
 from tests.support.worlds import moved_since, moving_world
 
 SHIFT = 0.4
 WORLD = moving_world(2, cameras=6, speed=SHIFT, width=96, height=64)
-BACKEND = reference_backend()
-CONFIG = LostAnchorConfig(neighbours=8, feature_bandwidth=5.0)
+BACKEND = quickest_backend()
+
+
+@pytest.fixture(autouse=True)
+def of_a_small_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(first_frame, "NEIGHBOURS", 8)
+    monkeypatch.setattr(first_frame, "FEATURE_BANDWIDTH", 5.0)
 
 
 def arrived(*, but: list[int], by: float = 0.0) -> Scene:
@@ -28,7 +35,7 @@ def arrived(*, but: list[int], by: float = 0.0) -> Scene:
     return replace(WORLD.scene, anchors=replace(anchors, positions=anchors.positions + shares * shift))
 
 
-def recalled(scene: Scene, *, config: LostAnchorConfig = CONFIG) -> tuple[torch.Tensor, int]:
+def recalled(scene: Scene) -> tuple[torch.Tensor, int]:
     motion = MotionConfig(enabled=True, picture_scale=1.0)
     first, views = (training_views(WORLD.frames[t], WORLD.rig, BACKEND.device) for t in (0, 1))
     found = moved_since(scene, views, first, config=motion, backend=BACKEND)
@@ -39,9 +46,7 @@ def recalled(scene: Scene, *, config: LostAnchorConfig = CONFIG) -> tuple[torch.
         views,
         find_active_tiles(split, views, config=motion, backend=BACKEND),
         floor=None,
-        min_pixels=motion.MIN_PIXELS,
-        births=SpawnRules(picture_width=96),
-        config=config,
+        rules=SpawnRules(picture_width=96),
         backend=BACKEND,
     )
     return moving.anchors.positions, count
@@ -69,16 +74,9 @@ def test_what_is_where_it_should_be_stays_bit_for_bit() -> None:
     assert torch.equal(positions, everything.anchors.positions)
 
 
-def test_what_is_a_little_off_is_left_to_the_iterations() -> None:
+def test_what_is_a_little_off_is_left_to_the_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
     row = seen_alone()
-    wide = replace(CONFIG, min_pixels=1e3)
-    positions, count = recalled(arrived(but=[row]), config=wide)
+    monkeypatch.setattr(first_frame, "MIN_LOST_PIXELS", 1e3)
+    positions, count = recalled(arrived(but=[row]))
     assert count == 0
     assert torch.equal(positions, arrived(but=[row]).anchors.positions)
-
-
-def test_it_can_be_switched_off() -> None:
-    row = seen_alone()
-    positions, count = recalled(arrived(but=[row]), config=replace(CONFIG, enabled=False))
-    assert count == 0
-    assert torch.equal(positions[row], WORLD.scene.anchors.positions[row])

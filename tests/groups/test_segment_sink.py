@@ -13,7 +13,7 @@ from structgstream.codec.container import byte_source
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import ConfigError, StorageError
 from structgstream.groups import segment_file as segment_sink
-from structgstream.groups.segment_file import GroupSoFar, SegmentSink, inspect_segment, open_segment, resume_segment
+from structgstream.groups.segment_file import GroupSoFar, SegmentSink, open_segment, resume_segment
 from tests.support.killed import folders_of_the_killed
 from tests.support.properties import examples
 from tests.support.small_segments import END, FIRST, FROM_FRAME_0, IDENTITY, base, encoded, write
@@ -49,9 +49,9 @@ def test_a_segment_has_its_name_when_it_is_whole(tmp_path: Path) -> None:
     for number in range(COUNT):
         write(path, encoded()[0][:number])
         assert not path.exists()
-        assert inspect_segment(partial_path(path)).frames == number
+        assert len(open_segment(partial_path(path)).entries) == number
     write(path, encoded()[0])
-    assert inspect_segment(path).complete
+    assert open_segment(path).complete
     assert not partial_path(path).exists()
 
 
@@ -73,7 +73,7 @@ def test_each_write_says_what_it_took(tmp_path: Path) -> None:
     assert partial_path(path).stat().st_size - before == sum(took)
     sink.close()
     sink.close()
-    assert inspect_segment(path).complete
+    assert open_segment(path).complete
 
 
 def test_the_segment_of_frame_0_begins_with_it(tmp_path: Path) -> None:
@@ -167,7 +167,7 @@ def test_a_nearly_full_disk_keeps_the_packets_before(tmp_path: Path, monkeypatch
     with pytest.raises(StorageError, match=r"g\.sgs\.partial"):
         sink.write(encoded()[0][1])
     sink.close()
-    assert inspect_segment(partial_path(path)).frames == 1
+    assert len(open_segment(partial_path(path)).entries) == 1
 
 
 def so_far(count: int) -> GroupSoFar:

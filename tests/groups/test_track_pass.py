@@ -10,9 +10,8 @@ import torch
 from structgstream.atomic_files import partial_path
 from structgstream.errors import ConfigError
 from structgstream.groups.base import GroupBase
-from structgstream.groups.boundaries import groups_path
 from structgstream.groups.segment_file import GroupSoFar, open_segment
-from structgstream.groups.track_file import open_track
+from structgstream.groups.track_file import groups_path, open_track
 from tests.support.clip_groups import FRAMES, LENGTH, OPTIONS, made, track
 
 

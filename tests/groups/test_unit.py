@@ -12,7 +12,7 @@ from structgstream.atomic_files import GrowingFile, partial_path
 from structgstream.errors import CaptureError, ConfigError, OutOfMemoryError, StorageError, StreamError
 from structgstream.groups import unit as method
 from structgstream.groups.base import GroupBase
-from structgstream.groups.segment_file import GroupSoFar, inspect_segment, open_segment
+from structgstream.groups.segment_file import GroupSoFar, open_segment
 from structgstream.scene.state import state_of
 from tests.support.backends import quickest_backend
 from tests.support.clip_groups import CAPTURE, LENGTH, fit, made, task
@@ -21,9 +21,9 @@ from tests.support.small_presets import QUICK
 
 def test_a_segment_is_finished_when_it_has_its_name() -> None:
     for number, path in enumerate(made().segments):
-        facts = inspect_segment(path)
-        assert (facts.first, facts.end, facts.frames) == (number * LENGTH, (number + 1) * LENGTH, LENGTH)
-        assert facts.complete
+        found = open_segment(path)
+        assert [frame for frame, _, _ in found.entries] == [*range(number * LENGTH, (number + 1) * LENGTH)]
+        assert found.complete
         assert not partial_path(path).exists()
 
 
@@ -39,7 +39,7 @@ def test_stopped_between_frames_and_within_one_it_goes_on_to_the_same_bytes(tmp_
     path, whole = tmp_path / "g.sgs", made().segments[1].read_bytes()
     assert fit(path, task(made(), LENGTH), stop_after=1) == 1
     assert not path.exists()
-    assert inspect_segment(partial_path(path)).frames == 1
+    assert len(open_segment(partial_path(path)).entries) == 1
     end = partial_path(path).stat().st_size
     partial_path(path).write_bytes(whole[: end + 3])
     assert fit(path, task(made(), LENGTH)) == 1
@@ -52,7 +52,7 @@ def test_a_flipped_byte_or_a_cut_end_is_repaired(tmp_path: Path) -> None:
     flipped = whole[: second + 20] + bytes([whole[second + 20] ^ 1]) + whole[second + 21 :]
     for damaged in (whole[:-1] + b"?", whole + b"more", whole[:-3], flipped):
         path.write_bytes(damaged)
-        assert not inspect_segment(path).complete
+        assert not open_segment(path).complete
     fit(path, task(made(), LENGTH))
     assert path.read_bytes() == whole
 
@@ -84,8 +84,8 @@ def test_another_group_is_not_written_over(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="another options"):
         fit(path, replace(task(made(), LENGTH), start=replace(task(made(), 0).start, iterations=8)))
     assert path.read_bytes() == made().segments[1].read_bytes()
-    assert fit(path, task(made(), 2 * LENGTH), overwrite=True) == LENGTH
-    assert path.read_bytes() == made().segments[2].read_bytes()
+    assert fit(path, task(made(), 2 * LENGTH), overwrite=True, stop_after=1) == 1
+    assert open_segment(partial_path(path)).entries[0][0] == 2 * LENGTH
 
 
 def test_one_process_writes_a_segment(tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_short_memory_lowers_the_budget_once(tmp_path: Path, monkeypatch: pytest
         return real(*arguments, **options)
 
     monkeypatch.setattr(method, "fit_group_start", short)
-    assert fit(tmp_path / "g.sgs", group) == LENGTH
+    assert fit(tmp_path / "g.sgs", group, stop_after=1) == 1
     assert [births for births, _ in asked] == [50, 12]
     assert asked[1][1] == asked[0][1] // 2
     assert '"lowered budgets": 1' in (tmp_path / "g.log.jsonl").read_text().splitlines()[0]

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from structgstream.cli import doctor
+from structgstream.errors import BackendError
 from structgstream.kernels import backend, cuda, cuda_library, reference_anchors, reference_losses
 from structgstream.kernels.cuda_library import CUDA_PROTOTYPES, KernelLibrary
 from structgstream.kernels.cuda_tiles import PairBudget
@@ -34,6 +35,13 @@ def test_own_operations_are_the_kernels_or_it_says_why_not(
     assert [(record.levelno, record.getMessage()) for record in caplog.records] == [
         (logging.INFO if compiled else logging.WARNING, "this is why")
     ]
+
+
+def test_without_compiled_kernels_native_iterations_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cuda, "cuda_reason", lambda **_: None)
+    monkeypatch.setattr(cuda_library, "kernel_library", lambda: (None, "nvcc was not found."))
+    with pytest.raises(BackendError, match=r"nvcc was not found\.$"):
+        backend.cuda_backend(native=True)
 
 
 def test_doctor_tells_what_the_loss_runs_on(monkeypatch: pytest.MonkeyPatch) -> None:

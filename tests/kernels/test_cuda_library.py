@@ -31,8 +31,9 @@ def pretended(folder: Path, script: str) -> Path:
 
 
 @needs_nvcc
-def test_the_sources_compile(tmp_path: Path) -> None:
+def test_the_sources_compile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert NVCC is not None
+    monkeypatch.setenv("NVCC_APPEND_FLAGS", "-Xcicc -O0 -Xptxas -O0")  # What is compiled is tested, not how fast it is.
     path = cuda_library.compiled("sm_80", nvcc=NVCC, sources=SOURCES, cache=tmp_path)
     library = ctypes.CDLL(str(path))  # CUDA's runtime is linked in, so it loads without a GPU.
     for name in CUDA_PROTOTYPES:

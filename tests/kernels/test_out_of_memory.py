@@ -4,15 +4,17 @@
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
 
-from structgstream.codec.entropy import adaptive, rans
+from structgstream.codec.entropy import decisions, rans
 from structgstream.codec.entropy.decisions import ArithmeticState
 from structgstream.errors import OutOfMemoryError
 from structgstream.kernels import cpu_anchors, cpu_motion, cpu_raster
+from structgstream.kernels.cuda_library import CUDA_PROTOTYPES, KernelLibrary
 from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import Anchors, Neighbors, ViewFlows
 from tests.support.splats import splats_of, viewport_of
@@ -99,10 +101,10 @@ CALLS: dict[str, tuple[object, str, int | None, Callable[[], object]]] = {
         lambda: rans._native_encode(np.zeros(2, np.uint8), np.zeros(2, np.uint16), tables(), lanes=1),
     ),
     "decisions": (
-        adaptive,
+        decisions,
         "sgs_code_numbers",
         1,
-        lambda: adaptive._code_native("sgs_code_numbers", ArithmeticState(None), [], 0),
+        lambda: decisions._code_native("sgs_code_numbers", ArithmeticState(None), [], 0),
     ),
     "decode": (
         rans,
@@ -119,6 +121,13 @@ def test_no_memory(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "native_library", lambda: SimpleNamespace(**{function: lambda *_: result}))
     with pytest.raises(OutOfMemoryError, match="^Not enough memory"):
         call()
+
+
+def test_no_memory_on_the_gpu() -> None:
+    names = {name: SimpleNamespace() for name in CUDA_PROTOTYPES}
+    library = KernelLibrary(cast(Any, SimpleNamespace(**names)), "cuda", lambda device: 0)
+    with pytest.raises(OutOfMemoryError, match="on the GPU"):
+        library.check(2)
 
 
 def test_no_memory_for_gradients() -> None:

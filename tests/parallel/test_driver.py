@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.errors import ConfigError, StorageError, TaskError
-from structgstream.executors.executor import TaskQueue
-from structgstream.executors.task import PYTHON, Task, TaskResult
+from structgstream.executors.tasks import PYTHON, Task, TaskQueue, TaskResult
 from structgstream.parallel.driver import Job, Status, _Drive, drive
 from structgstream.parallel.exchange import SharedFolder
 from structgstream.parallel.parts import Parts, group_name

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.executors.task import Task
+from structgstream.executors.tasks import Task
 from structgstream.parallel import exchange
 from structgstream.parallel.driver import drive
 from structgstream.parallel.exchange import ObjectFolder, ObjectStore, SharedFolder
@@ -20,7 +20,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The stream of a run without a store."""
     folder = tmp_path_factory.mktemp("plain")
     with Parts(folder / "plain").locked(), workers() as executor:
-        drive(job(folder), Parts(folder / "plain"), executor)
+        drive(job(folder, frames=8), Parts(folder / "plain"), executor)
     return folder / "out.sgs"
 
 
@@ -30,7 +30,7 @@ def stored(folder: Path, url: str) -> Path:
     (folder / "b").mkdir(exist_ok=True)
     with parts.locked(), workers() as executor:
         exchange = ObjectStore(ObjectFolder(url), parts, cut=stand_in.cut)
-        drive(job(folder / "b"), parts, executor, exchange=exchange)
+        drive(job(folder / "b", frames=8), parts, executor, exchange=exchange)
     return folder / "b" / "out.sgs"
 
 

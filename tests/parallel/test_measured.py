@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.errors import ConfigError
-from structgstream.executors.task import TaskResult
+from structgstream.executors.tasks import TaskResult
 from structgstream.parallel.cost import measured_in
 from structgstream.parallel.parts import Parts, group_name
 from tests.support.measured_runs import finished_run

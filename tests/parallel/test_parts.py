@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.errors import ConfigError, StorageError
-from structgstream.executors.task import TaskResult
+from structgstream.executors.tasks import TaskResult
 from structgstream.owned_folders import MARKER
 from structgstream.parallel.parts import Parts, read_completed
 from tests.support.killed import folders_of_the_killed

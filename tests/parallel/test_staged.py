@@ -2,18 +2,21 @@
 """Files of a command come from a store and go to it, also while they grow, and after the command was killed."""
 
 import errno
+import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
+from structgstream.errors import ConfigError
 from structgstream.parallel import exchange as staged
 from structgstream.parallel.driver import Unit
-from structgstream.parallel.exchange import ObjectFolder, ObjectStore, Staging
+from structgstream.parallel.exchange import ObjectFolder, ObjectStore, Staging, Transfer
 from structgstream.parallel.parts import Parts
 
 
@@ -36,10 +39,17 @@ def staging(store: ObjectFolder, tmp_path: Path) -> Staging:
 
 def run(store: ObjectFolder, script: str, *flags: str) -> int:
     """The status of a command whose first word is the folder of this machine."""
-    words = ["--name", "task", *flags, "--", "sh", "-c", script, staged.HERE]
     with pytest.MonkeyPatch.context() as variables:
         variables.setenv(staged.STORE, store.url)
-        return staged.run(staged.parsed(words))
+        return staged.run(transfer(*flags), ["sh", "-c", script, staged.HERE])
+
+
+def transfer(*flags: str) -> Transfer:
+    """The files of a task from pairs such as ``--needs NAME``."""
+    found: dict[str, list[str]] = {"needs": [], "gives": [], "grows": [], "run": []}
+    for flag, name in zip(flags[::2], flags[1::2]):
+        found[flag.removeprefix("--")].append(name)
+    return Transfer("task", "".join(found.pop("run")), **{kind: tuple(names) for kind, names in found.items()})
 
 
 def scratch(tmp_path: Path) -> list[Path]:
@@ -147,7 +157,7 @@ def test_a_growing_file_is_stored_when_it_is_a_tenth_longer(staging: Staging) ->
 
 
 def test_a_command_that_is_killed_ends_this_process_the_same_way(store: ObjectFolder, tmp_path: Path) -> None:
-    words = ["--name", "task", "--grows", "t.partial", "--", "sh", "-c"]
+    words = [json.dumps(asdict(transfer("--grows", "t.partial"))), "sh", "-c"]
     script = 'printf abc > "$0/t.partial"; kill -9 $$'
     done = subprocess.run(
         [sys.executable, "-m", "structgstream.parallel.exchange", *words, script, staged.HERE],
@@ -168,7 +178,7 @@ def test_a_disk_of_this_machine_without_room_is_a_sentence(
     store.write("a", b"a")
     monkeypatch.setattr(os, "fsync", full)
     monkeypatch.setenv(staged.STORE, store.url)
-    monkeypatch.setattr(sys, "argv", ["staged", "--name", "task", "--needs", "a", "--", "true"])
+    monkeypatch.setattr(sys, "argv", ["staged", json.dumps({"name": "task", "needs": ["a"]}), "true"])
     assert staged.main() == 1
     error = capsys.readouterr().err
     assert error.startswith("structgstream: ")
@@ -179,17 +189,11 @@ def test_a_store_that_cannot_be_used_is_a_sentence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv(staged.STORE, "nonsense://a")
-    monkeypatch.setattr(sys, "argv", ["staged", "--name", "task", "--", "true"])
+    monkeypatch.setattr(sys, "argv", ["staged", json.dumps({"name": "task"}), "true"])
     assert staged.main() == 1
     error = capsys.readouterr().err
     assert error.startswith("structgstream: nonsense://a cannot be used as a store (")
     assert error.count("\n") == 1
-
-
-def test_without_a_command_nothing_is_run(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        staged.parsed(["--name", "task"])
-    assert "command" in capsys.readouterr().err
 
 
 def test_the_url_of_the_store_is_on_no_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -202,5 +206,5 @@ def test_the_url_of_the_store_is_on_no_command_line(tmp_path: Path, monkeypatch:
     assert not any("secret" in word for word in task.command)
     assert task.environment[staged.STORE] == url
     monkeypatch.delenv(staged.STORE, raising=False)
-    with pytest.raises(SystemExit):
-        staged.parsed(["--name", "task", "--", "true"])
+    with pytest.raises(ConfigError, match="has no URL of a store"):
+        staged.run(transfer(), ["true"])

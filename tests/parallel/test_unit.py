@@ -11,7 +11,7 @@ from structgstream.atomic_files import partial_path
 from structgstream.cli.groups import FitGroup, Join, Track
 from structgstream.cli.options import parse_options
 from structgstream.errors import StreamError
-from structgstream.executors.task import PYTHON
+from structgstream.executors.tasks import PYTHON
 from structgstream.groups.track_file import TrackHead, TrackStart, TrackWriter, open_track
 from structgstream.parallel.driver import Unit, cut_track, starts_in
 from structgstream.parallel.parts import Parts

@@ -119,7 +119,7 @@ class WithSize(LossWeights):
     size: float = 0.0
 
 
-@pytest.mark.parametrize("size", [0.0, 0.1])
+@pytest.mark.parametrize("size", [0.0, 0.1, 1])
 def test_a_loss_that_they_do_not_know_is_minimised_in_torch(size: float) -> None:
     assert ("iterations" in fitted(cpu_backend(), losses=WithSize(size=size)).seconds) == (size == 0.0)
 

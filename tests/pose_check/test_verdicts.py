@@ -2,10 +2,12 @@
 """Which cameras are off, from matches of made rigs."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
-from structgstream.pose_check.verdicts import MIN_MATCHES, Verdict, judge
+from structgstream.pose_check import verdicts
+from structgstream.pose_check.verdicts import MIN_MATCHES, Resection, Verdict, judge
 from tests.support.evidence_made import Cameras, evidence_of, scattered, shifted, turned, wide_ring
 
 RIG = wide_ring(7)
@@ -18,6 +20,12 @@ def judged(change: Callable[[Cameras], object] | None = None, *, points: int = 2
     if change is not None:
         change(cameras)
     return judge(evidence, cameras)
+
+
+def farther(cameras: Cameras) -> None:
+    """Moves a camera away from everything, towards which epipolar lines run."""
+    direction = cameras["cam3"].center / cameras["cam3"].center.norm()
+    cameras["cam3"] = shifted(cameras["cam3"], tuple((0.15 * direction).tolist()))
 
 
 def test_a_rig_that_is_right() -> None:
@@ -47,15 +55,22 @@ def test_two_cameras_that_moved() -> None:
 
 
 def test_a_camera_that_moved_along_what_pairs_cannot_see_is_accused_by_points() -> None:
-    """Moved away from everything, towards which epipolar lines run: pairs look well, points do not."""
-
-    def change(cameras: Cameras) -> None:
-        direction = cameras["cam3"].center / cameras["cam3"].center.norm()
-        cameras["cam3"] = shifted(cameras["cam3"], tuple((0.15 * direction).tolist()))
-
-    found = judged(change)
+    """Pairs look well, points do not."""
+    found = judged(farther)
     assert found.suspects.off == ("cam3",)
     assert "cam3" in found.resections
+
+
+def test_a_camera_that_no_correction_explains_better_is_not_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Points of the others lie far from where it sees them: wrong matches do that, too."""
+    found = Resection(
+        points=20, given_points=25, seen=60, given_pixels=50.0, corrected_pixels=40.0, degrees=1.0, degrees_error=0.1,
+        share_of_distance=0.0, share_error=0.1, focal_percent=0.0, focal_error=0.1,
+    )  # fmt: skip
+    monkeypatch.setattr(verdicts, "resect", lambda *arguments: found)
+    assert judged(farther).suspects.off == ()
+    monkeypatch.setattr(verdicts, "resect", lambda *arguments: replace(found, points=30, corrected_pixels=1.0))
+    assert judged(farther).suspects.off == ("cam3",)
 
 
 def test_all_cameras_written_the_wrong_way_round_are_one_mistake() -> None:

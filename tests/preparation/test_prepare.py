@@ -10,7 +10,7 @@ import torch
 
 from structgstream.data.open import open_capture
 from structgstream.data.prepared import read_prepared
-from structgstream.errors import CalibrationError, CaptureError, ConfigError
+from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.options import Distance, PrepareOptions
 from structgstream.preparation.prepare import CaptureSteps, prepare_capture
 from tests.support.captures import write_picture, write_videos
@@ -125,30 +125,6 @@ def test_a_calibration_of_another_size_is_refused(tmp_path: Path) -> None:
     file.write_text(json.dumps(content | {"width": 200, "height": 100}))
     with pytest.raises(CalibrationError, match=r"camera 'cam00' have 160x120 pixels, .*cameras\.json is for 200x100"):
         prepare_capture(tmp_path / "videos", tmp_path / "out", options=OPTIONS)
-
-
-def test_a_pickle_is_refused(tmp_path: Path) -> None:
-    write_videos(tmp_path / "videos", ["a", "b", "c"], frames=2)
-    (tmp_path / "videos" / "calibration.pkl").write_bytes(b"\x80\x04.")
-    with pytest.raises(CalibrationError, match=r"calibration\.pkl is a pickle, .* refused"):
-        prepare_capture(tmp_path / "videos", tmp_path / "out", options=OPTIONS)
-
-
-@pytest.mark.parametrize(
-    ("options", "reported"),
-    [
-        (PrepareOptions(synchronize="none", without=("cam9",)), "no camera 'cam9' to leave out"),
-        (PrepareOptions(synchronize="none", held_out=("cam9",)), "no camera 'cam9' to hold out"),
-        (
-            PrepareOptions(synchronize="none", distance=Distance("cam1", "cam9", 1.0)),
-            "no camera.* 'cam9' to measure from",
-        ),
-    ],
-)
-def test_options_of_cameras_that_are_not_there(tmp_path: Path, options: PrepareOptions, reported: str) -> None:
-    write_room(tmp_path / "videos", cameras=4)
-    with pytest.raises(ConfigError, match=reported):
-        prepare_capture(tmp_path / "videos", tmp_path / "out", options=options)
 
 
 def test_a_calibration_that_is_not_there(tmp_path: Path) -> None:

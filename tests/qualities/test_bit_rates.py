@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from structgstream.codec.segments.quality_list import QUALITIES, read_list
-from structgstream.qualities.ladder import MIN_PACKETS, BitRates, Quality, bits_per_second, expected_bits
+from structgstream.qualities import MIN_PACKETS, BitRates, Quality, bits_per_second, expected_bits
 from tests.support.reports import frame_report
 
 LOW, HIGH = Quality("low", -1.0), Quality("high", 1.0)

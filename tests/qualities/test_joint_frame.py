@@ -2,7 +2,7 @@
 import math
 
 from structgstream.evaluation.run_log import log_entry
-from structgstream.qualities.recording import joint_entry, joint_report
+from structgstream.qualities import joint_entry, joint_report
 from tests.support.reports import frame_report
 
 

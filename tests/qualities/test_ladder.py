@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 
 from structgstream.errors import ConfigError
-from structgstream.qualities.ladder import Quality, configured, qualities_in
+from structgstream.qualities import Quality, configured, qualities_in
 from structgstream.session.presets import PRESETS
 
 

@@ -23,8 +23,7 @@ from structgstream.data.live.resume_cache import ResumeCache, resume_folder
 from structgstream.errors import ConfigError, StorageError
 from structgstream.evaluation.run_log import read_log
 from structgstream.frames import MultiViewFrame
-from structgstream.qualities.ladder import configured, qualities_in
-from structgstream.qualities.recording import QualitiesRun, QualityReport, record_qualities
+from structgstream.qualities import QualitiesRun, QualityReport, configured, qualities_in, record_qualities
 from structgstream.recorder import record, segments_at, segments_folder
 from structgstream.run_metrics import RunMetrics
 from structgstream.session import loop, struct_gstream

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from structgstream.qualities.recording import Once
+from structgstream.qualities import Once
 
 
 def test_who_asks_first_makes_it() -> None:

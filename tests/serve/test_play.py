@@ -134,28 +134,25 @@ def test_other_origins_may_not_read_and_the_page_loads_from_its_own_only(server:
     assert "http" not in " ".join(rules.values())
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        "/../../etc/passwd",
-        "/stream/../../../etc/passwd",
-        "/%2e%2e/%2e%2e/etc/passwd",
-        "/player.js/../server.py",
-        "/assets/player.js",
-        "/truth/../../../../etc/passwd",
-        "/truth/..%2f..%2f..%2fetc%2fpasswd/0.jpg",
-        "/truth/cam00/../../../etc/passwd.jpg",
-        "//etc/passwd",
-    ],
-)
-def test_addresses_name_no_files(tmp_path: Path, path: str) -> None:
+def test_addresses_name_no_files(tmp_path: Path) -> None:
     file = tmp_path / "s.sgs"
     file.write_bytes(STREAM)
     source = open_capture(bundled_clip_path(), scale=0.25, frames=1)
     with served(StreamFile(file), truth=Truth(source, ("cam00",))) as server:
-        answer = server.ask(path)
-    assert answer.status == 404
-    assert b"root:" not in answer.body
+        for path in (
+            "/../../etc/passwd",
+            "/stream/../../../etc/passwd",
+            "/%2e%2e/%2e%2e/etc/passwd",
+            "/player.js/../server.py",
+            "/assets/player.js",
+            "/truth/../../../../etc/passwd",
+            "/truth/..%2f..%2f..%2fetc%2fpasswd/0.jpg",
+            "/truth/cam00/../../../etc/passwd.jpg",
+            "//etc/passwd",
+        ):
+            answer = server.ask(path)
+            assert answer.status == 404, path
+            assert b"root:" not in answer.body
 
 
 def test_pictures_of_the_capture(tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ import pytest
 import torch
 from rich.console import Console
 
+from structgstream.cli.evaluate import report_tables
 from structgstream.cli.progress import summary
-from structgstream.cli.tables import report_tables
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.sinks import FileSink
 from structgstream.data.source import FrameSource

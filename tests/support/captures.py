@@ -4,7 +4,9 @@
 import json
 from collections.abc import Sequence
 from fractions import Fraction
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import av
 import cv2
@@ -100,8 +102,17 @@ def write_video(
 
 def write_videos(folder: Path, names: Sequence[str], *, frames: int = 6, fps: float = 30) -> None:
     """One numbered video per camera."""
+    folder.mkdir(parents=True, exist_ok=True)
     for number, name in enumerate(names):
-        write_video(folder / f"{name}.mp4", [picture(number, frame) for frame in range(frames)], fps=fps)
+        (folder / f"{name}.mp4").write_bytes(_numbered_video(number, frames, fps))
+
+
+@cache
+def _numbered_video(camera: int, frames: int, fps: float) -> bytes:
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "video.mp4")
+        write_video(path, [picture(camera, frame) for frame in range(frames)], fps=fps)
+        return path.read_bytes()
 
 
 def write_picture(path: Path, image: Picture) -> None:

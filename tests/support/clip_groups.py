@@ -19,7 +19,7 @@ from tests.support.small_presets import QUICK
 
 FRAMES, LENGTH = 6, 2
 START = GroupStartConfig(iterations=6, rounds=2, births=50)
-OPTIONS = TrackOptions(LENGTH, tracking=TrackConfig(scale=1.0, cameras=5, picture_scale=1.0))
+OPTIONS = TrackOptions(LENGTH, tracking=TrackConfig(cameras=5, picture_scale=1.0))
 CAPTURE = small_clip_path()
 
 

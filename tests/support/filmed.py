@@ -53,10 +53,10 @@ class Film:
         for plane in planes:
             window = self._window(plane)
             depth, seen = self._seen(plane, self._rays[window])
-            closer = (depth > 0) & (depth < nearest[window]) & np.isfinite(seen).all(-1)
+            closer = (depth > 0) & (depth < nearest[window]) & np.isfinite(seen[..., 0])
             nearest[window][closer], picture[window][closer] = depth[closer], seen[closer]
         camera = self.filmed.camera
-        reduced = picture.reshape(camera.height, self._samples, camera.width, self._samples, 3).mean((1, 3))
+        reduced = cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA)  # means of samples
         reduced += noise * np.random.default_rng(seed).normal(size=reduced.shape)
         return reduced.round().clip(0, 255).astype(np.uint8)
 
@@ -79,7 +79,8 @@ class Film:
     def _seen(self, plane: Plane, rays: Floats) -> tuple[Floats, NDArray[np.float32]]:
         """Distance along each ray and the colour there; NaN beside the plane."""
         depth, places = self._places(plane, rays)
-        inside = np.asarray(((places > 0) & (places < 1)).all(-1))
+        x, y = places[..., 0], places[..., 1]
+        inside = np.asarray((x > 0) & (x < 1) & (y > 0) & (y < 1))  # .all(-1) takes five times as long
         if not inside.any():
             return depth, np.full((*depth.shape, 3), np.nan, np.float32)
         height, width = plane.texture.shape[:2]
@@ -159,7 +160,8 @@ def noise_texture(seed: int, *, size: int = 768) -> NDArray[np.uint8]:
     return np.asarray(255 * total / total.max(), np.uint8)
 
 
-def room(seed: int = 0) -> list[Plane]:
+@cache
+def room(seed: int = 0) -> tuple[Plane, ...]:
     """A floor, a back wall and standing boards around the origin, each with a texture of its own; y points down."""
     sheets = [
         ((-2.0, 0.8, -2.0), (90.0, 0.0), (4.0, 4.0)),  # floor
@@ -174,7 +176,7 @@ def room(seed: int = 0) -> list[Plane]:
         pose[:3, :3] = turned(yaw, axis=1) @ turned(pitch, axis=0)
         pose[:3, 3] = corner
         planes.append(Plane(noise_texture(100 * seed + index), pose, size))
-    return planes
+    return tuple(planes)
 
 
 def turned(degrees: float, *, axis: int) -> Floats:

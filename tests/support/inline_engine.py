@@ -13,8 +13,7 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import IO
 
-from structgstream.executors.local import opened_log, tail_of
-from structgstream.executors.task import Task, TaskResult
+from structgstream.executors.tasks import Task, TaskResult, opened_log, tail_of
 
 INTERRUPTED = 130
 """Exit status of a command that was ended by Ctrl-C."""

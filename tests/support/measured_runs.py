@@ -4,7 +4,7 @@
 import json
 from pathlib import Path
 
-from structgstream.executors.task import TaskResult
+from structgstream.executors.tasks import TaskResult
 from structgstream.parallel.parts import Parts, group_name
 
 GROUPS = [(0, 4), (4, 8), (8, 12)]

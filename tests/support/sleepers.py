@@ -3,8 +3,7 @@
 
 from pathlib import Path
 
-from structgstream.executors.executor import TaskQueue
-from structgstream.executors.task import PYTHON, Task, TaskResult
+from structgstream.executors.tasks import PYTHON, Task, TaskQueue, TaskResult
 
 PATIENCE_SECONDS = 60.0
 

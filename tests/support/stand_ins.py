@@ -4,9 +4,7 @@
 import hashlib
 from pathlib import Path
 
-from structgstream.executors.executor import TaskQueue
-from structgstream.executors.local import LocalEngine
-from structgstream.executors.task import PYTHON, WorkerSlot
+from structgstream.executors.tasks import PYTHON, LocalEngine, TaskQueue, WorkerSlot
 from structgstream.parallel.driver import Job, Unit
 from tests.support import stand_in
 

@@ -139,7 +139,7 @@ def heard(
 
     ``echo`` is the amplitude of a sample of the reverberation (0.4 s) beside the direct sound's 1.
     """
-    from scipy.signal import fftconvolve
+    from scipy.signal import oaconvolve
 
     generator = np.random.default_rng(seed)
     start = min(clock.offset_seconds for clock in clocks.values()) - 0.5
@@ -158,7 +158,7 @@ def heard(
         tail *= np.exp(-np.arange(len(tail)) / (0.06 * SOUND_HERTZ))
         tail[: round(0.002 * SOUND_HERTZ)] = 0
         tail[0] = 1
-        wave = fftconvolve(made, tail)[: len(made)]
+        wave = oaconvolve(made, tail)[: len(made)]
         rate = rates[index % len(rates)]
         common = clock.offset_seconds + clock.rate * np.arange(round(seconds * rate)) / rate
         samples = np.interp(common - (delays or {}).get(name, 0.0), times, wave) * generator.uniform(0.1, 1)

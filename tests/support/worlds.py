@@ -11,7 +11,7 @@ import torch
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians, concatenate
-from structgstream.kernels.backend import Backend, reference_backend
+from structgstream.kernels.backend import Backend
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig
@@ -20,6 +20,7 @@ from structgstream.training.online.preprocess import detect_changes
 from structgstream.training.online.select import DynamicSelection, select_dynamic
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.views import View
+from tests.support.backends import quickest_backend
 from tests.support.rigs import arc_rig, random_scene
 
 
@@ -61,7 +62,7 @@ def moving_world(
     """
     rig = arc_rig(cameras, width=width, height=height)
     scene = random_scene(60, cameras=cameras - 1, seed=4)
-    backend = reference_backend()
+    backend = quickest_backend()
     shift = torch.zeros(60, 3)
     shift[:movers, 0] = speed
     pictures = []
@@ -85,7 +86,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 def rendered(scene: Scene, world: World, name: str) -> np.ndarray:
     """``scene`` as camera ``name`` of the world sees it, uint8."""
-    backend = reference_backend()
+    backend = quickest_backend()
     image = draw(scene.gaussians(world.rig[name], backend), world.rig[name], backend).image.detach()
     return (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 

@@ -17,7 +17,7 @@ from tests.support.backends import quickest_backend
 from tests.support.rigs import arc_rig
 from tests.support.varied import varied
 
-CONFIG = varied(FreeSpaceConfig(), MIN_VIEWS=4, SCALE=1.0)
+CONFIG = varied(FreeSpaceConfig(), MIN_CAMERAS=4, SCALE=1.0)
 RIG = arc_rig(9, width=64, height=48)
 CAMERAS = [RIG[name] for name in RIG.training]
 WIDTH = 8
@@ -101,7 +101,7 @@ def test_what_lies_on_or_behind_a_surface_stays() -> None:
 def test_too_few_cameras_judge_nothing() -> None:
     scene = wall_and(FLOATING, opacity=-0.5)
     assert found(scene, cameras=CAMERAS[:3]) == [False, False]
-    assert found(scene, config=varied(CONFIG, MIN_VIEWS=len(CAMERAS) + 1)) == [False, False]
+    assert found(scene, config=varied(CONFIG, MIN_CAMERAS=len(CAMERAS) + 1)) == [False, False]
     assert found(scene, cameras=[]) == [False, False]
 
 

@@ -5,15 +5,15 @@ from dataclasses import replace
 
 import torch
 
-from structgstream.kernels.backend import reference_backend
 from structgstream.training.online.config import LiftConfig
 from structgstream.training.online.measure import FlowEvidence
 from structgstream.training.online.scene_flow import lift_flow
 from structgstream.training.views import training_views
+from tests.support.backends import quickest_backend
 from tests.support.worlds import World, moving_world
 
 CPU = torch.device("cpu")
-BACKEND = reference_backend()
+BACKEND = quickest_backend()
 
 
 def world() -> World:

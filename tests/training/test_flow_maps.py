@@ -10,17 +10,17 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from structgstream.errors import ConfigError
-from structgstream.kernels.backend import reference_backend
 from structgstream.training.online.config import FlowConfig
 from structgstream.training.online.preprocess import FlowMaps, _parts, flow_map
+from tests.support.backends import quickest_backend
 
 
 def one_box(*given) -> torch.Tensor:
-    return flow_map(*given, config=FlowConfig(), backend=reference_backend()).maps
+    return flow_map(*given, config=FlowConfig(), backend=quickest_backend()).maps
 
 
 def boxes_apart(*given) -> torch.Tensor:
-    return flow_map(*given, config=FlowConfig(apart=True), backend=reference_backend()).maps
+    return flow_map(*given, config=FlowConfig(apart=True), backend=quickest_backend()).maps
 
 
 def textured(height: int = 120, width: int = 160) -> np.ndarray:
@@ -106,9 +106,9 @@ def test_parts_near_each_other_are_searched_together() -> None:
 WIDTHS = pytest.mark.parametrize("width", [320, 960, 1920])
 
 
-def thrown(width: int, *, far: bool, by: float = 60 / 320) -> tuple[FlowMaps, torch.Tensor]:
+def thrown(width: int, *, far: bool, by: float = 60 / 320, body: bool = False) -> tuple[FlowMaps, torch.Tensor]:
     """Flow, at the size of the pictures, of a ball that crosses a share of the width over a resting ground; the ball's
-    pixels in the first picture."""
+    pixels in the first picture. With ``body`` something large below it moves as well, by a hundredth."""
     height, radius, moved = width * 3 // 4, width // 20, round(by * width)
     small = textured(120, 160)
     ground = cv2.resize(small // 4 + 96, (width, height), interpolation=cv2.INTER_CUBIC)
@@ -116,11 +116,14 @@ def thrown(width: int, *, far: bool, by: float = 60 / 320) -> tuple[FlowMaps, to
     rows, columns = np.mgrid[:height, :width]
     ball = (rows - height // 2) ** 2 + (columns - width // 3) ** 2 < radius**2
     first, second = ground.copy(), ground.copy()
+    if body:
+        below = slice(height * 3 // 5, height)
+        first[below], second[below] = skin[below, ::-1], np.roll(skin[below, ::-1], width // 100, 1)
     first[ball], second[np.roll(ball, moved, 1)] = skin[ball], skin[ball]
     pictures = torch.from_numpy(first), torch.from_numpy(second)
-    changed = reference_backend().changed_pixels(*pictures, threshold=0.05, reach_pixels=3)
+    changed = quickest_backend().changed_pixels(*pictures, threshold=0.05, reach_pixels=3)
     config = FlowConfig(apart=True, far=far)
-    found = flow_map(*pictures, changed, (height, width), config=config, backend=reference_backend())
+    found = flow_map(*pictures, changed, (height, width), config=config, backend=quickest_backend())
     return found, torch.from_numpy(ball)
 
 
@@ -139,6 +142,15 @@ def test_a_ball_that_crosses_a_share_of_the_width_is_found_at_every_size(width: 
 
 
 @WIDTHS
+def test_a_ball_is_found_next_to_a_body_whose_flow_is_consistent(width: int) -> None:
+    found, ball = thrown(width, far=True, by=0.14, body=True)
+    assert found.far_boxes == 1
+    expected = torch.tensor([round(0.14 * width), 0.0])
+    confidence, flow = found.maps[ball][:, 0], found.maps[ball][:, 1:]
+    assert (confidence * ((flow - expected).norm(dim=1) < 0.01 * width)).mean() > 0.6
+
+
+@WIDTHS
 def test_what_does_not_move_far_is_searched_once(width: int) -> None:
     once, again = (thrown(width, far=far, by=0.01)[0] for far in (False, True))
     assert again.far_boxes == 0
@@ -151,9 +163,9 @@ def test_where_there_is_nothing_to_find_no_far_flow_is_found() -> None:
     second = first.copy()
     cv2.circle(second, (300, 200), 30, (250, 40, 40), -1)
     pictures = torch.from_numpy(first), torch.from_numpy(second)
-    changed = reference_backend().changed_pixels(*pictures, threshold=0.05, reach_pixels=3)
+    changed = quickest_backend().changed_pixels(*pictures, threshold=0.05, reach_pixels=3)
     config = FlowConfig(apart=True, far=True)
-    found = flow_map(*pictures, changed, (480, 640), config=config, backend=reference_backend())
+    found = flow_map(*pictures, changed, (480, 640), config=config, backend=quickest_backend())
     assert found.far_boxes == 1
     far = found.maps[..., 1:].norm(dim=-1) > 8.0
     assert (far & changed).sum() < 0.02 * changed.sum()

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from structgstream.cameras import CameraRig
-from structgstream.kernels.backend import reference_backend
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.render import render
 from structgstream.scene.scene import Scene
@@ -24,10 +23,11 @@ from structgstream.training.frame0.quantization import (
     regauge,
 )
 from structgstream.training.parameters import RoundingConfig
+from tests.support.backends import quickest_backend
 from tests.support.rigs import arc_rig, random_scene
 from tests.support.varied import varied
 
-BACKEND = reference_backend()
+BACKEND = quickest_backend()
 RIG = arc_rig(7, width=40, height=32)
 VOXEL = 0.02
 STEPS = {"anchor_positions": 0.003, "offset_scales": 0.02}

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import torch
 
-from structgstream.kernels.backend import reference_backend
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.state import ParameterName
 from structgstream.training.losses import GradientStatistics
@@ -14,10 +13,11 @@ from structgstream.training.online.patching import IDS_PER_FRAME, FreeSet
 from structgstream.training.optim import Adam
 from structgstream.training.parameters import FREE_ROWS, Parameters, parameters_of_fields
 from structgstream.training.views import training_views
+from tests.support.backends import quickest_backend
 from tests.support.worlds import moving_world
 
 CPU = torch.device("cpu")
-BACKEND = reference_backend()
+BACKEND = quickest_backend()
 WORLD = moving_world(1)
 SCENE = replace(
     WORLD.scene,

@@ -3,8 +3,10 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
+from structgstream.groups import first_frame
 from structgstream.groups.first_frame import GroupStartConfig, fit_group_start
 from structgstream.scene.state import state_of
 from structgstream.training.online.config import (
@@ -120,12 +122,13 @@ def test_motion_is_coherent_since_frame_0_and_not_since_the_round_began() -> Non
     assert spread(4.0) < 0.8 * spread(0.0)
 
 
-def test_births_of_several_rounds_have_identities_of_their_own() -> None:
+def test_births_of_several_rounds_have_identities_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(first_frame, "flow_views", lambda *_: ())
     world = moving_world(FRAME + 1, cameras=6, emerges_at=1, movers=0, width=96, height=64)
     none = torch.zeros(len(world.scene.anchors) + len(world.scene.free), 3)
     motion = MotionConfig(enabled=True, picture_scale=1.0)
     config = replace(CONFIG, motion=motion, spawn=varied(SpawnConfig(enabled=True), RULES=SpawnRules(min_hits=2)))
-    found = fit(world, none, start=replace(START, flow_rounds=0), config=config)
+    found = fit(world, none, config=config)
     births = found.scene.free.births
     assert len(births) > 0
     assert len(births.unique()) == len(births)

@@ -112,7 +112,7 @@ def test_what_floats_before_surfaces_is_removed_in_the_end_and_nothing_else_chan
     centers = torch.stack([world.rig[name].center for name in world.rig.training]).float()
     between = 0.6 * centers.mean(0) + 0.4 * surface.mean(0) + 0.02 * torch.randn(20, 3, generator=torch.manual_seed(1))
     points = torch.cat([surface, between])
-    removing = replace(QUICK, floaters=varied(FreeSpaceConfig(enabled=True), MIN_VIEWS=2, DRAWN_OPACITY=2.0))
+    removing = replace(QUICK, floaters=varied(FreeSpaceConfig(enabled=True), MIN_CAMERAS=2, DRAWN_OPACITY=2.0))
     kept, found = fit(world, points=points), fit(world, points=points, config=removing)
     cameras = [world.rig[name] for name in world.rig.training]
     floating = in_free_space(kept.scene, cameras, config=removing.floaters, backend=quickest_backend())

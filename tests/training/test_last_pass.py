@@ -4,16 +4,16 @@ import math
 import pytest
 import torch
 
-from structgstream.kernels.backend import reference_backend
 from structgstream.scene.color import CameraColor
 from structgstream.training.losses import LossWeights, ViewLoss, picture_loss
 from structgstream.training.optim import LastPass
 from structgstream.training.result import Stopwatch
 from structgstream.training.views import View
+from tests.support.backends import quickest_backend
 from tests.support.rigs import arc_rig, random_scene
 
 CPU = torch.device("cpu")
-BACKEND = reference_backend()
+BACKEND = quickest_backend()
 
 
 def loss_of(grey: int, index: int = 0) -> tuple[ViewLoss, View]:

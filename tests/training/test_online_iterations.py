@@ -7,7 +7,6 @@ from typing import Any, cast
 
 import torch
 
-from structgstream.kernels.backend import reference_backend
 from structgstream.kernels.values import TileSelection, tile_grid
 from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.scene import Scene
@@ -20,11 +19,12 @@ from structgstream.training.optim import Adam, LastPass
 from structgstream.training.parameters import Parameters, parameters_of_fields
 from structgstream.training.result import Stopwatch
 from structgstream.training.views import training_views
+from tests.support.backends import quickest_backend
 from tests.support.rigs import random_scene
 from tests.support.worlds import moving_world
 
 CPU = torch.device("cpu")
-BACKEND = reference_backend()
+BACKEND = quickest_backend()
 WORLD = moving_world(1)
 VIEWS = training_views(WORLD.frames[0], WORLD.rig, CPU)
 CAMERA = VIEWS[0].camera

@@ -8,13 +8,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from structgstream.kernels.backend import reference_backend
 from structgstream.scene.state import PAPER_DYNAMIC
 from structgstream.training.losses import Loss, LossWeights, view_loss
 from structgstream.training.optim import Adam, Hooks, Schedule, gradients_of, leaves, minimize
 from structgstream.training.parameters import FREE_ROWS, Parameters, parameters_of_fields
 from structgstream.training.result import Step, Stopwatch
 from structgstream.training.views import View
+from tests.support.backends import quickest_backend
 from tests.support.recorders import Repeater
 from tests.support.rigs import arc_rig, random_scene
 
@@ -26,7 +26,7 @@ def loss_of(parameters, scene, **weights):
     return view_loss(
         parameters.scene(scene),
         view,
-        backend=reference_backend(),
+        backend=quickest_backend(),
         weights=LossWeights(**weights),
         track_screen=True,
         watch=Stopwatch(),
@@ -61,7 +61,7 @@ class Repeating(Parabola):
 
 
 def run(iterations: int, **stages: int) -> tuple[int, Parabola, list[Step]]:
-    adam = Adam(reference_backend(), leaves({"x": torch.zeros(1)}))
+    adam = Adam(quickest_backend(), leaves({"x": torch.zeros(1)}))
     hooks, steps = Parabola(adam), []
     schedule = Schedule(iterations, lambda iteration: {"x": 0.1 * iteration}, **stages)
     done = minimize(adam, cycle([1.0, 2.0]), schedule, hooks, watch=Stopwatch(), on_step=steps.append)
@@ -84,7 +84,7 @@ def test_iterations_that_are_recorded_take_the_steps_of_their_time() -> None:
     """Rates and the numbers of steps differ from one to the next, and are read when a recording is run."""
     found = []
     for recorder in (None, Repeater()):
-        adam = Adam(reference_backend(), {**leaves({"x": torch.zeros(1)}), "fixed": torch.ones(1)})
+        adam = Adam(quickest_backend(), {**leaves({"x": torch.zeros(1)}), "fixed": torch.ones(1)})
         hooks = Repeating(adam)
         schedule: Schedule[str] = Schedule(9, lambda iteration: {"x": 0.1 * iteration, "fixed": 0.0})
         minimize(adam, cycle([1.0, 2.0]), schedule, hooks, watch=Stopwatch(), recorder=recorder)

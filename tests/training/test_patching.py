@@ -38,7 +38,9 @@ def parents(count: int) -> Gaussians:
 def test_children_are_drawn_from_two_sigma() -> None:
     source = parents(200_000)
     config = PatchingConfig()
-    means = spawn_children(source, first_birth=1 * IDS_PER_FRAME, config=config, generator=generator()).means.double()
+    means = spawn_children(
+        source, first_identity=1 * IDS_PER_FRAME, config=config, generator=generator()
+    ).means.double()
     rotation = quaternion_matrices(source.quats[:1].double())[0]
     sigma = rotation @ torch.diag(source.scales[0].double() ** 2) @ rotation.T
     assert torch.allclose(means.mean(0), source.means[0].double(), atol=5e-3)
@@ -47,7 +49,7 @@ def test_children_are_drawn_from_two_sigma() -> None:
 
 def test_a_childs_other_attributes() -> None:
     source = parents(3)
-    children = spawn_children(source, first_birth=7 * IDS_PER_FRAME, config=PatchingConfig(), generator=generator())
+    children = spawn_children(source, first_identity=7 * IDS_PER_FRAME, config=PatchingConfig(), generator=generator())
     assert torch.allclose(children.log_scales.exp(), source.scales)
     assert torch.equal(children.colors, source.colors)
     assert torch.equal(children.quats, torch.tensor([[1.0, 0, 0, 0]]).expand(3, 4))

@@ -44,26 +44,25 @@ def renewed(
         split,
         views,
         find_active_tiles(split, views, config=motion, backend=backend),
-        first_birth=1 << 32,
+        first_identity=1 << 32,
         floor=residual_floor(WORLD.scene, first, scale=1.0, backend=backend) if floor is None else floor,
         room=room,
-        min_pixels=motion.MIN_PIXELS,
         config=config,
         backend=backend,
     )
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_an_emerging_ball_is_born_where_it_is(backend) -> None:
+def test_an_emerging_ball_is_spawned_where_it_is(backend) -> None:
     found, ball = renewed(backend()), emerging_ball(0.95)
-    born = found.new_free
-    assert len(born) >= 3
+    spawned = found.new_free
+    assert len(spawned) >= 3
     assert not found.refused
-    near = (born.means - ball.means).norm(dim=1)
+    near = (spawned.means - ball.means).norm(dim=1)
     assert near.median() < 2.5 * float(ball.scales[0, 0])
-    torch.testing.assert_close(born.colors.median(0).values, ball.colors[0], atol=0.4, rtol=0)  # soft, before others
-    assert born.births.tolist() == [IDS_PER_FRAME + n for n in range(len(born))]
-    torch.testing.assert_close(born.logit_opacities.sigmoid(), torch.full((len(born),), 0.7))
+    torch.testing.assert_close(spawned.colors.median(0).values, ball.colors[0], atol=0.4, rtol=0)  # soft, before others
+    assert spawned.births.tolist() == [IDS_PER_FRAME + n for n in range(len(spawned))]
+    torch.testing.assert_close(spawned.logit_opacities.sigmoid(), torch.full((len(spawned),), 0.7))
 
 
 def test_what_emerges_before_something_that_frame_0_drew_badly_is_born_if_the_floor_is_eased() -> None:
@@ -73,12 +72,12 @@ def test_what_emerges_before_something_that_frame_0_drew_badly_is_born_if_the_fl
     bad = replace(floor, maps={i: torch.full_like(of_view, 0.02) for i, of_view in floor.maps.items()})
     for of_view in bad.maps.values():
         of_view[16:48, 24:72] = 0.9  # Frame 0 was drawn badly in the middle, where the ball is now.
-    born = [
+    spawned = [
         len(renewed(backend, floor=bad, config=varied(CONFIG, CHANGED_FLOOR_MEDIANS=medians)).new_free)
         for medians in (None, 1.0)
     ]
-    assert born[0] == 0
-    assert born[1] >= 3
+    assert spawned[0] == 0
+    assert spawned[1] >= 3
 
 
 def test_where_no_picture_lacks_anything_nothing_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,11 +94,13 @@ def test_where_no_picture_lacks_anything_nothing_is_drawn(monkeypatch: pytest.Mo
     assert drawn, "where something is missing it is"
 
 
-def test_births_keep_to_the_room_there_is() -> None:
+def test_spawning_keeps_to_the_room_there_is() -> None:
     everything = renewed(quickest_backend())
     few = renewed(quickest_backend(), config=replace(CONFIG, most=2)).new_free
     assert len(few) == 2
-    assert float(few.log_scales.min()) > float(everything.new_free.log_scales.max()), "what is missing is born coarser"
+    assert float(few.log_scales.min()) > float(everything.new_free.log_scales.max()), (
+        "what is missing is spawned coarser"
+    )
     assert len(renewed(quickest_backend(), room=1).new_free) == 1
     assert len(renewed(quickest_backend(), room=0).new_free) == 0
     assert len(everything.new_free) > 2
@@ -117,7 +118,7 @@ def test_when_everything_is_missing_nothing_is_born_and_that_is_reported() -> No
     assert len(found.new_free) == 0
 
 
-def test_births_are_repeated_bit_for_bit() -> None:
+def test_spawning_is_repeated_bit_for_bit() -> None:
     one, other = (renewed(quickest_backend()).new_free for _ in range(2))
     assert torch.equal(one.means, other.means)
     assert torch.equal(one.colors, other.colors)
@@ -147,10 +148,9 @@ def test_a_ghost_dies() -> None:
         split,
         views,
         find_active_tiles(split, views, config=motion, backend=backend),
-        first_birth=1 << 32,
+        first_identity=1 << 32,
         floor=floor,
         room=1000,
-        min_pixels=0.3,
         config=CONFIG,
         backend=backend,
     )
@@ -188,17 +188,17 @@ def test_the_second_sweep_is_left_out_where_the_first_one_bears() -> None:
 
 
 def test_the_second_sweep_bears_nothing_where_it_would_bear_more_than_thin_content() -> None:
-    """In a throw everything that lags would be born, and stand where anchors belong."""
+    """In a throw everything that lags would be spawned, and stand where anchors belong."""
     number = len(renewed(quickest_backend(), config=replace(BLIND, thin=THIN)).new_free)
-    for most, born in ((number, number), (number - 1, 0)):
+    for most, spawned in ((number, number), (number - 1, 0)):
         found = renewed(
             quickest_backend(), config=replace(BLIND, thin=varied(THIN, RULES=replace(THIN.RULES, most=most)))
         )
-        assert len(found.new_free) == found.thin_count == born
-        assert found.counts["refused thin"] == number - born, "counted in the log"
+        assert len(found.new_free) == found.thin_count == spawned
+        assert found.counts["refused thin"] == number - spawned, "counted in the log"
 
 
-def test_a_cap_that_makes_births_coarser_is_reported_in_the_log() -> None:
+def test_a_cap_that_makes_spawned_gaussians_coarser_is_reported_in_the_log() -> None:
     free = len(renewed(quickest_backend(), config=CONFIG).new_free)
     capped = renewed(quickest_backend(), config=replace(CONFIG, most=free - 1))
     assert 0 < len(capped.new_free) < free

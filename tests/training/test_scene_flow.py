@@ -3,16 +3,16 @@
 
 import torch
 
-from structgstream.kernels.backend import reference_backend
 from structgstream.training.online.config import MotionConfig, SceneFlowConfig
 from structgstream.training.online.preprocess import flow_views
 from structgstream.training.online.scene_flow import apply_scene_flow
 from structgstream.training.online.split import DynamicSplit, with_displacements
 from structgstream.training.views import training_views
+from tests.support.backends import quickest_backend
 from tests.support.worlds import World, moved_since, moving_world
 
 CPU = torch.device("cpu")
-BACKEND = reference_backend()
+BACKEND = quickest_backend()
 MOTION = MotionConfig(enabled=True, picture_scale=0.5)
 SPEED = 0.08  # 2.1 pixels of the pictures below
 

@@ -57,9 +57,9 @@ def test_nothing_moves_between_equal_pictures() -> None:
 
 
 def test_one_view_is_not_enough() -> None:
-    config = varied(CONFIG, MIN_VIEWS=len(WORLD.rig.training) + 1)
+    config = varied(CONFIG, MIN_VOTES=len(WORLD.rig.training) + 1)
     assert not moving(config=config).anchors.any()
-    assert moving(config=varied(CONFIG, MIN_VIEWS=1)).anchors.sum() >= moving().anchors.sum()
+    assert moving(config=varied(CONFIG, MIN_VOTES=1)).anchors.sum() >= moving().anchors.sum()
 
 
 def test_each_view_tells_which_gaussians_it_shows() -> None:
@@ -75,7 +75,7 @@ def test_each_view_tells_which_gaussians_it_shows() -> None:
 
 
 def test_what_moved_before_moves_more_easily() -> None:
-    strict = varied(replace(CONFIG, hysteresis=0.2), MIN_SHARE=0.9)
+    strict = varied(replace(CONFIG, hysteresis=0.2), MIN_CHANGED_SHARE=0.9)
     views, earlier = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (1, 0))
 
     def found(older: Scene | None) -> torch.Tensor:

@@ -7,15 +7,15 @@ import pytest
 import torch
 
 from structgstream.cameras import Camera
-from structgstream.kernels.backend import reference_backend
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import SmoothnessConfig
 from structgstream.training.online.smoothness import MotionSmoothness
 from structgstream.training.parameters import pixel_size
+from tests.support.backends import quickest_backend
 from tests.support.rigs import arc_rig, random_scene
 from tests.support.varied import varied
 
-BACKEND = reference_backend()
+BACKEND = quickest_backend()
 CONFIG = varied(SmoothnessConfig(weight=1.0), NEIGHBOURS=4, FEATURE_BANDWIDTH=0.0)
 
 

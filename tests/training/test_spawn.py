@@ -26,13 +26,13 @@ WORLD = moving_world(1, width=96, height=64)
 VIEWS = training_views(WORLD.frames[0], WORLD.rig, torch.device("cpu"))
 
 
-def test_blame_takes_two_views_and_half_of_those_that_see() -> None:
+def test_an_outlier_takes_two_views_and_half_of_those_that_see() -> None:
     coverage = torch.tensor([[10.0, 10, 10, 10], [10, 10, 10, 0.1], [10, 10, 10, 0.1], [10, 0, 10, 0.1]])
     wrong = torch.tensor([[6.0, 6, 6, 6], [6, 0, 6, 0.1], [0, 0, 6, 0.1], [0, 0, 0, 0.1]])
-    found = outlier_mask(coverage, wrong, min_pixels=0.3, rules=RULES)
+    found = outlier_mask(coverage, wrong, rules=RULES)
     # Two of four; one of three; three of four; one, since the others do not see it.
     assert found.tolist() == [True, False, True, False]
-    assert not outlier_mask(coverage, 0.5 * coverage, min_pixels=0.3, rules=RULES).any(), "half is not more than half"
+    assert not outlier_mask(coverage, 0.5 * coverage, rules=RULES).any(), "half is not more than half"
 
 
 def spoiled(view: View) -> torch.Tensor:
@@ -70,13 +70,13 @@ def test_without_anything_missing_nothing_is_born() -> None:
     views = [ViewResidual(v, torch.zeros(64, 96, dtype=torch.bool), torch.zeros(64, 96)) for v in VIEWS]
     depths = {v.index: torch.full((64, 96), 5.0) for v in VIEWS}
     color = CameraColor.identity(len(VIEWS))
-    found = spawn_by_sweep(views, depths, color, first_birth=7, rules=RULES, backend=reference_backend())
+    found = spawn_by_sweep(views, depths, color, first_identity=7, rules=RULES, backend=reference_backend())
     assert (len(found.free), found.refused_count) == (0, 0)
 
 
 def test_a_view_of_which_nothing_counts_neither_supports_nor_contradicts() -> None:
     """Four views miss a ball that frame 0 lacked; a fifth that is masked, or was absent from frame 0, misses nothing,
-    and as an equal voice would prevent its birth."""
+    and as an equal voice would prevent spawning."""
     world = moving_world(1, width=96, height=64, cameras=6, emerges_at=0)
     views = training_views(world.frames[0], world.rig, torch.device("cpu"))
     backend, color = reference_backend(), CameraColor.identity(len(views))
@@ -85,9 +85,9 @@ def test_a_view_of_which_nothing_counts_neither_supports_nor_contradicts() -> No
     rules = replace(RULES, residual_threshold=0.05, max_contradictions=0.2, min_hits=1)
     floor = ResidualFloor(1.0, {v.index: torch.zeros(64, 96) for v in views})
 
-    def born(last: ViewResidual) -> int:
+    def spawned(last: ViewResidual) -> int:
         found = [compared(without[v.index].clamp(0, 1), v, floor=floor, rules=rules) for v in views[:-1]]
-        return len(spawn_by_sweep([*found, last], depths, color, first_birth=0, rules=rules, backend=backend).free)
+        return len(spawn_by_sweep([*found, last], depths, color, first_identity=0, rules=rules, backend=backend).free)
 
     last = views[-1]
     silent = ViewResidual(last, torch.zeros(64, 96, dtype=torch.bool), torch.zeros(64, 96))
@@ -97,7 +97,7 @@ def test_a_view_of_which_nothing_counts_neither_supports_nor_contradicts() -> No
     seen = compared(without[last.index].clamp(0, 1), masked, floor=floor, rules=rules)
     assert not absent.missing_share.any()
     assert not seen.missing_share.any()
-    assert born(absent) == born(seen) > born(silent)
+    assert spawned(absent) == spawned(seen) > spawned(silent)
 
 
 def lines(*lengths: int) -> torch.Tensor:
@@ -121,20 +121,21 @@ def test_where_there_are_too_many_whole_clusters_are_born_or_none(
 ) -> None:
     points = lines(4, 8, 3)
     rules = replace(RULES, overflow=overflow, most=most, min_hits=1)
-    found = _merge_points(points, torch.rand(15, 3), torch.ones(15), first_birth=7, rules=rules)
+    found = _merge_points(points, torch.rand(15, 3), torch.ones(15), first_identity=7, rules=rules)
     assert found.refused_count == refused
     assert sorted({round(float(y) / 50) for y in found.free.means[:, 1]}) == rows
     assert len(found.free) == sum((4, 8, 3)[row] for row in rows)
     assert found.free.births.tolist() == list(range(7, 7 + len(found.free)))
 
 
-def test_where_there_are_too_many_births_are_coarser() -> None:
+def test_where_there_are_too_many_spawned_gaussians_are_coarser() -> None:
     rules = replace(RULES, overflow="coarser", most=9, min_hits=1)
-    found = _merge_points(lines(4, 8, 3), torch.rand(15, 3), torch.ones(15), first_birth=0, rules=rules)
+    found = _merge_points(lines(4, 8, 3), torch.rand(15, 3), torch.ones(15), first_identity=0, rules=rules)
     assert (0 < len(found.free) <= 9, found.refused_count) == (True, 0)
     assert found.merged_count == 15 - len(found.free), "a cap that binds is reported"
     assert float(found.free.log_scales.mean()) > float(torch.tensor(RULES.size).log())
     unbound = replace(rules, most=15)
     assert (
-        _merge_points(lines(4, 8, 3), torch.rand(15, 3), torch.ones(15), first_birth=0, rules=unbound).merged_count == 0
+        _merge_points(lines(4, 8, 3), torch.rand(15, 3), torch.ones(15), first_identity=0, rules=unbound).merged_count
+        == 0
     )

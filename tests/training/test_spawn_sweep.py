@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 import torch
 
-from structgstream.kernels.backend import reference_backend
 from structgstream.kernels.values import RasterOutput
 from structgstream.training.online import spawn
 from structgstream.training.online.config import MotionConfig, SpawnRules
@@ -15,6 +14,7 @@ from structgstream.training.online.spawn import Sweep, missing_share
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.residuals import residual_floor
 from structgstream.training.views import training_views
+from tests.support.backends import quickest_backend
 from tests.support.worlds import emerging_ball, moved_since, moving_world
 
 CPU = torch.device("cpu")
@@ -24,7 +24,7 @@ RULES = SpawnRules(min_hits=2)
 
 def sweep(rules: SpawnRules = RULES) -> Sweep:
     """Over the frame in which a ball emerges."""
-    backend, motion = reference_backend(), MotionConfig(enabled=True, picture_scale=1.0)
+    backend, motion = quickest_backend(), MotionConfig(enabled=True, picture_scale=1.0)
     first, views = (training_views(WORLD.frames[t], WORLD.rig, CPU) for t in (0, 1))
     split = DynamicSplit.of(WORLD.scene, moved_since(WORLD.scene, views, first, config=motion, backend=backend))
     active_tiles = find_active_tiles(split, views, config=motion, backend=backend)
@@ -80,9 +80,9 @@ def test_what_another_sweep_has_drawn_is_not_drawn_again() -> None:
 def test_without_room_nothing_is_born_and_with_room_as_much_as_there_is() -> None:
     swept = sweep()
     missing = swept.missing()
-    assert not len(swept.births(missing, first_birth=0, room=0).free)
-    assert len(swept.births(missing, first_birth=0, room=2).free) == 2
-    unsupported = sweep(replace(RULES, min_supports=6)).births(missing, first_birth=0, room=9)
+    assert not len(swept.spawn(missing, first_identity=0, room=0).free)
+    assert len(swept.spawn(missing, first_identity=0, room=2).free) == 2
+    unsupported = sweep(replace(RULES, min_supports=6)).spawn(missing, first_identity=0, room=9)
     assert not len(unsupported.free), "six others of six"
     assert not unsupported.refused_count
 
@@ -107,7 +107,7 @@ def test_what_is_found_lies_in_the_middle_of_a_pixel_of_its_view(monkeypatch: py
         return merge(points, *arguments, **options)
 
     monkeypatch.setattr(spawn, "_merge_points", noted)
-    swept.births(swept.missing(), first_birth=0, room=9)
+    swept.spawn(swept.missing(), first_identity=0, room=9)
     (points,) = found
     beside = []
     for view in swept.views:

@@ -8,13 +8,14 @@ import torch
 
 from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame
+from structgstream.groups import tracking
 from structgstream.groups.tracking import TrackConfig, Tracked, Tracker, _measure_view, track_frame
 from structgstream.training.online.config import LiftConfig, MotionConfig
 from tests.support.backends import quickest_backend
 from tests.support.worlds import World, moving_world
 
 SPEED, FRAMES = 0.06, 5
-CONFIG = TrackConfig(scale=1.0, cameras=8, picture_scale=0.5)
+CONFIG = TrackConfig(cameras=8, picture_scale=0.5)
 
 
 def world(*, speed: float = SPEED, movers: int = 60) -> World:
@@ -56,11 +57,14 @@ def test_hidden_anchors_go_along_with_what_hides_them() -> None:
     assert float(travelled.mean()) > 0.3
 
 
-def test_flow_from_the_rendering_corrects_drift() -> None:
+def test_flow_from_the_rendering_corrects_drift(monkeypatch: pytest.MonkeyPatch) -> None:
     scenery, errors = world(), []
     truth = (FRAMES - 1) * SPEED
-    for every in (1, 0):
-        found = tracked(scenery, replace(CONFIG, rendered_every=every))
+    monkeypatch.setattr(tracking, "RENDERED_EVERY", 1)
+    nothing = lambda tracker, scene, seen, velocities: torch.zeros_like(seen.flows)  # noqa: E731
+    for flow in (tracking._rendered_flow, nothing):
+        monkeypatch.setattr(tracking, "_rendered_flow", flow)
+        found = tracked(scenery)
         errors.append(
             float(((found.scene.anchors.positions - scenery.scene.anchors.positions)[:, 0] - truth).abs().mean())
         )
@@ -93,8 +97,6 @@ def test_pictures_of_the_size_of_the_stream_are_not_copied() -> None:
     assert [view.image.data_ptr() for view in views] == [
         frame.images[scenery.rig.training[view.index]].ctypes.data for view in views
     ]
-    small = tracker(scenery, replace(CONFIG, scale=0.5)).pictures(frame, None).views
-    assert [tuple(view.image.shape) for view in small] == [(48, 64, 3)] * len(views)
 
 
 @pytest.mark.parametrize(("cameras", "stride"), [(2, 1), (10, 1), (11, 2), (12, 2), (27, 2), (28, 2), (30, 3)])
@@ -123,16 +125,16 @@ def test_a_frame_without_a_known_picture_moves_nothing() -> None:
 
 
 def test_coverage_is_in_pixels_of_the_reference_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In pictures of twice the size, tracked at half of it or whole, movers cover as many pixels."""
+    """In pictures of twice the size movers cover as many pixels."""
     scenery = world()
     monkeypatch.setattr("structgstream.cameras.REFERENCE_PIXELS", 128)
 
-    def coverage(times: int, scale: float) -> torch.Tensor:
+    def coverage(times: int) -> torch.Tensor:
         rig = CameraRig(
             {name: scenery.rig[name].resized(128 * times, 96 * times) for name in scenery.rig}, scenery.rig.held_out
         )
         enlarged = World(rig, scenery.scene, [])
-        chosen = tracker(enlarged, replace(CONFIG, scale=scale))
+        chosen = tracker(enlarged)
         frames = [
             MultiViewFrame(n, 0.0, {name: i.repeat(times, 0).repeat(times, 1) for name, i in frame.images.items()})
             for n, frame in enumerate(scenery.frames[:2])
@@ -143,6 +145,4 @@ def test_coverage_is_in_pixels_of_the_reference_size(monkeypatch: pytest.MonkeyP
         ]
         return torch.stack([entry.flows[:, 3] for entry in measured]).sum(0)
 
-    small = coverage(1, 1.0)
-    for found in (coverage(2, 1.0), coverage(2, 0.5)):
-        assert 0.8 < float(found.sum() / small.sum()) < 1.25  # 4 if it were in pixels of each size.
+    assert 0.8 < float(coverage(2).sum() / coverage(1).sum()) < 1.25  # 4 if it were in pixels of each size.

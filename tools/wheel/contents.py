@@ -11,7 +11,7 @@ NEEDED = (
     "structgstream/serve/assets/player.js",
     "structgstream/data/clip/cameras.json",
     "structgstream/_native/libstructgstream.so",
-    *(f"structgstream/_native/cuda/{name}" for name in ("ssim.cu", "ssim.h", "ssim_phases.h", "ssim_window.h")),
+    *(f"structgstream/_native/cuda/{name}" for name in ("ssim.cu", "ssim.h", "ssim_calls.h", "ssim_phases.h")),
 )
 BESIDE = (".dist-info/", ".libs/")
 """Folders of a wheel that are no package: its description, and the libraries that were grafted."""

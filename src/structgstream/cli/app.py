@@ -8,13 +8,14 @@ import difflib
 import errno
 import importlib
 import os
+import signal
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from types import ModuleType
+from types import FrameType, ModuleType
 
-from structgstream.cli.signals import Terminated
 from structgstream.errors import ConfigError, StructGStreamError
 
 COMMANDS = {
@@ -62,6 +63,20 @@ class UsageError(Exception):
 
 class Interrupted(Exception):
     """The user pressed Ctrl-C; the message states what is stored and how to continue."""
+
+
+@contextmanager
+def interruption(message: Callable[[], str]) -> Iterator[None]:
+    """Gives Ctrl-C and SIGTERM in the block a message: what is stored and how to continue.
+
+    Raises:
+        Interrupted: the user pressed Ctrl-C.
+        Terminated: SIGTERM came.
+    """
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        raise (Terminated if isinstance(error, Terminated) else Interrupted)(message()) from None
 
 
 @contextmanager
@@ -190,3 +205,98 @@ def _packages() -> list[ModuleType]:
 
 def _print_error(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
+
+
+class Terminated(KeyboardInterrupt):
+    """The process was asked to end, as by Ctrl-C; the message states what is stored and how to continue."""
+
+
+class Termination:
+    """Within its ``with`` block the first SIGTERM only sets :attr:`asked`; a second one ends the block at once.
+
+    Only the main thread receives signals, so elsewhere the block changes nothing.
+
+    Args:
+        on_ask: called, in the signal's handler, at the first one: to wake what waits for frames.
+
+    Raises:
+        Terminated: at the second SIGTERM, wherever the block is.
+    """
+
+    def __init__(self, on_ask: Callable[[], object] = lambda: None) -> None:
+        self.asked = False
+        self._on_ask = on_ask
+        self._before: object = None
+
+    def __enter__(self) -> "Termination":
+        try:
+            self._before = signal.signal(signal.SIGTERM, self._handle)
+        except ValueError:  # not the main thread
+            self._before = None
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        if callable(self._before) or isinstance(self._before, int):
+            signal.signal(signal.SIGTERM, self._before)  # type: ignore[arg-type]
+
+    def end(self, *, whole: bool) -> None:
+        """Called between frames: ends the block if that was asked for, unless the run is ``whole`` anyway.
+
+        Raises:
+            Terminated: it was.
+        """
+        if self.asked and not whole:
+            raise Terminated
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.asked:
+            raise Terminated("The frame being fitted was given up.")
+        self.asked = True
+        self._on_ask()
+
+
+AGAIN_SECONDS = 3.0
+
+
+@contextmanager
+def interruptible(*, again_seconds: float = AGAIN_SECONDS) -> Iterator[None]:
+    """Within this block Ctrl-C is a ``KeyboardInterrupt`` that leaves it.
+
+    Libraries lose it: one that is loaded at the moment makes an error of its own of it (pycolmap does), a callback from
+    C drops it. So an error after Ctrl-C counts as Ctrl-C, and a block that goes on is interrupted again. Only for work
+    whose results are there whole or not at all, as what cleans up is interrupted again, too.
+
+    Outside of the main thread, and where Ctrl-C is ignored (``nohup``), the block changes nothing.
+
+    Args:
+        again_seconds: after which a block that goes on is interrupted again.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C was pressed.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield
+        return
+    asked = False
+
+    def interrupted(number: int, frame: FrameType | None) -> None:
+        nonlocal asked
+        asked = True
+        signal.setitimer(signal.ITIMER_REAL, again_seconds, again_seconds)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, interrupted)
+    alarm = signal.signal(signal.SIGALRM, interrupted)
+    try:
+        yield
+    except Exception as error:
+        if not asked:
+            raise
+        raise KeyboardInterrupt from error
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGALRM, alarm)
+    if asked:
+        raise KeyboardInterrupt

@@ -11,9 +11,9 @@ import tyro
 from rich.console import Console
 
 from structgstream.cli.app import Interrupted, UsageError
+from structgstream.cli.evaluate import quality_text, report_tables
 from structgstream.cli.options import Device, check_ending, parse_known_options, resolve_config
 from structgstream.cli.progress import print_lines
-from structgstream.cli.tables import quality_text, report_tables
 
 if TYPE_CHECKING:
     from structgstream.data.source import FrameSource

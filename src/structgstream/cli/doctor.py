@@ -9,7 +9,7 @@ from typing import Any
 from rich.table import Table
 
 from structgstream.cli.options import JsonPath, check_ending, parse_options, write_json_output
-from structgstream.cli.tables import compact_table, literal_cells, name_value_table
+from structgstream.cli.progress import compact_table, literal_cells, name_value_table
 
 # Import name, distribution, extra, what it is for.
 OPTIONAL = (

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """``structgstream evaluate``."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
-from rich.console import Console
+from rich.console import Console, Group
+from rich.table import Table
+from rich.text import Text
 
 from structgstream.cli.options import (
     Device,
@@ -17,14 +20,20 @@ from structgstream.cli.options import (
     parse_options,
     write_json_output,
 )
-from structgstream.cli.progress import print_lines
-from structgstream.cli.tables import quality_text, report_tables
+from structgstream.cli.progress import (
+    SHOWN_FRAMES,
+    compact_table,
+    human_bytes,
+    literal_cells,
+    name_value_table,
+    print_lines,
+)
 
 if TYPE_CHECKING:
     from structgstream.codec.reader import StreamReader
     from structgstream.data.source import FrameSource
     from structgstream.evaluation.optional_metrics import MetricSelection
-    from structgstream.evaluation.report import Report
+    from structgstream.evaluation.report import Report, Scores
     from structgstream.kernels.backend import Backend
 
 SHEET_COLUMNS = 5
@@ -140,3 +149,176 @@ def run_evaluation(
         contact_sheet(folder / "contact_sheet.png", compared_pictures, title=title)
         write_page(folder, worst.crops(), title=title, pictures=("over_time.png", "contact_sheet.png"))
     return report
+
+
+BASIC = ("PSNR", "colour", "SSIM", "changed", "still")
+"""Titles of the first columns of every table of scores; colour is PSNR after frame 0's colour fit."""
+
+FURTHER = (  # title, key, factor, digits
+    ("MS-SSIM", "ms_ssim", 1, 4),
+    ("FLIP", "flip", 1, 4),
+    ("LPIPS", "lpips_alex", 1, 4),
+    ("VGG", "lpips_vgg", 1, 4),
+    ("E_warp", "e_warp", 1, 5),
+    ("tFLIP", "temporal_flip", 1, 4),
+    ("tLPIPS", "t_lpips", 1, 5),
+    ("flicker", "flicker", 1, 2),
+    ("truth", "truth_flicker", 1, 2),
+)
+
+AT_OTHER_SIZES = (  # title, key, factor, digits
+    ("half", "psnr_half", 1, 2),
+    ("SSIM", "ssim_half", 1, 4),
+    ("stored", "psnr_stored", 1, 2),
+    ("SSIM", "ssim_stored", 1, 4),
+    ("disoccluded %", "disoccluded_share", 100, 2),
+    ("ghosts %", "ghost_share", 100, 2),
+    ("dB there", "psnr_disoccluded", 1, 2),
+)
+
+
+def report_tables(report: "Report", *, title: str) -> Group:
+    """Scores by frame and by camera, and the facts of the file."""
+    known = [column for column in AT_OTHER_SIZES if getattr(report.mean, column[1]) is not None]
+    parts = [_frames(report, title), _cameras(report), _by_camera(report, known)]
+    if report.stream["metrics"] == "all":
+        parts.append(_by_camera(report, FURTHER))
+    if report.stream["not_available"]:
+        parts.append(_not_available(report))
+    parts.append(_facts(report))
+    return Group(*(part for shown in parts for part in (shown, Text())))
+
+
+def _frames(report: "Report", title: str) -> Table:
+    table = compact_table()
+    table.title = Text(title)
+    for name in ("frame", *BASIC, "bytes", "anchors", "free", "seconds"):
+        table.add_column(name, justify="right", no_wrap=True)
+    frames = report.frames
+    step = -(-len(frames) // SHOWN_FRAMES)
+    for frame in frames[::step] if (len(frames) - 1) % step == 0 else [*frames[::step], frames[-1]]:
+        seconds = frame.log.get("total_seconds")
+        table.add_row(
+            str(frame.index),
+            *_scores(frame.mean),
+            human_bytes(frame.bytes),
+            f"{frame.anchors:,}",
+            f"{frame.free:,}",
+            "-" if seconds is None else f"{seconds:.1f}",
+        )
+    table.add_section()
+    mean_bytes = sum(frame.bytes for frame in frames) / len(frames)
+    table.add_row("mean", *_scores(report.mean), human_bytes(mean_bytes), "", "", "", style="bold")
+    return table
+
+
+def _cameras(report: "Report") -> Table:
+    table = compact_table("camera", "", *BASIC, "affine", left=("camera", ""))
+    for name, scores in report.cameras.items():
+        affine = f"{scores.psnr_affine:.2f}"
+        table.add_row(*literal_cells(name, report.stream["cameras"][name]), *_scores(scores), affine)
+    return table
+
+
+def _by_camera(report: "Report", columns: Sequence[tuple[str, str, int, int]]) -> Table:
+    """The scores of ``columns`` by camera, and their mean."""
+    table = compact_table("camera", *(title for title, *_ in columns), left=("camera",))
+    for name, scores in (*report.cameras.items(), ("mean", report.mean)):
+        values = [(getattr(scores, key), factor, digits) for _, key, factor, digits in columns]
+        cells = ["-" if v is None else f"{factor * v:.{digits}f}" for v, factor, digits in values]
+        table.add_row(*literal_cells(name), *cells)
+    return table
+
+
+def _not_available(report: "Report") -> Table:
+    """Which scores are missing, and why: one row for each reason."""
+    reasons: dict[str, list[str]] = {}
+    for name, reason in report.stream["not_available"].items():
+        reasons.setdefault(reason, []).append(name)
+    table = name_value_table()
+    for reason, names in reasons.items():
+        table.add_row("not available", Text(f"{', '.join(names)}: {reason}", overflow="fold"))
+    return table
+
+
+def _at_equal_shares(drift: float | None) -> str:
+    return "" if drift is None else f" ({drift:+.3f} if as many pixels had changed in all)"
+
+
+def _facts(report: "Report") -> Table:
+    s = report.stream
+    table = name_value_table()
+    if s["absent_frames"]:
+        counts = (f"{name} from {count} of {s['frames']} frames" for name, count in s["absent_frames"].items())
+        table.add_row("absent", Text(f"{', '.join(counts)}; means are over the pictures that exist"))
+    if s["masked_share"]:
+        shares = (f"{name} {share:.1%}" for name, share in s["masked_share"].items())
+        table.add_row("masked", Text(f"{', '.join(shares)} of the pixels, which are not scored"))
+    table.add_row(
+        "PSNR over time",
+        f"first {s['psnr_first']:.2f}, last {s['psnr_last']:.2f}, worst {s['psnr_worst']:.2f} dB; "
+        f"drift {s['drift_db_per_frame']:+.3f} dB a frame{_at_equal_shares(s['drift_at_equal_shares_db_per_frame'])}",
+    )
+    if s["worst"]["changed"]:
+        found = s["worst"]["changed"]
+        table.add_row(
+            "worst frame",
+            Text(f"{found['frame']} of {found['camera']}: {found['psnr_changed']:.2f} dB on changed pixels"),
+        )
+    if s["worst"]["ghosts"]:
+        found = s["worst"]["ghosts"]
+        pixels = 100 * found["ghost_share"] * found["disoccluded_share"]
+        table.add_row(
+            "most ghosts",
+            Text(
+                f"frame {found['frame']} of {found['camera']}: {100 * found['ghost_share']:.1f} % of the disoccluded "
+                f"pixels, {pixels:.2f} % of all"
+            ),
+        )
+    table.add_row(
+        "size",
+        f"{human_bytes(s['total_bytes'])}: header {human_bytes(s['header_bytes'])}, "
+        f"{s['frames']} packets {human_bytes(s['packet_bytes'])}; "
+        f"a frame {human_bytes(s['packet_bytes'] / s['frames'])}, {human_bytes(s['total_bytes'] / s['frames'])} with "
+        "the header shared over them",
+    )
+    table.add_row(
+        "rate",
+        f"{s['megabits_per_second']:.2f} Mbit/s at {s['fps']:g} frames a second, "
+        f"{s['megabits_per_second_with_header']:.2f} with the header",
+    )
+    fields = sorted(s["field_bytes"].items(), key=lambda item: -item[1])
+    table.add_row("bytes by field", ", ".join(f"{name} {human_bytes(size)}" for name, size in fields if size))
+    if "peak_memory_bytes" in s:
+        memory = human_bytes(s["peak_memory_bytes"]) if s["peak_memory_bytes"] else "-"
+        first = "-" if s["seconds_first"] is None else f"{s['seconds_first']:.1f} s"
+        online = "-" if s["seconds_online_mean"] is None else f"{s['seconds_online_mean']:.2f} s"
+        table.add_row("training", f"first frame {first}, each further one {online}, peak memory {memory}")
+        stages = s["peak_memory_bytes_by_stage"]
+        if stages:
+            table.add_row("memory by stage", "; ".join(f"{name} {human_bytes(size)}" for name, size in stages.items()))
+    table.add_row(
+        "rendering",
+        f"{s['render_fps']:.1f} pictures a second, {s['decode_and_render_fps']:.1f} with the decoding of the frame",
+    )
+    e = report.environment
+    machine = f"{e['gpu'] or e['cpu']}, {e['cores']} cores, back-end {e['backend']}, torch {e['torch']}"
+    table.add_row("machine", Text(machine))
+    if e["peak_memory_bytes"]:
+        table.add_row("this evaluation", f"peak memory {human_bytes(e['peak_memory_bytes'])}")
+    return table
+
+
+def _scores(scores: "Scores | None") -> list[str]:
+    if scores is None:  # Every scored camera is absent.
+        return ["-"] * len(BASIC)
+    values = (scores.psnr, scores.psnr_camera_color, scores.ssim, scores.psnr_changed, scores.psnr_still)
+    digits = (2, 2, 4, 2, 2)
+    return ["-" if value is None else f"{value:.{n}f}" for value, n in zip(values, digits, strict=True)]
+
+
+def quality_text(report: "Report") -> str:
+    """The mean PSNR as text, with that after frame 0's colour fit."""
+    held = report.mean.psnr_camera_color
+    corrected = "" if held is None else f" ({held:.2f} after frame 0's colour fit)"
+    return f"{report.mean.psnr:.2f} dB{corrected}"

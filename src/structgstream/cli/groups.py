@@ -12,10 +12,9 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from structgstream.cli.app import Interrupted, UsageError, usage_errors
+from structgstream.cli.app import Termination, UsageError, interruption, usage_errors
 from structgstream.cli.options import Device, Flag, Folder, StreamFile, check_ending, check_new, parse_options
 from structgstream.cli.progress import display, frames_text, human_bytes, print_lines
-from structgstream.cli.signals import Terminated, Termination
 
 if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
@@ -71,8 +70,8 @@ def track(arguments: list[str]) -> None:
     check_ending(options.output, command="track")
     from structgstream.atomic_files import partial_path
     from structgstream.groups.base import GroupBase, open_for
-    from structgstream.groups.boundaries import check_length, groups_path
     from structgstream.groups.segment_file import open_segment
+    from structgstream.groups.track_file import check_length, groups_path
     from structgstream.groups.track_pass import TrackOptions
     from structgstream.groups.tracking import TrackConfig
     from structgstream.kernels.backend import select_backend
@@ -103,25 +102,21 @@ def _track(
     from structgstream.groups.track_pass import track_capture
 
     columns = [TextColumn("{task.description}"), BarColumn(bar_width=32), MofNCompleteColumn(), TimeElapsedColumn()]
-    done, spent = 0, list[float]()
-    try:
-        with (
-            Termination() as ending,
-            Progress(*columns, TimeRemainingColumn(), console=Console()) as bars,
-            closing(track_capture(path, source, base, options, backend)) as frames,
-        ):
-            task = bars.add_task("tracking", total=len(source) - 1)
-            for progress in frames:
-                done = progress.frame
-                spent.append(progress.cpu_seconds)
-                bars.update(task, completed=done)
-                if ending.asked and done + 1 < len(source):
-                    raise Terminated
-    except KeyboardInterrupt as error:
-        ended = Terminated if isinstance(error, Terminated) else Interrupted
-        raise ended(
-            f"Frame {done} of {len(source) - 1} was tracked; give the same command to go on from the last start."
-        ) from None
+    done, last, spent = 0, len(source) - 1, list[float]()
+    with (
+        interruption(
+            lambda: f"Frame {done} of {last} was tracked; give the same command to go on from the last start."
+        ),
+        Termination() as ending,
+        Progress(*columns, TimeRemainingColumn(), console=Console()) as bars,
+        closing(track_capture(path, source, base, options, backend)) as frames,
+    ):
+        task = bars.add_task("tracking", total=last)
+        for progress in frames:
+            done = progress.frame
+            spent.append(progress.cpu_seconds)
+            bars.update(task, completed=done)
+            ending.end(whole=done == last)
     return sum(spent) / len(spent) if spent else None
 
 
@@ -205,17 +200,17 @@ def _fit(options: FitGroup, task: "SegmentTask") -> bool:
     )
     if run is None:
         return False
-    done = run.done
-    try:
-        with Termination() as ending, display(task.end, done=done) as progress, closing(run.reports) as reports:
-            for report in reports:
-                progress.frame(report)
-                done = report.index + 1
-                if ending.asked and done != task.end:
-                    raise Terminated
-    except KeyboardInterrupt as error:
-        message = f"{done - task.first} of {task.end - task.first} frames are safe; give the same command to go on."
-        raise (Terminated if isinstance(error, Terminated) else Interrupted)(message) from None
+    done, frames = run.done, task.end - task.first
+    with (
+        interruption(lambda: f"{done - task.first} of {frames} frames are safe; give the same command to go on."),
+        Termination() as ending,
+        display(task.end, done=done) as progress,
+        closing(run.reports) as reports,
+    ):
+        for report in reports:
+            progress.frame(report)
+            done = report.index + 1
+            ending.end(whole=done == task.end)
     return True
 
 

@@ -16,8 +16,16 @@ from rich.table import Table
 
 from structgstream.cli.app import UsageError
 from structgstream.cli.options import Flag, JsonPath, StreamFile, check_ending, parse_options, write_json_output
-from structgstream.cli.progress import change, frames_text, human_bytes, print_lines
-from structgstream.cli.tables import SHOWN_FRAMES, compact_table, literal_cells, name_value_table
+from structgstream.cli.progress import (
+    SHOWN_FRAMES,
+    change,
+    compact_table,
+    frames_text,
+    human_bytes,
+    literal_cells,
+    name_value_table,
+    print_lines,
+)
 
 if TYPE_CHECKING:
     from structgstream.codec.reader import StreamReader
@@ -105,11 +113,7 @@ def _print_capture(options: Inspect) -> None:
 
 
 def draw_byte_plot(path: Path, reader: "StreamReader", rows: "Sequence[Row]", *, name: str) -> None:
-    """Writes the picture.
-
-    Raises:
-        UsageError: there is nothing to draw.
-    """
+    """Writes the picture."""
     if not rows:
         raise UsageError("the stream has no whole frame, so there is nothing to draw.")
     from structgstream.evaluation.byte_count import parts_of, write_byte_plot
@@ -318,9 +322,6 @@ def describe_capture(path: Path) -> dict[str, Any]:
 
     ``remarks`` are the warnings of its reader: what is left out, and why. A folder without calibration is described as
     the footage that ``prepare`` would read.
-
-    Raises:
-        CaptureError: it cannot be opened.
     """
     from structgstream.data.open import Uncalibrated, layout_of, open_capture
     from structgstream.preparation.footage import NoFootage

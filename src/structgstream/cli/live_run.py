@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.cells import cell_len
@@ -22,7 +22,7 @@ from rich.text import Text
 
 from structgstream.cli.app import UsageError, usage_errors
 from structgstream.cli.options import CaptureOptions, Flag
-from structgstream.cli.progress import Display, Lines, display, human_bytes, summary
+from structgstream.cli.progress import Bars, Lines, display, human_bytes, summary
 
 if TYPE_CHECKING:
     from structgstream.data.denoising import DenoisingConfig
@@ -31,19 +31,6 @@ if TYPE_CHECKING:
     from structgstream.run_metrics import RunMetrics
     from structgstream.session.frame_report import FrameReport
     from structgstream.training.result import Step
-
-
-class Stoppable(Protocol):
-    """A run that can be stopped after the frame being fitted, such as a ``LiveSource``."""
-
-    @property
-    def stopped(self) -> bool:
-        """Whether :meth:`stop` was called."""
-        ...
-
-    def stop(self) -> None:
-        """Stops after this frame; may be called by a signal's handler."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -57,11 +44,7 @@ class LiveChoice:
     """Live only: record all that the cameras send, as a capture that can be reconstructed with every frame."""
 
     def check(self, scene: Path) -> None:
-        """Check the options of a run that is not live.
-
-        Raises:
-            UsageError: one is for live runs, or the scene is a rig file.
-        """
+        """Check the options of a run that is not live."""
         if self != LiveChoice():
             raise UsageError("--record is for live cameras: give --live and a rig file.")
         if scene.suffix == ".toml":
@@ -69,19 +52,9 @@ class LiveChoice:
 
 
 def open_live(
-    scene: Path,
-    capture: CaptureOptions,
-    live: LiveChoice,
-    *,
-    stream: Path,
-    resume: bool,
-    denoising: "DenoisingConfig",
+    scene: Path, capture: CaptureOptions, live: LiveChoice, *, stream: Path, resume: bool, denoising: "DenoisingConfig"
 ) -> "LiveSource":
-    """The cameras of a rig file; they are not opened yet.
-
-    Raises:
-        UsageError: an option that live cameras do not have.
-    """
+    """The cameras of a rig file; they are not opened yet."""
     from structgstream.data.live.source import LiveOptions, LiveSource
 
     if capture.start:
@@ -123,7 +96,7 @@ def stop_of(source: "FrameStream") -> Callable[[], object]:
 
 
 @contextmanager
-def monitored(source: "FrameStream", metrics: "RunMetrics | None", *, done: int) -> Iterator[Display]:
+def monitored(source: "FrameStream", metrics: "RunMetrics | None", *, done: int) -> "Iterator[Display]":
     """Shows a run and writes its metrics; Ctrl-C ends a live one after the frame being fitted."""
     from structgstream.data.live.source import LiveSource
     from structgstream.data.source import frame_count
@@ -133,23 +106,23 @@ def monitored(source: "FrameStream", metrics: "RunMetrics | None", *, done: int)
             stack.enter_context(metrics.running())
         if isinstance(source, LiveSource) and metrics is not None:
             stack.enter_context(source)
-            stack.enter_context(stop_on_interrupt(source))
+            stack.enter_context(stop_on_interrupt(lambda: source.stopped, source.stop))
             yield stack.enter_context(live_display(metrics.values, frames=None, done=done))
         else:
             yield stack.enter_context(display(frame_count(source), done=done))
 
 
 @contextmanager
-def stop_on_interrupt(source: Stoppable) -> Iterator[None]:
-    """The first Ctrl-C ends the stream after the frame being fitted, the second one at once."""
+def stop_on_interrupt(stopped: Callable[[], bool], stop: Callable[[], object]) -> Iterator[None]:
+    """The first Ctrl-C ends the stream by ``stop`` after the frame being fitted, the second one at once."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
     def interrupted(number: int, frame: FrameType | None) -> None:
-        if source.stopped:
+        if stopped():
             raise KeyboardInterrupt
-        source.stop()
+        stop()
         print("Ends after this frame; Ctrl-C again ends at once.", file=sys.stderr, flush=True)
 
     before = signal.signal(signal.SIGINT, interrupted)
@@ -164,14 +137,13 @@ GAP = "  "
 Values = Callable[[], Mapping[str, Any]]
 
 
-def live_display(values: Values, *, frames: int | None, done: int = 0, console: Console | None = None) -> Display:
+def live_display(
+    values: Values, *, frames: int | None, done: int = 0, console: Console | None = None
+) -> "Dashboard | LiveLines":
     """A dashboard when ``console`` (default: standard output) is a terminal, else a line a frame.
 
     Args:
-        values: of ``RunMetrics``.
         frames: number of frames of the stream when it is finished; None where that is unknown.
-        done: how many of them are stored already.
-        console: where to write.
     """
     console = Console() if console is None else console
     if console.is_terminal:
@@ -189,7 +161,7 @@ class LiveLines(Lines):
     def frame(self, report: "FrameReport", *, quality: str | None = None) -> None:
         """Prints the frame's line."""
         self._current = report.index + 1
-        self._print(f"{summary(report, self._frames, quality=quality)}  {state_line(self._values())}")
+        self._print(f"{summary(report, self._frames, quality=quality)}  {GAP.join(state_parts(self._values()))}")
 
 
 class Dashboard:
@@ -246,6 +218,10 @@ class Dashboard:
         return f"frame {self._next}  takes pictures and prepares them"
 
 
+Display = Bars | Lines | Dashboard
+"""Displays the progress of a reconstruction: ``step`` after each iteration, ``frame`` after a frame is stored."""
+
+
 class Flow:
     """Short texts one after the other, as many in a line as fit; none is broken that fits into one."""
 
@@ -261,11 +237,6 @@ class Flow:
             else:
                 lines.append(text)
         yield Text("\n".join(lines), style=self._style)
-
-
-def state_line(values: Mapping[str, Any]) -> str:
-    """Rates, queues, room and delay in one line."""
-    return GAP.join(state_parts(values))
 
 
 def state_parts(values: Mapping[str, Any]) -> list[str]:

@@ -3,10 +3,13 @@
 
 import ast
 import inspect
+import math
 import re
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -17,8 +20,16 @@ from structgstream.cli.app import UsageError, usage_errors
 from structgstream.exporters.formats import SUFFIXES
 
 if TYPE_CHECKING:
+    from structgstream.codec.segments.sink import SegmentsOptions
+    from structgstream.codec.segments.store import Store
     from structgstream.data.source import FrameSource
+    from structgstream.recorder import Storage
+    from structgstream.scene.scene import Scene
     from structgstream.session.presets import StreamConfig
+
+    Captured = Callable[[int], float | None]
+    SegmentsStorage = Callable[[Captured | None], Storage[Scene]]
+    """Given when frames were filmed, by their number, in seconds since 1970; None where that is not known."""
 
 Options = TypeVar("Options")
 Device = Literal["auto", "cpu", "cuda", "reference"]
@@ -66,14 +77,8 @@ def check_ending(output: Path | None, *endings: str, command: str, option: str =
     """Check that a name does not ask for a kind of file that the command does not write.
 
     Args:
-        output: the file or folder to write; None for none.
         endings: of :data:`KNOWN_ENDINGS`, those that the command writes.
-        command: for the message.
-        option: which names the output.
         folder: whether another name gives a folder.
-
-    Raises:
-        UsageError: it does.
     """
     if output is not None and (ending := output.suffix.lower()) in KNOWN_ENDINGS.difference(endings):
         written = " or ".join([*endings, *(["a folder of another name"] if folder else [])])
@@ -81,21 +86,13 @@ def check_ending(output: Path | None, *endings: str, command: str, option: str =
 
 
 def check_new(output: Path, *, overwrite: bool) -> None:
-    """Check that a file does not exist, or may be replaced.
-
-    Raises:
-        UsageError: it exists.
-    """
+    """Check that a file does not exist, or may be replaced."""
     if output.exists() and not overwrite:
         raise UsageError(f"{output} exists; replace it with --overwrite, or choose another name.")
 
 
 def checked_paths(options: Options) -> Options:
-    """Options, also those in groups, with ``~`` in paths expanded as a shell does it.
-
-    Raises:
-        UsageError: a path is ``-``, which is standard output for ``--json`` only, or ``~`` of a user there is not.
-    """
+    """Options, also those in groups, with ``~`` in paths expanded as a shell does it."""
     return replace(options, **{one.name: _checked(getattr(options, one.name), one.name) for one in fields(options)})  # type: ignore[type-var]
 
 
@@ -119,9 +116,6 @@ def write_json_output(path: Path | None, content: Mapping[str, Any]) -> Console:
 
     Returns:
         The console for everything else that is printed: standard error where JSON goes to standard output.
-
-    Raises:
-        StorageError: the file cannot be written.
     """
     from structgstream.evaluation.report import json_text, write_json
 
@@ -135,11 +129,7 @@ def write_json_output(path: Path | None, content: Mapping[str, Any]) -> Console:
 
 
 def parse_options(kind: type[Options], command: str, *, arguments: list[str]) -> Options:
-    """The options of a command; prints and exits on ``--help`` or wrong usage.
-
-    Raises:
-        UsageError: an option was renamed, or a path cannot be meant (:func:`checked_paths`).
-    """
+    """The options of a command; prints and exits on ``--help`` or wrong usage."""
     _check_renamed(arguments)
     return checked_paths(tyro.cli(kind, prog=f"structgstream {command}", args=arguments, config=STYLE))
 
@@ -153,6 +143,17 @@ def parse_known_options(kind: type[Options], command: str, *, arguments: list[st
     return checked_paths(options), rest
 
 
+def as_arguments(options: Any, *names: str) -> list[str]:
+    """The command line of those fields of a dataclass of options that differ from their defaults."""
+    words: list[str] = []
+    for field in fields(options):
+        value = getattr(options, field.name)
+        if field.name in names and value != field.default:
+            words.append(f"--{field.name.replace('_', '-')}")
+            words += [] if value is True else map(str, value) if isinstance(value, tuple) else [str(value)]
+    return words
+
+
 def _check_renamed(arguments: list[str]) -> None:
     for argument in arguments:
         if (name := argument.partition("=")[0]) in RENAMED:
@@ -162,12 +163,7 @@ def _check_renamed(arguments: list[str]) -> None:
 def resolve_config(
     preset: str | None, overrides: list[str], *, command: str, seed: int | None
 ) -> tuple["StreamConfig", str]:
-    """The preset with the fields set on the command line by their path (``--online.iterations 50``), and its name.
-
-    Raises:
-        UsageError: there is no such preset, the seed is negative, or a field has another name or is
-            a constant now.
-    """
+    """The preset with the fields set on the command line by their path (``--online.iterations 50``), and its name."""
     from structgstream.config_fields import constant_at
     from structgstream.session.presets import DEFAULT_PRESET, StreamConfig, preset_named, renamed
 
@@ -217,7 +213,6 @@ def config_lines(config: Any, *, width: int | None = None) -> list[str]:
     """A line for each field of a configuration: its option, its value, and its first sentence.
 
     Args:
-        config: a dataclass of dataclasses.
         width: columns; longer lines are cut. None for no limit.
     """
     lines = [f"{option:<{COLUMN - 2}}  {sentence}" for option, sentence in _rows(config, "--")]
@@ -257,3 +252,127 @@ def first_sentences(kind: type) -> dict[str, str]:
                 case _:
                     pass
     return found
+
+
+FINISH_SECONDS = 60.0
+"""How long the end of a run waits for what is still to be published."""
+Sink = Literal["file", "segments"]
+
+
+@dataclass(frozen=True)
+class SegmentOptions:
+    """Options of --sink segments (docs/segments.md)."""
+
+    sink: Annotated[Sink | None, tyro.conf.arg(help_behavior_hint="")] = None
+    """file: OUT is one file. segments: OUT is a folder of immutable files and a manifest, which any web host can serve
+    while it grows. Default: segments if OUT is a folder with a manifest.json, else file."""
+    window: Annotated[float | None, tyro.conf.arg(metavar="SECONDS", help_behavior_hint="")] = None
+    """Segments only: how far viewers can go back; older segments are removed. Default: nothing is removed."""
+    keep: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 120.0
+    """Segments only: how long a file stays that the manifest no longer names; viewers may be about to fetch it."""
+    publish: Annotated[str | None, tyro.conf.arg(metavar="URL", help_behavior_hint="")] = None
+    """Segments only: copy OUT to this folder of an object store as it grows, such as s3://bucket/studio. When it cannot
+    be reached, the stream continues in OUT, and is copied later. Needs the extra cloud."""
+
+    def chosen(self, output: Path) -> Sink:
+        """The sink of ``output``."""
+        from structgstream.codec.segments.manifest import MANIFEST
+        from structgstream.codec.segments.quality_list import read_list
+
+        if read_list(output) is not None:
+            raise UsageError(
+                f"{output} holds several qualities of one stream; continue them with --qualities, or choose another "
+                "name."
+            )
+        found: Sink = "segments" if (output / MANIFEST).is_file() else "file"
+        sink = self.sink or found
+        if sink == "file" and (self.window is not None or self.publish is not None):
+            raise UsageError(f"{'--publish' if self.window is None else '--window'} is for --sink segments.")
+        self._check_seconds()
+        return sink
+
+    def _check_seconds(self) -> None:
+        if not (self.window is None or 0 < self.window < math.inf) or not self.keep >= 0:
+            raise UsageError("--window must be a positive number of seconds, and --keep zero or more.")
+
+    def quality_folders(
+        self, output: Path, names: Sequence[str], *, resume: bool, overwrite: bool
+    ) -> "dict[str, SegmentsStorage]":
+        """Where each quality of a stream goes, a folder in ``output``, checked before anything takes time."""
+        from structgstream.codec.segments.manifest import MANIFEST
+        from structgstream.codec.segments.quality_list import read_list
+        from structgstream.codec.segments.sink import SegmentsOptions
+        from structgstream.recorder import segments_folder
+
+        listed = read_list(output)
+        if self.sink == "file" or (self.sink is None and listed is None):
+            got = "no --sink" if self.sink is None else "--sink file"
+            raise UsageError(
+                f"--qualities writes a folder of segments for each quality, got {got}; add --sink segments."
+            )
+        if self.publish is not None:
+            raise UsageError(
+                "--publish copies one stream, and --qualities writes several; copy the folder with another program, or "
+                "run without it."
+            )
+        self._check_seconds()
+        if (output / MANIFEST).is_file():
+            raise UsageError(f"{output} holds one stream, and --qualities writes several; choose another name.")
+        there = [] if listed is None else [quality.name for quality in listed]
+        if listed is not None and (resume or overwrite) and sorted(there) != sorted(names):
+            raise UsageError(
+                f"{output} holds the qualities {', '.join(there)}, got {', '.join(names)}; give the same names, or "
+                "choose another OUT."
+            )
+        stores = {name: segments_folder(output / name, may_exist=resume or overwrite) for name in names}
+        options = SegmentsOptions(self.window, self.keep)
+        return {name: partial(_storage, store, options) for name, store in stores.items()}
+
+    @contextmanager
+    def storage(
+        self, output: Path, *, may_exist: bool, report: Callable[[str], object]
+    ) -> Iterator["SegmentsStorage | None"]:
+        """Where the stream goes, checked before anything takes time; None for the file ``output``.
+
+        The end of the block waits until everything is published; ``report`` gets a sentence if that fails.
+        """
+        from structgstream.codec.segments.sink import SegmentsOptions
+        from structgstream.recorder import check_output, segments_folder
+
+        options = SegmentsOptions(self.window, self.keep)
+        if self.chosen(output) == "file":
+            check_output(output, may_exist=may_exist)
+            yield None
+        elif self.publish is None:
+            yield partial(_storage, segments_folder(output, may_exist=may_exist), options)
+        else:
+            from structgstream.codec.segments.mirror import AnotherStreamError, MirroredStore, MirrorOptions
+            from structgstream.codec.segments.store import CloudStore
+            from structgstream.errors import StorageError, StreamError
+
+            remote = CloudStore(self.publish)
+            folder = segments_folder(output, may_exist=may_exist)
+            mirror = MirroredStore(folder, remote, options=MirrorOptions(self.keep, report))
+            try:
+                mirror.claim()
+            except AnotherStreamError:
+                raise
+            except (StorageError, StreamError):
+                pass  # It cannot be reached now; it is claimed as soon as it can be.
+            mirror.copy_all()  # What an earlier run has left, also if there is nothing to do now.
+            try:
+                yield partial(_storage, mirror, options)
+            finally:
+                if left := mirror.finish(wait_seconds=FINISH_SECONDS):
+                    report(
+                        f"{left} files of {output} are not yet in {remote.name}; the next run with --resume, or any "
+                        "program that copies folders, copies them."
+                    )
+
+
+def _storage(store: "Store", options: "SegmentsOptions", captured: "Captured | None") -> "Storage[Scene]":
+    from structgstream.codec.segments.sink import Clocks
+    from structgstream.recorder import segments_at
+
+    clocks = Clocks() if captured is None else Clocks(captured=captured)
+    return segments_at(store, options=options, clocks=clocks)

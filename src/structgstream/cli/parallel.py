@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from structgstream.cli.app import Interrupted, UsageError, usage_errors
+from structgstream.cli.app import UsageError, interruption, usage_errors
 from structgstream.cli.options import (
     STANDARD_OUTPUT,
     CaptureOptions,
@@ -21,19 +21,19 @@ from structgstream.cli.options import (
     Flag,
     Folder,
     JsonPath,
+    as_arguments,
     check_ending,
     open_selected_capture,
     parse_known_options,
     resolve_config,
     write_json_output,
 )
-from structgstream.cli.progress import human_bytes, print_lines
-from structgstream.cli.tables import compact_table, literal_cells
-from structgstream.executors.executor import ExecutorName, ExecutorOptions
+from structgstream.cli.progress import compact_table, human_bytes, literal_cells, print_lines
+from structgstream.executors.tasks import ExecutorName, ExecutorOptions
 
 if TYPE_CHECKING:
     from structgstream.data.source import FrameSource
-    from structgstream.executors.executor import TaskQueue
+    from structgstream.executors.tasks import TaskQueue
     from structgstream.parallel.cost import Estimate, Measured, Work
     from structgstream.parallel.driver import Job, State, Status
     from structgstream.parallel.exchange import ObjectStore
@@ -59,11 +59,7 @@ class WorkerOptions:
 
     @property
     def chosen(self) -> ExecutorOptions:
-        """As executors take them.
-
-        Raises:
-            UsageError: an address without Ray.
-        """
+        """As executors take them."""
         if self.address is not None and self.executor != "ray":
             raise UsageError("--address is the head of a Ray cluster; add --executor ray.")
         return ExecutorOptions(self.executor, self.workers, self.threads, self.address)
@@ -148,12 +144,8 @@ def main(arguments: list[str]) -> None:
 
 
 def _check(options: Parallel, config: "StreamConfig", parts: "Parts") -> None:
-    """Check the options against the capture, and that the output and its parts may be written.
-
-    Raises:
-        StructGStreamError: the capture cannot be read, the groups do not fit it, or the output exists.
-    """
-    from structgstream.groups.boundaries import check_length
+    """Check the options against the capture, and that the output and its parts may be written."""
+    from structgstream.groups.track_file import check_length
     from structgstream.recorder import check_output
     from structgstream.session.struct_gstream import stream_pipeline
 
@@ -170,14 +162,9 @@ def parts_folder(output: Path) -> Path:
 
 
 def open_tasks(options: ExecutorOptions, device: Device) -> "TaskQueue":
-    """The executor of the options, on this machine's cores and GPUs.
-
-    Raises:
-        ConfigError: less than one worker, or a cluster that cannot be joined.
-        MissingExtraError: a package is missing.
-    """
+    """The executor of the options, on this machine's cores and GPUs."""
     from structgstream.evaluation.environment import usable_cores
-    from structgstream.executors.executor import open_executor
+    from structgstream.executors.tasks import open_executor
 
     return open_executor(options, cores=usable_cores(), gpus=gpus_of(device))
 
@@ -194,7 +181,7 @@ def gpus_of(device: Device) -> int:
 def join_arguments(options: WorkerOptions, device: Device) -> tuple[str, ...]:
     """As many processes as the workers have threads; on a cluster and with GPUs the default of ``join``."""
     from structgstream.evaluation.environment import usable_cores
-    from structgstream.executors.task import allocate_slots
+    from structgstream.executors.tasks import allocate_slots
 
     if options.executor == "ray" or gpus_of(device):
         return ()
@@ -207,16 +194,9 @@ def _job(options: Parallel, rest: list[str]) -> "Job":
     from structgstream.parallel.driver import Job, Unit
 
     capture = options.capture
-    header = [*_option("preset", options.preset), *_option("quality", options.quality), *_option("seed", options.seed)]
-    header += [*_option("start", capture.start or None), *_option("near", capture.near)]
-    header += _option("every", None if capture.every == 1 else capture.every)
-    header += _option("scale", None if capture.scale == 1.0 else capture.scale)
-    header += [] if capture.held_out is None else ["--held-out", *capture.held_out]
-    track = [
-        *_option("groups", options.groups),
-        *(["--split-at-low-motion"] if options.split_at_low_motion else []),
-        *(["--allow-unaligned"] if options.allow_unaligned else []),
-    ]
+    header = as_arguments(options, "preset", "quality", "seed")
+    header += as_arguments(capture, "start", "near", "every", "scale", "held_out")
+    track = as_arguments(options, "groups", "split_at_low_motion", "allow_unaligned")
     unit = Unit(
         str(options.scene.absolute()),
         capture.frames,
@@ -229,19 +209,15 @@ def _job(options: Parallel, rest: list[str]) -> "Job":
     return Job(unit, options.output.absolute(), int(options.device == "cuda" or gpus_of(options.device) > 0))
 
 
-def _option(name: str, value: object) -> list[str]:
-    return [] if value is None else [f"--{name}", str(value)]
-
-
 def _drive(job: "Job", parts: "Parts", executor: "TaskQueue", exchange: "ObjectStore | None", console: Console) -> None:
     from structgstream.evaluation.run_log import read_log
     from structgstream.parallel.driver import drive
 
-    with ParallelDisplay(console, lambda first, end: len(read_log(parts.segment(first, end)))) as display:
-        try:
-            drive(job, parts, executor, exchange=exchange, listener=display.show)
-        except KeyboardInterrupt:
-            raise Interrupted(f"Complete frames are in {parts.folder}; continue with the same command.") from None
+    with (
+        interruption(lambda: f"Complete frames are in {parts.folder}; continue with the same command."),
+        ParallelDisplay(console, lambda first, end: len(read_log(parts.segment(first, end)))) as display,
+    ):
+        drive(job, parts, executor, exchange=exchange, listener=display.show)
 
 
 STYLES = {
@@ -285,12 +261,7 @@ def counted(status: "Status") -> str:
 
 
 class ParallelDisplay:
-    """Shows the status: all groups, redrawn on a terminal, else lines.
-
-    Args:
-        console: where to write.
-        frames_of: number of fitted frames of a group.
-    """
+    """Shows the status: all groups, redrawn on a terminal, else lines."""
 
     def __init__(self, console: Console, frames_of: FramesOf) -> None:
         self._console, self._frames_of = console, frames_of
@@ -409,13 +380,10 @@ def _probe(options: Plan, rest: list[str], console: Console) -> Path:
     assert options.output is not None
     options.output.mkdir(parents=True, exist_ok=True)
     stream = options.output / "probe.sgs"
-    capture = options.capture
     probe = ["parallel", str(options.scene), "-o", str(stream), "--frames", str(PROBE_FRAMES)]
-    probe += ["--groups", str(PROBE_GROUP), "--allow-unaligned", "--workers", "1", "--device", options.device]
-    probe += [] if options.preset is None else ["--preset", options.preset]
-    probe += [] if capture.held_out is None else ["--held-out", *capture.held_out]
-    probe += ["--scale", str(capture.scale), "--start", str(capture.start), "--every", str(capture.every)]
-    probe += [] if capture.near is None else ["--near", str(capture.near)]
+    probe += ["--groups", str(PROBE_GROUP), "--allow-unaligned", "--workers", "1"]
+    probe += as_arguments(options, "device", "preset")
+    probe += as_arguments(options.capture, "held_out", "scale", "start", "every", "near")
     console.print(f"Probe: frame 0 and {PROBE_FRAMES - 1} frames, on one worker.", highlight=False)
     if status := command([*probe, *rest]):
         raise SystemExit(status)  # It has said why.

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from structgstream.cli.app import Interrupted, UsageError, usage_errors
+from structgstream.cli.app import UsageError, interruptible, interruption, usage_errors
 from structgstream.cli.options import Flag, Folder, check_ending, parse_options
 from structgstream.cli.progress import StepDisplay, print_lines
-from structgstream.cli.signals import interruptible
 
 if TYPE_CHECKING:
     from structgstream.pose_check.findings import Finding
@@ -111,11 +110,9 @@ def _prepare(options: Prepare, console: Console) -> "Sequence[Finding]":
 
     with usage_errors():
         chosen = _chosen(options)
-    try:
-        with interruptible(), StepDisplay(console) as display:
-            made = prepare_capture(options.videos, options.output, options=chosen, listener=display)
-    except KeyboardInterrupt:
-        raise Interrupted("Completed steps remain; continue with the same command.") from None
+    ended = "Completed steps remain; continue with the same command."
+    with interruption(lambda: ended), interruptible(), StepDisplay(console) as display:
+        made = prepare_capture(options.videos, options.output, options=chosen, listener=display)
     print_lines(console, f"Capture: {made.path}")
     print_lines(console, f"Report: {made.report}")
     return made.findings
@@ -156,11 +153,7 @@ def _chosen(options: Prepare) -> "PrepareOptions":
 
 
 def _conclude(findings: "Sequence[Finding]", console: Console) -> None:
-    """Prints what is wrong; the worst is an error.
-
-    Raises:
-        CaptureError: a stream made from this capture would be spoiled.
-    """
+    """Prints what is wrong; the worst is an error."""
     from structgstream.errors import CaptureError
 
     errors = [finding for finding in findings if finding.severity == "error"]

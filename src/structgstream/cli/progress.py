@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What commands print: sentences, and progress of runs and of preparation (bars on a terminal, lines elsewhere)."""
+"""What commands print: sentences, tables, and progress of runs and of preparation (bars on a terminal, else lines)."""
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group
 from rich.live import Live
 from rich.progress import (
@@ -18,6 +19,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
@@ -41,6 +43,32 @@ def frames_text(count: int) -> str:
     return "1 frame" if count == 1 else f"{count} frames"
 
 
+SHOWN_FRAMES = 24  # of a longer stream evenly spaced frames are shown
+
+
+def name_value_table() -> Table:
+    """A table of names and values without lines."""
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="dim")
+    table.add_column()
+    return table
+
+
+def literal_cells(*cells: str) -> tuple[Text, ...]:
+    """Cells without markup, because names may contain square brackets, and without what a terminal would obey."""
+    return tuple(Text(printable(cell)) for cell in cells)
+
+
+def compact_table(*titles: str, left: Collection[str] = (), title: str | Text | None = None) -> Table:
+    """A table with columns of these titles, of which ten columns of numbers fit into 80 characters."""
+    table = Table(
+        title=title, box=SIMPLE_HEAD, header_style="bold", title_justify="left", padding=(0, 1, 0, 0), show_edge=False
+    )
+    for name in titles:
+        table.add_column(name, justify="left" if name in left else "right")
+    return table
+
+
 @contextmanager
 def frame_bar(title: str, total: int) -> Iterator[Callable[[], None]]:
     """A bar of ``total`` frames on standard error while the block runs; call what it gives after each frame."""
@@ -54,25 +82,11 @@ MAX_NAMES = 5
 QUIET_SECONDS = 15.0  # without a terminal, interval of progress lines within a frame
 
 
-class Display(AbstractContextManager["Display"], Protocol):
-    """Displays the progress of a reconstruction."""
-
-    def step(self, step: "Step") -> None:
-        """Called after each iteration."""
-        ...
-
-    def frame(self, report: "FrameReport", *, quality: str | None = None) -> None:
-        """Called after a frame is stored, with the name of its quality where the run makes several."""
-        ...
-
-
-def display(frames: int | None, *, done: int = 0, console: Console | None = None) -> Display:
+def display(frames: int | None, *, done: int = 0, console: Console | None = None) -> "Bars | Lines":
     """Bars when ``console`` (default: standard output) is a terminal, else plain lines.
 
     Args:
         frames: number of frames of the stream when it is finished; None where that is unknown.
-        done: how many of them are stored already.
-        console: where to write.
     """
     console = Console() if console is None else console
     return Bars(frames, done, console=console) if console.is_terminal else Lines(frames, done, console=console)
@@ -89,7 +103,7 @@ def summary(report: "FrameReport", frames: int | None, *, quality: str | None = 
         f"{human_bytes(report.bytes):>9}  {report.seconds['total']:6.1f} s  "
         f"{report.anchors:,} anchors{moving}{change(report.grown, report.removed)}  "
         f"{report.free:,} free{change(report.spawned, report.pruned)}{remarks(report.counts)}{absences(report.absent)}"
-        f"{new_period(report.begins)}"
+        f"{'' if report.begins is None else f'  [new period: {report.begins}]'}"
     )
 
 
@@ -110,11 +124,6 @@ def remarks(counts: Mapping[str, int]) -> str:
     if counts.get("spawning refused"):
         found.append("no births: too many pixels are missing at once")
     return "".join(f"  [{remark}]" for remark in found)
-
-
-def new_period(why: str | None) -> str:
-    """A remark on a frame that begins another period; empty without one."""
-    return "" if why is None else f"  [new period: {why}]"
 
 
 def absences(cameras: Sequence[str]) -> str:
@@ -212,11 +221,7 @@ MIN_SHOWN_SECONDS = 0.05
 
 
 class StepDisplay(AbstractContextManager["StepDisplay"]):
-    """A listener of steps; bars are shown on a terminal only.
-
-    Args:
-        console: where to write.
-    """
+    """A listener of steps; bars are shown on a terminal only."""
 
     def __init__(self, console: Console) -> None:
         self._console = console

@@ -3,23 +3,25 @@
 
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from threading import Event
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
 
-from structgstream.cli.app import Interrupted, UsageError, usage_errors
+from structgstream.cli.app import Termination, UsageError, interruption, usage_errors
 from structgstream.cli.live_run import LiveChoice, monitored, open_live, run_metrics, stop_of, stop_on_interrupt
 from structgstream.cli.options import (
     CaptureOptions,
     Device,
     Flag,
     Folder,
+    SegmentOptions,
     check_ending,
     config_lines,
     open_selected_capture,
@@ -27,18 +29,21 @@ from structgstream.cli.options import (
     resolve_config,
 )
 from structgstream.cli.progress import human_bytes, print_lines
-from structgstream.cli.segment_options import SegmentOptions
-from structgstream.cli.signals import Terminated, Termination
 
 if TYPE_CHECKING:
-    from structgstream.cli.segment_options import Captured, SegmentsStorage
+    from structgstream.cli.options import Captured
     from structgstream.data.source import FrameStream
     from structgstream.kernels.backend import Backend
-    from structgstream.qualities.ladder import Quality
     from structgstream.recorder import Storage
     from structgstream.run_metrics import RunMetrics
     from structgstream.scene.scene import Scene
+    from structgstream.session.frame_report import FrameReport
     from structgstream.session.presets import StreamConfig
+    from structgstream.training.result import StepListener
+
+    Started = tuple[int, Generator[Any, None, None], Callable[[Any], tuple[FrameReport, str | None, bool]]]
+    """Number of existing frames, reports of the others, and what a report states: frame, quality, and whether all
+    qualities have it."""
 
 
 @dataclass(frozen=True)
@@ -121,57 +126,34 @@ def main(arguments: list[str]) -> None:
     options.segments.chosen(options.output)
     opened = open_scene(options, config, preset=preset, console=console)
     with options.segments.storage(options.output, may_exist=may_exist, report=partial(print_lines, console)) as storage:
-        _reconstruct(options, config, opened, storage=storage, console=console)
+        peaks = run_reconstruction(
+            opened.source,
+            config,
+            output=options.output,
+            backend=opened.backend,
+            metadata=opened.metadata,
+            resume=options.resume,
+            storage=None if storage is None else storage(opened.captured),
+            metrics=run_metrics(opened.source, options.output),
+        )
+        if peaks:
+            stages = ", ".join(f"{stage} {human_bytes(size)}" for stage, size in peaks.items())
+            print_lines(console, f"Peak memory by stage: {stages}.")
     print_lines(console, f"Wrote {options.output}")
-
-
-def _reconstruct(
-    options: Reconstruct,
-    config: "StreamConfig",
-    opened: "OpenedScene",
-    *,
-    storage: "SegmentsStorage | None",
-    console: Console,
-) -> None:
-    peaks = run_reconstruction(
-        opened.source,
-        config,
-        output=options.output,
-        backend=opened.backend,
-        metadata=opened.metadata,
-        resume=options.resume,
-        storage=None if storage is None else storage(opened.captured),
-        metrics=run_metrics(opened.source, options.output),
-    )
-    if peaks:
-        stages = ", ".join(f"{stage} {human_bytes(size)}" for stage, size in peaks.items())
-        print_lines(console, f"Peak memory by stage: {stages}.")
 
 
 @dataclass(frozen=True)
 class OpenedScene:
-    """What a run reads, and with what it computes.
+    """What a run reads, and with what it computes."""
 
-    Args:
-        source: a recording, or live cameras.
-        captured: when a frame was filmed, Unix time, by its number; None for a recording.
-        backend: the compute back-end.
-        metadata: of the run, for headers.
-    """
-
-    source: "FrameStream"
-    captured: "Captured | None"
+    source: "FrameStream"  # a recording, or live cameras
+    captured: "Captured | None"  # when a frame was filmed, Unix time, by its number; None for a recording
     backend: "Backend"
-    metadata: Mapping[str, object]
+    metadata: Mapping[str, object]  # of the run, for headers
 
 
 def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, console: Console) -> OpenedScene:
-    """The capture, or the live cameras, that the options name; says what it is.
-
-    Raises:
-        UsageError: options that contradict each other.
-        StructGStreamError: it cannot be read, or the back-end is not available.
-    """
+    """The capture, or the live cameras, that the options name; says what it is."""
     from structgstream.evaluation.recording import part_metadata
     from structgstream.kernels.backend import select_backend
     from structgstream.session.presets import departures
@@ -221,62 +203,72 @@ def run_reconstruction(
     """Reconstructs ``source`` into the file ``output`` or other storage, replacing what is there unless it is resumed.
 
     Args:
-        source: the capture, or live cameras, which need ``metrics``.
-        config: of the stream.
-        output: the stream file.
-        backend: the compute back-end.
-        metadata: for the header.
-        resume: continue after the last whole frame.
         metrics: the metrics of the run, written next to ``output``.
 
     Returns:
         the largest peak memory in bytes over all frames, by stage; a GPU's under the stage's name and "on the GPU".
-
-    Raises:
-        Interrupted: the user pressed Ctrl-C; whole frames stay in the file.
-        Terminated: SIGTERM came; the frame that was being fitted is in the file, too.
-        StructGStreamError: any other error; whole frames stay in the file.
     """
-    from structgstream.data.source import frame_count
     from structgstream.recorder import record
     from structgstream.session.struct_gstream import stream_pipeline
 
-    total = frame_count(source)
-    run = record(
-        output,
-        source,
-        stream_pipeline(config),
-        backend,
-        resume=resume,
-        storage=storage,
-        metadata=metadata,
-        on_step=lambda step: progress.step(step),  # Created below, because it needs the number of existing frames.
-        remarks=None if metrics is None else metrics.frame,
-    )
-    done = run.done
-    peaks: dict[str, int] = {}
-    try:
-        with (
-            Termination(on_ask=stop_of(source)) as ending,
-            monitored(source, metrics, done=done) as progress,
-            closing(run.reports) as reports,
-        ):
-            for report in reports:
-                on_gpu = {f"{stage} on the GPU": size for stage, size in report.peak_device_bytes.items()}
-                for stage, size in {**report.peak_memory_bytes, **on_gpu}.items():
-                    peaks[stage] = max(size, peaks.get(stage, 0))
-                progress.frame(report)
+    def start(on_step: "StepListener") -> "Started":
+        run = record(
+            output,
+            source,
+            stream_pipeline(config),
+            backend,
+            resume=resume,
+            storage=storage,
+            metadata=metadata,
+            on_step=on_step,
+            remarks=None if metrics is None else metrics.frame,
+        )
+        return run.done, run.reports, lambda report: (report, None, True)
+
+    return _follow(start, source, output=output, metrics=metrics)
+
+
+def _follow(
+    start: "Callable[[StepListener], Started]",
+    source: "FrameStream",
+    *,
+    output: Path,
+    metrics: "RunMetrics | None",
+    in_qualities: bool = False,
+) -> dict[str, int]:
+    """Starts a run and shows it until it ends or is stopped; returns the peaks of :func:`run_reconstruction`.
+
+    Ctrl-C interrupts a recording at once; live cameras and several qualities end after the frame being fitted.
+    """
+    from structgstream.data.source import frame_count
+
+    done, stored, read = start(lambda step: progress.step(step))  # progress needs the number of existing frames
+    total, pressed, peaks = frame_count(source), Event(), dict[str, int]()
+
+    def message() -> str:
+        if not done and not in_qualities:
+            return "No frame was done, so no stream was written; its log and its metrics were begun."
+        frames = f"{done}{'' if total is None else f' of {total}'} frames{' in all qualities' if in_qualities else ''}"
+        return f"{output} has {frames}; continue with the same command and --resume."
+
+    with (
+        interruption(message),
+        Termination(on_ask=stop_of(source)) as ending,
+        monitored(source, metrics, done=done) as progress,
+        stop_on_interrupt(pressed.is_set, pressed.set) if in_qualities and total is not None else nullcontext(),
+        closing(stored) as reports,
+    ):
+        for report, quality, whole in map(read, reports):
+            on_gpu = {f"{stage} on the GPU": size for stage, size in report.peak_device_bytes.items()}
+            for stage, size in {**report.peak_memory_bytes, **on_gpu}.items():
+                peaks[stage] = max(size, peaks.get(stage, 0))
+            progress.frame(report, quality=quality)
+            if whole:
                 done = report.index + 1
-                if ending.asked and done != total:
-                    raise Terminated
-            if ending.asked and done != total:  # Live cameras had nothing to give any more.
-                raise Terminated
-    except KeyboardInterrupt as error:
-        of = "" if total is None else f" of {total}"
-        message = f"{output} has {done}{of} frames; continue with the same command and --resume."
-        nothing = "No frame was done, so no stream was written; its log and its metrics were begun."
-        ended = Terminated if isinstance(error, Terminated) else Interrupted
-        raise ended(message if done else nothing) from None
+                ending.end(whole=done == total)
+                if pressed.is_set() and done != total:
+                    raise KeyboardInterrupt
+        ending.end(whole=done == total)  # Live cameras had nothing to give any more.
     return peaks
 
 
@@ -295,32 +287,14 @@ def _print_config(arguments: list[str]) -> None:
     print("\n".join(config_lines(config, width=width)))
 
 
-class _Asked:
-    """Whether Ctrl-C was pressed while a recording is reconstructed."""
-
-    def __init__(self) -> None:
-        self.stopped = False
-
-    def stop(self) -> None:
-        """Notes it."""
-        self.stopped = True
-
-
 def _reconstruct_qualities(options: Reconstruct, config: "StreamConfig", *, preset: str) -> None:
-    """Reconstructs in the qualities of the options, with a progress display.
-
-    Raises:
-        UsageError: options that several qualities do not have, or that contradict each other.
-        Interrupted: Ctrl-C; all qualities have the frame that was being fitted, unless it was pressed twice.
-        Terminated: SIGTERM; as after Ctrl-C.
-        StructGStreamError: any other error; whole frames stay.
-    """
+    """Reconstructs in the qualities of the options, with a progress display."""
     if options.quality is not None or options.mbits is not None:
         got = "--quality" if options.mbits is None else "--mbits"
         raise UsageError(
             f"--qualities has a Q for each quality, got {got} besides, which is for one stream; leave {got} out."
         )
-    from structgstream.qualities.ladder import configured, qualities_in
+    from structgstream.qualities import configured, qualities_in, record_qualities
 
     with usage_errors():
         qualities = qualities_in(options.qualities or ())
@@ -331,52 +305,22 @@ def _reconstruct_qualities(options: Reconstruct, config: "StreamConfig", *, pres
     folders = options.segments.quality_folders(
         options.output, names, resume=options.resume, overwrite=options.overwrite
     )
-    storages = {name: storage(opened.captured) for name, storage in folders.items()}
-    _run_qualities(options, config, qualities, opened=opened, storages=storages)
+    metrics = run_metrics(opened.source, options.output, qualities=names)
+
+    def start(on_step: "StepListener") -> "Started":
+        run = record_qualities(
+            options.output,
+            opened.source,
+            config,
+            qualities,
+            opened.backend,
+            storages={name: storage(opened.captured) for name, storage in folders.items()},
+            resume=options.resume,
+            metadata=opened.metadata,
+            on_step=on_step,
+            metrics=metrics,
+        )
+        return run.done, run.reports, lambda one: (one.report, one.quality, one.whole)
+
+    _follow(start, opened.source, output=options.output, metrics=metrics, in_qualities=True)
     print_lines(console, f"Wrote {options.output}: {', '.join(names)}")
-
-
-def _run_qualities(
-    options: Reconstruct,
-    config: "StreamConfig",
-    qualities: "Sequence[Quality]",
-    *,
-    opened: OpenedScene,
-    storages: "Mapping[str, Storage[Scene]]",
-) -> None:
-    from structgstream.data.source import frame_count
-    from structgstream.qualities.recording import record_qualities
-
-    source, output = opened.source, options.output
-    total, metrics = frame_count(source), run_metrics(source, output, qualities=[one.name for one in qualities])
-    run = record_qualities(
-        output,
-        source,
-        config,
-        qualities,
-        opened.backend,
-        storages=storages,
-        resume=options.resume,
-        metadata=opened.metadata,
-        on_step=lambda step: progress.step(step),  # Created below, because it needs the number of existing frames.
-        metrics=metrics,
-    )
-    done, pressed = run.done, _Asked()
-    try:
-        with (
-            Termination(on_ask=stop_of(source)) as ending,
-            monitored(source, metrics, done=done) as progress,
-            nullcontext() if total is None else stop_on_interrupt(pressed),  # Live cameras are stopped by themselves.
-            closing(run.reports) as reports,
-        ):
-            for one in reports:
-                progress.frame(one.report, quality=one.quality)
-                done = one.report.index + 1 if one.whole else done
-                if one.whole and (ending.asked or pressed.stopped):
-                    break
-        if done != total and (ending.asked or pressed.stopped):
-            raise Terminated if ending.asked else KeyboardInterrupt
-    except KeyboardInterrupt as error:
-        of = "" if total is None else f" of {total}"
-        message = f"{output} has {done}{of} frames in all qualities; continue with the same command and --resume."
-        raise (Terminated if isinstance(error, Terminated) else Interrupted)(message) from None

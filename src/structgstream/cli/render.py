@@ -101,11 +101,7 @@ def main(arguments: list[str]) -> None:
 
 
 def write_pictures(output: Path, pictures: "Iterable[NDArray[np.uint8]]", *, fps: float) -> None:
-    """Writes pictures as a video, one PNG or a folder of PNGs, by the suffix of ``output``.
-
-    Raises:
-        StorageError: something cannot be written.
-    """
+    """Writes pictures as a video, one PNG or a folder of PNGs, by the suffix of ``output``."""
     from structgstream.data.video_writer import VideoWriter
     from structgstream.evaluation.pictures import write_png
 
@@ -178,11 +174,7 @@ def compared_pictures(
 
 
 def choose_camera(reader: "StreamReader", camera: str | None) -> str:
-    """The named camera, the first held-out one, or the one in the middle of the rig.
-
-    Raises:
-        UsageError: the rig has no such camera.
-    """
+    """The named camera, the first held-out one, or the one in the middle of the rig."""
     from structgstream.evaluation.camera_path import central_camera
 
     rig = reader.header.rig
@@ -194,11 +186,7 @@ def choose_camera(reader: "StreamReader", camera: str | None) -> str:
 
 
 def scenes_of(reader: "StreamReader", frame: int | None) -> "Iterator[Scene]":
-    """All decoded scenes, or that of one frame.
-
-    Raises:
-        UsageError: there is no such frame.
-    """
+    """All decoded scenes, or that of one frame."""
     _check_frame(reader, frame)
     if frame is not None:
         yield reader.scene(frame)

@@ -169,14 +169,9 @@ def _wait_for(stream: "StreamFile") -> None:
 
 
 def _truth(stream: Path, scene: Path) -> "Truth":
-    """The capture's pictures, by the cameras that it shares with the stream.
-
-    Raises:
-        CaptureError: it is not the capture that the stream was made from.
-    """
+    """The capture's pictures, by the cameras that it shares with the stream."""
     from structgstream.codec.reader import open_stream
-    from structgstream.evaluation.facts import check_same_rig
-    from structgstream.evaluation.recording import capture_of
+    from structgstream.evaluation.recording import capture_of, check_same_rig
     from structgstream.serve.play import Truth
 
     with open_stream(stream, by_index=True) as reader:

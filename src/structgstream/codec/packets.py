@@ -117,7 +117,7 @@ def packet_from_blocks(
     Raises:
         StreamError: the stream is as long as it can be.
     """
-    # The identity of a birth is frame * 2^32 + number, of 63 bits. 2^31 frames are 2.27 years at 30 frames a second.
+    # Identities of free Gaussians are frame * 2^32 + number, of 63 bits. 2^31 frames are 2.27 years at 30 a second.
     if index >= MAX_FRAMES:
         raise StreamError(f"A stream has at most {MAX_FRAMES} frames; begin another one.")
     payload = FRAME.pack(index, pts_seconds) + b"".join(blocks.values())

@@ -284,7 +284,7 @@ class MemorySink:
 
 
 class StoredPackets(PacketInfos):
-    """Facts of all packets; of those that have left the window only size and kind are known."""
+    """Facts of all packets; of those that have left the window size and kind, and the time as interpolated."""
 
     def __init__(self, stored: StoredBytes, reader: StreamReader) -> None:
         self._stored = stored
@@ -297,7 +297,8 @@ class StoredPackets(PacketInfos):
         """Facts of the packet of a frame."""
         if self._reader.packets.offsets[index] != LOST:
             return self._reader.packets.at(index)
-        return PacketInfo(self._stored.kinds[index], index, float("nan"), LOST, self._stored.sizes[index], {})
+        stored = self._stored
+        return PacketInfo(stored.kinds[index], index, stored.seconds[index], LOST, stored.sizes[index], {})
 
 
 class StoredSegments:

@@ -27,7 +27,7 @@ SAME_ROTATION, SAME_SHARE, SAME_PIXELS = 1e-3, 0.01, 1.0
 """How far two files of one calibration differ: entries of rotations, shares of the rig's extent, pixels of K."""
 
 
-FORMATS = (
+CALIBRATION_FORMATS = (
     tools.ANIPOSE,
     tools.EASYMOCAP,
     tools.MULTICAL,
@@ -38,12 +38,14 @@ FORMATS = (
     tools.PROJECTIONS,
     OPENCV_CAMERAS,
 )
-"""The other tools' files. What reads pictures with OpenCV turns them as their EXIF orientation states."""
+"""The other tools' files, in any order: all that are found are read, and must agree.
+
+What reads pictures with OpenCV turns them as their EXIF orientation states."""
 
 
 def recognizes_calibrated(path: Path) -> bool:
     """Whether the folder has a calibration file of another tool that is known here, or one that is refused."""
-    return any(True for own in FORMATS for _ in own.find(path)) or bool(_pickles(path))
+    return any(True for own in CALIBRATION_FORMATS for _ in own.find(path)) or bool(_pickles(path))
 
 
 def read_calibrated(path: Path, file: Path | None = None) -> Calibration | None:
@@ -52,7 +54,7 @@ def read_calibrated(path: Path, file: Path | None = None) -> Calibration | None:
     Raises:
         CalibrationError: a broken file, one that only running it could read, or several that differ.
     """
-    found = [(own, files) for own in FORMATS for files in own.find(path)]
+    found = [(own, files) for own in CALIBRATION_FORMATS for files in own.find(path)]
     read = [own.read(files) for own, files in found if file is None or file in files]
     if different := [other for other in read[1:] if not _agree(read[0], other)]:
         raise CalibrationError(

@@ -14,6 +14,7 @@ converts those of tools that have it at (0, 0), such as OpenCV.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -57,7 +58,7 @@ class RadialTangential:
     k5: float = 0.0
     k6: float = 0.0
 
-    @property
+    @cached_property
     def reach(self) -> float:
         """The smallest radius at which the distorted picture folds, or the factor has a pole."""
         over, under = self._polynomials
@@ -71,7 +72,7 @@ class RadialTangential:
         folded = np.linalg.det(_jacobian(self._anywhere, radii[:-1, None, None] * rays)).min(1) <= 0
         return float(radii[:-1][folded][0]) if folded.any() else radial
 
-    @property
+    @cached_property
     def _polynomials(self) -> tuple[Polynomial, Polynomial]:
         """Numerator and denominator of the factor, in the radius."""
         over = Polynomial([1.0, 0.0, self.k1, 0.0, self.k2, 0.0, self.k3])
@@ -124,13 +125,13 @@ class Fisheye:
     k3: float = 0.0
     k4: float = 0.0
 
-    @property
+    @cached_property
     def widest_angle(self) -> float:
         """The angle to the axis, radians, up to which the model is invertible; at most a right angle."""
         grows = self._radius.deriv()
         return min(_first_root(grows), math.pi / 2 - 1e-6)
 
-    @property
+    @cached_property
     def _radius(self) -> Polynomial:
         return Polynomial([0.0, 1.0, 0.0, self.k1, 0.0, self.k2, 0.0, self.k3, 0.0, self.k4])
 

@@ -55,7 +55,7 @@ from structgstream.geometry import Floats
 
 log = logging.getLogger(__name__)
 
-LAYOUTS = """Supported layouts:
+LAYOUTS_HELP = """Supported layouts:
   prepared         capture.json, as structgstream prepare writes it: make one from videos without calibration
   PanopticSports   train_meta.json, test_meta.json, ims/CAMERA/FRAME.jpg
   videos + JSON    cameras.json, CAMERA.mp4
@@ -82,7 +82,7 @@ def open_calibrated(path: Path) -> FrameSource:
     return open_posed(path, calibration)
 
 
-FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path], FrameSource]], ...] = (
+CAPTURE_LAYOUTS: tuple[tuple[Callable[[Path], bool], Callable[[Path], FrameSource]], ...] = (
     (recognizes_prepared, open_prepared),
     (recognizes_panoptic, open_panoptic),
     (recognizes_json_videos, open_json_videos),
@@ -93,6 +93,13 @@ FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path], FrameSource]], ...
     (recognizes_calibrated, open_calibrated),
     (lambda path: calibration_below(path) is not None, open_calibrated),
 )
+"""Whether a folder has a layout, and what opens it. The first that recognises the folder opens it.
+
+A new layout goes among the first five, which are recognised by a file that no other layout has: ahead of ``find_model``
+and what follows, since a capture often has a COLMAP model or another calibration besides (Neural 3D Video does), and
+those entries would open it without what its own file states. ``prepared`` stays first: a folder that
+``structgstream prepare`` wrote into still has the files that it was prepared from. The last entry looks one folder
+below and stays last. ``LAYOUTS_HELP`` lists the layouts for users."""
 
 
 def open_capture(
@@ -169,7 +176,7 @@ def _chosen(held_out: tuple[str, ...] | Literal["auto"], rig: CameraRig) -> froz
 
 def _opener(path: Path) -> Callable[[Path], FrameSource] | None:
     """What opens the folder: that of the first layout that it has; None where it has none."""
-    return next((opens for recognises, opens in FORMATS if recognises(path)), None)
+    return next((opens for recognises, opens in CAPTURE_LAYOUTS if recognises(path)), None)
 
 
 class Uncalibrated(CaptureError):
@@ -201,7 +208,7 @@ def _located(path: Path) -> tuple[Path, Callable[[Path], FrameSource]]:
     if not path.exists():
         raise CaptureError(f"The capture {path} does not exist; give the folder that holds it.")
     if not path.is_dir():
-        raise CaptureError(f"The capture {path} is a file; give the folder that holds it.\n{LAYOUTS}")
+        raise CaptureError(f"The capture {path} is a file; give the folder that holds it.\n{LAYOUTS_HELP}")
     path = path.resolve()  # a name, even for "."
     if (opens := _opener(path)) is not None:
         return path, opens
@@ -215,7 +222,7 @@ def _located(path: Path) -> tuple[Path, Callable[[Path], FrameSource]]:
         raise CaptureError(f"{path} holds several captures ({names}); give the folder of one.")
     content = sorted(entry.name for entry in path.iterdir())
     if not content:
-        raise CaptureError(f"The capture {path} is an empty folder.\n{LAYOUTS}")
+        raise CaptureError(f"The capture {path} is an empty folder.\n{LAYOUTS_HELP}")
     if (above := _above(path)) is not None:
         raise CaptureError(f"{path} has no calibration; the capture is the folder above it: give {above}.")
     shown = ", ".join(content[:6]) + (", ..." if len(content) > 6 else "")
@@ -224,13 +231,13 @@ def _located(path: Path) -> tuple[Path, Callable[[Path], FrameSource]]:
     elif any(videos_in(root) or pictures_in(root) for root in roots_of(path)):
         raise Uncalibrated(
             f"The folder {path} has no calibration; it holds {shown}. structgstream prepare calibrates videos and "
-            f"pictures.\n{LAYOUTS}"
+            f"pictures.\n{LAYOUTS_HELP}"
         )
     else:
         raise Uncalibrated(
-            f"The folder {path} has no supported layout; it holds {shown}{unread_files(path)}.\n{LAYOUTS}"
+            f"The folder {path} has no supported layout; it holds {shown}{unread_files(path)}.\n{LAYOUTS_HELP}"
         )
-    raise CaptureError(f"The folder {path} has {why}.\n{LAYOUTS}")
+    raise CaptureError(f"The folder {path} has {why}.\n{LAYOUTS_HELP}")
 
 
 def _above(path: Path) -> Path | None:

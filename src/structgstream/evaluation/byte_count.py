@@ -126,7 +126,6 @@ def write_byte_plot(path: Path, rows: Sequence[Row], parts: Parts, *, title: str
         path: the picture; its suffix is a format that matplotlib writes.
         rows: all packets of the stream, at least one.
         parts: bytes by field of its parts; the last ones determine the order of the fields.
-        title: a line above.
 
     Raises:
         MissingExtraError: matplotlib is not installed.
@@ -165,12 +164,14 @@ def _packets(axis: "Axes", rows: Sequence[Row], colours: Mapping[str, str]) -> "
     cut = total > top
     shown = np.minimum(total, top)
     base: NDArray[np.float64] = np.zeros(len(rows))
-    # Bars that touch have an edge of their own colour, because otherwise white lines are visible between them.
-    width, edge = (0.85, 0.0) if len(rows) <= MAX_GAPS else (1.0, 0.3)
     for field, colour in colours.items():
         share = np.array([row.sizes.get(field, 0) / row.bytes for row in rows])
         height = shown - base if field == REST else shown * share
-        axis.bar(index, height, bottom=base, width=width, color=colour, edgecolor=colour, linewidth=edge)
+        if len(rows) <= MAX_GAPS:
+            axis.bar(index, height, bottom=base, width=0.85, color=colour)
+        else:  # One outline for all: thousands of bars would take minutes.
+            edges = np.append(index, index[-1] + 1) - 0.5
+            axis.stairs(base + height, edges, baseline=base, fill=True, facecolor=colour, edgecolor=colour, lw=0.3)
         base = base + height
     axis.hlines([0.93 * top] * int(cut.sum()), index[cut] - 0.6, index[cut] + 0.6, color="white", linewidth=2.5)
     for number, size in zip(index[cut], total[cut]):

@@ -41,7 +41,6 @@ def orbit(rig: CameraRig, frames: int, *, around: str | None = None) -> list[Cam
     """A flat ellipse around a camera of the rig, directed at the point in the centre of that camera's picture.
 
     Args:
-        rig: the cameras.
         frames: number of cameras on the path; the last is one step before the first.
         around: the camera in the middle; None for the one nearest to the mean of the rig.
 
@@ -67,8 +66,6 @@ def arc(rig: CameraRig, frames: int, *, between: tuple[str, str] | None = None) 
     """A path from one camera of the rig to another, at interpolated distances from the focus point.
 
     Args:
-        rig: the cameras.
-        frames: number of cameras on the path.
         between: the ends; None for the two most distant cameras within 50 degrees of the middle camera.
 
     Raises:
@@ -89,12 +86,17 @@ def arc(rig: CameraRig, frames: int, *, between: tuple[str, str] | None = None) 
 
 def looking(camera: Camera, eye: Tensor, target: Tensor, down: Tensor, rig: CameraRig) -> Camera:
     """``camera`` moved to ``eye`` and directed at ``target``; ``down`` is its vertical axis (``[3]`` each, world)."""
+    return replace(camera, viewmat=look_at(eye, target, down), near=free_near(rig, eye))
+
+
+def look_at(eye: Tensor, target: Tensor, down: Tensor) -> Tensor:
+    """World to camera ``[4, 4]`` at ``eye``, directed at ``target``, with the vertical axis ``down`` (``[3]`` each)."""
     forward = torch.nn.functional.normalize(target - eye, dim=0)
     right = torch.nn.functional.normalize(torch.linalg.cross(down, forward), dim=0)
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
-    return replace(camera, viewmat=viewmat, near=free_near(rig, eye))
+    return viewmat
 
 
 def free_near(rig: CameraRig, eye: Tensor) -> float:

@@ -17,14 +17,6 @@ from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import select_cameras
 from structgstream.errors import CaptureError
 from structgstream.evaluation.environment import environment
-from structgstream.evaluation.facts import (
-    check_same_frames,
-    check_same_rig,
-    comparison_facts,
-    scored_cameras,
-    stream_facts,
-    training_facts,
-)
 from structgstream.evaluation.ghosts import Ghosts, GhostSearch
 from structgstream.evaluation.metrics import ChannelFit, Mask, Picture, blackened, both, channel_fit, counting, score
 from structgstream.evaluation.optional_metrics import (
@@ -35,7 +27,17 @@ from structgstream.evaluation.optional_metrics import (
     load_optional_metrics,
     optional_scores,
 )
-from structgstream.evaluation.recording import Drawable, Recording, to_device
+from structgstream.evaluation.recording import (
+    Drawable,
+    Recording,
+    check_same_frames,
+    check_same_rig,
+    comparison_facts,
+    scored_cameras,
+    stream_facts,
+    to_device,
+    training_facts,
+)
 from structgstream.evaluation.report import FrameScores, Report, Scores, drawing_facts, mean_scores, psnr_trend
 from structgstream.evaluation.sizes import StoredSize, half_scores, halved, stored_size
 from structgstream.evaluation.worst import worst_facts
@@ -47,25 +49,15 @@ from structgstream.session.frame_report import counts
 
 @dataclass(frozen=True)
 class Compared:
-    """One camera of one frame: ground truth, rendering and scores.
-
-    Args:
-        camera: its name.
-        truth: ``[H, W, 3]`` picture of the camera, black in masked pixels.
-        picture: ``[H, W, 3]`` rendering, black in masked pixels.
-        scores: scores of the rendering.
-        first: the camera's first picture.
-        counting: ``[H, W]``, the pixels that count in both; None for all.
-        ghosts: ghosts of the rendering (``ghosts.py``); None if the camera's background is not known.
-    """
+    """One camera of one frame: ground truth, rendering and scores."""
 
     camera: str
-    truth: Picture
-    picture: Picture
-    scores: Scores
-    first: Picture
-    counting: Mask | None
-    ghosts: Ghosts | None
+    truth: Picture  # [H, W, 3] picture of the camera, black in masked pixels
+    picture: Picture  # [H, W, 3] rendering, black in masked pixels
+    scores: Scores  # scores of the rendering
+    first: Picture  # the camera's first picture
+    counting: Mask | None  # [H, W], the pixels that count in both; None for all
+    ghosts: Ghosts | None  # ghosts of the rendering (ghosts.py); None if the camera's background is not known
 
 
 EVALUATION = "evaluation"
@@ -153,30 +145,20 @@ def evaluate(
 
 @dataclass
 class _Comparison:
-    """Compares renderings with pictures frame by frame, and stores what scores need of each camera's earlier frames.
-
-    Args:
-        views: cameras by name, scene units.
-        backend: the compute back-end.
-        optional_metrics: the metrics that take longer; None for none.
-        ghosts: finds ghosts.
-        large: scores at the size of the stored pictures; None for none.
-        first: each camera's first picture, and its mask.
-        colors: each camera's colour response, fitted to frame 0.
-        before: each camera's last frame and its number, for temporal metrics.
-        left_out: each camera's share of masked pixels, by frame.
-    """
+    """Compares renderings with pictures frame by frame, and stores what scores need of each camera's earlier frames."""
 
     views: Mapping[str, Camera]
     backend: Backend
-    optional_metrics: OptionalMetrics | None
-    ghosts: GhostSearch
-    large: StoredSize | None
+    optional_metrics: OptionalMetrics | None  # the metrics that take longer; None for none
+    ghosts: GhostSearch  # finds ghosts
+    large: StoredSize | None  # scores at the size of the stored pictures; None for none
     halves: dict[str, Camera] = field(default_factory=dict, init=False)
+    # each camera's first picture, and its mask
     first: dict[str, tuple[Picture, Mask | None]] = field(default_factory=dict)
-    colors: dict[str, ChannelFit] = field(default_factory=dict)
+    colors: dict[str, ChannelFit] = field(default_factory=dict)  # each camera's colour response, fitted to frame 0
+    # each camera's last frame and its number, for temporal metrics
     before: dict[str, tuple[int, ComparedFrame]] = field(default_factory=dict)
-    left_out: dict[str, list[float]] = field(default_factory=dict)
+    left_out: dict[str, list[float]] = field(default_factory=dict)  # each camera's share of masked pixels, by frame
 
     def compare(
         self, camera: str, scene: Drawable, truth: Picture, *, index: int, mask: Mask | None = None

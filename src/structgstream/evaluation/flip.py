@@ -38,25 +38,16 @@ Plane = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class FlipFeatures:
-    """FLIP's features of one picture, each ``[H, W]``.
+    """FLIP's features of one picture, each ``[H, W]``."""
 
-    Args:
-        color: L*, a* and b* after filtering by contrast sensitivity, a* and b* with Hunt adjustment.
-        edges: edge strength at each pixel.
-        points: point and line strength at each pixel.
-    """
-
+    # L*, a* and b* after filtering by contrast sensitivity, a* and b* with Hunt adjustment
     color: tuple[Plane, Plane, Plane]
-    edges: Plane
-    points: Plane
+    edges: Plane  # edge strength at each pixel
+    points: Plane  # point and line strength at each pixel
 
 
 def opencv() -> ModuleType:
-    """The module OpenCV, which filters pictures.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
+    """The module OpenCV, which filters pictures. Raises MissingExtraError if it is not installed."""
     try:
         import cv2
     except ImportError:

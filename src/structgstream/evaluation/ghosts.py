@@ -28,7 +28,7 @@ from structgstream.evaluation.metrics import (
     mean_of_squares,
     squared_errors,
 )
-from structgstream.evaluation.sizes import block_mask, block_means
+from structgstream.evaluation.pictures import block_mask, block_means
 
 OCCUPIED, RESTORED, WRONG = 20, 8, 8  # levels of 255; noise of cameras and compression is 2 to 4 after the 3x3 mean
 REACH, MARGIN = 12 / 640, 6 / 640  # shares of the longer side: soft edges, and shadows next to moving objects
@@ -43,21 +43,13 @@ NEVER = -(10**9)
 
 @dataclass(frozen=True)
 class Ghosts:
-    """The ghosts of one picture.
+    """The ghosts of one picture."""
 
-    Args:
-        disoccluded: ``[h, w]`` mask of the disoccluded pixels of the reduced picture.
-        ghosts: ``[h, w]`` mask of the ghosts among them.
-        pixels: number of pixels that count.
-        factor: side of a pixel of these masks, in pixels of the picture.
-        psnr: dB over the disoccluded pixels; None without any.
-    """
-
-    disoccluded: Mask
-    ghosts: Mask
-    pixels: int
-    factor: int
-    psnr: float | None
+    disoccluded: Mask  # [h, w] mask of the disoccluded pixels of the reduced picture
+    ghosts: Mask  # [h, w] mask of the ghosts among them
+    pixels: int  # number of pixels that count
+    factor: int  # side of a pixel of these masks, in pixels of the picture
+    psnr: float | None  # dB over the disoccluded pixels; None without any
 
     @property
     def disoccluded_share(self) -> float:
@@ -73,24 +65,19 @@ class Ghosts:
 
 @dataclass
 class GhostFinder:
-    """Finds one camera's ghosts, frame by frame.
+    """Finds one camera's ghosts, frame by frame."""
 
-    Args:
-        memory: number of frames after which an occupied pixel can no longer become a ghost.
-        background: the present one, reduced; None before the first.
-        occupied: ``[h, w]`` number of the last frame in which the pixel, or one near it, was occupied.
-        left: reduced truth of each pixel when it was last occupied; the background for pixels that never were.
-        before: reduced rendering of each pixel when it was last not occupied.
-        seen: ``[h, w]`` mask of the pixels with a value in ``before``.
-        stuck: ``[h, w]`` mask of the last picture's ghosts among the pixels of ``seen``.
-    """
-
-    memory: int
-    background: Picture | None = None
+    memory: int  # number of frames after which an occupied pixel can no longer become a ghost
+    background: Picture | None = None  # the present one, reduced; None before the first
+    # [h, w] number of the last frame in which the pixel, or one near it, was occupied
     occupied: NDArray[np.int32] = field(default_factory=lambda: np.empty((0, 0), np.int32))
+    # reduced truth of each pixel when it was last occupied; the background for pixels that never were
     left: Picture = field(default_factory=lambda: np.empty((0, 0, 3), np.uint8))
+    # reduced rendering of each pixel when it was last not occupied
     before: Picture = field(default_factory=lambda: np.empty((0, 0, 3), np.uint8))
+    # [h, w] mask of the pixels with a value in before
     seen: Mask = field(default_factory=lambda: np.empty((0, 0), np.bool_))
+    # [h, w] mask of the last picture's ghosts among the pixels of seen
     stuck: Mask = field(default_factory=lambda: np.empty((0, 0), np.bool_))
 
     def begin(self, background: Picture) -> None:
@@ -112,8 +99,6 @@ class GhostFinder:
 
         Args:
             picture: the rendering, ``[H, W, 3]``, as large as the truth.
-            truth: the camera's picture.
-            index: number of the frame.
             mask: ``[H, W]``, the pixels that count; None for all.
         """
         assert self.background is not None
@@ -173,21 +158,13 @@ def _psnr(drawn: Picture, true: Picture, where: Mask) -> float | None:
 
 @dataclass
 class GhostSearch:
-    """The ghosts of several cameras, with the backgrounds that they need, section by section.
+    """The ghosts of several cameras, with the backgrounds that they need, section by section."""
 
-    Args:
-        source: the capture, which is read again for the backgrounds.
-        names: names of the cameras.
-        frames: number of frames that are scored.
-        finders: finder of each camera.
-        ends: number of the first frame of the next section.
-    """
-
-    source: FrameSource
-    names: tuple[str, ...]
-    frames: int
-    finders: dict[str, GhostFinder] = field(default_factory=dict)
-    ends: int = 0
+    source: FrameSource  # the capture, which is read again for the backgrounds
+    names: tuple[str, ...]  # names of the cameras
+    frames: int  # number of frames that are scored
+    finders: dict[str, GhostFinder] = field(default_factory=dict)  # finder of each camera
+    ends: int = 0  # number of the first frame of the next section
 
     def __post_init__(self) -> None:
         memory = max(round(MEMORY_SECONDS * self.source.fps), MEMORY_FRAMES)

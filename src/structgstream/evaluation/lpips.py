@@ -95,17 +95,11 @@ TRUNKS = (ALEX, VGG)
 
 @dataclass(frozen=True)
 class Lpips:
-    """A trunk with its weights and heads on one device.
+    """A trunk with its weights and heads on one device."""
 
-    Args:
-        trunk: the network.
-        weights: kernel and bias of each of the trunk's layers.
-        heads: for each tap the weight ``[C]`` of each channel's squared difference.
-    """
-
-    trunk: Trunk
-    weights: tuple[tuple[Tensor, Tensor], ...]
-    heads: tuple[Tensor, ...]
+    trunk: Trunk  # the network
+    weights: tuple[tuple[Tensor, Tensor], ...]  # kernel and bias of each of the trunk's layers
+    heads: tuple[Tensor, ...]  # for each tap the weight [C] of each channel's squared difference
 
     def features(self, picture: NDArray[np.uint8]) -> Features:
         """The unit features of an 8-bit sRGB picture ``[H, W, 3]``, with sides of at least ``trunk.smallest``."""

@@ -195,28 +195,24 @@ def ssim(picture: Picture, truth: Picture, backend: Backend) -> float:
         return float(backend.l1_ssim(image / 255.0, target)[1])
 
 
-CHUNK = 256  # pixels whose products of bytes can be added exactly in float32
-
-
 def psnr_affine(picture: Picture, truth: Picture) -> float:
     """PSNR of ``picture`` after its best affine change of colour towards ``truth``, dB."""
-    planes = _planes(picture, truth)
-    pixels = truth.size // 3
-    difference = _apply_matrix(planes[:4], _fit_matrix(planes))[:, :pixels] - planes[4:].flatten(1)[:, :pixels]
-    return decibels(float(difference.square_().sum(dtype=torch.float64)) / (255.0**2 * truth.size))
+    # In torch, because the spinning threads of NumPy's BLAS slowed the next rendering by half (2 cores).
+    given, wanted = (
+        torch.from_numpy(np.ascontiguousarray(p)).reshape(-1, 3).double() / 255.0 for p in (picture, truth)
+    )
+    given = torch.cat([given, torch.ones_like(given[:, :1])], dim=1)
+    matrix = np.linalg.lstsq((given.T @ given).numpy(), (given.T @ wanted).numpy(), rcond=None)[0]  # [4, 3]
+    errors = ((given @ torch.from_numpy(matrix)).clamp_(0.0, 1.0) - wanted).square_()
+    return decibels(float(errors.mean()))
 
 
 @dataclass(frozen=True)
 class ChannelFit:
-    """A camera's colour response, ``gain * rendering + bias`` per channel (Note [Colour of a camera]).
+    """A camera's colour response, ``gain * rendering + bias`` per channel (Note [Colour of a camera])."""
 
-    Args:
-        gains: gain of red, green and blue.
-        biases: bias of red, green and blue, full scale 1.
-    """
-
-    gains: tuple[float, float, float]
-    biases: tuple[float, float, float]
+    gains: tuple[float, float, float]  # gain of red, green and blue
+    biases: tuple[float, float, float]  # bias of red, green and blue, full scale 1
 
 
 def channel_fit(picture: Picture, truth: Picture) -> ChannelFit:
@@ -249,35 +245,6 @@ def psnr_camera_color(picture: Picture, truth: Picture, fit: ChannelFit) -> floa
     return decibels(total / (255.0**2 * truth.size))
 
 
-def _planes(*pictures: Picture) -> Tensor:
-    """A plane of ones, then the channels of the pictures: ``[1 + 3 n, chunks, CHUNK]`` float32, zero-padded.
-
-    Computed with torch, because the spinning threads of NumPy's BLAS slowed the next rendering by half (2 cores).
-    """
-    pixels = pictures[0].size // 3
-    planes = np.zeros((1 + 3 * len(pictures), -(-pixels // CHUNK) * CHUNK), np.float32)
-    planes[0, :pixels] = 1.0
-    for i, picture in enumerate(pictures):
-        for channel in range(3):
-            planes[1 + 3 * i + channel, :pixels] = picture[..., channel].ravel()
-    return torch.from_numpy(planes).reshape(len(planes), -1, CHUNK)
-
-
-def _fit_matrix(planes: Tensor) -> NDArray[np.float64]:
-    # The normal equations are 4x4, so the fit costs one pass over the pixels.
-    products = (planes.transpose(0, 1) @ planes.permute(1, 2, 0)).sum(0, dtype=torch.float64)  # [7, 7]
-    scale = torch.tensor([1.0] + 6 * [255.0], dtype=torch.float64)
-    products = (products / (scale[:, None] * scale)).numpy()
-    solution = np.linalg.lstsq(products[:4, :4], products[:4, 4:], rcond=None)[0].T
-    return np.roll(solution, -1, axis=1).astype(np.float64)  # the ones come last in the matrix
-
-
-def _apply_matrix(planes: Tensor, matrix: NDArray[np.float64]) -> Tensor:
-    """The first four planes through a 3x4 matrix, ``[3, pixels]``, 0 to 255, clamped."""
-    scaled = torch.from_numpy(np.roll(matrix * [1.0, 1.0, 1.0, 255.0], 1, axis=1)).float()
-    return (scaled @ planes.flatten(1)).clamp_(0.0, 255.0)
-
-
 def score(
     picture: Picture,
     truth: Picture,
@@ -292,14 +259,8 @@ def score(
     """The scores of a rendering against ``truth``.
 
     Args:
-        picture: the rendering.
-        truth: the camera's picture.
-        first: the camera's picture of frame 0.
-        backend: computes SSIM.
-        seconds: duration of the rendering.
         color: the camera's colour response, fitted to frame 0; None to leave out that score.
         mask: ``[H, W]`` bool, the pixels that count; None for all. Pictures are black in the others.
-        first_mask: mask of ``first``.
 
     Raises:
         CaptureError: the pictures have different sizes.

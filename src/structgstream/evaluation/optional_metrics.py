@@ -25,15 +25,11 @@ from structgstream.flow import consistency_mask, dis_search, sampled
 
 @dataclass(frozen=True)
 class FlowField:
-    """Backward flow of one frame.
+    """Backward flow of one frame."""
 
-    Args:
-        offsets: ``[H, W, 2]`` float32, x and y in pixels: pixel ``p`` was at ``p + offsets[p]`` in the frame before.
-        seen: ``[H, W]`` mask of the pixels that were not occluded in the frame before.
-    """
-
+    # [H, W, 2] float32, x and y in pixels: pixel p was at p + offsets[p] in the frame before
     offsets: NDArray[np.float32]
-    seen: Mask
+    seen: Mask  # [H, W] mask of the pixels that were not occluded in the frame before
 
 
 Flow = Callable[[Picture, Picture, str, int], FlowField]
@@ -100,21 +96,13 @@ TEMPORAL = ("e_warp", "temporal_flip", "t_lpips", "flicker", "truth_flicker")
 
 @dataclass(frozen=True)
 class OptionalMetrics:
-    """The available metrics, and the reasons for missing ones.
+    """The available metrics, and the reasons for missing ones."""
 
-    Args:
-        flip: computes FLIP's features of a picture, or None.
-        lpips: the trunks whose weights were found, by name.
-        flow: backward flow, or None.
-        weights: the file of each trunk's weights, by name of the trunk.
-        not_available: the reason for each missing metric.
-    """
-
-    flip: Callable[[Picture], FlipFeatures] | None
-    lpips: Mapping[str, Lpips]
-    flow: Flow | None
-    weights: Mapping[str, str] = field(default_factory=dict)
-    not_available: Mapping[str, str] = field(default_factory=dict)
+    flip: Callable[[Picture], FlipFeatures] | None  # computes FLIP's features of a picture, or None
+    lpips: Mapping[str, Lpips]  # the trunks whose weights were found, by name
+    flow: Flow | None  # backward flow, or None
+    weights: Mapping[str, str] = field(default_factory=dict)  # the file of each trunk's weights, by name of the trunk
+    not_available: Mapping[str, str] = field(default_factory=dict)  # the reason for each missing metric
 
 
 @dataclass(frozen=True)
@@ -132,19 +120,13 @@ class ComparedFrame:
 
 
 def load_optional_metrics(
-    cameras: Iterable[tuple[str, Camera]],
-    *,
-    frames: int,
-    device: torch.device,
-    lpips_weights: Path | None = None,
+    cameras: Iterable[tuple[str, Camera]], *, frames: int, device: torch.device, lpips_weights: Path | None = None
 ) -> OptionalMetrics:
     """The metrics that are available here for these cameras (by name) and this number of frames.
 
     Args:
         cameras: the scored cameras; a metric that needs larger pictures than one of them has is left out.
         frames: number of frames; temporal metrics need two.
-        device: device that computes LPIPS.
-        lpips_weights: folder or file with the trunks' weights (``lpips.py``, Note [Weights]).
 
     Raises:
         ConfigError: a file of weights is invalid.
@@ -196,12 +178,7 @@ def optional_scores(
     changes compare whole pictures, so they are None with a mask.
 
     Args:
-        optional_metrics: the available metrics.
-        truth: the camera's picture, ``[H, W, 3]`` uint8.
-        picture: the rendering.
         before: the same camera's previous frame; None for the first.
-        camera: its name.
-        index: number of the frame.
         mask: ``[H, W]``, the pixels that count; None for all. Both pictures are black in the others.
     """
     alex, vgg = (None if mask is not None else _usable(optional_metrics, trunk.name, truth) for trunk in (ALEX, VGG))

@@ -52,14 +52,7 @@ def _quality(axis: "Axes", report: Report) -> None:
     for number, name in enumerate(report.cameras):
         scores = [frame.cameras.get(name) for frame in report.frames]
         values = [float("nan") if found is None else found.psnr for found in scores]
-        axis.plot(
-            index,
-            values,
-            color=COLORS[number % len(COLORS)],
-            linewidth=1,
-            alpha=0.75,
-            label=f"camera {name}",
-        )
+        axis.plot(index, values, color=COLORS[number % len(COLORS)], linewidth=1, alpha=0.75, label=f"camera {name}")
     if len(report.cameras) > 1:
         axis.plot(*zip(*_known(report, "psnr")), color=INK, linewidth=2, label="mean")
     if colored := _known(report, "psnr_camera_color"):
@@ -135,13 +128,7 @@ def _seconds(axis: "Axes", report: Report) -> None:
 def _counts(axis: "Axes", report: Report) -> None:
     index = [frame.index for frame in report.frames]
     axis.plot(index, [frame.anchors for frame in report.frames], color=COLORS[0], linewidth=1.5, label="anchors")
-    axis.plot(
-        index,
-        [frame.free for frame in report.frames],
-        color=COLORS[3],
-        linewidth=1.5,
-        label="free Gaussians",
-    )
+    axis.plot(index, [frame.free for frame in report.frames], color=COLORS[3], linewidth=1.5, label="free Gaussians")
     axis.set_ylim(bottom=0)
     axis.set_ylabel("count", fontsize=9)
 

@@ -21,7 +21,7 @@ from structgstream.evaluation.metrics import (
     squared_errors,
     ssim,
 )
-from structgstream.evaluation.pictures import spread_indices
+from structgstream.evaluation.pictures import block_mask, block_means, spread_indices
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.scene.render import Drawable, render, to_8bit_image
@@ -29,29 +29,6 @@ from structgstream.scene.render import Drawable, render, to_8bit_image
 STORED_FRAMES, STORED_SHARE = 5, 4
 """At most five frames, and at most one in four, are scored at the stored size: twice the size has four times the
 pixels."""
-
-
-def block_means(picture: Picture, factor: int) -> Picture:
-    """``picture`` ``[H, W, 3]`` reduced by a whole factor, by area mean, rounded.
-
-    Rows and columns at the end that do not fill a pixel are left out.
-    """
-    if factor == 1:
-        return picture
-    height, width = picture.shape[0] // factor, picture.shape[1] // factor
-    blocks = picture[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)
-    total = np.zeros((height, width, 3), np.uint32)
-    for row in range(factor):  # many times faster than sums over so short axes
-        for column in range(factor):
-            total += blocks[:, row, :, column]
-    return ((total + factor**2 // 2) // factor**2).astype(np.uint8)
-
-
-def block_mask(mask: Mask, factor: int) -> Mask:
-    """``mask`` ``[H, W]`` reduced as in :func:`block_means`: a pixel counts if all its source pixels count."""
-    height, width = mask.shape[0] // factor, mask.shape[1] // factor
-    blocks = mask[: height * factor, : width * factor].reshape(height, factor, width, factor)
-    return np.logical_and.reduce(blocks, axis=(1, 3))
 
 
 def halved(camera: Camera) -> Camera:
@@ -66,10 +43,8 @@ def half_scores(
     """PSNR and SSIM, by their names in ``Scores``, of a rendering at half size against the area mean of the truth.
 
     Args:
-        scene: the drawable.
         camera: camera of the whole picture, or the result of :func:`halved` if the caller has it; scene units.
         truth: the camera's picture ``[H, W, 3]``, black outside ``mask``.
-        backend: the compute back-end.
         mask: ``[H, W]``, the pixels that count; None for all.
     """
     small = None if mask is None else block_mask(mask, 2)
@@ -79,19 +54,12 @@ def half_scores(
 
 @dataclass
 class StoredSize:
-    """Scores at the size of the capture's stored pictures, which are larger than those that a stream was made from.
+    """Scores at the size of the capture's stored pictures, which are larger than those that a stream was made from."""
 
-    Args:
-        source: the capture at that size, the same frames.
-        views: cameras of the stream by name, scene units.
-        backend: the compute back-end.
-        frames: numbers of the scored frames.
-    """
-
-    source: FrameSource
-    views: Mapping[str, Camera]
+    source: FrameSource  # the capture at that size, the same frames
+    views: Mapping[str, Camera]  # cameras of the stream by name, scene units
     backend: Backend
-    frames: frozenset[int]
+    frames: frozenset[int]  # numbers of the scored frames
     _frame: tuple[int, MultiViewFrame] | None = field(default=None, init=False)
 
     def scores(self, camera: str, scene: Drawable, *, index: int) -> dict[str, float | None]:

@@ -65,19 +65,12 @@ def shown(scores: Scores, reason: Reason) -> dict[str, float | None]:
 
 @dataclass(frozen=True)
 class Window:
-    """A square part of a picture, pixels.
+    """A square part of a picture, pixels."""
 
-    Args:
-        x: first column.
-        y: first row.
-        width: number of columns.
-        height: number of rows.
-    """
-
-    x: int
-    y: int
-    width: int
-    height: int
+    x: int  # first column
+    y: int  # first row
+    width: int  # number of columns
+    height: int  # number of rows
 
     def of(self, picture: Picture) -> Picture:
         """That part of a picture ``[H, W, 3]``."""
@@ -86,23 +79,14 @@ class Window:
 
 @dataclass(frozen=True)
 class Crop:
-    """A bad window of a bad frame.
+    """A bad window of a bad frame."""
 
-    Args:
-        reason: why it was chosen.
-        frame: number of the frame.
-        camera: name of the camera.
-        scores: scores of the whole picture.
-        window: position in the picture.
-        picture: truth, rendering and their difference times four, side by side.
-    """
-
-    reason: Reason
-    frame: int
-    camera: str
-    scores: Mapping[str, float | None]
-    window: Window
-    picture: Picture
+    reason: Reason  # why it was chosen
+    frame: int  # number of the frame
+    camera: str  # name of the camera
+    scores: Mapping[str, float | None]  # scores of the whole picture
+    window: Window  # position in the picture
+    picture: Picture  # truth, rendering and their difference times four, side by side
 
 
 @dataclass
@@ -184,12 +168,6 @@ def write_worst(folder: Path, crops: Sequence[Crop]) -> list[str]:
 
 def write_page(folder: Path, crops: Sequence[Crop], *, title: str, pictures: Sequence[str]) -> None:
     """Writes ``index.html`` and the crops into the folder of a report.
-
-    Args:
-        folder: folder of the report.
-        crops: the worst windows.
-        title: heading.
-        pictures: file names of further pictures in the folder.
 
     Raises:
         StorageError: a file cannot be written.

@@ -10,14 +10,13 @@ import secrets
 import tempfile
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from structgstream.errors import ConfigError, MissingExtraError
-from structgstream.executors.local import CommandProcess, waited_for
-from structgstream.executors.task import Task, TaskResult, thread_environment
+from structgstream.executors.tasks import CommandProcess, Task, TaskResult, thread_environment, waited_for
 
 OLDEST = (2, 52)
 OBJECT_STORE_BYTES = 80 * 2**20
@@ -29,24 +28,12 @@ COUNT_SECONDS = 10.0
 TOKEN_FILE = Path(".ray") / "auth_token"
 
 
-@dataclass(frozen=True)
-class RayOptions:
-    """Options of a Ray cluster and its workers.
+class RayEngine:
+    """Runs tasks on a Ray cluster.
 
     Args:
         address: ``HOST:PORT`` of the cluster's head, or ``auto`` for one on this machine; None starts one on this
             machine, for this process only, with ``workers``.
-        workers: number of workers of a cluster that is started here.
-        cores: number of cores of a worker.
-    """
-
-    address: str | None = None
-    workers: int = 1
-    cores: int = 1
-
-
-class RayEngine:
-    """Runs tasks on a Ray cluster; see :class:`RayOptions`.
 
     Raises:
         MissingExtraError: Ray is not installed.
@@ -56,13 +43,13 @@ class RayEngine:
     name = "ray"
     repeats = True
 
-    def __init__(self, options: RayOptions) -> None:
-        self._options = options
-        _protect(begins_one=options.address is None)
+    def __init__(self, address: str | None = None, workers: int = 1, cores: int = 1) -> None:
+        self._cores = cores
+        _protect(begins_one=address is None)
         self._ray = _imported()
         self._folder = tempfile.TemporaryDirectory(prefix="structgstream-ray-", ignore_cleanup_errors=True)
         try:
-            _join(self._ray, options, Path(self._folder.name))
+            _join(self._ray, address, workers * cores, Path(self._folder.name))
         except ConfigError:
             self._folder.cleanup()
             raise
@@ -81,18 +68,16 @@ class RayEngine:
         return len(self._pending) < IN_FLIGHT * max(1, self.workers())
 
     def workers(self) -> int:
-        """Number of tasks that the machines of the cluster can run concurrently at present."""
-        when, count = self._counted
-        if time.monotonic() - when > COUNT_SECONDS:
-            count = int(self._ray.cluster_resources().get("CPU", 0)) // self._options.cores
-            self._counted = (time.monotonic(), count)
-        return count
+        """Number of tasks that the machines of the cluster can run at a time; asks now and then."""
+        if time.monotonic() - self._counted[0] > COUNT_SECONDS:
+            self._counted = (time.monotonic(), int(self._ray.cluster_resources().get("CPU", 0)) // self._cores)
+        return self._counted[1]
 
     def start(self, task: Task, *, gpus: int, attempt: int) -> None:
         """See ``Engine.start``."""
         options = self._remote.options(
             name=task.name,
-            num_cpus=self._options.cores,
+            num_cpus=self._cores,
             num_gpus=gpus,
             max_retries=task.retries,
             retry_exceptions=[CommandKilled],
@@ -100,7 +85,7 @@ class RayEngine:
         )
         # Another machine cannot write its output to a file of this machine.
         sent = replace(task, log=None)
-        environment = thread_environment(self._options.cores)
+        environment = thread_environment(self._cores)
         self._pending[options.remote(sent, environment)] = (task.name, time.monotonic())
 
     def ended(self, seconds: float) -> list[TaskResult]:
@@ -128,11 +113,7 @@ class RayEngine:
 
 
 def _protect(*, begins_one: bool) -> None:
-    """Enables token authentication and disables usage statistics; must be called before Ray is imported.
-
-    Raises:
-        ConfigError: authentication is turned off, or there is no token for the cluster to join.
-    """
+    """Enables token authentication and disables usage statistics; must be called before Ray is imported."""
     mode = os.environ.setdefault("RAY_AUTH_MODE", "token")
     if mode == "disabled":
         raise ConfigError(
@@ -162,28 +143,24 @@ def _imported() -> Any:
     return ray
 
 
-def _join(ray: Any, options: RayOptions, folder: Path) -> None:
-    """Joins the cluster, or starts one.
-
-    Raises:
-        ConfigError: it cannot be reached, refuses the token, or cannot be started.
-    """
+def _join(ray: Any, address: str | None, cores: int, folder: Path) -> None:
+    """Joins the cluster, or starts one of so many cores."""
     given: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
-    if options.address is None:
-        given |= {"num_cpus": options.workers * options.cores, "include_dashboard": False}
+    if address is None:
+        given |= {"num_cpus": cores, "include_dashboard": False}
         given |= {"object_store_memory": OBJECT_STORE_BYTES, "_temp_dir": str(folder)}
     else:
-        given["address"] = options.address
+        given["address"] = address
     try:
         ray.init(**given)
     except Exception as error:  # Ray raises its own errors, RuntimeError and ConnectionError for the same reasons.
         reason = " ".join(str(error).split())[:300] or type(error).__name__
-        if options.address is None:
+        if address is None:
             raise ConfigError(
                 f"A Ray cluster cannot be started here ({reason}); try again when the machine is less busy."
             ) from error
         raise ConfigError(
-            f"The Ray cluster at {options.address} cannot be joined ({reason}); is its head running, and is the token "
+            f"The Ray cluster at {address} cannot be joined ({reason}); is its head running, and is the token "
             "the one that it was started with?"
         ) from error
 

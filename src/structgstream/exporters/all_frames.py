@@ -31,11 +31,7 @@ class UsdFile:
     """Collects frames and writes them to one file."""
 
     def __init__(self, *, fps: float) -> None:
-        """Begin a file.
-
-        Raises:
-            MissingExtraError: usd-core is not installed.
-        """
+        """Begin a file. Raises MissingExtraError if usd-core is not installed."""
         try:
             from pxr import Sdf, Usd, UsdGeom
         except ImportError:
@@ -103,11 +99,7 @@ class FourDgsFile:
     """Collects frames and writes them to one file."""
 
     def __init__(self, *, fps: float) -> None:
-        """Begin a file.
-
-        Raises:
-            MissingExtraError: fourdgs is not installed.
-        """
+        """Begin a file. Raises MissingExtraError if fourdgs is not installed."""
         try:
             import fourdgs  # noqa: F401
         except ImportError:

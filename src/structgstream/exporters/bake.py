@@ -34,21 +34,13 @@ HALF_TURN_SIGNS = (1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
 
 @dataclass(frozen=True)
 class BakedGaussians:
-    """``N`` Gaussians whose colour depends on the view direction.
+    """``N`` Gaussians whose colour depends on the view direction."""
 
-    Args:
-        means: ``[N, 3]``.
-        quats: ``[N, 4]`` wxyz, unit length, ``w`` not negative.
-        scales: ``[N, 3]`` standard deviations, in the unit of ``means``.
-        opacities: ``[N]`` in (0, 1).
-        sh: ``[N, (degree + 1)^2, 3]`` sRGB coefficients (``scene/harmonics.py``).
-    """
-
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    sh: Tensor
+    means: Tensor  # [N, 3]
+    quats: Tensor  # [N, 4] wxyz, unit length, w not negative
+    scales: Tensor  # [N, 3] standard deviations, in the unit of means
+    opacities: Tensor  # [N] in (0, 1)
+    sh: Tensor  # [N, (degree + 1)^2, 3] sRGB coefficients (scene/harmonics.py)
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -115,10 +107,7 @@ def bake(scene: Scene, cameras: Iterable[Camera], backend: Backend, *, degree: i
     """Plain Gaussians that approximate ``scene`` as seen from ``cameras`` and between them (Note [Baking]).
 
     Args:
-        scene: the scene, on the device of ``backend``.
         cameras: the training cameras of the stream, in the scene's units.
-        backend: the compute back-end.
-        degree: degree of the spherical harmonics.
 
     Returns:
         Gaussians in the scene's units, in the order of ids, without invisible ones.
@@ -145,8 +134,6 @@ def with_low_pass(gaussians: BakedGaussians, sampling: RigSampling, variance: fl
     smaller pixels.
 
     Args:
-        gaussians: the Gaussians, in the scene's units.
-        sampling: sampling by the scene's training cameras.
         variance: squared training pixels, at least 0; scenes are trained with 0.3.
     """
     intervals = sampling.intervals(gaussians.means)

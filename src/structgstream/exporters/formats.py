@@ -19,21 +19,13 @@ MAX_SH_DEGREE = 3
 
 @dataclass(frozen=True)
 class FormatInfo:
-    """A row of the table.
+    """A row of the table."""
 
-    Args:
-        purpose: what the format is good for.
-        readers: programs that open it.
-        max_degree: highest degree of spherical harmonics.
-        all_frames: whether one file contains all frames.
-        suffixes: further endings of file names.
-    """
-
-    purpose: str
-    readers: str
-    max_degree: int = MAX_SH_DEGREE
-    all_frames: bool = False
-    suffixes: tuple[str, ...] = ()
+    purpose: str  # what the format is good for
+    readers: str  # programs that open it
+    max_degree: int = MAX_SH_DEGREE  # highest degree of spherical harmonics
+    all_frames: bool = False  # whether one file contains all frames
+    suffixes: tuple[str, ...] = ()  # further endings of file names
 
 
 FORMATS: Mapping[Format, FormatInfo] = {
@@ -125,11 +117,8 @@ def destination(
     """The path to write to, and the format.
 
     Args:
-        stream: the stream's file.
         output: the file or folder to write; None for one next to the stream.
         format: the format; None for the suffix of ``output``, else ``ply``.
-        frame: the only frame to write, or None.
-        frames: the first and the last frame, or None.
 
     Raises:
         ConfigError: the suffix is not a format or differs from ``format``, or both ``frame`` and ``frames`` are given.
@@ -163,11 +152,7 @@ def destination(
 
 
 def check_page(*, frame: int | None, frames: tuple[int, int] | None, options: FrameOptions) -> None:
-    """Check that no options of other formats are given for a page.
-
-    Raises:
-        ConfigError: one is given.
-    """
+    """Check that no options of other formats are given for a page. Raises ConfigError if one is given."""
     if frame is not None or frames is not None or options != FrameOptions():
         raise ConfigError("a page contains the whole stream; choices of frames and of Gaussians are for other formats.")
 
@@ -180,8 +165,6 @@ def choose_frames(
     Args:
         runs: the frames of the stream that can be decoded.
         output: the destination; a file whose suffix is a format contains one frame.
-        frame: the only frame, or None.
-        frames: the first and the last frame, or None for all.
 
     Raises:
         ConfigError: there is no such frame, it is lost, or several would be written into one file.

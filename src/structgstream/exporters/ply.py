@@ -68,18 +68,11 @@ _MAX_HEADER_BYTES = 1 << 16
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """The header of a file.
+    """The header of a file."""
 
-    Args:
-        count: number of Gaussians.
-        row: names and types of a Gaussian's properties.
-        offset: byte at which the first row begins.
-        degree: degree of the spherical harmonics.
-    """
-
-    count: int
-    row: np.dtype
-    offset: int
+    count: int  # number of Gaussians
+    row: np.dtype  # names and types of a Gaussian's properties
+    offset: int  # byte at which the first row begins
     degree: int
 
 
@@ -118,11 +111,7 @@ def find_sequence(folder: Path) -> list[Path]:
 
 
 def read_header(path: Path) -> PlyHeader:
-    """The header of a ``.ply`` of Gaussians.
-
-    Raises:
-        CaptureError: it is not one, or lacks a property.
-    """
+    """The header of a ``.ply`` of Gaussians. Raises CaptureError if it is not one, or lacks a property."""
     with path.open("rb") as file:
         data = file.read(_MAX_HEADER_BYTES)
     text, separator, _ = data.partition(b"end_header\n")

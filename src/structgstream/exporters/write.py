@@ -18,9 +18,8 @@ from structgstream.errors import StorageError, StreamError
 from structgstream.exporters.all_frames import FourDgsFile, UsdFile
 from structgstream.exporters.bake import BakedGaussians, bake, with_low_pass
 from structgstream.exporters.formats import FORMATS, Format, FrameOptions, is_one_file
-from structgstream.exporters.glb import glb_bytes
 from structgstream.exporters.ply import ply_bytes
-from structgstream.exporters.web import sog_bytes, splat_bytes, spz_bytes
+from structgstream.exporters.web import glb_bytes, sog_bytes, splat_bytes, spz_bytes
 from structgstream.kernels.backend import Backend
 from structgstream.scene.render import Drawable, render
 from structgstream.scene.scene import Scene
@@ -56,9 +55,6 @@ def open_output(output: Path, format: Format, *, fps: float, options: FrameOptio
 
     Args:
         output: a file for one frame; ``NAME.zip``; a file of all frames; or a folder for ``frame_000000.ply`` etc.
-        format: format of the files.
-        fps: frames per second of the stream.
-        options: options of the format.
 
     Raises:
         ConfigError: the format does not support these Gaussians.
@@ -103,10 +99,8 @@ def write_gaussians(
     An existing file at ``path`` is replaced only when the new one is complete.
 
     Args:
-        path: the file.
         gaussians: the Gaussians, in the file's units, OpenCV axes.
         format: format of the file; ``splat`` supports only degree 0.
-        options: options of the format; None for the defaults.
 
     Returns:
         ``path``.
@@ -171,30 +165,19 @@ def check_finite(gaussians: BakedGaussians) -> None:
 
 @dataclass(frozen=True)
 class BakingLoss:
-    """How well baked Gaussians show what the stream shows, PSNR in dB over all pixels of the cameras.
+    """How well baked Gaussians show what the stream shows, PSNR in dB over all pixels of the cameras."""
 
-    Args:
-        training: at the training cameras.
-        held_out: at the held-out cameras; None without any.
-    """
-
-    training: float
-    held_out: float | None
+    training: float  # at the training cameras
+    held_out: float | None  # at the held-out cameras; None without any
 
 
 @dataclass(frozen=True)
 class WrittenFrame:
-    """One written frame.
+    """One written frame."""
 
-    Args:
-        path: the file that has it, complete when all frames are written.
-        gaussians: number of its Gaussians.
-        loss: of the first frame: what was lost; None for the others.
-    """
-
-    path: Path
-    gaussians: int
-    loss: BakingLoss | None
+    path: Path  # the file that has it, complete when all frames are written
+    gaussians: int  # number of its Gaussians
+    loss: BakingLoss | None  # of the first frame: what was lost; None for the others
 
 
 def write_frames(
@@ -209,11 +192,8 @@ def write_frames(
     """Bakes frames for the training cameras and writes each in the units of the capture.
 
     Args:
-        reader: the stream.
         numbers: numbers of the frames; a single one if ``output`` is a file for one frame.
         output: a file, or a folder for ``frame_000000.ply`` and so on (``write.open_output``).
-        format: format of the files.
-        backend: evaluates the MLPs.
         options: what is fitted and left out; None for the defaults.
 
     Raises:

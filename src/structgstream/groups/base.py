@@ -24,21 +24,13 @@ from structgstream.session.presets import StreamConfig, from_json
 
 @dataclass(frozen=True)
 class GroupBase:
-    """The beginning of a stream. A group is fitted from it, its pictures and the track.
+    """The beginning of a stream. A group is fitted from it, its pictures and the track."""
 
-    Args:
-        name: of the file, for messages.
-        header: content of the init record.
-        init: the bytes of prefix and init record.
-        first: the bytes of the record of frame 0.
-        packet: frame 0.
-    """
-
-    name: str
-    header: StreamHeader
-    init: bytes
-    first: bytes
-    packet: Packet
+    name: str  # of the file, for messages
+    header: StreamHeader  # content of the init record
+    init: bytes  # the bytes of prefix and init record
+    first: bytes  # the bytes of the record of frame 0
+    packet: Packet  # frame 0
 
     @classmethod
     def read(cls, path: Path | str) -> "GroupBase":

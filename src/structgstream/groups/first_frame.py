@@ -40,21 +40,14 @@ from structgstream.training.residuals import ResidualFloor
 from structgstream.training.result import FitResult, StepListener, Stopwatch
 from structgstream.training.views import View
 
+NEIGHBOURS = 32
+"""Number of nearest inlier anchors of frame 0 whose displacements a lost anchor gets."""
+FEATURE_BANDWIDTH = 0.5
+"""A neighbour's weight is a Gaussian of the root mean square difference of features; this is its standard deviation, in
+standard deviations of the features."""
+MIN_LOST_PIXELS = 3.0
+"""Anchors that would move by no more pixels than this are not relocated."""
 MEDIAN_STEPS = 12
-
-
-@dataclass(frozen=True)
-class LostAnchorConfig:
-    """Relocation of lost anchors by the displacements of their neighbours; not in the paper."""
-
-    enabled: bool = True
-    neighbours: int = 32
-    """Number of nearest inlier anchors of frame 0 whose displacements are used."""
-    feature_bandwidth: float = 0.5
-    """A neighbour's weight is a Gaussian of the root mean square difference of features; this is its standard
-    deviation, in standard deviations of the features."""
-    min_pixels: float = 3.0
-    """Anchors that would move by no more pixels than this are not relocated."""
 
 
 def relocate_lost_anchors(
@@ -64,39 +57,30 @@ def relocate_lost_anchors(
     active_tiles: Mapping[int, ActiveTiles],
     *,
     floor: ResidualFloor | None,
-    min_pixels: float,
-    births: SpawnRules,
-    config: LostAnchorConfig,
+    rules: SpawnRules,
     backend: Backend,
 ) -> tuple[Scene, int]:
     """``dynamic`` with its lost anchors moved to their neighbours, and the number of lost anchors.
 
     Args:
-        dynamic: the dynamic part of a scene.
         first: its anchors in frame 0, in the same order.
-        views: views of the frame.
         active_tiles: by view index, with up-to-date renderings; views without an entry are skipped.
-        floor: baseline residuals of frame 0; None for none.
-        min_pixels: views in which an anchor covers fewer pixels do not count.
-        births: thresholds of the outlier test.
-        config: configuration of the relocation.
-        backend: the compute back-end.
 
     Raises:
         MissingExtraError: SciPy is not installed.
     """
     pixel = pixel_size(first.positions, [view.camera for view in views])
-    if not config.enabled or pixel is None or len(first) < 2:
+    if pixel is None or len(first) < 2:
         return dynamic, 0
     with torch.no_grad():
-        outliers = _outlier_anchors(dynamic, views, active_tiles, floor, min_pixels, births, backend)
+        outliers = _outlier_anchors(dynamic, views, active_tiles, floor, rules, backend)
         if not outliers.any() or outliers.all():
             return dynamic, 0
         positions = dynamic.anchors.positions
         displacements = positions - first.positions
         rows = outliers.nonzero()[:, 0]
-        expected = _displacements_of_neighbours(first, displacements, rows, ~outliers, config)
-        far = (expected - displacements[rows]).norm(dim=1) > config.min_pixels * pixel
+        expected = _displacements_of_neighbours(first, displacements, rows, ~outliers)
+        far = (expected - displacements[rows]).norm(dim=1) > MIN_LOST_PIXELS * pixel
         rows, expected = rows[far], expected[far]
         positions = positions.index_copy(0, rows, first.positions[rows] + expected)
     return replace(dynamic, anchors=replace(dynamic.anchors, positions=positions)), len(rows)
@@ -107,17 +91,16 @@ def _outlier_anchors(
     views: Sequence[View],
     active_tiles: Mapping[int, ActiveTiles],
     floor: ResidualFloor | None,
-    min_pixels: float,
-    births: SpawnRules,
+    rules: SpawnRules,
     backend: Backend,
 ) -> Tensor:
-    """Mask ``[M]`` of the anchors that are outliers in several views (``births.outlier_mask``)."""
+    """Mask ``[M]`` of the anchors that are outliers in several views (``spawn.outlier_mask``)."""
     folded, coverage, wrong = dynamic.with_folded_appearance(), [], []
     for view in views:
         active = active_tiles.get(view.index)
         if active is None:
             continue
-        found = view_residual(active.picture, view, dynamic.camera_color, floor=floor, rules=births, backend=backend)
+        found = view_residual(active.picture, view, dynamic.camera_color, floor=floor, rules=rules, backend=backend)
         small = found.view
         pixels = found.wrong.to(active.picture)
         counting = torch.ones_like(pixels) if small.mask is None else small.mask.to(pixels)
@@ -129,23 +112,21 @@ def _outlier_anchors(
         wrong.append(sums[: len(dynamic.anchors), 1])
     if not coverage:
         return torch.zeros(len(dynamic.anchors), dtype=torch.bool, device=dynamic.anchors.positions.device)
-    return outlier_mask(torch.stack(coverage), torch.stack(wrong), min_pixels=min_pixels, rules=births)
+    return outlier_mask(torch.stack(coverage), torch.stack(wrong), rules=rules)
 
 
-def _displacements_of_neighbours(
-    first: AnchorCloud, displacements: Tensor, rows: Tensor, inliers: Tensor, config: LostAnchorConfig
-) -> Tensor:
+def _displacements_of_neighbours(first: AnchorCloud, displacements: Tensor, rows: Tensor, inliers: Tensor) -> Tensor:
     """Weighted geometric median ``[R, 3]`` of the displacements of the neighbours of ``rows`` in frame 0.
 
     Neighbours are chosen from the mask ``inliers``. Unlike a mean, the median ignores a few neighbours on another body.
     """
     among = inliers.nonzero()[:, 0]
-    near, _ = nearest(first.positions[rows], first.positions[among], config.neighbours)
+    near, _ = nearest(first.positions[rows], first.positions[among], NEIGHBOURS)
     near = among[near]
     features = first.features.detach()
     features = features / features.std(0).clamp(min=1e-6)
     differences = (features[near] - features[rows][:, None]).square().mean(-1)
-    weights = torch.exp(-0.5 * differences / config.feature_bandwidth**2).clamp(min=1e-12)
+    weights = torch.exp(-0.5 * differences / FEATURE_BANDWIDTH**2).clamp(min=1e-12)
     values = displacements[near]
     median = (weights[..., None] * values).sum(1) / weights.sum(1, keepdim=True)
     for _ in range(MEDIAN_STEPS):  # Weiszfeld
@@ -159,6 +140,12 @@ USUAL_FRAMES = 11
 iterations would have corrected, which costs bytes, and late groups lose quality (lab/notes/groups-measured.md)."""
 
 
+SMOOTHNESS_SHARE = 0.25
+"""Weight of the motion smoothness ``online.smoothness``, measured from frame 0 here, relative to that of other frames.
+The full weight suits moving bodies, but costs 0.8 dB where the appearance changes in place, because displacements also
+have to represent that change."""
+
+
 @dataclass(frozen=True)
 class GroupStartConfig:
     """The fit of a group's first frame; not in the paper."""
@@ -167,17 +154,8 @@ class GroupStartConfig:
     """Optimisation steps of all rounds together; None for :data:`USUAL_FRAMES` times those of an online frame."""
     rounds: int = 3
     """Rounds of flow, spawning and iterations."""
-    flow_rounds: int = 1
-    """Number of displacements by flow from the rendering to the pictures before the iterations of a round. Each adds
-    noise."""
-    lost_anchors: LostAnchorConfig = LostAnchorConfig()
-    """Relocation of anchors that tracking lost."""
     births: int = 2000
     """Largest number of Gaussians spawned in a round, for content that appeared since frame 0."""
-    smoothness_share: float = 0.25
-    """Weight of the motion smoothness ``online.smoothness``, measured from frame 0 here, relative to that of other
-    frames. The full weight suits moving bodies, but costs 0.8 dB where the appearance changes in place, because
-    displacements also have to represent that change."""
 
 
 def fit_group_start(
@@ -199,26 +177,16 @@ def fit_group_start(
     """Fit ``scene``, the decoded scene of frame 0, to a later frame.
 
     Args:
-        scene: of frame 0.
         displacements: ``[M + F, 3]`` of its primitives (Note [Primitives]) since frame 0, as tracked.
-        views: the pictures of the frame.
         changes: change of each picture since frame 0; a view with None does not vote.
-        frame_index: index of the frame, for the identities of spawned Gaussians.
-        config: configuration of online frames.
-        start: configuration of this fit.
-        backend: the compute back-end.
-        seed: seed of all random numbers.
-        steps: quantization steps (Note [Bins]).
-        floor: baseline residuals of frame 0; None for none.
         light: exposure reference of frame 0, for ``config.exposure``; None for none.
-        on_step: called after every iteration.
     """
     iterations = USUAL_FRAMES * config.iterations if start.iterations is None else start.iterations
     each = replace(
         config,
         iterations=-(-iterations // start.rounds),
         spawn=replace(config.spawn, most=start.births),
-        smoothness=replace(config.smoothness, weight=start.smoothness_share * config.smoothness.weight),
+        smoothness=replace(config.smoothness, weight=SMOOTHNESS_SHARE * config.smoothness.weight),
     )
     if config.exposure.enabled and light is not None:
         step = None if steps is None else steps.get("color_mlp")
@@ -263,10 +231,9 @@ class _Rounds:
                 displaced,
                 inliers,
                 active_tiles,
-                first_birth=self._first_birth(current.free),
+                first_identity=self._first_identity(current.free),
                 floor=self.floor,
                 room=config.patching.max_free - len(split.static.free),
-                min_pixels=config.motion.MIN_PIXELS,
                 config=config.spawn,
                 backend=backend,
             )
@@ -308,32 +275,29 @@ class _Rounds:
             views,
             find_active_tiles(split, views, config=config.motion, backend=fit.backend),
             floor=self.floor,
-            min_pixels=config.motion.MIN_PIXELS,
-            births=config.spawn.rules,
-            config=self.start.lost_anchors,
+            rules=config.spawn.rules,
             backend=fit.backend,
         )
         return replace(split, dynamic=dynamic), count
 
     def _displaced(self, split: DynamicSplit, views: list[View]) -> tuple[DynamicSplit, int]:
-        """``split`` after rounds of flow from its rendering to the pictures, and the number of displaced primitives."""
+        """``split`` after flow from its rendering to the pictures, and the number of displaced primitives."""
         fit, config = self.fit, self.fit.config
         chosen = flow_views(views, fit.frame_index, config.scene_flow)
-        seen, lifted = [view for view in views if view.index in chosen], 0
-        for _ in range(self.start.flow_rounds if chosen else 0):
-            found = residual_flow(
-                split.dynamic,
-                seen,
-                find_active_tiles(split, seen, config=config.motion, backend=fit.backend),
-                scale=config.motion.picture_scale,
-                config=config.scene_flow,
-                backend=fit.backend,
-            )
-            lifted = int(found.lifted.sum())
-            split = split.displaced(found.displacements)
-        return split, lifted
+        seen = [view for view in views if view.index in chosen]
+        if not seen:
+            return split, 0
+        found = residual_flow(
+            split.dynamic,
+            seen,
+            find_active_tiles(split, seen, config=config.motion, backend=fit.backend),
+            scale=config.motion.picture_scale,
+            config=config.scene_flow,
+            backend=fit.backend,
+        )
+        return split.displaced(found.displacements), int(found.lifted.sum())
 
-    def _first_birth(self, free: FreeGaussians) -> int:
+    def _first_identity(self, free: FreeGaussians) -> int:
         """The first identity of the frame that no earlier round has used."""
         first = self.fit.frame_index * IDS_PER_FRAME
         return max(first, int(free.births.max()) + 1) if len(free) else first

@@ -1,30 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joins segments to one stream file, with or without a seam blend at their borders."""
+"""Joins segments to one stream file, with or without a seam blend at their borders.
 
+A seam blend needs the last two frames of the group before. If that group is long enough, its own blend has faded by
+then. So a run of groups that starts after such a group is independent of other runs: processes blend runs side by side
+(this module as a program: ``DEVICE OUTPUT PREVIOUS SEGMENT...``), and give the same bytes as a single process.
+"""
+
+import json
 import re
+import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
+from dataclasses import asdict
 from itertools import accumulate
 from pathlib import Path
-from typing import BinaryIO
+from typing import cast
 
-from structgstream.atomic_files import atomic_file
-from structgstream.codec.container.records import pack_index
+from structgstream.atomic_files import atomic_file, atomic_write
+from structgstream.codec.container.records import FRAME, PREFIX, pack_index, read_record
+from structgstream.codec.header import unpack_header
+from structgstream.codec.packets import StreamHeader
 from structgstream.codec.reader import open_stream
 from structgstream.errors import ConfigError, StreamError, TaskError
-from structgstream.executors.executor import TaskQueue
-from structgstream.executors.local import LocalEngine
-from structgstream.executors.task import allocate_slots
-from structgstream.groups.blending_run import BlendedRun, header_of, run_task, runs_of
-from structgstream.groups.seam_blend import Border, GroupBlender
+from structgstream.executors.tasks import PYTHON, LocalEngine, Task, TaskQueue, allocate_slots
+from structgstream.groups.seam_blend import OWN_FRAMES, Border, GroupBlender
 from structgstream.groups.segment_file import Segment, open_segment
-from structgstream.kernels.backend import Backend
+from structgstream.kernels.backend import Backend, BackendName, select_backend
 from structgstream.owned_folders import own_folder, remove_own
 from structgstream.training.online.patching import IDS_PER_FRAME
 
+MAX_GROUPS = 8
+"""Largest number of groups in a run: a process takes two seconds to start, and reports its result when it ends."""
 POLL_SECONDS = 0.2
 PURPOSE = "hand-over of a join"
 RUNS = re.compile(r"run-\d+(\.partial)?")
+OnBorder = Callable[[Border], None]
 
 
 def join_segments(
@@ -34,7 +44,7 @@ def join_segments(
     check: bool = False,
     backend: Backend | None = None,
     workers: int = 1,
-    on_border: Callable[[Border], None] | None = None,
+    on_border: OnBorder | None = None,
 ) -> int:
     """Writes the stream of these segments, in order of their frames, and returns its number of frames.
 
@@ -43,12 +53,9 @@ def join_segments(
     blended at borders (``seam_blend``) and packets are coded again; otherwise packets are copied.
 
     Args:
-        paths: finished segments, in any order.
-        output: the stream file.
         check: decode every frame of the result and check the identities of free Gaussians before it is renamed.
         backend: the compute back-end that renders the frames around borders; None to copy packets.
         workers: processes that blend borders, each with one thread; 1 for this process. A GPU needs 1.
-        on_border: called for each border, in order.
 
     Raises:
         StreamError: a segment is damaged or not finished, or frames are missing or duplicated.
@@ -58,26 +65,73 @@ def join_segments(
     """
     if workers < 1 or (workers > 1 and backend is not None and backend.name == "cuda"):
         raise ConfigError(f"{workers} workers cannot blend borders; use one on a GPU, and one or more on CPUs.")
-    segments = _in_order(paths)
-    ordered = [path for path, _, _ in segments]
-    runs = runs_of([frames for _, _, frames in segments], workers=workers)
+    init, ordered, lengths = _in_order(paths)
     # A blended stream is checked as a single group.
-    ends = accumulate(frames for _, _, frames in segments)
-    firsts = [0, *ends][:-1] if backend is None else [0]
+    firsts = [0, *accumulate(lengths)][:-1] if backend is None else [0]
+    runs = [] if backend is None or workers == 1 else runs_of(lengths, workers=workers)
+    if backend is not None and len(runs) > 1:
+        records = _blended_by_workers(ordered, runs, output, backend, workers, on_border or (lambda border: None))
+    else:
+        blender = None if backend is None else GroupBlender(header_of(init), backend, on_border=on_border)
+        records = _records(ordered, blender)
+    entries: list[tuple[int, int, int]] = []
     with atomic_file(output, check=(lambda path: check_births(path, firsts)) if check else None) as file:
-        written = _Written(file)
-        written.add(segments[0][1])
-        if backend is not None and workers > 1 and len(runs) > 1:
-            written.segment(ordered[0], None)
-            with _folder_of_runs(output) as folder:
-                for run, blended in zip(runs, _blended(ordered, runs, folder, backend, workers)):
-                    written.run(ordered[run.start : run.stop], blended, on_border)
-        else:
-            blender = None if backend is None else GroupBlender(header_of(segments[0][1]), backend, on_border=on_border)
-            for path in ordered:
-                written.segment(path, blender)
-        file.write(pack_index(written.entries, file.tell()))
-    return len(written.entries)
+        file.write(init)
+        for data in records:
+            record = read_record(data, 0)
+            assert record is not None, "verified when the segment was opened"
+            entries.append((FRAME.unpack_from(record.payload)[0], record.type, file.tell()))
+            file.write(data)
+        file.write(pack_index(entries, file.tell()))
+    return len(entries)
+
+
+def _records(paths: Sequence[Path], blender: GroupBlender | None) -> Iterator[bytes]:
+    """The records of the packets of all segments, copied or blended."""
+    for path in paths:
+        with open_segment(path) as segment:
+            yield from segment.records() if blender is None else blender.records(segment)
+
+
+def runs_of(lengths: Sequence[int], *, workers: int) -> list[range]:
+    """Independent runs of groups, without the first group, which is not blended.
+
+    Args:
+        workers: number of processes; there are at least as many runs if groups are long enough.
+    """
+    size = min(MAX_GROUPS, -(-(len(lengths) - 1) // workers))
+    runs, begin = [], 1
+    for number in range(2, len(lengths)):
+        if number - begin >= size and lengths[number - 1] >= OWN_FRAMES:
+            runs.append(range(begin, number))
+            begin = number
+    return [*runs, range(begin, len(lengths))] if len(lengths) > 1 else []
+
+
+def _blended_by_workers(
+    paths: Sequence[Path], runs: Sequence[range], output: Path, backend: Backend, workers: int, on_border: OnBorder
+) -> Iterator[bytes]:
+    """The records of all groups in order; ``workers`` processes blend the runs."""
+    yield from _records(paths[:1], None)
+    done = set[str]()
+    with _folder_of_runs(output) as folder, TaskQueue(LocalEngine(allocate_slots(workers=workers, cores=workers))) as q:
+        outputs = [folder / f"run-{number}" for number in range(len(runs))]
+        for run, result in zip(runs, outputs):
+            q.submit(run_task(paths[run.start - 1 : run.stop], result, device=backend.name))
+        for result in outputs:
+            while result.name not in done:
+                for ended in q.wait(POLL_SECONDS):
+                    if not ended.done:
+                        last_line = ended.output.strip().splitlines()[-1:] or [f"status {ended.status}"]
+                        raise TaskError(
+                            f"A worker that blends borders failed: {last_line[0]}. Try again with one worker."
+                        )
+                    done.add(ended.name)
+            borders, records = read_run(result)
+            for border in borders:
+                on_border(border)
+            yield from records
+            result.unlink()
 
 
 @contextmanager
@@ -92,84 +146,57 @@ def _folder_of_runs(output: Path) -> Iterator[Path]:
         remove_own(folder, PURPOSE, RUNS, whole=True)
 
 
-def _blended(
-    paths: Sequence[Path], runs: Sequence[range], folder: Path, backend: Backend, workers: int
-) -> Iterator[BlendedRun]:
-    """The result of each of ``runs``, in order, computed by ``workers`` processes."""
-    outputs = [folder / f"run-{number}" for number in range(len(runs))]
-    done = set[str]()
-    with TaskQueue(LocalEngine(allocate_slots(workers=workers, cores=workers))) as queue:
-        for run, output in zip(runs, outputs):
-            queue.submit(run_task(paths[run.start - 1 : run.stop], output, device=backend.name))
-        for output in outputs:
-            while output.name not in done:
-                for result in queue.wait(POLL_SECONDS):
-                    if not result.done:
-                        last_line = result.output.strip().splitlines()[-1:] or [f"status {result.status}"]
-                        raise TaskError(
-                            f"A worker that blends borders failed: {last_line[0]}. Try again with one worker."
-                        )
-                    done.add(result.name)
-            yield BlendedRun.read(output)
-            output.unlink()
+def run_task(paths: Sequence[Path], output: Path, *, device: str) -> Task:
+    """The task of blending the groups ``paths[1:]``, which follow the group ``paths[0]``."""
+    argv = (PYTHON, "-m", "structgstream.groups.join", device, str(output), *map(str, paths))
+    return Task(output.name, argv, str(output))
 
 
-class _Written:
-    """The stream while it is written."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-        self.entries: list[tuple[int, int, int]] = []
-
-    def add(self, data: bytes) -> None:
-        """Appends bytes other than packets."""
-        self._file.write(data)
-
-    def segment(self, path: Path, blender: GroupBlender | None) -> None:
-        """Appends the packets of a segment, copied or blended."""
-        found = open_segment(path)
-        own = (found.record(number) for number in range(len(found.entries)))
-        for (frame, kind, _), record in zip(found.entries, own if blender is None else blender.records(found)):
-            self._record(frame, kind, record)
-        found.close()
-
-    def run(self, paths: Sequence[Path], blended: BlendedRun, on_border: Callable[[Border], None] | None) -> None:
-        """Appends the packets of segments that one run has blended."""
-        records = iter(blended.records)
-        for path in paths:
-            found = open_segment(path)
-            for frame, kind, _ in found.entries:
-                self._record(frame, kind, next(records))
-            found.close()
-        if on_border is not None:
-            for border in blended.borders:
-                on_border(border)
-
-    def _record(self, frame: int, kind: int, record: bytes) -> None:
-        self.entries.append((frame, kind, self._file.tell()))
-        self._file.write(record)
+def main(arguments: list[str]) -> None:
+    """Blends a run; writes its borders as a line of JSON, followed by the records of its packets."""
+    device, output, previous, *paths = arguments
+    borders = list[Border]()
+    with open_segment(Path(previous)) as before:
+        blender = GroupBlender(
+            header_of(before.init), select_backend(cast(BackendName, device)), on_border=borders.append
+        )
+        blender.follow(before)
+    records = b"".join(_records([Path(path) for path in paths], blender))
+    atomic_write(Path(output), json.dumps([asdict(border) for border in borders]).encode() + b"\n" + records)
 
 
-def _in_order(paths: Sequence[Path]) -> list[tuple[Path, bytes, int]]:
-    """Path, prefix with init record, and number of frames of each segment, checked and in order of frames."""
+def read_run(path: Path) -> tuple[list[Border], list[bytes]]:
+    """The borders and the records that :func:`main` has written to ``path``."""
+    data, records = path.read_bytes(), list[bytes]()
+    at = data.index(b"\n") + 1
+    borders = [Border(**border) for border in json.loads(data[:at])]
+    while at < len(data):
+        record = read_record(data, at)
+        assert record is not None, "the file was written whole"
+        records.append(data[at : record.end])
+        at = record.end
+    return borders, records
+
+
+def header_of(init: bytes) -> StreamHeader:
+    """The header in the bytes of prefix and init record."""
+    record = read_record(init, PREFIX.size)
+    assert record is not None, "verified when the segment was opened"
+    return unpack_header(record.payload)
+
+
+def _in_order(paths: Sequence[Path]) -> tuple[bytes, list[Path], list[int]]:
+    """Prefix with init record, and paths and numbers of frames of the segments in order, which form one stream."""
     if not paths:
         raise ConfigError("There is nothing to join; give the segments of one stream.")
-    with ExitStack() as stack:
-        found: list[tuple[Path, Segment]] = []
-        for path in paths:
-            segment = open_segment(path)
-            stack.callback(segment.close)
+    found: list[tuple[Path, Segment]] = []
+    for path in paths:
+        with open_segment(path) as segment:
             found.append((path, segment))
-        found.sort(key=lambda entry: entry[1].identity.first)
-        _check(found)
-        return [(path, segment.init, len(segment.entries)) for path, segment in found]
-
-
-def _check(segments: Sequence[tuple[Path, Segment]]) -> None:
-    """Check that segments, in order of their frames, form one stream."""
-    first_path, first = segments[0]
+    found.sort(key=lambda entry: entry[1].identity.first)
+    first_path, first = found[0]
     expected = 0
-    for path, segment in segments:
+    for path, segment in found:
         identity = segment.identity
         if not segment.complete:
             raise StreamError(
@@ -184,6 +211,7 @@ def _check(segments: Sequence[tuple[Path, Segment]]) -> None:
             low, high = sorted((identity.first, expected))
             raise StreamError(f"Frames {low} to {high - 1} {what} before {path}; a stream needs every frame once.")
         expected = identity.end
+    return first.init, [path for path, _ in found], [len(segment.entries) for _, segment in found]
 
 
 def check_births(path: Path, firsts: Sequence[int]) -> None:
@@ -192,7 +220,6 @@ def check_births(path: Path, firsts: Sequence[int]) -> None:
     The identity of a spawned Gaussian is its frame times 2^32 plus a number, so identities of groups do not collide.
 
     Args:
-        path: of the stream.
         firsts: the first frame of each group, ascending.
 
     Raises:
@@ -209,3 +236,7 @@ def check_births(path: Path, firsts: Sequence[int]) -> None:
                     f"Frame {info.index} of {path} has free Gaussians spawned in frames {int(frames.min())} to "
                     f"{int(frames.max())}; its group begins at frame {group}. Fit its group again."
                 )
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

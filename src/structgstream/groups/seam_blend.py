@@ -63,7 +63,6 @@ class SeamBlend:
 
     Args:
         before: the decoded last frame of the group before, itself blended.
-        first: the group's own first frame.
         moving: mask ``[M]`` of the anchors that move at the border.
         steps: quantization steps by field; a field without one is not blended.
     """
@@ -168,15 +167,11 @@ def border_cameras(rig: CameraRig) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class BorderPictures:
-    """Renderings of the two frames at a border; at 640 x 360 they take 50 MB.
+    """Renderings of the two frames at a border; at 640 x 360 they take 50 MB."""
 
-    Args:
-        before: rendering ``[H, W, 3]`` of the last frame of the group before, by name of the :func:`border_cameras`.
-        first: rendering ``[H, W, 3]`` of the first frame of the group, by the same names.
-    """
-
+    # rendering [H, W, 3] of the last frame of the group before, by name of the border_cameras
     before: Mapping[str, Tensor]
-    first: Mapping[str, Tensor]
+    first: Mapping[str, Tensor]  # rendering [H, W, 3] of the first frame of the group, by the same names
 
 
 def draw_border(before: Scene, first: Scene, rig: CameraRig, backend: Backend) -> BorderPictures:
@@ -204,11 +199,7 @@ def moving_at_border(
     slow motion, and fast motion of an untextured surface, change the pictures by less than the two fits differ.
 
     Args:
-        before: the last frame of the group before.
-        first: the first frame of the group.
-        pictures: renderings of these two frames.
         rig: in the units of the scene.
-        backend: the compute back-end.
         earlier: the last but one frame of the group before; None if that group has one frame only.
         second: the second frame of the group; None if it has one frame only.
     """
@@ -237,7 +228,7 @@ TOLERANCE = 3.0 / 255.0
 (lab/notes/groups-measured.md)."""
 MIN_EXCESS = 1.0 / 255.0
 """An anchor is a visible mixture if the mean distance beyond the tolerance, over the pixels it covers, reaches this."""
-MIN_PIXELS = 0.5
+MIN_COVERED_PIXELS = 0.5
 """Anchors that cover fewer pixels of the reduced pictures do not count."""
 _SCALE = 0.5  # relative to pictures of the reference size
 
@@ -248,10 +239,8 @@ def visible_mixtures(mixed: Scene, pictures: BorderPictures, rig: CameraRig, bac
     A pixel may have any colour between those of the two.
 
     Args:
-        mixed: the group's first frame, blended.
         pictures: renderings of the last frame of the group before and of the group's own first frame.
         rig: in the units of the scene.
-        backend: the compute back-end.
     """
     folded, count = mixed.with_folded_appearance(), len(mixed.anchors)
     sums = torch.zeros(count, 2).to(mixed.anchors.positions)
@@ -267,7 +256,7 @@ def visible_mixtures(mixed: Scene, pictures: BorderPictures, rig: CameraRig, bac
             of_gaussians = accumulate(gaussians, small, maps, backend)
             sums += sum_by_primitive(of_gaussians, primitive_of(gaussians, folded), folded)[:count]
     covered = sums[:, 0]
-    return (covered > MIN_PIXELS) & (sums[:, 1] > MIN_EXCESS * covered)
+    return (covered > MIN_COVERED_PIXELS) & (sums[:, 1] > MIN_EXCESS * covered)
 
 
 def _excess(mixed: Tensor, before: Tensor, first: Tensor) -> Tensor:
@@ -283,26 +272,18 @@ WITHDRAWING_ROUNDS = 3
 
 @dataclass(frozen=True)
 class Border:
-    """Result of the seam blend at the beginning of a group.
+    """Result of the seam blend at the beginning of a group."""
 
-    Args:
-        frame: the group's first frame.
-        blended: number of anchors that start with the values of the frame before.
-        withdrawn: number of anchors that do not, because the mixture would be visible.
-    """
-
-    frame: int
-    blended: int
-    withdrawn: int
+    frame: int  # the group's first frame
+    blended: int  # number of anchors that start with the values of the frame before
+    withdrawn: int  # number of anchors that do not, because the mixture would be visible
 
 
 class GroupBlender:
     """Blends the groups of a stream, which must be given in order; at most four scenes are in memory.
 
     Args:
-        header: of the stream.
         backend: the compute back-end that renders the frames around borders.
-        on_border: called for each border, in order.
     """
 
     def __init__(
@@ -330,9 +311,9 @@ class GroupBlender:
             StreamError: a packet is damaged.
         """
         if not self._shown:
-            for number, (_, scene) in enumerate(self._decoded(segment)):
+            for data, (_, scene) in zip(segment.records(), self._decoded(segment)):
                 self._shown.append(scene)
-                yield segment.record(number)
+                yield data
             return
         frames = self._decoded(segment)
         begun = [next(frames)] + [frame for frame in (next(frames, None),) if frame is not None]
@@ -374,8 +355,8 @@ class GroupBlender:
 
     def _decoded(self, segment: Segment) -> Iterator[tuple[Packet, Scene]]:
         decoder = SceneDecoder(self._header)
-        for number in range(len(segment.entries)):
-            record = read_record(segment.record(number), 0)
+        for data in segment.records():
+            record = read_record(data, 0)
             assert record is not None, "verified when the segment was opened"
             packet = parse_packet(record.payload, PACKET_KINDS[record.type])
             yield packet, decoder.decode(packet)

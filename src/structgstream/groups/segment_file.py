@@ -45,23 +45,14 @@ FORMAT, VERSION = "structgstream-group", 1
 
 @dataclass(frozen=True)
 class SegmentIdentity:
-    """Everything that determines the bytes of a segment, except the machine.
+    """Everything that determines the bytes of a segment, except the machine."""
 
-    Args:
-        header: SHA-256 of header and frame 0 (``base.GroupBase.sha256``), including the configuration.
-        capture: fingerprint of the capture.
-        track: SHA-256 of the track's start at the first frame; empty for the group of frame 0.
-        options: options of the group, as plain JSON values.
-        first: the first frame.
-        end: the frame after the last one.
-    """
-
-    header: str
-    capture: str
-    track: str
-    options: Mapping[str, object]
-    first: int
-    end: int
+    header: str  # SHA-256 of header and frame 0 (base.GroupBase.sha256), including the configuration
+    capture: str  # fingerprint of the capture
+    track: str  # SHA-256 of the track's start at the first frame; empty for the group of frame 0
+    options: Mapping[str, object]  # options of the group, as plain JSON values
+    first: int  # the first frame
+    end: int  # the frame after the last one
 
     @property
     def sha256(self) -> str:
@@ -76,38 +67,32 @@ class SegmentIdentity:
 
 @dataclass(frozen=True)
 class Segment:
-    """The complete records of a segment file, up to the first that is missing or damaged.
+    """The complete records of a segment file, up to the first that is missing or damaged."""
 
-    Args:
-        name: name of the file, for messages.
-        data: bytes of the file.
-        identity: what the segment was fitted from.
-        init: bytes of prefix and init record.
-        entries: frame, type and offset of each packet.
-        end: offset after the last complete packet.
-        complete: whether every frame is present, index and footer are valid, and nothing follows.
-        reason: why the segment is not complete; None if it is.
-    """
+    name: str  # name of the file, for messages
+    data: ByteSource  # bytes of the file
+    identity: SegmentIdentity  # what the segment was fitted from
+    init: bytes  # bytes of prefix and init record
+    entries: list[tuple[int, int, int]]  # frame, type and offset of each packet
+    end: int  # offset after the last complete packet
+    complete: bool  # whether every frame is present, index and footer are valid, and nothing follows
+    reason: str | None  # why the segment is not complete; None if it is
 
-    name: str
-    data: ByteSource
-    identity: SegmentIdentity
-    init: bytes
-    entries: list[tuple[int, int, int]]
-    end: int
-    complete: bool
-    reason: str | None
+    def __enter__(self) -> "Segment":
+        return self
 
-    @property
-    def next_frame(self) -> int:
-        """The first frame that is missing."""
-        return self.identity.first + len(self.entries)
+    def __exit__(self, *raised: object) -> None:
+        self.close()
 
     def record(self, number: int) -> bytes:
         """The record of the segment's packet ``number``, framing included."""
         start = self.entries[number][2]
         stop = self.entries[number + 1][2] if number + 1 < len(self.entries) else self.end
         return bytes(self.data[start:stop])
+
+    def records(self) -> Iterator[bytes]:
+        """The records of all its packets."""
+        return map(self.record, range(len(self.entries)))
 
     def close(self) -> None:
         """Closes the file."""
@@ -129,39 +114,6 @@ def open_segment(path: Path) -> Segment:
         raise
 
 
-@dataclass(frozen=True)
-class SegmentFacts:
-    """Result of :func:`inspect_segment`.
-
-    Args:
-        first: first frame of the group.
-        end: the frame after its last one.
-        frames: number of complete frames, from the first on.
-        complete: whether the segment is finished and undamaged.
-        identity: SHA-256 of what the segment was fitted from.
-        reason: why the segment is not complete; None if it is.
-    """
-
-    first: int
-    end: int
-    frames: int
-    complete: bool
-    identity: str
-    reason: str | None = None
-
-
-def inspect_segment(path: Path) -> SegmentFacts:
-    """Verifies a segment file.
-
-    Raises:
-        StreamError: see :func:`open_segment`.
-    """
-    found = open_segment(path)
-    found.close()
-    identity = found.identity
-    return SegmentFacts(identity.first, identity.end, len(found.entries), found.complete, identity.sha256, found.reason)
-
-
 def _read(data: ByteSource, name: str) -> Segment:
     check_prefix(data, name)
     init = read_record(data, PREFIX.size)
@@ -173,8 +125,13 @@ def _read(data: ByteSource, name: str) -> Segment:
     identity = _identity(note, name)
     entries: list[tuple[int, int, int]] = []
     end = note.end
-    for record in _packets(data, note.end, identity):
-        entries.append((identity.first + len(entries), record.type, record.offset))
+    for frame in range(identity.first, identity.end):
+        record = read_record(data, end)
+        if record is None or record.type not in PACKET_KINDS or len(record.payload) < FRAME.size:
+            break
+        if FRAME.unpack_from(record.payload)[0] != frame:
+            break
+        entries.append((frame, record.type, record.offset))
         end = record.end
     frames = identity.end - identity.first
     closing = pack_index(entries, end)
@@ -184,18 +141,6 @@ def _read(data: ByteSource, name: str) -> Segment:
         cut = "its index is damaged" if len(entries) == frames else incomplete_reason(data, end)
         reason = f"it has {len(entries)} of {frames} frames; {cut}"
     return Segment(name, data, identity, bytes(data[: init.end]), entries, end, complete, reason)
-
-
-def _packets(data: ByteSource, offset: int, identity: SegmentIdentity) -> Iterator[Record]:
-    """The complete packets from byte ``offset`` on, up to the first that is not the group's next frame."""
-    for frame in range(identity.first, identity.end):
-        record = read_record(data, offset)
-        if record is None or record.type not in PACKET_KINDS or len(record.payload) < FRAME.size:
-            return
-        if FRAME.unpack_from(record.payload)[0] != frame:
-            return
-        yield record
-        offset = record.end
 
 
 def _identity(note: Record, name: str) -> SegmentIdentity:
@@ -220,9 +165,6 @@ class SegmentSink:
     """Appends the packets of a group; the file is renamed after the last one.
 
     Args:
-        path: path of the finished segment.
-        base: the part of the stream that all groups share.
-        identity: identity of the segment.
         found: existing part that is retained; None for a new segment.
 
     Raises:
@@ -245,11 +187,7 @@ class SegmentSink:
         return 0
 
     def begin(self, header: StreamHeader) -> int:
-        """Not supported: groups share one header.
-
-        Raises:
-            ConfigError: always.
-        """
+        """Not supported: groups share one header. Raises ConfigError always."""
         raise ConfigError("A group cannot begin another period; leave out --period.")
 
     def write(self, packet: Packet) -> int:
@@ -283,16 +221,11 @@ class GroupSoFar:
     """What a session resumes from: frame 0 and the packets of the group that exist.
 
     Its length is the index of the next frame, as if the frames before the group existed.
-
-    Args:
-        base: the part of the stream that all groups share.
-        first: the group's first frame.
-        records: records of the group's packets, framing included.
     """
 
     base: GroupBase
-    first: int
-    records: Sequence[bytes]
+    first: int  # the group's first frame
+    records: Sequence[bytes]  # records of the group's packets, framing included
 
     @property
     def header(self) -> StreamHeader:

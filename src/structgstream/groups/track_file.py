@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.atomic_files import GrowingFile, partial_path
+from structgstream.atomic_files import GrowingFile, atomic_write, partial_path
 from structgstream.codec.container.byte_source import ByteSource, FileBytes
 from structgstream.codec.container.records import RECORD, packed, read_head, read_record
-from structgstream.errors import StreamError
+from structgstream.errors import ConfigError, StreamError
 
 SIGNATURE = b"\x89SGT\r\n\x1a\n"
 MAJOR, MINOR = 1, 0
@@ -46,19 +46,13 @@ class TrackStart:
     """Displacements of primitives (Note [Primitives]) in a frame, in quantization steps of positions.
 
     Primitives that are not listed have not moved since frame 0.
-
-    Args:
-        frame: the frame.
-        primitives: ``[r]`` int32, ascending.
-        displacements: ``[r, 3]`` int32, since frame 0.
-        velocities: ``[r, 3]`` int32, since the frame before.
-        changed: ``[n]`` float32, share of changed pixels in each frame after the last start, up to this one.
     """
 
-    frame: int
-    primitives: NDArray[np.int32]
-    displacements: NDArray[np.int32]
-    velocities: NDArray[np.int32]
+    frame: int  # the frame
+    primitives: NDArray[np.int32]  # [r] int32, ascending
+    displacements: NDArray[np.int32]  # [r, 3] int32, since frame 0
+    velocities: NDArray[np.int32]  # [r, 3] int32, since the frame before
+    # [n] float32, share of changed pixels in each frame after the last start, up to this one
     changed: NDArray[np.float32]
 
     def packed(self) -> bytes:
@@ -72,11 +66,7 @@ class TrackStart:
 
     @classmethod
     def unpacked(cls, payload: bytes) -> "TrackStart":
-        """The content of a start record.
-
-        Raises:
-            ValueError: it violates the format.
-        """
+        """The content of a start record. Raises ValueError if it violates the format."""
         frame, rows, shares = START.unpack_from(payload)
         size = 2 * shares + 28 * rows
         unpacker = zlib.decompressobj()
@@ -92,23 +82,14 @@ class TrackStart:
 
 @dataclass(frozen=True)
 class TrackHead:
-    """What a track was made from.
+    """What a track was made from."""
 
-    Args:
-        header: SHA-256 of the header and frame 0 (``base.GroupBase.sha256``).
-        capture: fingerprint of the capture.
-        step: quantization step of positions, in units of the scene.
-        primitives: number of primitives of frame 0.
-        every: frames from one possible start to the next.
-        config: configuration of the pass, as plain JSON values.
-    """
-
-    header: str
-    capture: str
-    step: float
-    primitives: int
-    every: int
-    config: Mapping[str, Any]
+    header: str  # SHA-256 of the header and frame 0 (base.GroupBase.sha256)
+    capture: str  # fingerprint of the capture
+    step: float  # quantization step of positions, in units of the scene
+    primitives: int  # number of primitives of frame 0
+    every: int  # frames from one possible start to the next
+    config: Mapping[str, Any]  # configuration of the pass, as plain JSON values
 
 
 class TrackFile:
@@ -207,11 +188,6 @@ def open_track(path: Path) -> TrackFile:
 class TrackWriter:
     """Writes the track ``path``.
 
-    Args:
-        path: path of the finished track.
-        head: what the track is made from.
-        keep: bytes of an interrupted pass to retain; 0 to start again.
-
     Raises:
         StorageError: it cannot be written.
     """
@@ -235,3 +211,99 @@ class TrackWriter:
     def close(self) -> None:
         """Closes the file, which can be resumed later."""
         self._file.close()
+
+
+Groups = Sequence[tuple[int, int]]
+"""First frame and end of each group, in order."""
+
+
+def groups_path(track: Path) -> Path:
+    """The path of a track's list."""
+    return track.with_name(f"{track.name}.groups")
+
+
+def write_groups(track: Path, groups: Groups) -> None:
+    """Writes the list of a track atomically. Raises StorageError if it cannot be written."""
+    atomic_write(groups_path(track), "".join(f"{first}:{end}\n" for first, end in groups).encode())
+
+
+def read_groups(track: Path) -> Groups | None:
+    """The groups of a track of a whole capture; None while the pass has not chosen them.
+
+    Raises:
+        StreamError: the list has gaps or does not follow the format.
+    """
+    path = groups_path(track)
+    try:
+        text = path.read_text(errors="replace")
+    except OSError:
+        return None
+    if not text.endswith("\n"):
+        return None
+    try:
+        groups = [(int(first), int(end)) for first, _, end in (line.partition(":") for line in text.split())]
+    except ValueError:
+        raise StreamError(f"{path} has no groups, 'first:end' a line.") from None
+    borders = [0, *(end for _, end in groups)]
+    if not groups or [first for first, _ in groups] != borders[:-1] or borders != sorted(set(borders)):
+        raise StreamError(f"The groups in {path} do not follow each other from frame 0 on.")
+    return groups
+
+
+def check_length(length: int, *, key_interval: int) -> None:
+    """Check that groups of ``length`` frames begin at frames that are key packets anyway.
+
+    Raises:
+        ConfigError: they do not, so every group would cost an additional key packet.
+    """
+    if length < 1 or length % key_interval:
+        near = max(1, round(length / key_interval)) * key_interval
+        raise ConfigError(
+            f"Groups of {length} frames cost a key packet each, because the stream has one every {key_interval} frames "
+            f"(key_interval_seconds); take {near}, or another multiple, or add --allow-unaligned to pay for them."
+        )
+
+
+def equal_groups(frames: int, length: int) -> list[tuple[int, int]]:
+    """Groups ``(first frame, end)`` of ``length`` frames; the last may be shorter, or one frame longer.
+
+    A single frame at the end joins the group before, because a seam blend needs a group's second frame
+    (``seam_blend.py``).
+    """
+    firsts = [*range(0, frames, length)]
+    if length > 1 and len(firsts) > 1 and frames - firsts[-1] == 1:
+        firsts.pop()
+    return [*zip(firsts, [*firsts[1:], frames], strict=True)]
+
+
+def quiet_groups(frames: int, length: int, changed: Mapping[int, float]) -> list[tuple[int, int]]:
+    """Groups of about ``length`` frames that begin at frames with little motion.
+
+    Every group has at least half and at most one and a half times ``length`` frames; the last may be shorter, but has
+    at least two. Among all such divisions, this one minimizes the sum of ``changed`` over the borders, relative to
+    their number.
+
+    Args:
+        changed: share of pixels that changed, by frame at which a group may begin.
+    """
+    least, most = (length + 1) // 2, length + length // 2
+    mean = sum(changed.values()) / max(len(changed), 1)
+    # The cost of a border is its change plus the mean of all changes, so that about frames / length borders are chosen.
+    best: dict[int, tuple[float, int]] = {0: (0.0, -1)}
+    for frame in sorted(changed):
+        found = [(cost, first) for first, (cost, _) in best.items() if least <= frame - first <= most]
+        if found and frame < frames:
+            cost, first = min(found)
+            best[frame] = (cost + changed[frame] + mean, first)
+    ends = [
+        (cost, first)
+        for first, (cost, _) in best.items()
+        if frames - first <= most and (frames - first > 1 or not first)
+    ]
+    if not ends:
+        return equal_groups(frames, length)
+    first, end, groups = min(ends)[1], frames, []
+    while first >= 0:
+        groups.append((first, end))
+        first, end = best[first][1], first
+    return groups[::-1]

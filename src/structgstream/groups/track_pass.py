@@ -12,15 +12,26 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from structgstream.atomic_files import name_finished, partial_path
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import read_ahead
 from structgstream.errors import ConfigError, StreamError
 from structgstream.groups.base import GroupBase, fingerprint
-from structgstream.groups.boundaries import Groups, equal_groups, groups_path, quiet_groups, write_groups
 from structgstream.groups.segment_file import GroupSoFar, Segment
-from structgstream.groups.track_file import TrackFile, TrackHead, TrackStart, TrackWriter, open_track
+from structgstream.groups.track_file import (
+    Groups,
+    TrackFile,
+    TrackHead,
+    TrackStart,
+    TrackWriter,
+    equal_groups,
+    groups_path,
+    open_track,
+    quiet_groups,
+    write_groups,
+)
 from structgstream.groups.tracking import TrackConfig, Tracked, Tracker, TrackPictures, track_frame
 from structgstream.kernels.backend import Backend
 from structgstream.lookahead import Lookahead
@@ -31,19 +42,13 @@ from structgstream.training.online.split import with_displacements
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """Options of a pass.
+    """Options of a pass."""
 
-    Args:
-        length: frames of a group.
-        quiet: whether groups begin at frames with little motion rather than at equal distances.
-        after: a finished group from whose last frame the pass starts, which corrects earlier tracking errors.
-        tracking: configuration of the tracking.
-    """
-
-    length: int
-    quiet: bool = False
+    length: int  # frames of a group
+    quiet: bool = False  # whether groups begin at frames with little motion rather than at equal distances
+    # a finished group from whose last frame the pass starts, which corrects earlier tracking errors
     after: Segment | None = None
-    tracking: TrackConfig = field(default_factory=TrackConfig)
+    tracking: TrackConfig = field(default_factory=TrackConfig)  # configuration of the tracking
 
     @property
     def first(self) -> int:
@@ -53,23 +58,14 @@ class TrackOptions:
 
 @dataclass(frozen=True)
 class TrackProgress:
-    """Report of one tracked frame.
+    """Report of one tracked frame."""
 
-    Args:
-        frame: its index.
-        moved: number of primitives that were displaced.
-        changed: share of changed pixels.
-        cpu_seconds: processor time of all threads.
-        seconds: wall-clock seconds by stage.
-        stored_bytes: size of its start record; 0 if it has none.
-    """
-
-    frame: int
-    moved: int
-    changed: float
-    cpu_seconds: float
-    seconds: Mapping[str, float]
-    stored_bytes: int = 0
+    frame: int  # its index
+    moved: int  # number of primitives that were displaced
+    changed: float  # share of changed pixels
+    cpu_seconds: float  # processor time of all threads
+    seconds: Mapping[str, float]  # wall-clock seconds by stage
+    stored_bytes: int = 0  # size of its start record; 0 if it has none
 
 
 def track_capture(
@@ -148,28 +144,22 @@ def start_after(group: Segment, base: GroupBase) -> TrackStart:
         what = "is not finished" if not group.complete else "has another header"
         raise ConfigError(f"{group.name} {what}; track on from a finished group of the same header.")
     identity, first = group.identity, base.scene()
-    so_far = GroupSoFar(base, identity.first, [group.record(number) for number in range(len(group.entries))])
+    so_far = GroupSoFar(base, identity.first, [*group.records()])
     last, before = so_far.scene(identity.end - 1), so_far.scene(max(identity.end - 2, identity.first))
     at, then, z = (scene.anchors.positions for scene in (last, before, first))
-    displacements = ((at - z) / base.position_step).round().to(torch.int32)
-    velocities = ((at - then) / base.position_step).round().to(torch.int32)
-    rows = ((displacements != 0) | (velocities != 0)).any(1).nonzero()[:, 0]
-    return TrackStart(
-        identity.end - 1,
-        rows.to(torch.int32).numpy(),
-        displacements[rows].numpy(),
-        velocities[rows].numpy(),
-        np.zeros(0, np.float32),
-    )
+    return _rounded(identity.end - 1, at - z, at - then, [], step=base.position_step)
+
+
+def _rounded(frame: int, moved: Tensor, velocities: Tensor, changed: list[float], *, step: float) -> TrackStart:
+    """A start record from displacements ``[M + F, 3]`` since frame 0 and the frame before, in units of the scene."""
+    moved, velocities = ((values / step).round().to(torch.int32).cpu() for values in (moved, velocities))
+    rows = ((moved != 0) | (velocities != 0)).any(1).nonzero()[:, 0]
+    shares = np.asarray(changed, np.float32)
+    return TrackStart(frame, rows.to(torch.int32).numpy(), moved[rows].numpy(), velocities[rows].numpy(), shares)
 
 
 def _existing(path: Path, head: TrackHead) -> TrackFile | None:
-    """The existing part of the track; None if there is none.
-
-    Raises:
-        ConfigError: it is a track of another header, capture or configuration.
-        StreamError: it is finished but damaged.
-    """
+    """The existing part of the track; None if there is none."""
     if not path.exists() and not partial_path(path).exists():
         return None
     try:
@@ -189,21 +179,13 @@ def _existing(path: Path, head: TrackHead) -> TrackFile | None:
 
 @dataclass
 class Pass:
-    """State of a pass.
+    """State of a pass."""
 
-    Args:
-        first: scene of frame 0.
-        tracker: follows primitives from frame to frame.
-        step: quantization step of positions, in units of the scene.
-        tracked: primitives in the last frame.
-        index: index of the last frame.
-    """
-
-    first: Scene
-    tracker: Tracker
-    step: float
-    tracked: Tracked
-    index: int
+    first: Scene  # scene of frame 0
+    tracker: Tracker  # follows primitives from frame to frame
+    step: float  # quantization step of positions, in units of the scene
+    tracked: Tracked  # primitives in the last frame
+    index: int  # index of the last frame
 
     @classmethod
     def at(cls, base: GroupBase, config: TrackConfig, backend: Backend, start: TrackStart | None) -> "Pass":
@@ -219,16 +201,7 @@ class Pass:
         """The start record of the last frame; rounds the state to it."""
         z = torch.cat([self.first.anchors.positions, self.first.free.means])
         now = torch.cat([self.tracked.scene.anchors.positions, self.tracked.scene.free.means])
-        displacements = ((now - z) / self.step).round().to(torch.int32).cpu()
-        velocities = (self.tracked.velocities / self.step).round().to(torch.int32).cpu()
-        rows = ((displacements != 0) | (velocities != 0)).any(1).nonzero()[:, 0]
-        found = TrackStart(
-            self.index,
-            rows.to(torch.int32).numpy(),
-            displacements[rows].numpy(),
-            velocities[rows].numpy(),
-            np.asarray(changed, np.float32),
-        )
+        found = _rounded(self.index, now - z, self.tracked.velocities, changed, step=self.step)
         stored = TrackStart.unpacked(found.packed())  # A resumed pass reads these values.
         self.tracked = tracked_at(self.first, stored, step=self.step)
         return stored
@@ -240,7 +213,7 @@ def tracked_at(first: Scene, start: TrackStart, *, step: float) -> Tracked:
     return Tracked(with_displacements(first, displacements), velocities)
 
 
-def dense(first: Scene, start: TrackStart, *, step: float) -> tuple[torch.Tensor, torch.Tensor]:
+def dense(first: Scene, start: TrackStart, *, step: float) -> tuple[Tensor, Tensor]:
     """Displacements since frame 0 and since the frame before ``start``, ``[M + F, 3]`` each, in units of the scene."""
     like, rows = first.anchors.positions, torch.from_numpy(start.primitives).to(first.anchors.positions.device).long()
     found = []

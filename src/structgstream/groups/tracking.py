@@ -23,6 +23,7 @@ from structgstream.kernels.values import TileSelection
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import FlowConfig, LiftConfig, MotionConfig
 from structgstream.training.online.measure import (
+    VISIBLE_PIXELS,
     ViewChange,
     accumulate,
     flow_evidence,
@@ -41,39 +42,31 @@ from structgstream.training.views import View, area_mean, as_picture, blackened,
 
 FEWEST_HALVED, MAX_CAMERAS = 6, 14
 """A frame uses half of a rig's cameras if that number is within these bounds."""
+FLOW = FlowConfig(apart=True, far=True)
+PRIOR = 0.7
+"""Initial displacement of a primitive, as a share of its last displacement."""
+RENDERED_EVERY = 3
+"""Flow from the rendering is computed in every n-th of the cameras of a frame, in turn."""
 
 
 @dataclass(frozen=True)
 class TrackConfig:
     """Tracking; not in the paper."""
 
-    scale: float = 1.0
-    """Size of the pictures relative to those of the stream."""
     cameras: int | None = None
     """Approximate upper bound of the cameras used in a frame. Of a larger rig every second or third camera is used, in
     turn. None: half of the cameras (:data:`FEWEST_HALVED`, :data:`MAX_CAMERAS`)."""
     picture_scale: float = 0.25
-    """Scale at which coverage is computed, relative to these pictures."""
-    flow: FlowConfig = FlowConfig(apart=True, far=True)
-    """Configuration of optical flow."""
-    prior: float = 0.7
-    """Initial displacement of a primitive, as a share of its last displacement."""
-    rendered_every: int = 3
-    """Flow from the rendering is computed in every n-th of these cameras, in turn; 0: in none."""
+    """Scale at which coverage is computed, relative to the pictures of the stream."""
 
 
 @dataclass(frozen=True)
 class TrackPictures:
-    """Reduced pictures of one frame.
+    """Reduced pictures of one frame."""
 
-    Args:
-        index: index of the frame.
-        views: views of all cameras.
-        changes: change since the frame before, with flow, of the cameras in use, by position in ``views``.
-    """
-
-    index: int
-    views: list[View]
+    index: int  # index of the frame
+    views: list[View]  # views of all cameras
+    # change since the frame before, with flow, of the cameras in use, by position in views
     changes: Mapping[int, PictureChange] = field(default_factory=dict)
 
     @property
@@ -85,20 +78,12 @@ class TrackPictures:
 
 @dataclass(frozen=True)
 class Tracker:
-    """Follows the primitives of a scene.
+    """Follows the primitives of a scene."""
 
-    Args:
-        config: sizes and cameras.
-        motion: thresholds of the selection, for pictures of the stream.
-        lift: configuration of the scene flow.
-        rig: rig of the stream, in the units of the scene.
-        backend: the compute back-end.
-    """
-
-    config: TrackConfig
-    motion: MotionConfig
-    lift: LiftConfig
-    rig: CameraRig
+    config: TrackConfig  # sizes and cameras
+    motion: MotionConfig  # thresholds of the selection, for pictures of the stream
+    lift: LiftConfig  # configuration of the scene flow
+    rig: CameraRig  # rig of the stream, in the units of the scene
     backend: Backend
 
     def stride(self, cameras: int) -> int:
@@ -110,7 +95,7 @@ class Tracker:
 
     def pictures(self, frame: MultiViewFrame, before: Sequence[View] | None) -> TrackPictures:
         """The reduced pictures of ``frame`` and their change since ``before``; independent of the scene."""
-        views = [view.reduced(self.config.scale) for view in training_views(frame, self.rig, self.backend.device)]
+        views = training_views(frame, self.rig, self.backend.device)
         if before is None:
             return TrackPictures(frame.index, views)
         stride = self.stride(len(views))
@@ -122,8 +107,7 @@ class Tracker:
             config=replace(self.motion, picture_scale=self.config.picture_scale),
             backend=self.backend,
             flow_from=[view.index for view in taken],
-            flow=self.config.flow,
-            reach_pixels=max(1, round(self.motion.REACH_PIXELS * self.config.scale)),
+            flow=FLOW,
         )
         changes = {n: change for n, change in zip(chosen, found, strict=True) if change is not None}
         return TrackPictures(frame.index, views, changes)
@@ -131,19 +115,12 @@ class Tracker:
 
 @dataclass(frozen=True)
 class Tracked:
-    """The primitives of a scene after a tracked frame.
+    """The primitives of a scene after a tracked frame."""
 
-    Args:
-        scene: the displaced scene.
-        velocities: ``[M + F, 3]`` displacements by the last frame.
-        seconds: wall-clock seconds by stage of the last frame.
-        moved: number of primitives that the last frame displaced.
-    """
-
-    scene: Scene
-    velocities: Tensor
-    seconds: Mapping[str, float] = field(default_factory=dict)
-    moved: int = 0
+    scene: Scene  # the displaced scene
+    velocities: Tensor  # [M + F, 3] displacements by the last frame
+    seconds: Mapping[str, float] = field(default_factory=dict)  # wall-clock seconds by stage of the last frame
+    moved: int = 0  # number of primitives that the last frame displaced
 
     @classmethod
     def at_rest(cls, scene: Scene) -> "Tracked":
@@ -152,13 +129,7 @@ class Tracked:
 
 
 def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tracked:
-    """Displace the primitives of ``past`` to the next frame.
-
-    Args:
-        tracker: thresholds and cameras.
-        past: primitives in the frame before.
-        pictures: pictures of this frame.
-    """
+    """Displace the primitives of ``past`` to the next frame."""
     watch, velocities = Stopwatch(), torch.zeros_like(past.velocities)
     scene = past.scene.with_folded_appearance()
     with torch.no_grad():
@@ -171,20 +142,20 @@ def track_frame(tracker: Tracker, past: Tracked, pictures: TrackPictures) -> Tra
             votes = torch.stack([entry.votes for entry in seen]).sum(0)
             # A moving primitive stays dynamic with a single vote, because not all cameras are used in each frame.
             continued = (past.velocities != 0).any(1) & (votes > 0)
-            moving = (votes >= tracker.motion.MIN_VIEWS) | continued
+            moving = (votes >= tracker.motion.MIN_VOTES) | continued
             moving[: len(scene.anchors)] |= _occluded(tracker.motion, scene, seen, moving[: len(scene.anchors)])
             primitives = moving.nonzero()[:, 0]
         with watch.stage("flow between pictures"):
             views = [entry.view for entry in seen]
             evidence = flow_evidence([entry.flows[primitives] for entry in seen])
             centers = primitive_centers(scene, _coverage(seen, scene))
-            priors, lift = tracker.config.prior * past.velocities[primitives], tracker.lift
+            priors, lift = PRIOR * past.velocities[primitives], tracker.lift
             found = lift_flow(evidence, centers[primitives], priors, views, config=lift, backend=tracker.backend)
             velocities[primitives] = found.displacements
-        if len(primitives) and (every := tracker.config.rendered_every):
+        if len(primitives):
             with watch.stage("flow from the rendering"):
                 turn = pictures.index // tracker.stride(len(pictures.views))
-                part = [entry for n, entry in enumerate(seen) if (n + turn) % every == 0] or seen
+                part = [entry for n, entry in enumerate(seen) if (n + turn) % RENDERED_EVERY == 0] or seen
                 flows = [_rendered_flow(tracker, scene, entry, velocities)[primitives] for entry in part]
                 again = lift_flow(
                     flow_evidence(flows),
@@ -227,10 +198,10 @@ def _measure_view(tracker: Tracker, scene: Scene, view: View, change: PictureCha
     maps = torch.cat([change.flow[..., :3], inside[..., None], colors, part[..., None]], dim=-1)
     primitives = primitive_of(gaussians, scene)
     sums = accumulate(gaussians, small.camera, maps, backend)
-    sums *= _pixel_area(tracker, view, size)
+    sums *= _pixel_area(view, size)
     moved = sum_by_primitive(sums, primitives, scene)
     total, changed = moved[:, 3], moved[:, 7]
-    votes = (changed > motion.MIN_PIXELS) & (changed > motion.MIN_SHARE * total)
+    votes = (changed > motion.MIN_CHANGED_PIXELS) & (changed > motion.MIN_CHANGED_SHARE * total)
     of_view = ViewChange(float(change.changed.float().mean()), 0.0, repeated=change.repeated)
     return _ViewEvidence(view, tiles, gaussians, primitives, votes, sums[:, 3], moved[:, :7], of_view)
 
@@ -241,9 +212,6 @@ def _occluded(motion: MotionConfig, scene: Scene, seen: Sequence[_ViewEvidence],
     Anchors outside these tiles are neither selected nor used as neighbours, because nothing is measured there.
 
     Args:
-        motion: thresholds.
-        scene: the scene before the frame.
-        seen: measurements of the cameras.
         moving: mask ``[M]`` of the anchors that are dynamic by votes.
     """
     anchors, occluded = len(moving), torch.zeros_like(moving)
@@ -252,10 +220,10 @@ def _occluded(motion: MotionConfig, scene: Scene, seen: Sequence[_ViewEvidence],
         of_view = torch.zeros(len(entry.votes), dtype=torch.bool, device=moving.device)
         of_view[entry.primitives] = True
         drawn += of_view[:anchors]
-        shown += entry.flows[:anchors, 3] > motion.MIN_PIXELS
-    among = ((drawn >= motion.MIN_VIEWS) | (shown >= motion.MIN_VIEWS)).nonzero()[:, 0]
+        shown += entry.flows[:anchors, 3] > VISIBLE_PIXELS
+    among = ((drawn >= motion.MIN_VOTES) | (shown >= motion.MIN_VOTES)).nonzero()[:, 0]
     occluded[among] = occluded_dynamic(
-        scene.anchors.positions[among], moving[among], shown[among] >= motion.MIN_VIEWS, share=motion.occluded_share
+        scene.anchors.positions[among], moving[among], shown[among] >= motion.MIN_VOTES, share=motion.occluded_share
     )
     return occluded
 
@@ -274,11 +242,11 @@ def _rendered_flow(tracker: Tracker, scene: Scene, seen: _ViewEvidence, velociti
     picture = seen.tiles.choose(blackened(rendered, view.mask), view.image)
     small = view.evidence(tracker.config.picture_scale)
     size = (small.camera.height, small.camera.width)
-    found = flow_map(picture, view.image, counting, size, mask=counting, config=tracker.config.flow, backend=backend)
+    found = flow_map(picture, view.image, counting, size, mask=counting, config=FLOW, backend=backend)
     inside = area_mean(counting[None, None].float(), size)[0, 0]
     maps = torch.cat([found.maps, inside[..., None], small.colors * inside[..., None]], dim=-1)
     sums = accumulate(moved, small.camera, maps, backend)
-    sums *= _pixel_area(tracker, view, size)
+    sums *= _pixel_area(view, size)
     return sum_by_primitive(sums, seen.primitives, scene)
 
 
@@ -290,9 +258,9 @@ def _coverage(seen: Sequence[_ViewEvidence], scene: Scene) -> Tensor:
     return found
 
 
-def _pixel_area(tracker: Tracker, view: View, size: tuple[int, int]) -> float:
+def _pixel_area(view: View, size: tuple[int, int]) -> float:
     """Pixels of the stream's pictures at the reference size, the unit of thresholds, per pixel of the maps."""
-    width, height = (side / tracker.config.scale for side in (view.camera.width, view.camera.height))
+    width, height = view.camera.width, view.camera.height
     return width * height / enlargement(width, height) ** 2 / (size[0] * size[1])
 
 

@@ -22,14 +22,14 @@ from structgstream.errors import ConfigError, StorageError
 from structgstream.frames import MIN_CAMERAS, MultiViewFrame
 from structgstream.groups.base import GroupBase, fingerprint, open_for
 from structgstream.groups.first_frame import GroupStartConfig, fit_group_start
-from structgstream.groups.segment_file import GroupSoFar, Segment, SegmentIdentity, SegmentSink, resume_segment
+from structgstream.groups.segment_file import GroupSoFar, SegmentIdentity, SegmentSink, resume_segment
 from structgstream.groups.track_file import TrackStart, open_track
 from structgstream.groups.track_pass import dense
 from structgstream.kernels.backend import Backend
 from structgstream.recorder import LogExtras, Run, record
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
-from structgstream.session.pipeline import FrameTask, Past, Pipeline
+from structgstream.session.pipeline import FrameTask, Past
 from structgstream.session.presets import StreamConfig
 from structgstream.session.rate_control import with_rate_control
 from structgstream.session.struct_gstream import FrameZeroContext, StructGStream, stream_pipeline
@@ -47,19 +47,12 @@ _OUT_OF_MEMORY = (MemoryError, torch.OutOfMemoryError)
 
 @dataclass(frozen=True)
 class GroupEntry:
-    """Start of a group.
+    """Start of a group."""
 
-    Args:
-        frame: its first frame, after frame 0.
-        displacements: ``[M + F, 3]`` displacements of frame 0's primitives (Note [Primitives]) since frame 0.
-        velocities: ``[M + F, 3]`` displacements since the frame before.
-        first_pictures: returns the pictures of frame 0.
-    """
-
-    frame: int
-    displacements: Tensor
-    velocities: Tensor
-    first_pictures: Callable[[], MultiViewFrame]
+    frame: int  # its first frame, after frame 0
+    displacements: Tensor  # [M + F, 3] displacements of frame 0's primitives (Note [Primitives]) since frame 0
+    velocities: Tensor  # [M + F, 3] displacements since the frame before
+    first_pictures: Callable[[], MultiViewFrame]  # returns the pictures of frame 0
 
 
 @dataclass
@@ -67,18 +60,12 @@ class GroupMethod:
     """The method of a group's frames. The state before its first frame is frame 0.
 
     If memory runs out it lowers its budget once and fits the frame again.
-
-    Args:
-        config: configuration of the stream.
-        start: configuration of the first frame's fit.
-        entry: start of the group; None for the group of frame 0, which is fitted as any stream.
-        lowered: whether the budget has been lowered.
     """
 
-    config: StreamConfig
-    start: GroupStartConfig
-    entry: GroupEntry | None
-    lowered: bool = False
+    config: StreamConfig  # configuration of the stream
+    start: GroupStartConfig  # configuration of the first frame's fit
+    entry: GroupEntry | None  # start of the group; None for the group of frame 0, which is fitted as any stream
+    lowered: bool = False  # whether the budget has been lowered
     _first: MultiViewFrame | None = field(default=None, repr=False)
 
     @property
@@ -112,11 +99,7 @@ class GroupMethod:
         return preprocess(frame, rig, before=first, motion=online.motion, start=without_flow, backend=backend)
 
     def first(self, task: FrameTask) -> FitResult[Scene]:
-        """Not supported: frame 0 is that of the header.
-
-        Raises:
-            ConfigError: always.
-        """
+        """Not supported: frame 0 is that of the header. Raises ConfigError always."""
         raise ConfigError("A group needs a header with frame 0; give one with --init.")
 
     def prepare(self, state: Scene, task: Callable[[], FrameTask]) -> FrameZeroContext:
@@ -200,29 +183,20 @@ def _older(state: Scene, velocities: Tensor) -> Scene:
     return replace(state.without_free(), anchors=replace(anchors, positions=positions))
 
 
-MIN_PIXELS = 0.5
+MIN_DISPLACED_PIXELS = 0.5
 """A primitive whose tracked displacement is at most this, in pixels of a median camera, counts as not displaced."""
 
 
 @dataclass(frozen=True)
 class SegmentTask:
-    """A group of frames.
+    """A group of frames."""
 
-    Args:
-        capture: folder of the capture.
-        header: stream file whose init record and frame 0 the groups share.
-        track: track of the capture, made from that header; may be None for the group of frame 0.
-        first: the first frame, counted from the header's.
-        end: the frame after the last one.
-        start: configuration of the first frame's fit.
-    """
-
-    capture: Path
-    header: Path
-    track: Path | None
-    first: int
-    end: int
-    start: GroupStartConfig = field(default_factory=GroupStartConfig)
+    capture: Path  # folder of the capture
+    header: Path  # stream file whose init record and frame 0 the groups share
+    track: Path | None  # track of the capture, made from that header; may be None for the group of frame 0
+    first: int  # the first frame, counted from the header's
+    end: int  # the frame after the last one
+    start: GroupStartConfig = field(default_factory=GroupStartConfig)  # configuration of the first frame's fit
 
 
 def fit_segment(
@@ -238,14 +212,6 @@ def fit_segment(
 
     The call checks existing files. The segment is written while the run's reports are consumed; frames have the indices
     of the stream.
-
-    Args:
-        path: path of the segment.
-        task: the group.
-        backend: the compute back-end.
-        overwrite: remove an existing segment.
-        on_step: called after every optimisation step.
-        remarks: see ``recorder.LogExtras``.
 
     Returns:
         the run; None if the segment exists, finished and undamaged.
@@ -269,7 +235,24 @@ def fit_segment(
     if found is not None and found.complete:
         found.close()
         return None
-    return _run(path, source, base, identity, found, task.start, start, backend, on_step=on_step, remarks=remarks)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    records = [base.first] if found is None and not identity.first else []
+    if found is not None:
+        records = [*found.records()]
+        found.close()
+    sink, so_far = SegmentSink(path, base, identity, found), GroupSoFar(base, identity.first, records)
+    method = GroupMethod(base.config, task.start, None if start is None else _entry(start, base, source))
+    return record(
+        path,
+        source,
+        # The group's first frame is denoised as frame 0 is.
+        replace(stream_pipeline(base.config), method=method, denoised=(0, identity.first)),
+        backend,
+        storage=lambda _: (sink, so_far),
+        metadata=base.header.metadata,
+        on_step=on_step,
+        remarks=remarks,
+    )
 
 
 def _start(task: SegmentTask, base: GroupBase) -> TrackStart | None:
@@ -286,43 +269,10 @@ def _start(task: SegmentTask, base: GroupBase) -> TrackStart | None:
     return track.start(task.first)
 
 
-def _run(
-    path: Path,
-    source: FrameSource,
-    base: GroupBase,
-    identity: SegmentIdentity,
-    found: Segment | None,
-    config: GroupStartConfig,
-    start: TrackStart | None,
-    backend: Backend,
-    *,
-    on_step: StepListener | None,
-    remarks: LogExtras | None,
-) -> Run:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    records = [base.first] if found is None and not identity.first else []
-    if found is not None:
-        records = [found.record(number) for number in range(len(found.entries))]
-        found.close()
-    sink = SegmentSink(path, base, identity, found)
-    so_far = GroupSoFar(base, identity.first, records)
-    method = GroupMethod(base.config, config, None if start is None else _entry(start, base, source))
-    return record(
-        path,
-        source,
-        _pipeline(base, method, identity.first),
-        backend,
-        storage=lambda _: (sink, so_far),
-        metadata=base.header.metadata,
-        on_step=on_step,
-        remarks=remarks,
-    )
-
-
 def _entry(start: TrackStart, base: GroupBase, source: FrameSource) -> GroupEntry:
     displacements, velocities = dense(base.scene(), start, step=base.position_step)
     # Smaller displacements are within the tracking error; these primitives retain frame 0's exact values.
-    least = MIN_PIXELS / base.config.online.rounding.at_quality("position_pixels") * base.position_step
+    least = MIN_DISPLACED_PIXELS / base.config.online.rounding.at_quality("position_pixels") * base.position_step
     displacements[(displacements.abs() <= least).all(1)] = 0.0
 
     @cache
@@ -330,11 +280,6 @@ def _entry(start: TrackStart, base: GroupBase, source: FrameSource) -> GroupEntr
         return next(denoised(source, base.config.denoising).frames(0))
 
     return GroupEntry(start.frame, displacements, velocities, first_pictures)
-
-
-def _pipeline(base: GroupBase, method: GroupMethod, first: int) -> Pipeline[Scene, FrameZeroContext]:
-    """The pipeline of the stream with the group's method; the group's first frame is denoised as frame 0 is."""
-    return replace(stream_pipeline(base.config), method=method, denoised=(0, first))
 
 
 def _remove(path: Path) -> None:

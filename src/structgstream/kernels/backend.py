@@ -153,7 +153,7 @@ def cuda_backend(*, native: bool = False) -> Backend:
             be missing. Not the default until it has run on a GPU (``benchmarks.gpu`` measures it).
 
     Raises:
-        BackendError: no GPU, or gsplat is not installed or does not load.
+        BackendError: no GPU, or gsplat is not installed or does not load; with ``native``, the kernels do not compile.
     """
     from structgstream.kernels import cuda, cuda_anchors, cuda_fit, cuda_library, cuda_picture
 
@@ -161,6 +161,8 @@ def cuda_backend(*, native: bool = False) -> Backend:
     if reason is not None:
         raise BackendError(reason)
     library, sentence = cuda_library.kernel_library()
+    if native and library is None:
+        raise BackendError(f"The cuda back-end has no iterations of its own here: {sentence}")
     _log.log(logging.WARNING if library is None else logging.INFO, sentence)
     processor, rasterize = processor_backend(), partial(cuda.rasterize, library=library)
     backend = replace(

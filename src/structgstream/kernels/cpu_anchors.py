@@ -157,10 +157,9 @@ def visible_anchors(
     native.offsets_per_anchor = anchors.offsets.shape[1]
     viewmat, K = map(constant, (viewport.viewmat, viewport.K))
     mask = None if tiles is None else tiles.mask.contiguous()
-    sizes = None if intervals is None else constant(intervals)
     found = torch.empty(count, dtype=torch.int64)
     seen = native_library().sgs_anchors_visible(
-        *(ctypes.byref(native), count, sizes, viewmat, K, viewport.width, viewport.height, viewport.near),
+        *(ctypes.byref(native), count, constant(intervals), viewmat, K, viewport.width, viewport.height, viewport.near),
         *(mask, found, torch.get_num_threads()),
     )
     if seen < 0:

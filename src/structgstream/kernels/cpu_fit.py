@@ -79,7 +79,7 @@ def native_frame(frame: FitFrame) -> tuple[ctypes.Structure, list[Any]]:
             *(len(static), of.viewport.near, of.viewport.width, of.viewport.height),
         )
 
-    prices, plan = frame.prices, frame.plan
+    factors, plan = frame.factors, frame.plan
     positions, offsets, features, means = (frame.leaves[n] for n in (0, 3, 4, 6))
     assert positions
     assert offsets
@@ -103,8 +103,8 @@ def native_frame(frame: FitFrame) -> tuple[ctypes.Structure, list[Any]]:
             len(frame.mlps.opacity.b1),
             int(frame.distance_input),
         ),
-        *(0 if frame.basis is None else len(frame.basis), int(prices.mean_volume), plan.mean_from, plan.errors_from),
-        *(prices.l1, prices.ssim, prices.volume, prices.smoothness, prices.rate, prices.pixel, prices.slack),
+        *(0 if frame.basis is None else len(frame.basis), int(factors.mean_volume), plan.mean_from, plan.errors_from),
+        *(factors.l1, factors.ssim, factors.volume, factors.smoothness, factors.rate, factors.pixel, factors.slack),
         *(*plan.betas, plan.eps),
     )
     return native, [*alive, native]

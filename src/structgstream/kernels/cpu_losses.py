@@ -41,7 +41,7 @@ class Comparison:
             raise BackendError(
                 f"Two pictures [H, W, 3] of one size are expected, got {tuple(image.shape)} and {tuple(target.shape)}."
             )
-        gains, biases = (None if t is None else constant(t) for t in (gains, biases))
+        gains, biases = (constant(t) for t in (gains, biases))
         assert (gains is None) == (biases is None)
         assert all(t is None or t.shape == (3,) for t in (gains, biases))
         assert tiles is None or (tiles.height, tiles.width) == image.shape[:2], tiles

@@ -74,7 +74,7 @@ def picture_residual(
     assert picture.dtype == torch.uint8, picture.dtype
     assert outside is None or outside.shape == rendering.shape, (outside.shape, rendering.shape)
     assert mask is None or mask.shape == picture.shape[:2], (mask.shape, picture.shape)
-    floats = [None if t is None else constant(t) for t in (rendering, gains, biases)]
+    floats = [constant(t) for t in (rendering, gains, biases)]
     bytes_ = [None if t is None else t.contiguous() for t in (picture, tiles and tiles.mask, outside, mask)]
     given = _Residual(*addresses(*floats, *bytes_), *rendering.shape[:2], *picture.shape[:2])
     found = torch.empty(picture.shape[:2])

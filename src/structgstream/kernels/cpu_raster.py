@@ -28,7 +28,7 @@ class _State:
 
 @dataclass(frozen=True)
 class _View:
-    """The arguments of a rendering except Gaussians: float32, contiguous, without gradient."""
+    """The arguments of a rendering except Gaussians."""
 
     viewport: Viewport
     background: Tensor | None
@@ -36,18 +36,15 @@ class _View:
     trained: int
     intervals: Tensor | None
 
-    def arguments(self) -> list[Tensor | int | float]:
-        """The camera's arguments in the order of the C++ functions."""
-        viewport = self.viewport
-        return [viewport.viewmat, viewport.K, viewport.width, viewport.height, viewport.near]
+
+def shape_arguments(gaussians: Gaussians) -> list[Tensor]:
+    """Means, quaternions, scales and opacities for a C function: float32, contiguous, without gradient."""
+    return [constant(t) for t in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)]
 
 
-def _intervals(gaussians: Gaussians) -> Tensor | None:
-    return None if gaussians.sampling_intervals is None else constant(gaussians.sampling_intervals)
-
-
-def _in_float32(viewport: Viewport) -> Viewport:
-    return viewport._replace(viewmat=constant(viewport.viewmat), K=constant(viewport.K))
+def camera_arguments(viewport: Viewport) -> list[Tensor | int | float]:
+    """A camera in the order of the C functions' arguments."""
+    return [constant(viewport.viewmat), constant(viewport.K), viewport.width, viewport.height, viewport.near]
 
 
 class _Rasterize(torch.autograd.Function):
@@ -67,7 +64,7 @@ class _Rasterize(torch.autograd.Function):
             native_library().sgs_raster_forward(
                 count,
                 *gaussians,
-                *view.arguments(),
+                *camera_arguments(view.viewport),
                 *(view.background, screen_offsets, view.intervals, view.tiles, view.trained),
                 *(image, alpha, radii, torch.get_num_threads()),
             )
@@ -133,11 +130,11 @@ def rasterize(
         assert not onto.requires_grad
         onto = onto.detach()  # An alias, because autograd marks the tensor it is given as the function's result.
     view = _View(
-        _in_float32(viewport),
-        None if background is None else constant(background),
+        viewport,
+        constant(background),
         None if tiles is None else tiles.mask.contiguous(),
         n if trained is None else trained,
-        _intervals(gaussians),
+        constant(gaussians.sampling_intervals),
     )
     offsets = None if screen_offsets is None else screen_offsets.contiguous()
     image, alpha, radii = _Rasterize.apply(  # type: ignore[misc]
@@ -152,11 +149,10 @@ def projected_radii(gaussians: Gaussians, viewport: Viewport) -> Tensor:
     Raises:
         OutOfMemoryError: there is no memory for the projected Gaussians.
     """
-    tensors = [constant(t) for t in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)]
-    view = _View(_in_float32(viewport), None, None, 0, _intervals(gaussians))
     radii = torch.empty(len(gaussians))
     if native_library().sgs_raster_radii(
-        len(gaussians), *tensors, *view.arguments(), view.intervals, radii, torch.get_num_threads()
+        *(len(gaussians), *shape_arguments(gaussians), *camera_arguments(viewport)),
+        *(constant(gaussians.sampling_intervals), radii, torch.get_num_threads()),
     ):
         raise OutOfMemoryError("to project Gaussians")
     return radii
@@ -186,18 +182,15 @@ def picture_and_weights(
 def _weights(
     gaussians: Gaussians, viewport: Viewport, maps: Tensor, *, background: Tensor | None, image: Tensor | None
 ) -> Tensor:
-    tensors = [constant(t) for t in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)]
     colors = None if image is None else constant(gaussians.colors)
     maps = maps.float().contiguous()
     height, width, channels = maps.shape
     assert channels > 0, maps.shape
     assert (width, height) == (viewport.width, viewport.height), maps.shape
-    view = _View(
-        _in_float32(viewport), None if background is None else constant(background), None, 0, _intervals(gaussians)
-    )
     weights = torch.empty(len(gaussians), channels)
     if native_library().sgs_raster_weights(
-        *(len(gaussians), *tensors, colors, *view.arguments(), view.background, view.intervals),
+        *(len(gaussians), *shape_arguments(gaussians), colors, *camera_arguments(viewport)),
+        *(constant(background), constant(gaussians.sampling_intervals)),
         *(maps, channels, weights, image, torch.get_num_threads()),
     ):
         raise OutOfMemoryError("for the lists of the Gaussians that each tile draws")

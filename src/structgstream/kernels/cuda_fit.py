@@ -5,14 +5,12 @@ import ctypes
 import weakref
 from collections.abc import Callable
 
-from structgstream.errors import BackendError, OutOfMemoryError
 from structgstream.kernels.cpu_fit import native_frame
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.values import FitFrame
 
 SLOTS_PER_GAUSSIAN = 16
 """Places for the gradients of pairs of a Gaussian and a tile; more are made when an iteration needs them."""
-_NO_MEMORY = 2  # cudaErrorMemoryAllocation
 
 
 def iterations(library: KernelLibrary, frame: FitFrame, *, slots: int | None = None) -> Callable[[int, int], None]:
@@ -40,21 +38,14 @@ def iterations(library: KernelLibrary, frame: FitFrame, *, slots: int | None = N
     functions, fit = library.library, ctypes.c_void_p()
     stream = library.stream(positions.values.device)
 
-    def check(error: int) -> None:
-        if error == _NO_MEMORY:
-            raise OutOfMemoryError("for the iterations of a frame on the GPU")
-        if error:
-            message = functions.sgs_cuda_error(error).decode()
-            raise BackendError(f"The CUDA kernels failed ({message}); take the cpu back-end, or report this.")
-
     error = functions.sgs_cuda_fit_new(
         ctypes.byref(native), slots or SLOTS_PER_GAUSSIAN * gaussians, stream, ctypes.byref(fit)
     )
 
     def run(first: int, last: int) -> None:
         assert alive
-        check(functions.sgs_cuda_fit_run(fit, first, last))
+        library.check(functions.sgs_cuda_fit_run(fit, first, last))
 
     weakref.finalize(run, functions.sgs_cuda_fit_free, fit)
-    check(error)
+    library.check(error)
     return run

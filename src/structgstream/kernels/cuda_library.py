@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from structgstream.atomic_files import give_name
-from structgstream.errors import BackendError
+from structgstream.errors import BackendError, OutOfMemoryError
 from structgstream.kernels.native import declare
 
 CUDA_PROTOTYPES: Mapping[str, tuple[str, str]] = {
@@ -46,8 +46,9 @@ CUDA_PROTOTYPES: Mapping[str, tuple[str, str]] = {
 """For each function of csrc/cuda: result type, argument types in order (``native.TYPES``)."""
 FLAGS = ("-O3", "-std=c++17", "-shared", "-Xcompiler", "-fPIC", "--threads", "0")
 SHARED_HEADERS = ("include", "cpu")
-"""Folders beside that of the sources; they have the headers of the C interface of the CPU kernels."""
+"""Folders next to that of the sources, with the headers of the C interface of the CPU kernels."""
 _OPERATIONS = "L1, SSIM, anchors, sweeps and tile lists"
+_NO_MEMORY = 2  # cudaErrorMemoryAllocation
 _LAST_LINES = 5  # of a failing compiler's output that an error quotes
 
 
@@ -69,12 +70,18 @@ class KernelLibrary:
         declare(self.library, CUDA_PROTOTYPES)
 
     def call(self, name: str, *arguments: Tensor | int | float | None, device: torch.device) -> None:
-        """Launch one function.
+        """Launch one function; errors are those of :meth:`check`."""
+        self.check(getattr(self.library, name)(*arguments, self.stream(device)))
+
+    def check(self, error: int) -> None:
+        """Check the number that a function returned.
 
         Raises:
-            BackendError: CUDA reports an error.
+            OutOfMemoryError: the GPU has no memory for what the function needs.
+            BackendError: CUDA reports another error.
         """
-        error = getattr(self.library, name)(*arguments, self.stream(device))
+        if error == _NO_MEMORY:
+            raise OutOfMemoryError("on the GPU for the CUDA kernels")
         if error:
             message = self.library.sgs_cuda_error(error).decode()
             raise BackendError(f"The CUDA kernels failed ({message}); take the cpu back-end, or report this.")

@@ -1,30 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures without gradients on a GPU in this package's kernels (csrc/cuda/picture_calls.h)."""
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from structgstream.cameras import Viewport
 from structgstream.gaussians import Gaussians
+from structgstream.kernels.cpu_raster import camera_arguments, shape_arguments
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.native import constant
-from structgstream.kernels.values import Rasterizer, RasterOutput, TileSelection
-
-
-def _attributes(gaussians: Gaussians) -> tuple[Tensor, ...]:
-    return gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
-
-
-def _shape(gaussians: Gaussians) -> list[Tensor]:
-    return [constant(tensor) for tensor in _attributes(gaussians)]
-
-
-def _camera(viewport: Viewport) -> list[Tensor | int | float]:
-    return [constant(viewport.viewmat), constant(viewport.K), viewport.width, viewport.height, viewport.near]
-
-
-def _intervals(gaussians: Gaussians) -> Tensor | None:
-    return None if gaussians.sampling_intervals is None else constant(gaussians.sampling_intervals)
+from structgstream.kernels.values import Rasterizer, RasterOutput
 
 
 def rasterize(
@@ -34,10 +21,7 @@ def rasterize(
     viewport: Viewport,
     *,
     background: Tensor | None = None,
-    screen_offsets: Tensor | None = None,
-    tiles: TileSelection | None = None,
-    onto: Tensor | None = None,
-    trained: int | None = None,
+    **options: Any,
 ) -> RasterOutput:
     """See ``reference_raster.rasterize``; waits once for the GPU. Results repeat bit for bit.
 
@@ -47,44 +31,27 @@ def rasterize(
         gaussians: to draw.
         viewport: the camera.
         background: ``[3]``, black when None.
-        screen_offsets: for ``with_gradients``, as the following.
-        tiles: as above.
-        onto: as above.
-        trained: as above.
+        options: the others of ``reference_raster.rasterize``, for ``with_gradients``.
     """
-    tensors = (*_attributes(gaussians), gaussians.colors)
+    tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
     needed = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-    if needed or screen_offsets is not None or tiles is not None:
-        return with_gradients(
-            gaussians,
-            viewport,
-            background=background,
-            screen_offsets=screen_offsets,
-            tiles=tiles,
-            onto=onto,
-            trained=trained,
-        )
-    assert onto is None, "a picture to draw onto needs tiles"
-    *shape, colors = map(constant, tensors)
-    intervals, background = _intervals(gaussians), None if background is None else constant(background)
-    library.check_devices(*shape, colors, intervals, viewport.viewmat, background)
-    image, alpha = (colors.new_empty(viewport.height, viewport.width, *more) for more in ((3,), ()))
-    radii = colors.new_empty(len(gaussians))
-    library.call(
-        "sgs_cuda_picture",
-        *(len(gaussians), *shape, colors, *_camera(viewport), background, intervals),
-        *(None, 0, None, image, alpha, radii),
-        device=colors.device,
-    )
+    if needed or any(options.get(name) is not None for name in ("screen_offsets", "tiles", "onto")):
+        return with_gradients(gaussians, viewport, background=background, **options)
+    size, device = (viewport.height, viewport.width), gaussians.means.device
+    image, alpha = torch.empty(*size, 3, device=device), torch.empty(size, device=device)
+    radii = torch.empty(len(gaussians), device=device)
+    _draw(library, gaussians, viewport, background, None, None, image, alpha, radii)
     return RasterOutput(image, alpha, radii)
 
 
 def projected_radii(library: KernelLibrary, gaussians: Gaussians, viewport: Viewport) -> Tensor:
     """See ``reference_raster.projected_radii``; without host synchronisation."""
-    shape, intervals = _shape(gaussians), _intervals(gaussians)
+    shape, intervals = shape_arguments(gaussians), constant(gaussians.sampling_intervals)
     library.check_devices(*shape, intervals, viewport.viewmat)
     radii = shape[0].new_empty(len(gaussians))
-    library.call("sgs_cuda_radii", len(gaussians), *shape, *_camera(viewport), intervals, radii, device=shape[0].device)
+    library.call(
+        "sgs_cuda_radii", len(gaussians), *shape, *camera_arguments(viewport), intervals, radii, device=radii.device
+    )
     return radii
 
 
@@ -102,9 +69,8 @@ def picture_and_weights(
     background: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """See ``reference_raster.picture_and_weights``; waits once for the GPU. Results repeat bit for bit."""
-    image = gaussians.means.new_empty(viewport.height, viewport.width, 3)
-    weights = _weights(library, gaussians, viewport, maps, background, image)
-    return image, weights
+    image = torch.empty(viewport.height, viewport.width, 3, device=gaussians.means.device)
+    return image, _weights(library, gaussians, viewport, maps, background, image)
 
 
 def _weights(
@@ -119,15 +85,29 @@ def _weights(
     height, width, channels = maps.shape
     assert channels > 0, maps.shape
     assert (width, height) == (viewport.width, viewport.height), maps.shape
-    shape, intervals, maps = _shape(gaussians), _intervals(gaussians), constant(maps)
-    colors = None if image is None else constant(gaussians.colors)
-    background = None if background is None else constant(background)
-    library.check_devices(*shape, intervals, viewport.viewmat, maps, colors, background)
-    weights = maps.new_empty(len(gaussians), channels)
+    weights = torch.empty(len(gaussians), channels, device=maps.device)
+    _draw(library, gaussians, viewport, background, constant(maps), weights, image, None, None)
+    return weights
+
+
+def _draw(
+    library: KernelLibrary,
+    gaussians: Gaussians,
+    viewport: Viewport,
+    background: Tensor | None,
+    maps: Tensor | None,
+    weights: Tensor | None,
+    image: Tensor | None,
+    alpha: Tensor | None,
+    radii: Tensor | None,
+) -> None:
+    """Fill those of ``weights``, ``image``, ``alpha`` and ``radii`` that are not None (csrc/cuda/picture.h)."""
+    shape, colors = shape_arguments(gaussians), None if image is None else constant(gaussians.colors)
+    background, intervals = constant(background), constant(gaussians.sampling_intervals)
+    library.check_devices(*shape, colors, intervals, background, viewport.viewmat, maps)
     library.call(
         "sgs_cuda_picture",
-        *(len(gaussians), *shape, colors, *_camera(viewport), background, intervals),
-        *(maps, channels, weights, image, None, None),
-        device=maps.device,
+        *(len(gaussians), *shape, colors, *camera_arguments(viewport), background, intervals),
+        *(maps, 0 if maps is None else maps.shape[2], weights, image, alpha, radii),
+        device=shape[0].device,
     )
-    return weights

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from torch import Tensor
 
@@ -95,9 +95,12 @@ def addresses(*tensors: Tensor | None) -> list[int | None]:
     return [None if tensor is None else tensor.data_ptr() for tensor in tensors]
 
 
-def constant(tensor: Tensor) -> Tensor:
-    """The tensor as float32, contiguous, without gradient."""
-    return tensor.detach().float().contiguous()
+OptionalTensor = TypeVar("OptionalTensor", bound=Tensor | None)
+
+
+def constant(tensor: OptionalTensor) -> OptionalTensor:
+    """The tensor as float32, contiguous, without gradient; None for None."""
+    return None if tensor is None else tensor.detach().float().contiguous()  # type: ignore[return-value]
 
 
 def members(of_type: Any, names: str) -> list[tuple[str, Any]]:

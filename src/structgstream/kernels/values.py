@@ -238,7 +238,7 @@ class FitLeaf(NamedTuple):
         first: Adam's first moments, zero at the first iteration; None: not trained.
         second: its second moments.
         sums: get the values of the last iterations; None: no mean.
-        before: values from which changes of the first rows are priced; None for no price.
+        before: values from which the rate term counts changes of the first rows; None: has none.
         step: the quantization step with which it is drawn; 0 for none.
     """
 
@@ -278,7 +278,7 @@ class FitView(NamedTuple):
     static: Gaussians
 
 
-class FitPrices(NamedTuple):
+class LossFactors(NamedTuple):
     """Weights of the loss.
 
     Args:
@@ -342,7 +342,7 @@ class FitFrame(NamedTuple):
         start: ``[M, 3]`` positions from which displacements are counted; None without smoothness.
         neighbours: ``[M, N]`` int64 anchors that each is compared with.
         shares: ``[M, N]`` their weights.
-        prices: weights of the loss.
+        factors: weights of the loss.
         plan: the iterations.
     """
 
@@ -356,5 +356,5 @@ class FitFrame(NamedTuple):
     start: Tensor | None
     neighbours: Tensor | None
     shares: Tensor | None
-    prices: FitPrices
+    factors: LossFactors
     plan: FitPlan

@@ -18,62 +18,41 @@ from typing import Any
 
 from structgstream.errors import ConfigError
 from structgstream.evaluation.run_log import read_log
-from structgstream.groups.boundaries import read_groups
+from structgstream.groups.track_file import read_groups
 from structgstream.parallel.driver import HEADER, JOIN, TRACK
 from structgstream.parallel.parts import CompletedTask, Parts, group_name
 
 
 @dataclass(frozen=True)
 class Costs:
-    """What was measured, of one worker.
+    """What was measured, of one worker."""
 
-    Args:
-        header_seconds: frame 0, with the start of its process.
-        track_start_seconds: of the tracking pass, until its first frame.
-        track_seconds: of a tracked frame.
-        process_seconds: of a group, until its first frame begins.
-        first_seconds: what the first frame of a group takes longer than others; not that of frame 0's group.
-        frame_seconds: of a frame fitted after another.
-        join_start_seconds: until joining begins.
-        join_seconds: of a joined frame.
-        header_bytes: init record and frame 0.
-        first_bytes: key packet that begins a group.
-        key_bytes: another key packet.
-        frame_bytes: another packet.
-        worker_bytes: largest resident memory of a worker.
-    """
-
-    header_seconds: float
-    track_start_seconds: float
-    track_seconds: float
-    process_seconds: float
-    first_seconds: float
-    frame_seconds: float
-    join_start_seconds: float
-    join_seconds: float
-    header_bytes: float
-    first_bytes: float
-    key_bytes: float
-    frame_bytes: float
-    worker_bytes: float
+    header_seconds: float  # frame 0, with the start of its process
+    track_start_seconds: float  # of the tracking pass, until its first frame
+    track_seconds: float  # of a tracked frame
+    process_seconds: float  # of a group, until its first frame begins
+    first_seconds: float  # what the first frame of a group takes longer than others; not that of frame 0's group
+    frame_seconds: float  # of a frame fitted after another
+    join_start_seconds: float  # until joining begins
+    join_seconds: float  # of a joined frame
+    header_bytes: float  # init record and frame 0
+    first_bytes: float  # key packet that begins a group
+    key_bytes: float  # another key packet
+    frame_bytes: float  # another packet
+    worker_bytes: float  # largest resident memory of a worker
 
 
 @dataclass(frozen=True)
 class Work:
     """How much there is to do.
 
-    Args:
-        frames: of the capture.
-        group: frames of a group.
-        key_interval: frames from one key packet to the next.
-
     Raises:
         ConfigError: less than one of them.
     """
 
-    frames: int
-    group: int
-    key_interval: int
+    frames: int  # of the capture
+    group: int  # frames of a group
+    key_interval: int  # frames from one key packet to the next
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -89,23 +68,14 @@ class Work:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a run takes.
+    """What a run takes."""
 
-    Args:
-        workers: at a time.
-        seconds: from the beginning to the joined stream.
-        header_seconds: of these, frame 0, alone.
-        tail_seconds: of these, after the tracking pass: what is left of the groups.
-        join_seconds: of these, joining, alone.
-        speedup: against one frame after the other on one worker.
-    """
-
-    workers: int
-    seconds: float
-    header_seconds: float
-    tail_seconds: float
-    join_seconds: float
-    speedup: float
+    workers: int  # at a time
+    seconds: float  # from the beginning to the joined stream
+    header_seconds: float  # of these, frame 0, alone
+    tail_seconds: float  # of these, after the tracking pass: what is left of the groups
+    join_seconds: float  # of these, joining, alone
+    speedup: float  # against one frame after the other on one worker
 
     @property
     def efficiency(self) -> float:
@@ -175,19 +145,12 @@ def stream_bytes(costs: Costs, work: Work) -> float:
 
 @dataclass(frozen=True)
 class Measured:
-    """What a run has shown.
+    """What a run has shown."""
 
-    Args:
-        costs: of one of its workers.
-        frames: of the run.
-        groups: that were measured; those that were begun more than once are not.
-        seconds: of all its tasks together.
-    """
-
-    costs: Costs
-    frames: int
-    groups: int
-    seconds: float
+    costs: Costs  # of one of its workers
+    frames: int  # of the run
+    groups: int  # that were measured; those that were begun more than once are not
+    seconds: float  # of all its tasks together
 
 
 def measured_in(folder: Path) -> Measured:

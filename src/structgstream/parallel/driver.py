@@ -4,17 +4,23 @@ start, and the join.
 """
 
 import tempfile
-from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 
 from structgstream.atomic_files import atomic_write, partial_path
 from structgstream.errors import StorageError, StreamError, TaskError
-from structgstream.executors.executor import TaskQueue
-from structgstream.executors.local import LocalEngine
-from structgstream.executors.task import PYTHON, Task, TaskResult, WorkerSlot, thread_environment
-from structgstream.groups.boundaries import Groups, groups_path, read_groups
+from structgstream.executors.tasks import (
+    PYTHON,
+    LocalEngine,
+    Task,
+    TaskQueue,
+    TaskResult,
+    WorkerSlot,
+    thread_environment,
+)
+from structgstream.groups.track_file import Groups, groups_path, read_groups
 from structgstream.parallel.exchange import SharedFolder
 from structgstream.parallel.parts import Parts, group_name, key_of, sha256_of
 
@@ -52,30 +58,20 @@ def cut_track(track: Path, first: int) -> bytes:
 
 @dataclass(frozen=True)
 class Unit:
-    """Options of the commands.
+    """Options of the commands."""
 
-    Args:
-        capture: folder of the capture.
-        frames: number of frames; None for all.
-        header: further arguments of ``reconstruct`` for frame 0: preset, scale, held-out cameras.
-        track: further arguments of ``track``: length of groups.
-        track_threads: threads of the tracking pass, which all groups wait for; None for those of its worker slot.
-        device: further arguments of all commands: the back-end.
-        join: further arguments of ``join``: number of processes.
-        program: runs the commands.
-        starts: the frames at which a group may start, of a track that is finished or growing.
-        cut: extracts from a track what one group needs.
-    """
-
-    capture: str
-    frames: int | None = None
-    header: tuple[str, ...] = ()
-    track: tuple[str, ...] = ()
+    capture: str  # folder of the capture
+    frames: int | None = None  # number of frames; None for all
+    header: tuple[str, ...] = ()  # further arguments of reconstruct for frame 0: preset, scale, held-out cameras
+    track: tuple[str, ...] = ()  # further arguments of track: length of groups
+    # threads of the tracking pass, which all groups wait for; None for those of its worker slot
     track_threads: int | None = None
-    device: tuple[str, ...] = ()
-    join: tuple[str, ...] = ()
-    program: tuple[str, ...] = PROGRAM
+    device: tuple[str, ...] = ()  # further arguments of all commands: the back-end
+    join: tuple[str, ...] = ()  # further arguments of join: number of processes
+    program: tuple[str, ...] = PROGRAM  # runs the commands
+    # the frames at which a group may start, of a track that is finished or growing
     starts: Callable[[Path], Collection[int]] = field(default=starts_in, compare=False)
+    # extracts from a track what one group needs
     cut: Callable[[Path, int], bytes] = field(default=cut_track, compare=False)
 
     def header_task(self, parts: Parts) -> Task:
@@ -122,21 +118,12 @@ class State(StrEnum):
 
 @dataclass(frozen=True)
 class Status:
-    """Progress of a run.
+    """Progress of a run."""
 
-    Args:
-        stage: header, track, groups (perhaps while the track grows) or join.
-        groups: frames of each group, once they are known.
-        states: state of each group.
-        tracked: number of groups whose start has been tracked.
-        failed: names of tasks that failed.
-    """
-
-    stage: str
-    groups: Groups = ()
+    stage: str  # header, track, groups (perhaps while the track grows) or join
+    groups: Groups = ()  # frames of each group, once they are known
     states: tuple[State, ...] = ()
-    tracked: int = 0
-    failed: tuple[str, ...] = ()
+    failed: tuple[str, ...] = ()  # names of tasks that failed
 
 
 Listener = Callable[[Status], object]
@@ -144,17 +131,11 @@ Listener = Callable[[Status], object]
 
 @dataclass(frozen=True)
 class Job:
-    """A parallel run.
+    """A parallel run."""
 
-    Args:
-        unit: its commands.
-        output: the stream file.
-        gpus: number of GPUs that a task needs, 0 or 1.
-    """
-
-    unit: Unit
-    output: Path
-    gpus: int = 0
+    unit: Unit  # its commands
+    output: Path  # the stream file
+    gpus: int = 0  # number of GPUs that a task needs, 0 or 1
 
     @property
     def key(self) -> str:
@@ -182,11 +163,7 @@ def drive(
     Call it again after an interruption: complete parts are not made again.
 
     Args:
-        job: the run.
-        parts: the folder of parts, locked by this process (:meth:`Parts.locked`).
-        executor: runs the tasks, except the join, which runs here.
         exchange: how parts are transferred; by default all machines see the folder.
-        listener: called with the status twice a second and when a task ends.
 
     Raises:
         TaskError: tasks failed; complete parts remain.
@@ -202,74 +179,69 @@ class _Drive:
     def __init__(self, job: Job, parts: Parts, executor: TaskQueue, exchange: SharedFolder, listener: Listener) -> None:
         self._job, self._unit, self._parts, self._executor = job, job.unit, parts, executor
         self._exchange, self._listener = exchange, listener
-        self._status = Status(HEADER)
-        self._index: dict[str, int] = {}
-        self._next = 0  # of the groups, the first that is not submitted
+        self._stage, self._header_key = HEADER, ""
+        self._groups: dict[str, tuple[int, int]] = {}  # by name, in order
+        self._states: dict[str, State] = {}
         self._failed: list[TaskResult] = []
-        self._header_key = ""
 
     def run(self) -> Groups:
         """Runs all tasks in order."""
-        self._run_alone(self._unit.header_task(self._parts), self._parts.header)
-        self._header_key = sha256_of(self._parts.header)
-        self._update(stage=TRACK)
-        self._executor.submit(self._exchange.track(self._unit.track_task(self._parts)), gpus=self._job.gpus)
-        is_tracked = False
+        parts, gpus = self._parts, self._job.gpus
+        task = self._unit.header_task(parts)
+        made = self._alone(self._executor, self._exchange.header(task), gpus=gpus)
+        self._exchange.fetch(parts.header)
+        parts.record(made, key_of(task.command), parts.header, frames=1)
+        self._stage, self._header_key = TRACK, sha256_of(parts.header)
+        self._executor.submit(self._exchange.track(self._unit.track_task(parts)), gpus=gpus)
+        is_tracked = is_lost = False
         while not is_tracked or self._executor.running or self._executor.waiting:
-            self._submit_groups(is_tracked=is_tracked)
+            if not is_lost:
+                self._submit_groups(is_tracked=is_tracked)
             for result in self._executor.wait(POLL_SECONDS):
                 is_tracked |= result.name == TRACK
+                is_lost |= result.name == TRACK and not result.done
                 self._record(result)
-            if any(result.name == TRACK for result in self._failed):
-                is_tracked = True
-                self._next = len(self._status.groups)
-            elif is_tracked:
+            if is_tracked and not is_lost:
                 self._submit_groups(is_tracked=True)
-                self._check_groups()
-            self._show_running()
+                if not self._groups:
+                    raise TaskError(f"The tracking pass has ended, and there are no groups next to {parts.track}.")
+            self._states |= {name: State.RUNNING for name in self._executor.running if name in self._states}
+            self._show()
         if self._failed:
-            raise TaskError(_sentence(self._failed, self._parts))
+            raise TaskError(_sentence(self._failed, parts))
         return self._join()
 
-    def _run_alone(self, task: Task, part: Path) -> None:
-        """Runs a task on which all others depend."""
-        self._listener(self._status)
-        self._executor.submit(self._exchange.header(task), gpus=self._job.gpus)
-        while not (results := self._executor.wait(POLL_SECONDS)):
-            self._listener(self._status)
+    def _alone(self, queue: TaskQueue, task: Task, *, gpus: int = 0) -> TaskResult:
+        """Runs a task that all others depend on, or that depends on them."""
+        self._show()
+        queue.submit(task, gpus=gpus)
+        while not (results := queue.wait(POLL_SECONDS)):
+            self._show()
         self._store_output(results[0])
         if not results[0].done:
             raise TaskError(_sentence(results, self._parts))
-        self._exchange.fetch(part)
-        self._parts.record(results[0], key_of(task.command), part, frames=1)
+        return results[0]
 
     def _submit_groups(self, *, is_tracked: bool) -> None:
-        """Submits the groups whose start the track has."""
+        """Submits the groups whose start the track has, unless they are complete."""
         if not is_tracked:
             self._exchange.fetch_track()
-        if not self._status.groups:
-            groups = read_groups(self._parts.track)
-            if groups is None:
+        if not self._groups:
+            self._groups = {group_name(*group): group for group in read_groups(self._parts.track) or ()}
+            self._states = dict.fromkeys(self._groups, State.UNTRACKED)
+            self._stage = "groups" if self._groups else self._stage
+        left = [name for name, state in self._states.items() if state is State.UNTRACKED]
+        starts = {0, *self._unit.starts(self._parts.track)} if left and not is_tracked else ()
+        for name in left:
+            first = self._groups[name][0]
+            if not is_tracked and first not in starts:
                 return
-            self._index = {group_name(*group): i for i, group in enumerate(groups)}
-            self._update(stage="groups", groups=groups, states=(State.UNTRACKED,) * len(groups))
-        groups, states = self._status.groups, list(self._status.states)
-        if self._next == len(groups):
-            return
-        starts = None if is_tracked else {0, *self._unit.starts(self._parts.track)}
-        while self._next < len(groups) and (starts is None or groups[self._next][0] in starts):
-            task = self._unit.group_task(self._parts, *groups[self._next])
-            if self._parts.is_complete(task.name, self._key(task), Path(task.result)):
-                states[self._next] = State.DONE
+            task = self._unit.group_task(self._parts, *self._groups[name])
+            if self._parts.is_complete(name, self._key(task), Path(task.result)):
+                self._states[name] = State.DONE
             else:
-                self._executor.submit(self._exchange.group(task, groups[self._next][0]), gpus=self._job.gpus)
-                states[self._next] = State.READY
-            self._next += 1
-        self._update(states=tuple(states), tracked=self._next)
-
-    def _check_groups(self) -> None:
-        if not self._status.groups:
-            raise TaskError(f"The tracking pass has ended, and there are no groups next to {self._parts.track}.")
+                self._executor.submit(self._exchange.group(task, first), gpus=self._job.gpus)
+                self._states[name] = State.READY
 
     def _key(self, task: Task) -> str:
         return key_of(task.command, self._header_key)
@@ -278,7 +250,6 @@ class _Drive:
         self._store_output(result)
         if not result.done:
             self._failed.append(result)
-            self._update(failed=tuple(failed.name for failed in self._failed))
         if result.name == TRACK:
             if result.done:
                 self._exchange.fetch(self._parts.track)
@@ -286,12 +257,12 @@ class _Drive:
                 frames = (read_groups(self._parts.track) or [(0, 0)])[-1][1]
                 self._parts.record(result, key_of(self._header_key), self._parts.track, frames=frames)
             return
-        first, end = self._status.groups[self._index[result.name]]
         if result.done:
+            first, end = self._groups[result.name]
             task = self._unit.group_task(self._parts, first, end)
             self._exchange.fetch(Path(task.result))
             self._parts.record(result, self._key(task), Path(task.result), frames=end - first)
-        self._set_states({result.name: State.DONE if result.done else State.FAILED})
+        self._states[result.name] = State.DONE if result.done else State.FAILED
 
     def _store_output(self, result: TaskResult) -> None:
         """Appends the output of a task on another machine to its log here."""
@@ -303,41 +274,25 @@ class _Drive:
         except OSError as error:
             raise StorageError(f"{log} cannot be read ({error.strerror}).") from error
 
-    def _show_running(self) -> None:
-        self._set_states({name: State.RUNNING for name in self._executor.running if name in self._index})
-        self._listener(self._status)
-
-    def _set_states(self, new: dict[str, State]) -> None:
-        states = list(self._status.states)
-        for name, state in new.items():
-            states[self._index[name]] = state
-        self._update(states=tuple(states))
+    def _show(self) -> None:
+        failed = tuple(result.name for result in self._failed)
+        self._listener(Status(self._stage, [*self._groups.values()], tuple(self._states.values()), failed))
 
     def _join(self) -> Groups:
         """Joins the segments in a process of this machine."""
-        groups, output = self._status.groups, self._job.output
-        self._update(stage=JOIN)
-        self._listener(self._status)
-        task = self._unit.join_task(self._parts, groups, output)
-        key = key_of([self._parts.completed[group_name(*group)].sha256 for group in groups])
+        groups, output, self._stage = [*self._groups.values()], self._job.output, JOIN
+        key = key_of([self._parts.completed[name].sha256 for name in self._groups])
         if self._parts.is_complete(JOIN, key, output):
+            self._show()
             return groups
         with TaskQueue(LocalEngine([WorkerSlot(1)])) as here:
-            here.submit(task)
-            while not (results := here.wait(POLL_SECONDS)):
-                self._listener(self._status)
-        if not results[0].done:
-            raise TaskError(_sentence(results, self._parts))
-        self._parts.record(results[0], key, output, frames=groups[-1][1])
+            made = self._alone(here, self._unit.join_task(self._parts, groups, output))
+        self._parts.record(made, key, output, frames=groups[-1][1])
         return groups
 
-    def _update(self, **changes: object) -> None:
-        self._status = replace(self._status, **changes)  # type: ignore[arg-type]
 
-
-def _sentence(failed: Iterable[TaskResult], parts: Parts) -> str:
+def _sentence(failed: Sequence[TaskResult], parts: Parts) -> str:
     """Which tasks failed, and the output of the first of them."""
-    failed = list(failed)
     first = failed[0]
     output = " ".join(first.output.strip().splitlines()[-MESSAGE_LINES:]) or f"it ended with status {first.status}"
     others = f" and {len(failed) - 1} more" if len(failed) > 1 else ""

@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Transfer of parts between the driver and the machines of the tasks: a shared folder, or an object store.
 
-With an object store the command of a task runs in this module as a program. It copies inputs (``--needs``) into a
-folder of its machine, and outputs to the store: a growing file (``--grows``) repeatedly while the command runs, results
-(``--gives``) when it succeeded. The folder remains when the command is killed, so that the next attempt of the same run
-on this machine continues there; a run that was started again (``--run``) has another folder, and removes the earlier
-one.
+With an object store the command of a task runs in this module as a program, after a :class:`Transfer` as JSON. It
+copies inputs into a folder of its machine, and outputs to the store: a growing file repeatedly while the command runs,
+results when it succeeded. The folder remains when the command is killed, so that the next attempt of the same run on
+this machine continues there; a run that was started again has another folder, and removes the earlier one.
 """
 
-import argparse
 import hashlib
+import json
 import os
 import random
 import re
@@ -19,15 +18,15 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
 from structgstream.atomic_files import atomic_write, partial_path
-from structgstream.errors import StorageError, StructGStreamError
+from structgstream.errors import ConfigError, StorageError, StructGStreamError
 from structgstream.evaluation.run_log import log_path
-from structgstream.executors.task import PYTHON, Task, argv_of
-from structgstream.groups.boundaries import groups_path
+from structgstream.executors.tasks import PYTHON, Task, argv_of
+from structgstream.groups.track_file import groups_path
 from structgstream.owned_folders import MARKER, Owner, own_folder, owner_of, parse_owner, remove_own
 from structgstream.parallel.parts import PART_NAMES, Parts
 from structgstream.remote_folders import open_url, reason_of, shown_address
@@ -41,7 +40,8 @@ LONGEST_DELAY_SECONDS = 10.0
 class ObjectFolder:
     """Objects by name, with the bytes of the files that they are copies of.
 
-    A request that fails is made again, :data:`TRIES` times in all, with growing, varied pauses.
+    A request that fails is made again, :data:`TRIES` times in all, with growing, varied pauses; then it is a
+    ``StorageError``.
 
     Args:
         url: of the folder, as fsspec takes it. Addresses and credentials come from the environment, as the scheme's
@@ -54,59 +54,37 @@ class ObjectFolder:
 
     def __init__(self, url: str) -> None:
         self.url = url.rstrip("/")
-        self.name = shown_address(self.url)
-        """For messages."""
+        self.name = shown_address(self.url)  # for messages
         self._files, self._root = open_url(self.url)
 
     def write(self, name: str, data: bytes) -> None:
-        """Writes or replaces an object.
-
-        Raises:
-            StorageError: it cannot be written.
-        """
+        """Writes or replaces an object."""
 
         def put() -> None:
             if self._files.protocol in ("file", ("file", "local")):
                 self._files.makedirs(str(Path(f"{self._root}/{name}").parent), exist_ok=True)
             self._files.pipe_file(f"{self._root}/{name}", data)
 
-        self._tried(put, f"write {name}")
+        self._tried(put, f"write {name}", may_miss=False)
 
     def read(self, name: str) -> bytes | None:
-        """The content of an object; None if there is none.
-
-        Raises:
-            StorageError: it cannot be read.
-        """
-
-        def get() -> bytes | None:
-            try:
-                return self._files.cat_file(f"{self._root}/{name}")
-            except FileNotFoundError:
-                return None
-
-        return self._tried(get, f"read {name}")
+        """The content of an object; None if there is none."""
+        return self._tried(lambda: self._files.cat_file(f"{self._root}/{name}"), f"read {name}")
 
     def size(self, name: str) -> int | None:
-        """The bytes of an object; None if there is none.
+        """The bytes of an object; None if there is none."""
+        return self._tried(lambda: int(self._files.info(f"{self._root}/{name}")["size"]), f"look for {name}")
 
-        Raises:
-            StorageError: the store cannot be asked.
-        """
-
-        def found() -> int | None:
-            try:
-                return int(self._files.info(f"{self._root}/{name}")["size"])
-            except FileNotFoundError:
-                return None
-
-        return self._tried(found, f"look for {name}")
+    def fetch(self, name: str, path: Path) -> None:
+        """Copies an object to a file if there is one."""
+        if (data := self.read(name)) is not None:
+            atomic_write(path, data, new_folder=True)
 
     def owner(self) -> Owner | None:
-        """Whose the folder is; None if there is nothing in it.
+        """The owner of the folder; None if there is nothing in it.
 
         Raises:
-            StorageError: it holds objects and no marker, or cannot be listed.
+            StorageError: it holds objects and no marker.
         """
         names = self._all()
         if not names:
@@ -121,38 +99,29 @@ class ObjectFolder:
         return found
 
     def remove(self, names: re.Pattern[str]) -> None:
-        """Removes the objects of a marked folder whose names match in full; others stay.
-
-        Raises:
-            StorageError: the folder is not marked, or they cannot be removed.
-        """
-        if self.owner() is None:
-            return
-
-        def removed() -> None:
-            if found := [f"{self._root}/{name}" for name in self._all() if names.fullmatch(name)]:
-                self._files.rm(found)
-
-        self._tried(removed, "remove what is")
+        """Removes the objects of a marked folder whose names match in full; others stay."""
+        if self.owner() is not None:
+            found = [f"{self._root}/{name}" for name in self._all() if names.fullmatch(name)]
+            self._tried(lambda: found and self._files.rm(found), "remove what is")
 
     def _all(self) -> list[str]:
         """Names of all objects, also of those in folders."""
 
         def listed() -> list[str]:
             self._files.invalidate_cache()
-            try:
-                return [str(path).removeprefix(f"{self._root}/") for path in self._files.find(self._root)]
-            except FileNotFoundError:
-                return []
+            return [str(path).removeprefix(f"{self._root}/") for path in self._files.find(self._root)]
 
-        return self._tried(listed, "list the content of")
+        return self._tried(listed, "list the content of") or []
 
-    def _tried(self, action: Callable[[], T], what: str) -> T:
+    def _tried(self, action: Callable[[], T], what: str, *, may_miss: bool = True) -> T | None:
+        """The result of a request; None for an object that does not exist, if it ``may_miss``."""
         delay = FIRST_DELAY_SECONDS
         for attempt in range(TRIES):
             try:
                 return action()
             except Exception as error:  # Each file system has its own.
+                if may_miss and isinstance(error, FileNotFoundError):
+                    return None
                 if attempt + 1 == TRIES:
                     raise StorageError(f"Cannot {what} in {self.name} ({reason_of(error, self.url)}).") from error
             time.sleep(delay * random.uniform(0.5, 1.5))  # so that two processes do not fail in step
@@ -187,13 +156,7 @@ class SharedFolder:
 
 
 class ObjectStore(SharedFolder):
-    """Parts are exchanged through an object store; the driver has copies.
-
-    Args:
-        store: the folder of the store.
-        parts: the driver's folder.
-        cut: extracts from a track what one group needs.
-    """
+    """Parts are exchanged through an object store; the driver has copies."""
 
     def __init__(self, store: ObjectFolder, parts: Parts, *, cut: Callable[[Path, int], bytes]) -> None:
         self._store, self._parts, self._cut = store, parts, cut
@@ -201,34 +164,28 @@ class ObjectStore(SharedFolder):
         self._fetched_bytes: int | None = None  # of the growing track
 
     def header(self, task: Task) -> Task:
-        """See :meth:`SharedFolder.header`."""
-        return self._staged(task, ["--gives", self._name(self._parts.header)])
+        return self._staged(task, gives=[self._parts.header])
 
     def track(self, task: Task) -> Task:
-        """See :meth:`SharedFolder.track`."""
         track = self._parts.track
-        files = ["--needs", self._name(self._parts.header)]
-        files += ["--grows", self._name(groups_path(track)), "--grows", self._name(partial_path(track))]
-        return self._staged(task, [*files, "--gives", self._name(track)])
+        growing = [groups_path(track), partial_path(track)]
+        return self._staged(task, needs=[self._parts.header], grows=growing, gives=[track])
 
     def group(self, task: Task, first: int) -> Task:
-        """See :meth:`SharedFolder.group`."""
         track = self._parts.track.with_name(f"start-{first:06d}.sgt")
         command = tuple(argument.replace(str(self._parts.track), str(track)) for argument in task.command)
-        partial = self._name(partial_path(track))
         if first:
-            self._store.write(partial, self._cut(self._parts.track, first))
+            self._store.write(self._name(partial_path(track)), self._cut(self._parts.track, first))
         segment = Path(task.result)
-        log = log_path(segment)
-        files = ["--needs", self._name(self._parts.header), "--needs", partial]
-        # The segment last: once it is in the store, so is its log.
-        files += ["--gives", self._name(log), "--gives", self._name(segment)]
-        return self._staged(replace(task, command=command), files)
+        return self._staged(
+            replace(task, command=command),
+            needs=[self._parts.header, partial_path(track)],
+            # The segment last: once it is in the store, so is its log.
+            gives=[log_path(segment), segment],
+        )
 
     def fetch(self, part: Path) -> None:
-        """See :meth:`SharedFolder.fetch`."""
-        if (data := self._store.read(self._name(part))) is not None:
-            atomic_write(part, data, new_folder=True)
+        self._store.fetch(self._name(part), part)
 
     def fetch_track(self) -> None:
         """See :meth:`SharedFolder.fetch_track`; asks the store once a second."""
@@ -273,12 +230,24 @@ class ObjectStore(SharedFolder):
     def _name(self, path: Path) -> str:
         return str(path.relative_to(self._parts.folder))
 
-    def _staged(self, task: Task, files: Sequence[str]) -> Task:
+    def _staged(self, task: Task, **files: Sequence[Path]) -> Task:
         folder = str(self._parts.folder)
         inner = (argument.replace(folder, HERE) for argument in task.command)
-        outer = (*STAGED, "--name", task.name, "--run", self._parts.run, *files, "--")
+        names = {kind: tuple(map(self._name, paths)) for kind, paths in files.items()}
+        transfer = Transfer(task.name, self._parts.run, **names)
         environment = {**task.environment, STORE: self._store.url}
-        return replace(task, command=(*outer, *inner), environment=environment)
+        return replace(task, command=(*STAGED, json.dumps(asdict(transfer)), *inner), environment=environment)
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """The files of a task, by their names in the store."""
+
+    name: str  # of the task
+    run: str = ""  # random name of the run
+    needs: tuple[str, ...] = ()  # files to fetch
+    gives: tuple[str, ...] = ()  # files to store when the command has ended well, and to fetch before if they are there
+    grows: tuple[str, ...] = ()  # files to store while they grow, and to fetch before if not all that is given is there
 
 
 HERE = "{here}"
@@ -304,16 +273,13 @@ class Staging:
 
     def fetch(self, name: str, *, replace: bool = False) -> None:
         """Copies a file from the store if it is there and missing here; with ``replace`` even if it is here."""
-        path = self.folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if (replace or not path.exists()) and (data := self.store.read(name)) is not None:
-            atomic_write(path, data)
+        if replace or not (self.folder / name).exists():
+            self.store.fetch(name, self.folder / name)
 
     def put(self, name: str) -> None:
         """Copies a file to the store if it exists."""
-        path = self.folder / name
-        if path.exists():
-            self.store.write(name, path.read_bytes())
+        if (self.folder / name).exists():
+            self.store.write(name, (self.folder / name).read_bytes())
 
     def put_growing(self, name: str, *, ended: bool) -> None:
         """Replaces a file in the store when it has grown by the factor :data:`GROWTH`, or the command has ended.
@@ -328,27 +294,28 @@ class Staging:
             self._sizes[name] = size
 
 
-def run(options: argparse.Namespace) -> int:
+def run(transfer: Transfer, command: Sequence[str]) -> int:
     """Fetches inputs, runs the command and stores outputs; returns its status."""
-    staging = Staging(ObjectFolder(options.store), scratch_folder(options))
-    for name in options.needs:
+    url = os.environ.get(STORE)
+    if not url:
+        raise ConfigError(f"The variable {STORE} has no URL of a store.")
+    staging = Staging(ObjectFolder(url), scratch_folder(transfer, url))
+    for name in transfer.needs:
         staging.fetch(name, replace=True)
-    for name in options.gives:
+    for name in transfer.gives:
         staging.fetch(name)
-    if not all((staging.folder / name).exists() for name in options.gives):
-        for name in options.grows:
+    if not all((staging.folder / name).exists() for name in transfer.gives):
+        for name in transfer.grows:
             staging.fetch(name)
-    process = subprocess.Popen(
-        argv_of(tuple(argument.replace(HERE, str(staging.folder)) for argument in options.command))
-    )
+    process = subprocess.Popen(argv_of(tuple(argument.replace(HERE, str(staging.folder)) for argument in command)))
     status = None
     while status is None:
         with suppress(subprocess.TimeoutExpired):
             status = process.wait(POLL_SECONDS)
-        for name in options.grows:
+        for name in transfer.grows:
             staging.put_growing(name, ended=status is not None)
     if status == 0:
-        for name in options.gives:
+        for name in transfer.gives:
             staging.put(name)
     if 0 <= status < SIGNALLED:  # A command that failed by itself would fail again.
         remove_own(staging.folder, PURPOSE, ANY, whole=True)
@@ -357,7 +324,7 @@ def run(options: argparse.Namespace) -> int:
     return status
 
 
-def scratch_folder(options: argparse.Namespace) -> Path:
+def scratch_folder(transfer: Transfer, url: str) -> Path:
     """The marked folder of a task on this machine; those of earlier runs of the task are removed.
 
     Raises:
@@ -365,8 +332,8 @@ def scratch_folder(options: argparse.Namespace) -> Path:
     """
     above = Path(os.environ.get(SCRATCH) or tempfile.gettempdir())
     # Names of tasks are unique within a run only.
-    task = hashlib.sha256(f"{options.store}\n{options.name}".encode()).hexdigest()[:16]
-    folder = above / f"structgstream-{task}-{options.run}"
+    task = hashlib.sha256(f"{url}\n{transfer.name}".encode()).hexdigest()[:16]
+    folder = above / f"structgstream-{task}-{transfer.run}"
     for earlier in above.glob(f"structgstream-{task}-*"):
         if earlier != folder and (owner := owner_of(earlier)) is not None and owner.purpose == PURPOSE:
             remove_own(earlier, PURPOSE, ANY, whole=True)
@@ -374,29 +341,10 @@ def scratch_folder(options: argparse.Namespace) -> Path:
     return folder
 
 
-def parsed(arguments: Sequence[str]) -> argparse.Namespace:
-    """The command line, and the store's URL from :data:`STORE`; what follows ``--`` is the command."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--name", required=True, help="of the task")
-    parser.add_argument("--run", default="", help="random name of the run")
-    for flag, text in (
-        ("needs", "file to fetch"),
-        ("gives", "file to store when the command has ended well, and to fetch before if it is there"),
-        ("grows", "file to store while it grows, and to fetch before if not all that is given is there"),
-    ):
-        parser.add_argument(f"--{flag}", action="append", default=[], metavar="NAME", help=text)
-    parser.add_argument("command", nargs="+")
-    options = parser.parse_args(arguments)
-    options.store = os.environ.get(STORE)
-    if not options.store:
-        parser.error(f"the variable {STORE} has no URL of a store")
-    return options
-
-
 def main() -> int:
     """Runs; an error of the store is one sentence."""
     try:
-        return run(parsed(sys.argv[1:]))
+        return run(Transfer(**json.loads(sys.argv[1])), sys.argv[2:])
     except StructGStreamError as error:
         print(f"structgstream: {error}", file=sys.stderr, flush=True)
         return 1

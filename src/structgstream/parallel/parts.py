@@ -17,7 +17,7 @@ from typing import Any
 
 from structgstream.atomic_files import atomic_write, lock_file, open_lockable
 from structgstream.errors import ConfigError, StorageError
-from structgstream.executors.task import TaskResult
+from structgstream.executors.tasks import TaskResult
 from structgstream.owned_folders import Owner, check_owned, own_folder, remove_own
 
 PLAN = "plan.json"
@@ -36,27 +36,16 @@ _PIECE_BYTES = 2**20
 
 @dataclass(frozen=True)
 class CompletedTask:
-    """Record of a completed task and its part.
+    """Record of a completed task and its part."""
 
-    Args:
-        name: name of the task.
-        key: hash of its arguments.
-        sha256: of the part.
-        bytes: size of the part.
-        seconds: duration of the last attempt.
-        attempts: number of attempts.
-        peak_bytes: largest resident memory; 0 if unknown.
-        frames: number of fitted, or tracked, frames.
-    """
-
-    name: str
-    key: str
-    sha256: str
-    bytes: int
-    seconds: float
-    attempts: int
-    peak_bytes: int
-    frames: int
+    name: str  # name of the task
+    key: str  # hash of its arguments
+    sha256: str  # of the part
+    bytes: int  # size of the part
+    seconds: float  # duration of the last attempt
+    attempts: int  # number of attempts
+    peak_bytes: int  # largest resident memory; 0 if unknown
+    frames: int  # number of fitted, or tracked, frames
 
 
 class Parts:
@@ -116,11 +105,7 @@ class Parts:
             yield
 
     def clear(self) -> None:
-        """Removes all parts and records, and nothing else.
-
-        Raises:
-            StorageError: they cannot be removed.
-        """
+        """Removes all parts and records, and nothing else. Raises StorageError if they cannot be removed."""
         # The records go first and the plan last: parts that remain if this is killed are incomplete ones of the plan.
         remove_own(self.folder, PURPOSE, PART_NAMES, order={COMPLETED: 0, PLAN: 2})
         (self.folder / "segments").mkdir(exist_ok=True)
@@ -221,11 +206,7 @@ def key_of(*facts: object) -> str:
 
 
 def sha256_of(path: Path) -> str:
-    """Of a file, which is read in pieces.
-
-    Raises:
-        OSError: it cannot be read.
-    """
+    """Of a file, which is read in pieces. Raises OSError if it cannot be read."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while piece := file.read(_PIECE_BYTES):

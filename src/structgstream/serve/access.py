@@ -135,15 +135,10 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Query:
-    """The query parameters that the server knows; others are ignored.
+    """The query parameters that the server knows; others are ignored."""
 
-    Args:
-        token: access token; None if there is none.
-        after: sequence of the manifest that the client has; None if it does not wait for a newer one.
-    """
-
-    token: str | None
-    after: int | None
+    token: str | None  # access token; None if there is none
+    after: int | None  # sequence of the manifest that the client has; None if it does not wait for a newer one
 
 
 def parsed_query(raw: bytes, headers: Mapping[str, str]) -> Query:
@@ -151,7 +146,6 @@ def parsed_query(raw: bytes, headers: Mapping[str, str]) -> Query:
 
     Args:
         raw: the query as the client wrote it, without question mark.
-        headers: headers by their names in lower case.
 
     Raises:
         Refused: it has too many parameters, one of them twice, or ``after`` is not a number.
@@ -171,11 +165,7 @@ def parsed_query(raw: bytes, headers: Mapping[str, str]) -> Query:
 
 
 def query_of(request: "Request") -> Query:
-    """The query of a request.
-
-    Raises:
-        Refused: it is malformed.
-    """
+    """The query of a request. Raises Refused if it is malformed."""
     return parsed_query(request.scope["query_string"], request.headers)
 
 
@@ -184,7 +174,6 @@ class Authorizer:
 
     Args:
         keys: secrets; None gives everyone access.
-        clock: Unix seconds.
     """
 
     def __init__(self, keys: TokenKeys | None, *, clock: Callable[[], float] = time.time) -> None:
@@ -192,11 +181,7 @@ class Authorizer:
         self._clock = clock
 
     def access(self, request: "Request", name: str) -> Access:
-        """Access of a request to the stream ``name``.
-
-        Raises:
-            Refused: the query is malformed.
-        """
+        """Access of a request to the stream ``name``. Raises Refused if the query is malformed."""
         query = query_of(request)
         if self._keys is None:
             return Access.GRANTED

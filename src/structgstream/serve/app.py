@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from anyio import to_thread
 from starlette.applications import Starlette
@@ -36,11 +36,7 @@ from structgstream.serve.listening import LOOPBACK_NAMES
 from structgstream.serve.manifest_watch import BrokenManifest, Manifests, Snapshot
 from structgstream.serve.metrics import CONTENT_TYPE, CountRequests, Metrics, exposition, run_numbers, stream_families
 from structgstream.serve.pages import SERVED_POLICY, bundle, linked_page, list_page, policy
-from structgstream.serve.responses import (
-    NO_STORE_HEADERS,
-    content_response,
-    file_response,
-)
+from structgstream.serve.responses import NO_STORE_HEADERS, content_response, file_response
 from structgstream.serve.streams import (
     Catalog,
     OpenedFile,
@@ -51,6 +47,7 @@ from structgstream.serve.streams import (
     is_stream_name,
 )
 
+T = TypeVar("T")
 YEAR_SECONDS: Final = 31536000
 MAX_RUN_BYTES: Final = 256 * 1024
 MAX_PICTURE_BYTES: Final = 2 * 10**6
@@ -63,29 +60,17 @@ _NOTHING_HERE: Final = "There is nothing at this address."
 
 @dataclass(frozen=True)
 class ServerSettings:
-    """Settings of the server.
+    """Settings of the server."""
 
-    Args:
-        folder: contains the streams, or is one.
-        keys: secrets of access tokens; None gives everyone access.
-        origins: origins whose pages may read responses, ``*`` for all; empty: only pages of this server.
-        hosts: host names that requests may have; ``*`` for any.
-        wait_seconds: longest time that a request waits for a newer manifest.
-    """
-
-    folder: Path
-    keys: TokenKeys | None = None
-    origins: tuple[str, ...] = ()
-    hosts: tuple[str, ...] = LOOPBACK_NAMES
-    wait_seconds: float = 25.0
+    folder: Path  # contains the streams, or is one
+    keys: TokenKeys | None = None  # secrets of access tokens; None gives everyone access
+    origins: tuple[str, ...] = ()  # origins whose pages may read responses, * for all; empty: only pages of this server
+    hosts: tuple[str, ...] = LOOPBACK_NAMES  # host names that requests may have; * for any
+    wait_seconds: float = 25.0  # longest time that a request waits for a newer manifest
 
 
 def application(settings: ServerSettings, *, clock: Callable[[], float] = time.time) -> Starlette:
     """The application (Note [What is served]).
-
-    Args:
-        settings: settings of the server.
-        clock: Unix seconds.
 
     Raises:
         PlayerError: the folder cannot be read, or the installation lacks the player.
@@ -108,12 +93,7 @@ def application(settings: ServerSettings, *, clock: Callable[[], float] = time.t
     application = Starlette(
         routes=_Routes(settings, metrics, clock).all(),
         middleware=middleware,
-        exception_handlers={
-            HTTPException: _unrouted,
-            Refused: _refused,
-            BrokenManifest: _broken,
-            OSError: _unreadable,
-        },
+        exception_handlers={HTTPException: _unrouted, Refused: _refused, BrokenManifest: _broken, OSError: _unreadable},
     )
     application.router.redirect_slashes = False  # A redirect would name this server's host, also behind a proxy.
     return application
@@ -216,11 +196,7 @@ class _Routes:
         return await to_thread.run_sync(self._catalog.found)
 
     async def _stream(self, request: Request) -> ServedStream:
-        """The stream, or the rendition of it, that the address names.
-
-        Raises:
-            Refused: the address is not plain, the token gives no access, or there is no such stream.
-        """
+        """The stream, or the rendition of it, that the address names."""
         _check_plain(request)
         name, rendition = request.path_params["name"], request.path_params.get("rendition")
         self._authorizer.check(request, name)
@@ -232,11 +208,7 @@ class _Routes:
         return found
 
     async def _listed(self, request: Request) -> list[dict[str, Any]]:
-        """The entries of the streams that the token gives access to; addresses are relative.
-
-        Raises:
-            Refused: the token gives access to no stream.
-        """
+        """The entries of the streams that the token gives access to; addresses are relative."""
         request.scope["counted_as"] = ("", "list")
         streams = (await self._streams()).values()
         visible = [one for one in streams if self._authorizer.access(request, one.name) is Access.GRANTED]
@@ -260,9 +232,7 @@ class _Routes:
 
     async def _renditions(self, stream: ServedStream, request: Request) -> Response:
         request.scope["counted_as"] = (stream.name, "qualities")
-        content = await _content(await to_thread.run_sync(stream.open, QUALITIES), MAX_LIST_BYTES)
-        if content is None:
-            raise Refused(404, f"{stream.name} has no such file.")
+        content = _found(await _content(await to_thread.run_sync(stream.open, QUALITIES), MAX_LIST_BYTES), stream)
         headers = {**self._headers, "Cache-Control": self._revalidated}
         return content_response(content, request, headers, media_type="application/json")
 
@@ -279,16 +249,12 @@ class _Routes:
             found = await watch.current()
         else:
             found = await _while_connected(watch.newer(after, seconds=self._wait_seconds), request)
-        if found is None:
-            raise Refused(404, f"{stream.name} has no such file.")
         headers = {**self._headers, "Cache-Control": self._revalidated}
-        return content_response(found.content, request, headers, media_type="application/json")
+        return content_response(_found(found, stream).content, request, headers, media_type="application/json")
 
     async def _immutable(self, stream: ServedStream, file: str, request: Request) -> Response:
         request.scope["counted_as"] = (stream.name, file.partition("-")[0])
-        opened = await to_thread.run_sync(stream.open, file)
-        if opened is None:
-            raise Refused(404, f"{stream.name} has no such file.")
+        opened = _found(await to_thread.run_sync(stream.open, file), stream)
         headers = {**self._headers, "Cache-Control": f"{self._visibility}, max-age={YEAR_SECONDS}, immutable"}
         media_type = "application/json" if file.endswith(".json") else "application/octet-stream"
         return file_response(opened, request, headers, etag=f'"{hash_in_name(file)}"', media_type=media_type)
@@ -297,9 +263,7 @@ class _Routes:
         """Bytes, or length, of a stream that is one file; without validators, because it may grow."""
         request.scope["counted_as"] = (stream.name, "state" if state else "file")
         self._metrics.viewers.see(stream.name, request.scope.get("client"))
-        opened = await to_thread.run_sync(stream.open_whole)
-        if opened is None:
-            raise Refused(404, f"{stream.name} has no such file.")
+        opened = _found(await to_thread.run_sync(stream.open_whole), stream)
         if not state:
             return file_response(opened, request, self._headers)
         with opened:
@@ -317,12 +281,15 @@ class _Routes:
         return content_response(content, request, headers, media_type=media_type)
 
 
-def _check_plain(request: Request) -> None:
-    """Check that the path consists of plain names.
+def _found(something: T | None, stream: ServedStream) -> T:
+    """What a stream has; 404 for nothing."""
+    if something is None:
+        raise Refused(404, f"{stream.name} has no such file.")
+    return something
 
-    Raises:
-        Refused: it is not.
-    """
+
+def _check_plain(request: Request) -> None:
+    """Check that the path consists of plain names."""
     if not is_plain_path(request.scope["raw_path"]):
         raise Refused(404, _NOTHING_HERE)
 

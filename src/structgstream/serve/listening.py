@@ -54,11 +54,7 @@ def accepted_hosts(address: str, names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def checked_proxies(proxies: tuple[str, ...]) -> tuple[str, ...]:
-    """Addresses or networks of proxies.
-
-    Raises:
-        ConfigError: a text is neither.
-    """
+    """Addresses or networks of proxies. Raises ConfigError if a text is neither."""
     for proxy in proxies:
         try:
             ipaddress.ip_network(proxy)
@@ -68,11 +64,7 @@ def checked_proxies(proxies: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def checked_origins(origins: tuple[str, ...]) -> tuple[str, ...]:
-    """Origins as a browser writes them.
-
-    Raises:
-        ConfigError: a text is not an origin.
-    """
+    """Origins as a browser writes them. Raises ConfigError if a text is not an origin."""
     for origin in origins:
         scheme, separator, host = origin.partition("://")
         plain = host == host.lower() and not set(host) & set("/?#@* \\")
@@ -83,9 +75,6 @@ def checked_origins(origins: tuple[str, ...]) -> tuple[str, ...]:
 
 def bound(port: int, *, address: str = LOOPBACK) -> socket.socket:
     """A listening socket, which queues connections before the server runs.
-
-    Args:
-        port: the port; 0 for a free one.
 
 
     Raises:
@@ -112,8 +101,6 @@ def server(app: ASGIApp, *, proxies: Sequence[str] = (), connections: int | None
     """A server, not yet running.
 
     Args:
-        app: the application.
-        proxies: addresses or networks whose ``X-Forwarded-For`` and ``-Proto`` are trusted.
         connections: number of connections above which requests are answered with 503; None for no limit.
     """
     config = uvicorn.Config(
@@ -139,9 +126,6 @@ def run(server: uvicorn.Server, *, port: int, address: str = LOOPBACK, on_start:
     """Serve until Ctrl-C or SIGTERM.
 
     Args:
-        server: see :func:`server`.
-        port: the port; 0 for a free one.
-        address: the address to listen on.
         on_start: called with the server's address once the port is bound.
 
     Raises:

@@ -48,12 +48,7 @@ class Snapshot:
 
 
 class ManifestWatch:
-    """The manifest of one stream (Note [One watcher]).
-
-    Args:
-        open_file: opens the file; called in a thread.
-        clock: monotonic seconds.
-    """
+    """The manifest of one stream (Note [One watcher])."""
 
     def __init__(
         self, open_file: Callable[[], OpenedFile | None], *, clock: Callable[[], float] = time.monotonic
@@ -141,11 +136,7 @@ class ManifestWatch:
 
 
 def snapshot(content: bytes) -> Snapshot:
-    """The manifest in a file.
-
-    Raises:
-        BrokenManifest: it is not a manifest.
-    """
+    """The manifest in a file. Raises BrokenManifest if it is not a manifest."""
     try:
         fields = parse_object(content, MANIFEST, max_bytes=MAX_MANIFEST_BYTES)
         if fields.text("format") != FORMAT:

@@ -74,12 +74,7 @@ class Metrics:
 
 
 class CountRequests:
-    """ASGI middleware that counts responses; routes set ``scope["counted_as"] = (stream, kind)``.
-
-    Args:
-        app: the application.
-        metrics: the counters.
-    """
+    """ASGI middleware that counts responses; routes set ``scope["counted_as"] = (stream, kind)``."""
 
     def __init__(self, app: ASGIApp, *, metrics: Metrics) -> None:
         self._app = app
@@ -122,14 +117,7 @@ def stream_families(
     runs: Mapping[str, Mapping[str, float]],
     unix_seconds: float,
 ) -> list[Metric]:
-    """Gauges of streams and of the runs that write them.
-
-    Args:
-        manifests: manifests by stream.
-        waiters: number of requests that wait for a manifest, by stream.
-        runs: metrics of a run by name, by stream.
-        unix_seconds: the present time.
-    """
+    """Gauges of streams and of the runs that write them."""
     published = {name: one.edge("published_unix_seconds") for name, one in manifests.items()}
     ages = {name: None if then is None else unix_seconds - then for name, then in published.items()}
     run = GaugeMetricFamily(

@@ -69,11 +69,7 @@ _NO_SCRIPT: Final = "<noscript>This page plays a free-viewpoint video and needs 
 
 
 def bundle_path() -> Path:
-    """The file ``player.js``.
-
-    Raises:
-        PlayerError: the installation lacks it.
-    """
+    """The file ``player.js``. Raises PlayerError if the installation lacks it."""
     path = Path(str(files("structgstream.serve") / "assets" / "player.js"))
     if not path.is_file():
         raise PlayerError(
@@ -84,11 +80,7 @@ def bundle_path() -> Path:
 
 
 def bundle() -> str:
-    """The module's source.
-
-    Raises:
-        PlayerError: the installation lacks it.
-    """
+    """The module's source. Raises PlayerError if the installation lacks it."""
     return bundle_path().read_text(encoding="utf-8")
 
 
@@ -112,7 +104,6 @@ def linked_page(
     """A page that loads the player and the stream, for a server.
 
     Args:
-        title: title of the window.
         stream: address of the stream, relative to the page.
         module: address of the player, relative to the page.
         attributes: further attributes of the element.
@@ -124,11 +115,6 @@ def linked_page(
 
 def single_page(title: str, *, module: str, stream: ByteSource) -> bytes:
     """A page that contains player and stream, and can be opened from a disk without a server.
-
-    Args:
-        title: title of the window.
-        module: the player's source.
-        stream: the whole stream file.
 
     Raises:
         PlayerError: the stream is too long for a page.
@@ -166,14 +152,7 @@ def _element(attributes: Mapping[str, str]) -> str:
 
 
 def html_page(title: str, *, head: str, body: str, rules: str) -> str:
-    """A whole page.
-
-    Args:
-        title: title of the window, as plain text.
-        head: further elements of the head, as HTML.
-        body: content, as HTML.
-        rules: its Content-Security-Policy.
-    """
+    """A whole page."""
     return f"""<!doctype html>
 <html lang="en">
 <head>
@@ -192,12 +171,7 @@ def html_page(title: str, *, head: str, body: str, rules: str) -> str:
 
 
 def list_page(streams: Sequence[Mapping[str, Any]], *, query: str) -> str:
-    """The page of all streams.
-
-    Args:
-        streams: entries of ``streams.json``.
-        query: appended to every address: empty, or ``?token=...``.
-    """
+    """The page of all streams."""
     entries = "\n".join(_entry(stream, query) for stream in streams)
     body = f"<h1>Streams</h1>\n<ul>\n{entries}\n</ul>" if streams else "<h1>Streams</h1>\n<p>There is none yet.</p>"
     refresh = f'<meta http-equiv="refresh" content="{REFRESH_SECONDS}">\n'
@@ -322,10 +296,7 @@ def write_site(folder: Path, stream: StreamFile) -> int:
     copy = folder / "stream.sgs"
     if copy.exists() and copy.samefile(stream.path):
         raise StorageError(f"{copy} is the stream itself; name another folder.")
-    small = {
-        "index.html": linked_page(stream.path.stem, stream="stream.sgs").encode(),
-        "player.js": bundle().encode(),
-    }
+    small = {"index.html": linked_page(stream.path.stem, stream="stream.sgs").encode(), "player.js": bundle().encode()}
     for name, content in small.items():
         atomic_write(folder / name, content, new_folder=True)
     with stream.opened() as data:

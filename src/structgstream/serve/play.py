@@ -41,7 +41,6 @@ class Truth:
     Args:
         source: the part of the capture that the stream was made from, at the stream's size.
         cameras: names of the cameras that are in both capture and stream.
-        max_cached_bytes: size of the cache of encoded pictures.
 
     Raises:
         MissingExtraError: OpenCV, which encodes pictures, is not installed.
@@ -113,7 +112,6 @@ def application(stream: StreamFile, *, truth: Truth | None = None) -> Starlette:
     """The application; each request opens the file anew, so it may grow meanwhile.
 
     Args:
-        stream: the file to play.
         truth: the capture's pictures to compare with, or None.
 
     Raises:

@@ -4,7 +4,6 @@
 import hashlib
 import re
 from collections.abc import AsyncIterator, Mapping
-from dataclasses import dataclass
 from typing import Final, Protocol
 
 from anyio import to_thread
@@ -25,64 +24,20 @@ NO_STORE_HEADERS: Final[Mapping[str, str]] = {
 _ONE_RANGE = re.compile(r"bytes=\s*(\d{0,18})-(\d{0,18})\s*", re.ASCII | re.IGNORECASE)
 
 
-class UnsatisfiableRange(Exception):
-    """The range starts after the last byte."""
-
-
 def requested_range(header: str | None, size_bytes: int) -> range | None:
-    """The bytes of ``size_bytes`` that a ``Range`` header requests.
+    """The offsets of the bytes of ``size_bytes`` that a ``Range`` header requests; empty if none of them exists.
 
-    Multiple ranges, other units and malformed headers count as no range; a server may always answer with all bytes.
-
-    Returns:
-        offsets of the first byte and the one after the last; None for all.
-
-    Raises:
-        UnsatisfiableRange: none of the bytes exists.
+    None for all: also for multiple ranges, other units and malformed headers, as a server may always answer with all.
     """
     found = _ONE_RANGE.fullmatch(header) if header else None
     if found is None or not any(found.groups()):
         return None
     first, last = found.groups()
     if not first:
-        asked = range(max(size_bytes - int(last), 0), size_bytes)
-    else:
-        if last and int(last) < int(first):
-            return None
-        asked = range(int(first), min(int(last) + 1, size_bytes) if last else size_bytes)
-    if not asked:
-        raise UnsatisfiableRange
-    return asked
-
-
-@dataclass(frozen=True)
-class Part:
-    """The answer to a request for bytes: status, headers, and the offsets of the bytes."""
-
-    status: int
-    headers: Mapping[str, str]
-    wanted: range
-
-
-def requested_part(request: Mapping[str, str], size_bytes: int, *, etag: str | None = None) -> Part:
-    """The answer to a request for some or all of ``size_bytes`` bytes: 200, 206, or 416 without bytes.
-
-    Args:
-        request: headers by their names in lower case.
-        size_bytes: length of the file.
-        etag: strong validator of the bytes. Without one a request with ``If-Range`` gets all of them, because the
-            version of its part is unknown.
-    """
-    valid = "if-range" not in request or (etag is not None and request["if-range"] == etag)
-    try:
-        asked = requested_range(request.get("range") if valid else None, size_bytes)
-    except UnsatisfiableRange:
-        return Part(416, {"Accept-Ranges": "bytes", "Content-Range": f"bytes */{size_bytes}"}, range(0))
-    wanted = range(size_bytes) if asked is None else asked
-    headers = {"Accept-Ranges": "bytes", "Content-Length": str(len(wanted))}
-    if asked is not None:
-        headers["Content-Range"] = f"bytes {wanted.start}-{wanted.stop - 1}/{size_bytes}"
-    return Part(200 if asked is None else 206, headers, wanted)
+        return range(max(size_bytes - int(last), 0), size_bytes)
+    if last and int(last) < int(first):
+        return None
+    return range(int(first), min(int(last) + 1, size_bytes) if last else size_bytes)
 
 
 def etag_matches(headers: Mapping[str, str], etag: str) -> bool:
@@ -110,26 +65,29 @@ def file_response(
     etag: str | None = None,
     media_type: str = "application/octet-stream",
 ) -> Response:
-    """The response to a request for a file or a range of it; closes the file.
-
-    Args:
-        opened: the file at its current length.
-        request: GET or HEAD.
-        headers: headers of the response.
-        etag: strong validator of the bytes.
-        media_type: media type of the bytes.
-    """
+    """The response to a request for a file or a range of it; closes the file."""
     if etag is not None:
         headers = {**headers, "ETag": etag}
         if etag_matches(request.headers, etag):
             opened.close()
             return Response(status_code=304, headers=headers)
-    part = requested_part(request.headers, len(opened), etag=etag)
-    headers = {**headers, **part.headers}
-    if part.status == 416 or request.method == "HEAD":
+    # Without a validator the version of the client's part is unknown.
+    valid = "if-range" not in request.headers or (etag is not None and request.headers["if-range"] == etag)
+    size_bytes = len(opened)
+    wanted = requested_range(request.headers.get("range"), size_bytes) if valid else None
+    headers = {**headers, "Accept-Ranges": "bytes"}
+    if wanted is not None and not wanted:
+        status, headers["Content-Range"] = 416, f"bytes */{size_bytes}"
+    elif wanted is not None:
+        status, headers["Content-Range"] = 206, f"bytes {wanted.start}-{wanted.stop - 1}/{size_bytes}"
+    else:
+        status, wanted = 200, range(size_bytes)
+    if status != 416:
+        headers["Content-Length"] = str(len(wanted))
+    if status == 416 or request.method == "HEAD":
         opened.close()
-        return Response(status_code=part.status, headers=headers, media_type=media_type)
-    return StreamingResponse(_pieces(opened, part.wanted), part.status, headers, media_type)
+        return Response(status_code=status, headers=headers, media_type=media_type)
+    return StreamingResponse(_pieces(opened, wanted), status, headers, media_type)
 
 
 async def _pieces(opened: OpenBytes, wanted: range) -> AsyncIterator[bytes]:

@@ -158,20 +158,14 @@ class StreamKind(Enum):
 
 @dataclass(frozen=True)
 class ServedStream:
-    """A stream in the folder ``root``.
+    """A stream in the folder ``root``."""
 
-    Args:
-        root: the folder.
-        name: of the folder of segments, of the folder of renditions (qualities), or of the file with its suffix; a
-            rendition is named FOLDER/RENDITION.
-        kind: how it is stored.
-        renditions: folders of segments in the folder of renditions, by rising bit rate.
-    """
-
-    root: Path
+    root: Path  # the folder
+    # of the folder of segments, of the folder of renditions (qualities), or of the file with its suffix; a rendition is
+    # named FOLDER/RENDITION
     name: str
-    kind: StreamKind
-    renditions: tuple[str, ...] = ()
+    kind: StreamKind  # how it is stored
+    renditions: tuple[str, ...] = ()  # folders of segments in the folder of renditions, by rising bit rate
 
     @property
     def segments(self) -> tuple["ServedStream", ...]:
@@ -181,11 +175,7 @@ class ServedStream:
         return tuple(ServedStream(self.root, f"{self.name}/{one}", StreamKind.SEGMENTS) for one in self.renditions)
 
     def open(self, file: str) -> OpenedFile | None:
-        """A file of its folder; None if there is none. Blocks.
-
-        Raises:
-            OSError: the system cannot open files now.
-        """
+        """A file of its folder; None if there is none. Blocks. Raises OSError if the system cannot open files now."""
         return open_below(self.root, *self.name.split("/"), file)
 
     def open_whole(self) -> OpenedFile | None:
@@ -211,10 +201,6 @@ class Catalog:
 
     A folder of segments, or of renditions, is one stream: itself.
 
-    Args:
-        folder: the folder.
-        clock: monotonic seconds.
-
     Raises:
         PlayerError: it is no folder, or cannot be read.
     """
@@ -233,11 +219,7 @@ class Catalog:
             raise PlayerError(f"The folder {folder} cannot be read ({error.strerror}).") from None
 
     def found(self) -> Mapping[str, ServedStream]:
-        """The streams by their names, sorted. Blocks; thread-safe.
-
-        Raises:
-            OSError: the folder cannot be read.
-        """
+        """The streams by their names, sorted. Blocks; thread-safe. Raises OSError if the folder cannot be read."""
         with self._lock:
             if self._clock() - self._listed_at >= REFRESH_SECONDS:
                 self._found = self._list()

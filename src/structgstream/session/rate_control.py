@@ -204,7 +204,7 @@ class RateController:
 
 
 def with_rate_control(config: OnlineConfig, pressure: float) -> OnlineConfig:
-    """``config`` with the price of a bit times ``pressure``, and the thresholds for spawning times its square root."""
+    """``config``, its rate weight times ``pressure`` and its thresholds for spawning times the square root of that."""
     if pressure == 1.0:
         return config
     rounding, patching, spawn = config.rounding, config.patching, config.spawn

@@ -33,7 +33,7 @@ class RoundingConfig:
     rate_weight: float = 7.5e-5
     """What a kilobyte of changes adds to the loss."""
     free_priced: bool = False
-    """Whether bits of free Gaussians that existed in the last frame are priced too."""
+    """Whether the rate term also counts free Gaussians that existed in the last frame."""
     quality: float = 0.0
     """Steps are multiplied by 2^-quality and ``rate_weight`` by 4^-quality; frame 0's steps and those of MLPs by
     2^(-quality / 2)."""

@@ -38,7 +38,7 @@ class ResidualFloor:
     def eased(self, changed: Mapping[int, Tensor], *, medians: float) -> "ResidualFloor":
         """The floor, with at most ``medians`` times a view's median where it has changed.
 
-        Frame 0's residual there was of other content, and tells nothing of how well what is there now can be drawn.
+        Frame 0's residual there was of other content, and does not show how well the present content can be drawn.
 
         Args:
             changed: by view index, mask ``[h, w]`` of the changed pixels, at the maps' scale.

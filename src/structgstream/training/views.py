@@ -6,7 +6,7 @@ Note [Masked pixels]
 A pixel that a mask leaves out is treated as if it lay outside of the picture: both pictures are black there when they
 are compared, as SSIM's window sees zeros beyond the border. So neither what the camera nor what the scene shows there
 has any influence, on the loss or on its gradient. Losses stay means over all pixels, in which masked ones count as
-equal, as tiles that are not drawn do: the weight of a pixel against prices and regularisers, and the thresholds of
+equal, as tiles that are not drawn do: the weight of a pixel against regularisers, and the thresholds of
 view-space gradients, then mean the same with and without a mask. Scores, shares and PSNR are over the pixels that
 count. A pixel of a reduced picture counts if all of its pixels do.
 """

@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.codec.entropy import decisions as reference
-from structgstream.codec.entropy.adaptive import code_activity, code_numbers, code_residuals
 from structgstream.codec.entropy.decisions import (
     ACTIVITY_CONTEXTS,
     BLOCK_CONTEXTS,
@@ -15,6 +14,9 @@ from structgstream.codec.entropy.decisions import (
     ArithmeticState,
     Model,
     Models,
+    code_activity,
+    code_numbers,
+    code_residuals,
     residual_contexts,
 )
 from structgstream.codec.entropy.rans import has_native

@@ -75,6 +75,14 @@ def test_a_segment_leaves_the_window_at_once_and_the_store_after_the_time_of_gra
     assert there(store) == [4, 5, 6, 7], "a period begins at segment 4, so that nothing needs segment 0"
 
 
+def test_a_period_that_ends_with_the_first_manifest_after_resuming_leaves_the_store(store: FolderStore) -> None:
+    store.put(FIRST.file, b"")
+    retention = Retention(store, SegmentsOptions(window_seconds=4.0, grace_seconds=0.0), lambda: 0.0)
+    retention.take_up(manifest(6, periods=(FIRST, SECOND)))
+    publish(retention, manifest(6, periods=(SECOND,)))
+    assert FIRST.file not in store.names()
+
+
 def test_the_segment_that_resuming_needs_stays(store: FolderStore) -> None:
     retention = Retention(store, SegmentsOptions(window_seconds=4.0, grace_seconds=0.0), lambda: 0.0)
     last = None

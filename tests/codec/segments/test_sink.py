@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Segments are the bytes of the file sink in pieces, a reader of late finds everything, and a kill loses nothing."""
 
-import math
 import os
 import shutil
 from contextlib import suppress
@@ -316,7 +315,20 @@ def test_a_disk_that_is_nearly_full_closes_the_stream(tmp_path: Path, monkeypatc
     assert archived(store) == as_file(SENT)
 
 
-def test_of_frames_that_have_left_the_window_size_and_kind_are_known(tmp_path: Path) -> None:
+def test_a_stream_that_cannot_be_closed_reports_its_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(store: FolderStore, name: str, data: bytes) -> None:
+        raise StorageError("No space left.")
+
+    sink = SegmentsSink(folder(tmp_path / "out"))
+    sink.open(header())
+    sink.write(SENT[0])
+    monkeypatch.setattr(FolderStore, "put", full)
+    with pytest.raises(StorageError, match="The 1 frames before are safe"):
+        sink.close()
+    sink.close()
+
+
+def test_of_frames_that_have_left_the_window_size_kind_and_time_are_known(tmp_path: Path) -> None:
     sent, store = packets(9), folder(tmp_path)
     written(store, sent, options=SegmentsOptions(window_seconds=0.01, grace_seconds=0.0))
     found = resume_segments(store)[1]
@@ -326,5 +338,6 @@ def test_of_frames_that_have_left_the_window_size_and_kind_are_known(tmp_path: P
         assert [info.index for info in gone] == [3, 4, 5]
         assert [info.kind for info in gone] == [PacketKind.KEY, PacketKind.DELTA, PacketKind.DELTA]
         assert [info.bytes for info in found.packets] == [info.bytes for info in whole.packets]
-        assert all(math.isnan(info.pts_seconds) for info in gone)
+        seconds = [info.pts_seconds for info in whole.packets]
+        assert [info.pts_seconds for info in found.packets] == pytest.approx(seconds), "rate control needs all times"
         assert same(found.scene(8), whole.scene(8))

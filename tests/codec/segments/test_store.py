@@ -11,7 +11,6 @@ import pytest
 
 from structgstream.codec.segments.store import FolderStore, is_ours
 from structgstream.errors import StorageError, StreamError
-from tests.support.killed import folders_of_the_killed
 
 
 def test_files_are_written_replaced_listed_and_removed(tmp_path: Path) -> None:
@@ -45,40 +44,6 @@ def test_a_failed_write_leaves_what_was_there(tmp_path: Path, monkeypatch: pytes
         store.put("manifest.json", b"new")
     assert os.listdir(tmp_path) == ["manifest.json"]
     assert store.get("manifest.json") == b"old"
-
-
-def test_content_and_folder_are_synced_before_and_after_the_rename(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Without the first a file may be empty after a power cut, without the second it may be gone."""
-    steps: list[str] = []
-    fsync, replace = os.fsync, Path.replace
-
-    def synced(descriptor: int) -> None:
-        steps.append("sync " + ("folder" if os.path.isdir(f"/proc/self/fd/{descriptor}") else "file"))
-        fsync(descriptor)
-
-    def replaced(self: Path, target: Path) -> Path:
-        steps.append("rename")
-        return replace(self, target)
-
-    monkeypatch.setattr(os, "fsync", synced)
-    monkeypatch.setattr(Path, "replace", replaced)
-    FolderStore(tmp_path).put("manifest.json", b"x")
-    assert steps == ["sync file", "rename", "sync folder"]
-
-
-def test_killed_at_any_step_a_file_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
-    def begin(path: Path) -> None:
-        FolderStore(path).put("manifest.json", b"old")
-
-    killed = folders_of_the_killed(tmp_path, lambda path: FolderStore(path).put("manifest.json", b"new"), begin=begin)
-    found = [FolderStore(path).get("manifest.json") for path in killed]
-    assert found == sorted(found, reverse=True)
-    assert {*found} == {b"old", b"new"}
-    for path in killed:
-        FolderStore(path).prepare()
-        assert os.listdir(path) == ["manifest.json"]
 
 
 def test_what_a_killed_writer_left_is_removed_and_nothing_else(tmp_path: Path) -> None:

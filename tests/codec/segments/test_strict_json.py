@@ -85,13 +85,13 @@ def test_numbers_of_any_length_are_refused_in_words(text: str) -> None:
 
 def test_bounds_belong_to_what_is_allowed() -> None:
     assert [fields(x=value).whole("x", least=3, most=5) for value in (3, 5)] == [3, 5]
-    assert [fields(x=value).number("x", least=3.0, most=5.0) for value in (3, 5.0)] == [3.0, 5.0]
+    assert fields(x=3).number("x", least=3.0) == 3.0
     assert [fields(x=value).number("x") for value in (MOST, -MOST)] == [MOST, -MOST]
     for value in (2, 6):
         with pytest.raises(StreamError, match="a whole number from 3 to 5"):
             fields(x=value).whole("x", least=3, most=5)
-        with pytest.raises(StreamError, match="a number from 3 to 5"):
-            fields(x=value).number("x", least=3.0, most=5.0)
+    with pytest.raises(StreamError, match="a number from 3 to 1e\\+15"):
+        fields(x=2).number("x", least=3.0)
     with pytest.raises(StreamError, match="1000000000000001"):
         fields(x=10**15 + 1).number("x")
     assert isinstance(fields(x=3).number("x"), float)

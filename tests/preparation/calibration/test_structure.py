@@ -4,6 +4,7 @@
 import logging
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -126,6 +127,23 @@ def test_focal_lengths_that_files_state_are_tried_first(monkeypatch: pytest.Monk
     with pytest.raises(StopIteration):
         solve_structure(pictures, lens="pinhole", focals={"cam00": 980.0, "cam01": 1010.0, "cam03": 990.0})
     assert starts == [pytest.approx({"cam00": 980.0, "cam01": 1010.0, "cam02": 990.0, "cam03": 990.0}, rel=1e-3)]
+
+
+def test_the_start_that_places_most_cameras_wins(monkeypatch: pytest.MonkeyPatch) -> None:
+    attempts = [SimpleNamespace(model=size, size=size, pairs={}) for size in ((2, 900), (3, 500), (3, 400))]
+    left, taken = iter(attempts), []
+
+    def finished(best: SimpleNamespace, *arguments: Any, **options: Any) -> SimpleNamespace:
+        taken.append(best)
+        return SimpleNamespace(missing=())
+
+    monkeypatch.setattr(structure, "FIELDS_OF_VIEW", {"pinhole": (40.0, 60.0, 80.0)})
+    monkeypatch.setattr(structure, "all_keypoints", lambda *arguments, **options: {})
+    monkeypatch.setattr(structure, "all_matches", lambda *arguments, **options: {})
+    monkeypatch.setattr(structure, "_attempt", lambda *arguments, **options: next(left))
+    monkeypatch.setattr(structure, "_finished", finished)
+    solve_structure({f"cam{index}": [noise(0)] for index in range(4)}, lens="pinhole")
+    assert taken == [attempts[1]]
 
 
 def test_what_is_stated_wrongly_is_not_the_last_word() -> None:

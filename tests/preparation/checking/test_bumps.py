@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A thing that moves before a plain background, and cameras that are bumped."""
 
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
@@ -35,7 +36,7 @@ def sheet(yaw: float, middle: tuple[float, float, float], texture: int = 5) -> P
     return Plane(noise_texture(texture), pose, (1.5, 1.5))
 
 
-def filmed(planes: list[Plane], seed: int) -> Pictures:
+def filmed(planes: Sequence[Plane], seed: int) -> Pictures:
     return {
         name: film.picture(planes, noise=1, seed=seed + number) for number, (name, film) in enumerate(rig().items())
     }

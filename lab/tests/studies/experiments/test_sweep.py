@@ -11,7 +11,7 @@ import pytest
 from fake_tasks import Frames
 from structgstream.errors import ConfigError
 from structgstream.evaluation.run_log import log_path, read_log
-from structgstream.executors.executor import ExecutorOptions
+from structgstream.executors.tasks import ExecutorOptions
 from structgstream_studies.experiments import sweep as module
 from structgstream_studies.experiments.sweep import Listener, Outcome, Progress, executor_for, sweep, unique
 

@@ -96,16 +96,14 @@ def iterate_blocks(payload: ByteSource, start: int, *, where: str) -> Iterator[B
 
 
 def unpack_raw_blocks(payload: bytes, start: int, *, where: str) -> dict[FieldName, Tensor]:
-    """The tensors of all blocks from byte ``start`` to the end.
+    """The tensors of all blocks from byte ``start`` to the end, which must be raw.
 
     Raises:
-        StreamError: as :func:`iterate_blocks`.
+        StreamError: as :func:`iterate_blocks`, or a block is coded.
     """
-    values: dict[FieldName, Tensor] = {}
-    for block in iterate_blocks(payload, start, where=where):
-        if block.coding != RAW:
-            raise StreamError(f"{where} holds field {block.name} coded; expected raw.")
-        values[block.name] = _numbers(payload, block)
+    values, coded = unpack_blocks(payload, start, where=where)
+    if coded:
+        raise StreamError(f"{where} holds field {next(iter(coded))} coded; expected raw.")
     return values
 
 
@@ -133,12 +131,10 @@ def coded_payloads(payload: bytes, start: int, *, where: str) -> dict[FieldName,
     Raises:
         StreamError: as :func:`iterate_blocks`, or a block is raw.
     """
-    found: dict[FieldName, memoryview] = {}
-    for block in iterate_blocks(payload, start, where=where):
-        if block.coding != CODED:
-            raise StreamError(f"{where} holds field {block.name} raw; expected coded.")
-        found[block.name] = memoryview(payload)[block.data : block.end]
-    return found
+    values, coded = unpack_blocks(payload, start, where=where)
+    if values:
+        raise StreamError(f"{where} holds field {next(iter(values))} raw; expected coded.")
+    return coded
 
 
 def _numbers(payload: bytes, block: Block) -> Tensor:

@@ -98,7 +98,7 @@ MARGIN_PACKETS = 3
 
 
 def free_bytes(path: Path) -> int | None:
-    """What an ordinary user may still write beside ``path``; None if that is not known."""
+    """What an ordinary user may still write to the disk of ``path``; None if that is not known."""
     try:
         return shutil.disk_usage(path).free
     except OSError:

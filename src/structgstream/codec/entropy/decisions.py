@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adaptive binary decisions: their state, and their coding in Python, the oracle, used when the C++ is not built
-(docs/entropy.md, Decisions).
+"""Adaptive binary decisions: their state, and their coding in C++ or, where that is not built and in tests, in Python
+(docs/entropy.md, Decisions). An encoder reads the array of values, a decoder fills it; both update models and
+arithmetic code in place.
 
 Note [One state a field]
 ~~~~~~~~~~~~~~~~~~~~~~~~
@@ -17,6 +18,10 @@ from functools import cache, cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.codec.entropy.rans import uses_native
+from structgstream.errors import OutOfMemoryError, StreamError
+from structgstream.kernels.native import native_library
+
 HALF = 1 << 15
 NEAR_SIZES = 6
 LENGTH_NODES = 9
@@ -28,6 +33,7 @@ BLOCK_CONTEXTS = (90, 198)
 ACTIVITY_CONTEXTS = (255, 108, 360)
 AHEAD = 3
 """Bytes that a decoder reads past the end of the data."""
+_NO_MEMORY, _DAMAGED = 1, 2  # results of the C++ coders
 _NUMBER_BYTES = 64  # upper bound of the bytes of a number or of two flags
 
 
@@ -317,6 +323,29 @@ class _Coder:
         return -size if negative else size
 
 
+def _code_native(name: str, arithmetic: ArithmeticState, models: Sequence[Model], *given: int | np.ndarray) -> bool:
+    """Calls a C++ coder with sizes and arrays; returns whether the coded values are within bounds.
+
+    Raises:
+        OutOfMemoryError: there is not enough memory.
+        StreamError: a model has the wrong shape.
+    """
+    state, arguments = arithmetic.native(), list[int]()
+    for value in given:
+        if isinstance(value, np.ndarray):
+            assert value.flags.c_contiguous
+            value = value.ctypes.data
+        arguments.append(value)
+    coder = getattr(native_library(), name)
+    result = coder(*map(ctypes.byref, (state, *(model.native for model in models))), arithmetic.encodes, *arguments)
+    arithmetic.take(state)
+    if result == _NO_MEMORY:
+        raise OutOfMemoryError("to code decisions")
+    if result > _DAMAGED:
+        raise StreamError("Decisions to code do not fit their models.")
+    return not result
+
+
 def size_class(size: int) -> int:
     """Classes 0 to 15 of sizes: one per size below 8, then two per octave."""
     if size < 8:
@@ -332,8 +361,22 @@ def code_activity(
     history: NDArray[np.uint8],
     sizes: NDArray[np.int32],
     active: NDArray[np.uint8],
+    native: bool | None = None,
 ) -> None:
-    """As in ``adaptive.py``."""
+    """Codes which rows are active (docs/bitstream.md, section Rows).
+
+    Args:
+        arithmetic: of the field.
+        models: of blocks and of rows.
+        history: ``[n]``: bit 0 is the row's activity in the last frame, bits 1 and 2 in the two before.
+        sizes: ``[n]``, sum of the magnitudes of each row's last residuals.
+        active: ``[n]``, read or filled.
+        native: C++ or Python; None takes C++ if available.
+    """
+    arithmetic.reserve(len(active))
+    if uses_native(native):
+        _code_native("sgs_code_activity", arithmetic, models, len(active), history, sizes, active)
+        return
     count, pad = len(active), 24
     blocks = -(-count // BLOCK)
     past, before = history.tolist(), [past & 1 for past in history.tolist()]
@@ -349,9 +392,9 @@ def code_activity(
     with _Coder(arithmetic, models[0]) as coder:
         for level, (first, step) in enumerate(PASSES):
             for b in range(first, blocks, step):
-                beside = there[b - first] + there[b + first] if level else 0
+                adjacent = there[b - first] + there[b + first] if level else 0
                 wide = min(ever[b].bit_length(), 5) * 11 + last[b] + last[b + 2]
-                there[b] = coder.decide(true[b], ((last[b + 1] * 3 + beside) * 5 + level, wide * 3 + beside), 0)
+                there[b] = coder.decide(true[b], ((last[b + 1] * 3 + adjacent) * 5 + level, wide * 3 + adjacent), 0)
     found = [0] * (count + 2 * pad)
     given = active.tolist()
     with _Coder(arithmetic, models[1]) as coder:
@@ -360,14 +403,14 @@ def code_activity(
                 if not there[i // BLOCK]:
                     continue
                 at = i + pad
-                beside = found[at - first] + found[at + first] if level else 0
-                beyond = found[at - 3 * first] + found[at + 3 * first] if level else 0
+                adjacent = found[at - first] + found[at + first] if level else 0
+                farther = found[at - 3 * first] + found[at + 3 * first] if level else 0
                 wide = sum(before[max(i - 8, 0) : i + 9]) - before[i]
                 around = moved[i] + moved[i + 1] + moved[i + 3] + moved[i + 4]
                 contexts = (
-                    (wide * 3 + beside) * 5 + level,
-                    (min(moved[i + 2].bit_length(), 5) * 3 + beside) * 6 + min(around.bit_length(), 5),
-                    ((level * 3 + beyond) * 3 + beside) * 8 + (past[i] & 7),
+                    (wide * 3 + adjacent) * 5 + level,
+                    (min(moved[i + 2].bit_length(), 5) * 3 + adjacent) * 6 + min(around.bit_length(), 5),
+                    ((level * 3 + farther) * 3 + adjacent) * 8 + (past[i] & 7),
                 )
                 found[at] = coder.decide(given[i], contexts, 0)
     active[:] = found[pad : pad + count]
@@ -380,8 +423,21 @@ def code_residuals(
     last: NDArray[np.int32],
     others: NDArray[np.int32],
     residuals: NDArray[np.int32],
+    native: bool | None = None,
 ) -> bool:
-    """As in ``adaptive.py``."""
+    """Codes residuals of active rows (docs/bitstream.md, section Rows); returns whether they are within bounds.
+
+    Args:
+        arithmetic: of the field.
+        model: of the group of columns.
+        last: ``[n, c]``, the rows' last residuals.
+        others: ``[n]``, sizes of the residuals in earlier groups.
+        residuals: ``[n, c]``, read or filled.
+        native: as in :func:`code_activity`.
+    """
+    arithmetic.reserve(residuals.size)
+    if uses_native(native):
+        return _code_native("sgs_code_residuals", arithmetic, [model], *residuals.shape, last, others, residuals)
     count, columns = residuals.shape
     past: list[list[int]] = last.tolist()
     found: list[list[int]] = residuals.tolist()
@@ -406,20 +462,20 @@ def code_residuals(
 def _residual_contexts(
     past: list[int], row: list[int], own: int, above: int, below: int, column: int, level: int, other: int
 ) -> tuple[int, ...]:
-    columns, beside = len(past), abs(above) + abs(below)
+    columns, adjacent = len(past), abs(above) + abs(below)
     size = sum(map(abs, row[:column]))
     first = row[column - 1] if column else 0
     off = first - past[column - 1] if column else 0
-    beginning = 8 * (above + below)
-    going_on = 10 * own + 3 * (above + below) if level else 16 * own
-    led = going_on if any(past) else beginning
-    expected = size_class(abs(led) + 4 >> 3)
+    started = 8 * (above + below)
+    continued = 10 * own + 3 * (above + below) if level else 16 * own
+    predicted = continued if any(past) else started
+    expected = size_class(abs(predicted) + 4 >> 3)
     return (
         (_limited(own, 8) + 8) * columns + column,
         (_limited(above, 4) + 4) * 9 + _limited(below, 4) + 4,
-        ((-expected if led < 0 else expected) + 15) * 5 + level,
-        (min(size, 9) * 6 + min(beside, 5)) * columns + column,
-        (other * columns + column) * 16 + size_class(2 * abs(own) + beside),
+        ((-expected if predicted < 0 else expected) + 15) * 5 + level,
+        (min(size, 9) * 6 + min(adjacent, 5)) * columns + column,
+        (other * columns + column) * 16 + size_class(2 * abs(own) + adjacent),
         ((_limited(first, 3) + 3) * 7 + _limited(off, 3) + 3) * 7 + _limited(own, 3) + 3,
     )
 
@@ -434,9 +490,22 @@ def code_numbers(
     *,
     contexts: NDArray[np.int32],
     values: NDArray[np.int64],
-    flags: bool,
+    flags: bool = False,
+    native: bool | None = None,
 ) -> bool:
-    """As in ``adaptive.py``."""
+    """Codes signed 32-bit numbers, or flags; returns whether they are within bounds.
+
+    Args:
+        arithmetic: of the field.
+        model: with one input per column of the contexts.
+        contexts: ``[n, K]``, each below the model's number of contexts for its input.
+        values: ``[n]``, read or filled.
+        flags: whether the values are 0 and 1, with a model of one node.
+        native: as in :func:`code_activity`.
+    """
+    arithmetic.reserve(len(values))
+    if uses_native(native):
+        return _code_native("sgs_code_numbers", arithmetic, [model], len(values), contexts, flags, values)
     given = values.tolist()
     with _Coder(arithmetic, model) as coder:
         for i, places in enumerate(contexts.tolist()):

@@ -22,7 +22,7 @@ def quantized_fields(granularity: Granularity) -> tuple[FieldName, ...]:
 
 
 FREE_FIELDS: frozenset[FieldName] = frozenset(fields_of("free"))
-"""Births, deaths and changes of free Gaussians are coded together: these fields are all dynamic, or none is."""
+"""Spawned, pruned and changed free Gaussians are coded together: these fields are all dynamic, or none is."""
 CODABLE: frozenset[FieldName] = frozenset(quantized_fields("anchor") + quantized_fields("shared")) | FREE_FIELDS
 """Fields that may be dynamic."""
 

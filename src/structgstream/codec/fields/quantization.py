@@ -107,7 +107,7 @@ _BITS_PER_KB: Final = 8000
 class RateTerm:
     """An estimate of the bits of changes, as a loss term.
 
-    A bit has the same price in every frame, however much moves: that gives the best pictures for the bytes of all.
+    A bit has the same weight in every frame, however much moves: that gives the best pictures for the bytes of all.
 
     Args:
         weight: what a kilobyte adds to the loss.
@@ -155,9 +155,9 @@ class RateTerm:
 
     def value(self, values: Mapping[ParameterName, Tensor], backend: Backend) -> Tensor:
         """Weighted sum of log2(1 + distance in bins), in kilobytes."""
-        priced = [_first_rows(values[name], len(self.before[name])) for name in self.steps]
+        changed = [_first_rows(values[name], len(self.before[name])) for name in self.steps]
         before = [self.before[name] for name in self.steps]
-        return self.weight_per_bit * backend.change_bits(priced, before, [*self.steps.values()])
+        return self.weight_per_bit * backend.change_bits(changed, before, [*self.steps.values()])
 
 
 def _first_rows(value: Tensor, count: int) -> Tensor:

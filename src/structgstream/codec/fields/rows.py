@@ -114,7 +114,7 @@ MAX_FREE = 2**18
 """Largest number of free Gaussians of a scene: symbols can cost less than a bit, so bytes do not bound it."""
 _MEANS = range(6, 11)  # columns predicted from the mean: quaternions and opacities
 _LED = (12, 13)  # columns predicted from the change in the column before: green and blue
-_FRAME_BITS = 32  # a birth is frame * 2^32 + number
+_FRAME_BITS = 32  # an identity is frame * 2^32 + number
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class FreeBins:
     """Free Gaussians as bins.
 
     Args:
-        births: int64 ``[F]``, ascending.
+        births: int64 ``[F]`` identities, from the frame in which each was spawned; ascending.
         bins: ``[F, 14]``.
         change: by the last frame; zero for Gaussians spawned in it.
     """
@@ -142,7 +142,7 @@ class FreeBins:
 
     @classmethod
     def quantized(cls, values: Tensor, births: Tensor, steps: Mapping[str, float]) -> "FreeBins":
-        """The bins of ``values`` ``[F, 14]`` and their ``births`` ``[F]``, with zero change.
+        """The bins of ``values`` ``[F, 14]`` with identities ``births`` ``[F]``, and zero change.
 
         Raises:
             StreamError: a bin is beyond 22 bits.
@@ -164,10 +164,10 @@ def _steps_of_columns(steps: Mapping[str, float]) -> NDArray[np.float32]:
 
 
 def code_free(coder: AdaptiveCoder, after: FreeBins | None, before: FreeBins, *, where: str) -> FreeBins:
-    """Codes deaths, changes and births from ``before`` to ``after``, whose births and bins are read.
+    """Codes pruned, changed and spawned Gaussians from ``before`` to ``after``, whose identities and bins are read.
 
     Raises:
-        StreamError: births do not ascend or are out of range, or there are too many.
+        StreamError: identities do not ascend or are out of range, or there are too many.
     """
     alive = None if after is None else np.isin(before.births, after.births)
     alive = coder.flags("free_births.alive", alive, [before.change.history], counts=[8])
@@ -184,19 +184,19 @@ def code_free(coder: AdaptiveCoder, after: FreeBins | None, before: FreeBins, *,
         new = FreeBins(after.births[~kept], after.bins[~kept], Change.none(0, FREE_COLUMNS))
     change = code_change(coder, change, old.change, groups=GROUPS)
     kept_bins = old.bins + change.residuals
-    born = _code_births(coder, new, kept_bins, where=where)
-    births = np.concatenate([old.births, born.births])
+    spawned = _code_spawned(coder, new, kept_bins, where=where)
+    births = np.concatenate([old.births, spawned.births])
     if not (np.diff(births) > 0).all():
         raise StreamError(f"{where} has births that do not ascend; it is damaged.")
     return FreeBins(
         births,
-        np.concatenate([kept_bins, born.bins]),
-        change.extended(len(born.births)),
+        np.concatenate([kept_bins, spawned.bins]),
+        change.extended(len(spawned.births)),
     )
 
 
-def _code_births(coder: AdaptiveCoder, new: FreeBins | None, alive: Bins, *, where: str) -> FreeBins:
-    """Codes the births, given the bins of the survivors."""
+def _code_spawned(coder: AdaptiveCoder, new: FreeBins | None, alive: Bins, *, where: str) -> FreeBins:
+    """Codes the spawned Gaussians, given the bins of the survivors."""
     given = None if new is None else np.array([len(new.births)])
     count = int(coder.numbers("free_births.count", given, [np.zeros(1, np.int32)], counts=[1])[0])
     if not 0 <= count <= MAX_FREE - len(alive):
@@ -220,12 +220,12 @@ def _code_births(coder: AdaptiveCoder, new: FreeBins | None, alive: Bins, *, whe
     if int(number.max()) >= 1 << _FRAME_BITS:
         raise StreamError(f"{where} has births beyond 63 bits; it is damaged.")
     births = (frame << _FRAME_BITS) + number
-    bins = _code_birth_gaps(coder, None if new is None else new.bins, alive, count=count, where=where)
+    bins = _code_spawned_bins(coder, None if new is None else new.bins, alive, count=count, where=where)
     return FreeBins(births, bins, Change.none(count, FREE_COLUMNS))
 
 
-def _code_birth_gaps(coder: AdaptiveCoder, new: Bins | None, alive: Bins, *, count: int, where: str) -> Bins:
-    """Codes the bins ``[count, 14]`` of newborn Gaussians, column by column.
+def _code_spawned_bins(coder: AdaptiveCoder, new: Bins | None, alive: Bins, *, count: int, where: str) -> Bins:
+    """Codes the bins ``[count, 14]`` of spawned Gaussians, column by column.
 
     Most columns are predicted from the row before (the first from the last survivor). Quaternions and opacities, which
     vary little, are predicted from the survivors' mean; green and blue also by the change of the colour before.

@@ -137,7 +137,7 @@ def _code_fields(
 
 def _shaped(found: dict[FieldName, Bins]) -> dict[FieldName, Bins]:
     """Reshapes bins to the shapes of the state table; the first field with a letter determines its size."""
-    tellers: dict[str | int, FieldName] = {size: row.name for row in reversed(STATE_TABLE) for size in row.shape}
+    first_fields: dict[str | int, FieldName] = {size: row.name for row in reversed(STATE_TABLE) for size in row.shape}
     sizes: dict[str | int, int] = {}
     for name in _coded_names(found.keys()):
         bins, wanted = found[name], FIELDS[name].shape
@@ -145,8 +145,8 @@ def _shaped(found: dict[FieldName, Bins]) -> dict[FieldName, Bins]:
         rows, count = ((len(bins),), math.prod(bins.shape[1:])) if bins.ndim > 1 else ((), bins.size)
         rest: list[int | None] = []
         for size in wanted[len(rows) :]:
-            if isinstance(size, str) and size not in sizes and tellers[size] != name:
-                raise StreamError(f"{_WHERE} holds {name} without {tellers[size]}, which determines its shape.")
+            if isinstance(size, str) and size not in sizes and first_fields[size] != name:
+                raise StreamError(f"{_WHERE} holds {name} without {first_fields[size]}, which determines its shape.")
             rest.append(size if isinstance(size, int) else sizes.get(size))
         left = count // max(1, math.prod(size for size in rest if size is not None))
         columns = tuple(left if size is None else size for size in rest)

@@ -54,16 +54,16 @@ class Fields:
             self._refuse(name, values, f"a list of {count} whole numbers")
         return tuple(self._whole(name, value, least, most) for value in values)
 
-    def number(self, name: str, *, least: float = -MOST, most: float = MOST) -> float:
+    def number(self, name: str, *, least: float = -MOST) -> float:
         """A finite number."""
-        return self._number(name, self._get(name), least, most)
+        return self._number(name, self._get(name), least)
 
     def pair(self, name: str) -> tuple[float, float]:
         """Two finite numbers that do not fall."""
         values = self._get(name)
         if not isinstance(values, list) or len(values) != 2:
             self._refuse(name, values, "two numbers")
-        first, last = (self._number(name, value, -MOST, MOST) for value in values)
+        first, last = (self._number(name, value, -MOST) for value in values)
         if first > last:
             self._refuse(name, values, "two numbers that do not fall")
         return first, last
@@ -83,7 +83,7 @@ class Fields:
         return value
 
     def file(self, name: str = "file") -> str:
-        """The plain name of a file beside the manifest: no folder, no scheme, no leading dot."""
+        """The plain name of a file in the manifest's folder: no folder, no scheme, no leading dot."""
         value = self._get(name)
         if not isinstance(value, str) or not _FILE.fullmatch(value):
             self._refuse(name, value, "the plain name of a file beside it (letters, digits, '.', '_' and '-')")
@@ -122,9 +122,9 @@ class Fields:
             self._refuse(name, value, f"a whole number from {least} to {most}")
         return int(value)
 
-    def _number(self, name: str, value: Any, least: float, most: float) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
-            self._refuse(name, value, f"a number from {least:g} to {most:g}")
+    def _number(self, name: str, value: Any, least: float) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= MOST:
+            self._refuse(name, value, f"a number from {least:g} to {MOST:g}")
         return float(value)
 
     def _refuse(self, name: str, value: object, expected: str) -> NoReturn:

@@ -39,7 +39,7 @@ class ListedQuality:
 
     @property
     def folder(self) -> str | None:
-        """The folder of segments beside the list; None if its manifest lies elsewhere."""
+        """The folder of segments in the list's folder; None if its manifest lies elsewhere."""
         folder, _, file = self.manifest.rpartition("/")
         return folder if file == MANIFEST and folder and "/" not in folder else None
 

@@ -99,6 +99,7 @@ class Retention:
             StreamError: a page of its history is missing or damaged.
         """
         there = self._store.names()
+        self._periods = manifest.periods
         if self._options.window_seconds is not None:
             first, needed = manifest.window.first_segment, running_period(manifest).first_segment
             listed = [*segments_from(self._store, manifest.history, manifest.segments, first=min(first, needed))]
@@ -273,14 +274,16 @@ class SegmentsSink:
         Raises:
             StorageError: no room; all frames are safe.
         """
-        draft, self._draft = self._draft, None
-        if draft is None or draft.manifest.edge.frame < 0:
-            return
-        leaving = [part.file for part in draft.manifest.parts]
-        draft = with_segment(draft)
-        manifest = without_empty_period(draft.manifest)
-        self._publish(replace(draft, manifest=replace(manifest, live=False)), leaving)
-        self._draft = None
+        draft = self._draft
+        try:
+            if draft is None or draft.manifest.edge.frame < 0:
+                return
+            leaving = [part.file for part in draft.manifest.parts]
+            draft = with_segment(draft)
+            manifest = without_empty_period(draft.manifest)
+            self._publish(replace(draft, manifest=replace(manifest, live=False)), leaving)
+        finally:
+            self._draft = None
 
     def _opened(self) -> Draft:
         assert self._draft is not None, "open() comes before write()"

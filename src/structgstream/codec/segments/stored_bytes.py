@@ -7,6 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from structgstream.atomic_files import atomic_write
 from structgstream.codec.container.records import PREFIX, PacketKind, Period, RecordType, pack_index
 from structgstream.codec.segments.manifest import (
@@ -150,6 +152,7 @@ class StoredBytes:
         gone: frames that are no longer there, in order.
         sizes: of every frame from 0 on, in bytes, gone ones included.
         kinds: of every frame.
+        seconds: presentation time of every frame; those within a segment are interpolated between its first and last.
         periods: those of all frames; of one that is no longer there, offset and length are 0.
 
     Raises:
@@ -168,6 +171,7 @@ class StoredBytes:
         self.gone: list[range] = []
         self.sizes: list[int] = []
         self.kinds: list[PacketKind] = []
+        self.seconds: list[float] = []
         self.periods: list[Period] = []
         self._periods = {period.period: period for period in manifest.periods}
         self._period: int | None = None  # whose init record has been added
@@ -239,14 +243,16 @@ class StoredBytes:
     ) -> None:
         """Add a segment or a part, and what an index says of it."""
         if isinstance(entry, PartEntry):
-            first, sizes, kinds = entry.frame, (entry.bytes,), [entry.kind]
+            first, sizes, kinds, seconds = entry.frame, (entry.bytes,), [entry.kind], [entry.pts_seconds]
         else:
             first, sizes = entry.first_frame, entry.frame_bytes
             kinds = [PacketKind.KEY, *[PacketKind.DELTA] * (entry.frames - 1)]
+            seconds = np.linspace(*entry.pts_seconds, entry.frames).tolist()
         if not self.periods or self.periods[-1].number != entry.period:
             self.periods.append(Period(entry.period, first, 0, 0))
         self.sizes += sizes
         self.kinds += kinds
+        self.seconds += seconds
         if entry.file not in there:
             if not isinstance(entry, SegmentEntry) or entry.segment >= manifest.window.first_segment:
                 raise StreamError(f"{self._store.name} has no {entry.file}, which its manifest names.")

@@ -179,7 +179,7 @@ class FreeSpaceConfig:
 
     DEPTH_SHARE: ClassVar[float] = 0.9
     """An anchor is in front of what a camera draws if its depth is below this share of the drawn depth."""
-    MIN_VIEWS: ClassVar[int] = 6
+    MIN_CAMERAS: ClassVar[int] = 6
     """An anchor is judged only if as many cameras see it in front of what they draw."""
     DRAWN_SHARE: ClassVar[float] = 0.34
     """It is removed if at most this share of them, or a single one, draws one of its Gaussians."""
@@ -202,7 +202,7 @@ def in_free_space(scene: Scene, cameras: Sequence[Camera], *, config: FreeSpaceC
             opaque = structured.raw_opacities.amax(1) > config.DRAWN_OPACITY
             in_front[rows] += before.to(in_front)
             drawn[rows] += (before & opaque).to(drawn)
-    return (in_front >= config.MIN_VIEWS) & (drawn <= (config.DRAWN_SHARE * in_front).clamp(min=1.0))
+    return (in_front >= config.MIN_CAMERAS) & (drawn <= (config.DRAWN_SHARE * in_front).clamp(min=1.0))
 
 
 def _before_surfaces(points: Tensor, scene: Scene, camera: Camera, share: float, backend: Backend) -> Tensor:

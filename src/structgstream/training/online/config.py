@@ -63,7 +63,7 @@ class MotionConfig:
     """Factor (hysteresis) on the thresholds of pixels and shares for primitives that the last frame changed. 1:
     none."""
     occluded_share: float = 0.0
-    """An anchor that fewer than ``MIN_VIEWS`` views show is trained if at least this share of its nearest shown ones
+    """An anchor that fewer than ``MIN_VOTES`` views show is trained if at least this share of its nearest shown ones
     is: it lies in or behind what moves. 0: none."""
     picture_scale: float = 0.25
     """Scale of width and height, relative to the reference size, of the pictures on which coverage is computed."""
@@ -78,12 +78,14 @@ class MotionConfig:
     (full scale 1) exceeds this; above the sensors' noise."""
     REACH_PIXELS: ClassVar[int] = 3
     """Changed pixels are dilated by this many pixels."""
-    MIN_PIXELS: ClassVar[float] = 0.3
-    """Least number of changed pixels, summed by blending weight, that a primitive covers in a view to get its vote."""
-    MIN_SHARE: ClassVar[float] = 0.3
+    MIN_CHANGED_PIXELS: ClassVar[float] = 0.3
+    """Least number of changed pixels, summed by blending weight, that a primitive covers in a view to get its vote: in
+    ``select.select_dynamic`` and, for tracks of groups, in ``groups/tracking.py``, as the two below."""
+    MIN_CHANGED_SHARE: ClassVar[float] = 0.3
     """Least share of changed pixels among all that a primitive covers in a view to get its vote."""
-    MIN_VIEWS: ClassVar[int] = 2
-    """Least number of votes of a primitive that is trained: two, because one view may have changed by noise."""
+    MIN_VOTES: ClassVar[int] = 2
+    """Least number of votes of a dynamic primitive: two, because one view may have changed by noise. An anchor that is
+    visible in fewer views is occluded, and of frames with fewer cameras everything is trained."""
     MARGIN_PIXELS: ClassVar[int] = 8
     """Tiles within this many pixels of dynamic Gaussians are drawn too, so that these get gradients where they move."""
 
@@ -233,7 +235,7 @@ class SpawnConfig:
 
 @dataclass(frozen=True)
 class SmoothnessConfig:
-    """The price of moving unlike the neighbours; not in the paper."""
+    """Penalty on motion unlike the neighbours'; not in the paper."""
 
     weight: float = 0.0
     """Weight in the loss of the mean difference of displacement from the neighbours, pixels (paper: 0, none)."""
@@ -263,7 +265,7 @@ class ExposureConfig:
     """Largest mean difference over the channels (full scale 1), beyond the light followed so far, of a pixel that shows
     the same as in frame 0."""
     MIN_SHARE: ClassVar[float] = 0.2
-    """Least share of such pixels, weighted by what they tell (black and white ones little), in a view that counts."""
+    """Least share of such pixels, weighted by information (black and white ones little), in a view that counts."""
     MIN_CHANGE: ClassVar[float] = 1 / 256
     """Smallest change of a bias that is followed at first, at most a quarter of an 8-bit level: flicker below it costs
     no bits."""
@@ -340,7 +342,7 @@ class OnlineConfig:
     spawn: SpawnConfig = field(default_factory=SpawnConfig)
     """Spawning of free Gaussians from geometry, and pruning of outliers; only with ``motion``."""
     smoothness: SmoothnessConfig = field(default_factory=SmoothnessConfig)
-    """The price of moving unlike the neighbours."""
+    """Penalty on motion unlike the neighbours'."""
     motion_prior: float = 0.0
     """Moving anchors are initially displaced by this share of their last displacement (paper: 0)."""
     mean_of_last: float = 0.0

@@ -31,7 +31,7 @@ from structgstream.scene.scene import Scene
 from structgstream.training.online.config import ExposureConfig
 from structgstream.training.views import View
 
-MIN_VIEWS = 3
+MIN_COMPARED_VIEWS = 3
 """Fewer views have no median that leaves one out."""
 REACH_PIXELS = 2
 """Pixels of the reduced pictures around one that shows something else do not count."""
@@ -84,7 +84,7 @@ def with_exposure_of(
 def _light_change(
     scene: Scene, views: Sequence[View], reference: ExposureReference, so_far: Tensor, config: ExposureConfig
 ) -> Tensor:
-    """Change ``[3]`` of the biases since frame 0; ``so_far`` if too few views tell."""
+    """Change ``[3]`` of the biases since frame 0; ``so_far`` if too few views can be compared."""
     found = []
     with torch.no_grad():
         for view in views:
@@ -93,7 +93,7 @@ def _light_change(
                 now, then = view.evidence(config.PICTURE_SCALE), reference.views[view.index]
                 change = _view_change(now, then, gains, biases, so_far, config)
                 found += [] if change is None else [change]
-    return torch.stack(found).quantile(0.5, dim=0) if len(found) >= MIN_VIEWS else so_far
+    return torch.stack(found).quantile(0.5, dim=0) if len(found) >= MIN_COMPARED_VIEWS else so_far
 
 
 def _view_change(

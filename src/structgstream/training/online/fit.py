@@ -102,10 +102,9 @@ def fit_next_frame(
             flow.split,
             [view for view in inliers if view.index in selection.views_with_flow] or inliers,
             flow.active_tiles,
-            first_birth=frame.index * IDS_PER_FRAME,
+            first_identity=frame.index * IDS_PER_FRAME,
             floor=floor,
             room=config.patching.max_free - len(split.static.free),
-            min_pixels=config.motion.MIN_PIXELS,
             config=config.spawn,
             backend=backend,
         )

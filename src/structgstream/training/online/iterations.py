@@ -15,7 +15,7 @@ from torch import Tensor
 
 from structgstream.codec.fields.quantization import RateTerm
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.values import FitFrame, FitLeaf, FitPlan, FitPrices, FitView
+from structgstream.kernels.values import FitFrame, FitLeaf, FitPlan, FitView, LossFactors
 from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
@@ -48,8 +48,8 @@ class StartingPoint:
         split: of which the scene is the moving part; None for a whole scene.
         active_tiles: by view index, the tiles that the scene reaches; None for whole pictures of all views.
         new_free: free Gaussians to add.
-        reference: anchors as in ``scene``, from whose values changes and motion are priced; free Gaussians then have no
-            price. None: since ``scene``.
+        reference: anchors as in ``scene``, from whose values the rate term and smoothness count; it has no free
+            Gaussians, so these have no rate term. None: from ``scene``.
     """
 
     scene: Scene
@@ -90,8 +90,8 @@ class OnlineHooks(Hooks[View, SceneLoss]):
         start: the initial state.
         parameters: of the scene.
         losses: weights of the terms.
-        rate_term: the price of changing bins; None for none.
-        smoothness: the price of incoherent motion; None for none.
+        rate_term: bits of changes; None for none.
+        smoothness: of motion; None for none.
         free_set: of the free Gaussians.
         patch_at: the iteration after which free Gaussians are pruned and spawned.
         patches: whether they are.
@@ -288,7 +288,7 @@ def _frame(adam: Adam[ParameterName], plan: FitPlan, hooks: OnlineHooks, done: i
         start=None if smoothness is None else smoothness.start,
         neighbours=None if smoothness is None else smoothness.neighbours,
         shares=None if smoothness is None else smoothness.shares,
-        prices=FitPrices(
+        factors=LossFactors(
             losses.l1,
             losses.ssim,
             losses.volume,

@@ -77,6 +77,10 @@ def sum_by_primitive(sums: Tensor, primitives: Tensor, scene: Scene) -> Tensor:
     return found.index_add_(0, primitives, sums)
 
 
+VISIBLE_PIXELS = 0.3
+"""A primitive is visible in a view if it covers more pixels than this, summed by blending weight. Outlier tests and
+occlusion count the views in which it is; the threshold of its vote is ``MotionConfig.MIN_CHANGED_PIXELS``."""
+
 FLOW_MIN_PIXELS, FLOW_MAX_PIXELS = 0.3, 20.0
 """Bounds of a primitive's flow weight in a view, in pixels of a picture of the reference size: below the first it is 0,
 above the second it is clamped."""

@@ -85,7 +85,7 @@ class FrameOptimizer:
         """Whether the back-end's own iterations can run these."""
         patching, losses = self.config.patching, self.config.losses
         tracks_screen = patching.spawn != "off" and patching.collect_from < self._patch_at(start)
-        weights = {name for name, value in vars(losses).items() if isinstance(value, float) and value}
+        weights = {name for name, value in vars(losses).items() if not isinstance(value, str) and value}
         knows = weights <= NATIVE_LOSSES and len(LEAVES) == FIT_LEAVES
         splits = None not in (start.active_tiles, start.split)
         return self.backend.iterations is not None and splits and not tracks_screen and knows

@@ -82,12 +82,12 @@ def _empty_like(scene: Scene) -> Gaussians:
 
 
 def spawn_children(
-    parents: Gaussians, *, first_birth: int, config: PatchingConfig, generator: torch.Generator
+    parents: Gaussians, *, first_identity: int, config: PatchingConfig, generator: torch.Generator
 ) -> FreeGaussians:
     """One free Gaussian per parent, with its mean drawn from N(mu, factor * Sigma).
 
     With Sigma = R S S^T R^T a sample is mu + sqrt(factor) R S z with z standard normal. Colour and scale are the
-    parent's, the rotation is the identity, the opacity ``config.OPACITY``. Identities count from ``first_birth``.
+    parent's, the rotation is the identity, the opacity ``config.OPACITY``. Identities count from ``first_identity``.
     """
     count = len(parents)
     z = torch.randn(count, 3, generator=generator).to(parents.means)
@@ -101,7 +101,7 @@ def spawn_children(
         quats=unit.expand(count, 4).clone(),
         logit_opacities=torch.logit(opacity).to(parents.means).expand(count).clone(),
         colors=parents.colors.clone(),
-        births=first_birth + torch.arange(count, device=parents.means.device),
+        births=first_identity + torch.arange(count, device=parents.means.device),
     )
 
 
@@ -116,7 +116,7 @@ class FreeSet:
         adam: of their values.
         statistics: view-space gradients by id.
         views: from which children may copy colour and scale.
-        frame_index: of the frame, for births.
+        frame_index: of the frame, for identities of spawned Gaussians.
         room: largest number of free Gaussians.
         backend: the compute back-end.
         generator: of random numbers.
@@ -151,7 +151,9 @@ class FreeSet:
         keep = survivor_mask(current.free, self.config)
         others = [other for other in self.views if other.index != view.index]
         parents = gaussians_by_id(current, [view, *others], self._parents(keep), self.backend)
-        children = spawn_children(parents, first_birth=self._next_birth(), config=self.config, generator=self.generator)
+        children = spawn_children(
+            parents, first_identity=self._next_identity(), config=self.config, generator=self.generator
+        )
         if keep.all() and not len(children):
             return keep
         self.version += 1
@@ -172,7 +174,7 @@ class FreeSet:
             generator=self.generator,
         )
 
-    def _next_birth(self) -> int:
+    def _next_identity(self) -> int:
         first = self.frame_index * IDS_PER_FRAME
         births = self.parameters.births
         # Some may have been spawned in this frame already.

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from structgstream.cameras import CameraRig
-from structgstream.errors import MissingExtraError
-from structgstream.flow import ABSOLUTE, RELATIVE, block_search, dis_refinement, dis_search
+from structgstream.flow import ABSOLUTE, RELATIVE, block_search, dis_refinement, dis_search, same_color
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.training.online.config import USUAL_FLOW, FlowConfig, MotionConfig, SceneFlowConfig
@@ -35,11 +34,12 @@ MIN_SAVING = 0.8
 CELLS, REACH_CELLS = 80, 12
 """The search for large motion matches cells, of which so many make the longer side, and finds what has moved by so many
 of them: 15 per cent of it."""
-CONSISTENT_SHARE = 0.6
-"""Large motion is searched for where less than this share of the changed pixels has consistent flow. What has left its
-own outline leaves at most half of them."""
-CHANGED_CELLS = 1.0
-"""But at least so many cells have to have changed: less is noise, or too small to be matched."""
+COLOR_SHARE = 1 / 640
+"""Radius of the means of colours that flow is checked by, of the picture's longer side."""
+MISSED_CELLS, CONSISTENT_SHARE = 3, 0.5
+"""Large motion is searched for around squares of so many cells, in each of which less than this share of the changed
+pixels has consistent flow: what has left its own outline, and not the narrow bands that slower motion occludes. The
+search compares squares of three cells."""
 REPEATED_LEVELS = 0.2
 """Mean absolute difference, in levels of 255, below which a picture without a changed pixel is the last one once more.
 
@@ -101,7 +101,7 @@ def preprocess(
     earlier = training_views(before, rig, backend.device)
     known = {view.index for view in earlier}
     compared = [view for view in views if view.index in known]
-    if len(compared) < min(motion.MIN_VIEWS, len(rig.training)):
+    if len(compared) < min(motion.MIN_VOTES, len(rig.training)):
         return FramePictures(views, None)
     flow_from = flow_views(compared, frame.index, start)
     changes = detect_changes(views, earlier, config=motion, backend=backend, flow_from=flow_from, flow=start.FLOW)
@@ -124,7 +124,6 @@ def detect_changes(
     backend: Backend,
     flow_from: Collection[int] = (),
     flow: FlowConfig = USUAL_FLOW,
-    reach_pixels: int | None = None,
 ) -> list[PictureChange | None]:
     """Change of each of ``views`` since the picture of the same camera in ``before``; None if that has none.
 
@@ -138,7 +137,6 @@ def detect_changes(
         backend: the compute back-end.
         flow_from: indices of the views in which flow is estimated.
         flow: how it is searched.
-        reach_pixels: dilation in other pictures than a frame's; None for ``config``'s.
     """
     changes: list[PictureChange | None] = []
     earlier = {last.index: last for last in before}
@@ -150,7 +148,7 @@ def detect_changes(
                 continue
             both = _both(view.mask, last.mask)
             then, now = blackened(last.image, both), blackened(view.image, both)
-            reach = round((config.REACH_PIXELS if reach_pixels is None else reach_pixels) * view.enlargement)
+            reach = round(config.REACH_PIXELS * view.enlargement)
             changed = backend.changed_pixels(then, now, threshold=config.CHANGE_THRESHOLD, reach_pixels=reach)
             changed = changed if both is None else changed & both
             small, found, far_boxes = view.evidence(config.picture_scale).camera, None, 0
@@ -224,22 +222,20 @@ def flow_map(
     where = changed.numpy(force=True)
     longer, level = max(where.shape), config.level_of(where.shape[1])
     context = max(MIN_CONTEXT_PIXELS, round(CONTEXT_SHARE * longer))
+    radius = max(1, round(COLOR_SHARE * longer))
     search = dis_search("capture", refined=False, finest_level=level)
 
     def consistent(box: Box, flow: NDArray[np.float32], back: NDArray[np.float32]) -> Tensor:
-        counts = None if mask is None else mask[box].cpu()
+        alike = torch.from_numpy(same_color(_cut(first, box), _cut(second, box), flow, radius=radius))
+        counts = alike if mask is None else alike & mask[box].cpu()
         forward, backward = torch.from_numpy(flow), torch.from_numpy(back)
         return backend.confident_flow(forward, backward, counts, relative=RELATIVE, absolute=ABSOLUTE)
 
-    missed: list[Box] = []
     cell = max(1, round(longer / CELLS))
     for box in _boxes(where, context) if config.apart else _box(where, context):
         earlier, later = _cut(first, box), _cut(second, box)
-        maps[:, *box] = found = consistent(box, search(earlier, later), search(later, earlier))
-        at = where[box]
-        if config.far and at.sum() >= CHANGED_CELLS * cell**2 and found[0].numpy()[at].mean() < CONSISTENT_SHARE:
-            missed.append(box)
-    far = _grown(missed, REACH_CELLS * cell, where.shape)
+        maps[:, *box] = consistent(box, search(earlier, later), search(later, earlier))
+    far = _far_boxes(where, maps[0].numpy() > 0.0, cell) if config.far else []
     for box in far:
         earlier, later = _cut(first, box), _cut(second, box)
         flows = block_search(earlier, later, cell_pixels=cell, reach_cells=REACH_CELLS)
@@ -290,19 +286,35 @@ def _boxes(mask: Mask, context: int) -> list[Box]:
     return [box for box in found if min(span.stop - span.start for span in box) >= 2 * context]
 
 
-def _grown(boxes: Sequence[Box], by: int, shape: tuple[int, ...]) -> list[Box]:
-    """Disjoint boxes around ``boxes`` and ``by`` pixels more on every side, within ``shape``."""
-    edges = [(rows.start - by, rows.stop + by, columns.start - by, columns.stop + by) for rows, columns in boxes]
-    return [_within(box, shape) for box in _disjoint(edges)]
+def _far_boxes(changed: Mask, consistent: Mask, cell: int) -> list[Box]:
+    """Boxes in which large motion is searched for: parts that changed without consistent flow, with margin.
+
+    Args:
+        changed: ``[H, W]``.
+        consistent: ``[H, W]``, pixels with consistent flow.
+        cell: pixels of a cell's side.
+    """
+    import cv2  # The flow search has refused to go on without it.
+
+    rows, columns = (-(-length // cell) for length in changed.shape)
+    padded = np.zeros((2, rows * cell, columns * cell), bool)
+    padded[:, : changed.shape[0], : changed.shape[1]] = changed, changed & consistent
+    count, found = padded.reshape(2, rows, cell, columns, cell).sum((2, 4))
+    missed = (count >= cell**2 / 2) & (found < CONSISTENT_SHARE * count)
+    missed = cv2.morphologyEx(missed.astype(np.uint8), cv2.MORPH_OPEN, np.ones((MISSED_CELLS, MISSED_CELLS), np.uint8))
+    reach = REACH_CELLS * cell
+    edges = [
+        (cell * top - reach, cell * bottom + reach, cell * left - reach, cell * right + reach)
+        for top, bottom, left, right in _parts(missed > 0)
+    ]
+    return [_within(box, changed.shape) for box in _disjoint(edges)]
 
 
 def _parts(cells: Mask) -> list[Edges]:
     """Disjoint boxes (first and end row, first and end column) around the connected parts of ``cells`` and the eight
     cells around each."""
-    try:
-        import cv2
-    except ImportError:
-        raise MissingExtraError("cv2", "capture") from None
+    import cv2  # The flow search has refused to go on without it.
+
     grown = cv2.dilate(cells.astype(np.uint8), np.ones((3, 3), np.uint8))
     _, _, stats, _ = cv2.connectedComponentsWithStats(grown, connectivity=8)
     boxes = np.asarray(stats)[1:, :4].tolist()  # The first is what is no part.

@@ -156,13 +156,27 @@ def apply_scene_flow(
 ) -> SceneFlow:
     """Displace the dynamic part of ``split`` by optical flow, in up to two rounds; without flow by ``priors``.
 
+    ``M`` anchors and ``F`` free Gaussians are dynamic; displacements are in scene units, anchors before free Gaussians.
+
+    A replacement returns a :class:`SceneFlow`. The optimisation starts from ``split`` shifted by ``displacements``,
+    finite ``[M + F, 3]`` on the device of ``split``; one of 0 leaves a primitive at its last position, from which the
+    rate term and smoothness count in any case. Spawning draws ``SceneFlow.split``, which is
+    ``split.displaced(displacements)``, in ``active_tiles``, which are :func:`find_active_tiles` of that split and hold
+    its renderings. From here on only these tiles are drawn. Nothing but the log depends on the counts.
+
     Args:
-        split: with the evidence of flow, if it was estimated.
-        views: of the frame.
-        priors: ``[M + F, 3]`` displacements of the dynamic part expected without flow.
+        split: the scene of the previous frame in two parts, and ``split.selection``. If flow was estimated, that has
+            ``evidence`` (``[V, E]`` weights, ``[V, E, 2]`` flow in pixels of each view's full picture) and ``centers``
+            ``[E, 3]`` of all ``E`` primitives, of which ``selection.primitives`` are the ``M + F`` dynamic ones, and
+            ``views_with_flow``, the ``V`` views' indices in order; otherwise ``evidence`` and ``centers`` are None.
+        views: inliers of the frame's training views, with pictures ``[H, W, 3]`` uint8 and cameras in scene units.
+        priors: ``[M + F, 3]`` displacements expected without flow.
         config: of the scene flow.
         motion: of the selection.
-        backend: the compute back-end.
+        backend: the compute back-end, on the device of ``split``.
+
+    Raises:
+        MissingExtraError: SciPy, or OpenCV for the second round, is not installed.
     """
     selection = split.selection
     if not config.enabled or selection.evidence is None or selection.centers is None or not len(priors):

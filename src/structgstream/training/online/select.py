@@ -38,6 +38,7 @@ from structgstream.scene.state import Granularity, fields_of, parameters_of
 from structgstream.training.neighbours import nearest
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.measure import (
+    VISIBLE_PIXELS,
     FlowEvidence,
     ViewChange,
     ViewMeasurement,
@@ -134,18 +135,18 @@ def select_dynamic(
     votes, shown = (torch.zeros_like(ease, dtype=torch.int64) for _ in range(2))
     for of_view in (measured[number] for number in inliers):
         if of_view.covered_changed is not None:
-            enough = of_view.covered_changed > config.MIN_PIXELS * ease
-            votes += enough & (of_view.covered_changed > config.MIN_SHARE * ease * of_view.covered)
-            shown += of_view.covered > config.MIN_PIXELS
-    dynamic = votes >= config.MIN_VIEWS
+            enough = of_view.covered_changed > config.MIN_CHANGED_PIXELS * ease
+            votes += enough & (of_view.covered_changed > config.MIN_CHANGED_SHARE * ease * of_view.covered)
+            shown += of_view.covered > VISIBLE_PIXELS
+    dynamic = votes >= config.MIN_VOTES
     occluded = occluded_dynamic(
-        scene.anchors.positions, dynamic[:anchors], shown[:anchors] >= config.MIN_VIEWS, share=config.occluded_share
+        scene.anchors.positions, dynamic[:anchors], shown[:anchors] >= config.MIN_VOTES, share=config.occluded_share
     )
 
     found = DynamicSelection(
         anchors=dynamic[:anchors] | occluded,
         free=dynamic[anchors:],
-        visible={measured[n].view.index: measured[n].coverage > config.MIN_PIXELS for n in inliers},
+        visible={measured[n].view.index: measured[n].coverage > VISIBLE_PIXELS for n in inliers},
         inliers=tuple(inliers),
         scene_cut=is_scene_cut(view_changes),
         changed={measured[n].view.index: changed for n in inliers if (changed := measured[n].changed) is not None},

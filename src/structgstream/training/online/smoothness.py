@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Coherent motion: a penalty on anchors that move unlike their neighbours.
 
-Pictures do not tell every anchor's motion: along an edge, on a plain surface, or behind another anchor, what is left is
+Pictures do not show every anchor's motion: along an edge, on a plain surface, or behind another anchor, what is left is
 noise, which costs bits, and which shows in views that were not trained on. Neighbours on one body move alike. So
 differences of displacement between neighbours are penalised by their length and not its square (like L1), as two
 bodies that pass each other differ much at few places.
@@ -23,7 +23,7 @@ from structgstream.training.parameters import pixel_size
 
 @dataclass(frozen=True)
 class MotionSmoothness:
-    """The price of incoherent motion of ``M`` anchors.
+    """Penalty on incoherent motion of ``M`` anchors.
 
     Args:
         weight: weight in the loss.
@@ -43,12 +43,12 @@ class MotionSmoothness:
 
     @classmethod
     def of(cls, scene: Scene, cameras: Sequence[Camera], *, config: SmoothnessConfig) -> "MotionSmoothness | None":
-        """The price of displacing the anchors of ``scene``; None for none, or if no two are seen.
+        """The penalty on displacements of the anchors of ``scene``; None for none, or if no two are seen.
 
         Args:
             scene: at the start, usually the moving part.
             cameras: of the training views, in scene units.
-            config: of the price.
+            config: of the penalty.
 
         Raises:
             MissingExtraError: SciPy is not installed.

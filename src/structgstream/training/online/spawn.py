@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Free Gaussians where content is missing, before the first iteration (not in the paper).
 
-Spawning by gradients places a faint child beside a parent, which then needs frames to converge. Where pixels of several
+Spawning by gradients places a faint child near a parent, which then needs frames to converge. Where pixels of several
 views still have a large residual after the scene flow, new content is located directly by a plane sweep: along the ray
 of such a pixel, in front of the rendered depth, at the depth where other views have the same missing colour. Free
 Gaussians that are outliers in several views are pruned first.
@@ -28,7 +28,7 @@ from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import SpawnConfig, SpawnRules
-from structgstream.training.online.measure import accumulate
+from structgstream.training.online.measure import VISIBLE_PIXELS, accumulate
 from structgstream.training.online.split import DynamicSplit, changed_tiles
 from structgstream.training.residuals import ResidualFloor, box_mean
 from structgstream.training.views import View, mean_of_counting
@@ -101,16 +101,15 @@ def view_residual(
     return ViewResidual(small, off > rules.residual_threshold, missing if small.mask is None else missing * small.mask)
 
 
-def outlier_mask(coverage: Tensor, wrong: Tensor, *, min_pixels: float, rules: SpawnRules) -> Tensor:
-    """Mask ``[F]`` of the free Gaussians to remove, as outliers in several views.
+def outlier_mask(coverage: Tensor, wrong: Tensor, *, rules: SpawnRules) -> Tensor:
+    """Mask ``[F]`` of the free Gaussians to remove, as outliers in several of the views in which they are visible.
 
     Args:
         coverage: ``[V, F]`` pixels that each covers, by blending weight.
         wrong: ``[V, F]`` wrong pixels among them.
-        min_pixels: views where a Gaussian covers fewer pixels do not count.
         rules: the rule.
     """
-    seen = coverage > min_pixels
+    seen = coverage > VISIBLE_PIXELS
     bad = (seen & (wrong > rules.outlier_share * coverage)).sum(0)
     return (bad >= rules.outlier_views) & (2 * bad >= seen.sum(0))
 
@@ -136,7 +135,7 @@ def spawn_by_sweep(
     depths: Mapping[int, Tensor],
     color: CameraColor,
     *,
-    first_birth: int,
+    first_identity: int,
     rules: SpawnRules,
     backend: Backend,
 ) -> Spawned:
@@ -146,7 +145,7 @@ def spawn_by_sweep(
         missing: of every training view.
         depths: by view index, rendered depth ``[h, w]``, infinite where nothing is rendered.
         color: colour corrections of the cameras.
-        first_birth: identity of the first.
+        first_identity: identity of the first.
         rules: the rule.
         backend: the compute back-end.
 
@@ -182,7 +181,7 @@ def spawn_by_sweep(
     if not points or not sum(len(group) for group in points):
         return Spawned(FreeGaussians.empty(views[0].colors))
     return _merge_points(
-        torch.cat(points), torch.cat(colors), torch.cat(spacings), first_birth=first_birth, rules=rules
+        torch.cat(points), torch.cat(colors), torch.cat(spacings), first_identity=first_identity, rules=rules
     )
 
 
@@ -203,7 +202,9 @@ def _strided_mask(step: int, like: Tensor) -> Tensor:
     return mask
 
 
-def _merge_points(points: Tensor, colors: Tensor, spacings: Tensor, *, first_birth: int, rules: SpawnRules) -> Spawned:
+def _merge_points(
+    points: Tensor, colors: Tensor, spacings: Tensor, *, first_identity: int, rules: SpawnRules
+) -> Spawned:
     """One free Gaussian per voxel of the points, if at least ``min_hits`` points lie around it."""
     try:
         from scipy.spatial import KDTree
@@ -239,7 +240,7 @@ def _merge_points(points: Tensor, colors: Tensor, spacings: Tensor, *, first_bir
             quats=unit.expand(count, 4).clone(),
             logit_opacities=opacity.expand(count).clone(),
             colors=looks.contiguous(),
-            births=first_birth + torch.arange(count, device=points.device),
+            births=first_identity + torch.arange(count, device=points.device),
         ),
         refused_count=wanted - count if rules.overflow == "small-clusters" else 0,
         merged_count=max(0, finest - count) if rules.overflow == "coarser" else 0,
@@ -275,7 +276,7 @@ def _cells(values: Tensor, tree: Any, voxel: float) -> tuple[Tensor, Tensor]:
 MIN_COVERAGE = 0.5
 """Pixels with less coverage have no depth."""
 DEPTH_WIDTH = 240
-"""Depth maps are drawn at most this wide, pixels, and enlarged: they cost most of a frame without births."""
+"""Depth maps are drawn at most this wide, pixels, and enlarged: they cost most of a frame without spawning."""
 
 
 @dataclass(frozen=True)
@@ -332,15 +333,15 @@ class Sweep:
     backend: Backend
     known: Mapping[int, Missing] = field(default_factory=dict)
 
-    def missing(self, *, blames: bool = True) -> list[Missing]:
+    def missing(self, *, prunes: bool = True) -> list[Missing]:
         """Missing pixels of every view, none outside its active tiles.
 
         Args:
-            blames: whether outliers will be pruned by wrong pixels, which then must be rendered again as well.
+            prunes: whether outliers will be pruned by wrong pixels, which then must be rendered again as well.
         """
         # The pictures are from before the second round: tiles without missing pixels then are assumed to have none.
-        found = [self._before(view, wrong=blames) for view in self.views]
-        every = blames and len(self.dynamic.free) > 0
+        found = [self._before(view, wrong=prunes) for view in self.views]
+        every = prunes and len(self.dynamic.free) > 0
         if not every and not self._enough(found):
             return found
         return [self._drawn(entry) if every or entry.any else entry for entry in found]
@@ -349,7 +350,7 @@ class Sweep:
         """The same views, drawn again."""
         return [self._drawn(entry, again=True) for entry in missing]
 
-    def births(self, missing: Sequence[Missing], *, first_birth: int, room: int) -> Spawned:
+    def spawn(self, missing: Sequence[Missing], *, first_identity: int, room: int) -> Spawned:
         """New free Gaussians where several views miss the same; at most ``room``."""
         if not self._enough(missing):
             return Spawned(FreeGaussians.empty(self.dynamic.free.means))
@@ -358,13 +359,13 @@ class Sweep:
             residuals,
             {entry.view.index: self.depth_map(entry.view) for entry in residuals},
             self.dynamic.camera_color,
-            first_birth=first_birth,
+            first_identity=first_identity,
             rules=replace(self.rules, most=min(self.rules.most, room)),
             backend=self.backend,
         )
 
     def _enough(self, missing: Sequence[Missing]) -> bool:
-        """Whether enough views have missing pixels for a birth."""
+        """Whether enough views have missing pixels to spawn from."""
         return sum(entry.any for entry in missing) > self.rules.min_supports
 
     def _before(self, view: View, *, wrong: bool) -> Missing:
@@ -467,10 +468,9 @@ def prune_and_spawn(
     views: Sequence[View],
     active_tiles: Mapping[int, ActiveTiles],
     *,
-    first_birth: int,
+    first_identity: int,
     floor: ResidualFloor | None,
     room: int,
-    min_pixels: float,
     config: SpawnConfig,
     backend: Backend,
 ) -> SpawnResult:
@@ -480,10 +480,9 @@ def prune_and_spawn(
         split: with its dynamic part after the scene flow.
         views: of the frame.
         active_tiles: by view index, the tiles that the dynamic part reaches.
-        first_birth: identity of the first birth.
+        first_identity: identity of the first new Gaussian.
         floor: residuals of frame 0; None for none.
-        room: largest number of births.
-        min_pixels: views where a Gaussian covers fewer pixels do not count.
+        room: largest number of new Gaussians.
         config: the rules.
         backend: the compute back-end.
     """
@@ -502,27 +501,27 @@ def prune_and_spawn(
             return replace(none, refused=True)
         kept = everything
         if len(dynamic.free):
-            kept = ~_outlier_mask(dynamic, missing, active_tiles, min_pixels=min_pixels, rules=rules, backend=backend)
+            kept = ~_outlier_mask(dynamic, missing, active_tiles, rules=rules, backend=backend)
         if not kept.all():
             sweep = replace(sweep, dynamic=replace(dynamic, free=dynamic.free.select(kept)))
             missing = sweep.drawn(missing)
         room = max(0, room - int(kept.sum()))
-        large = sweep.births(missing, first_birth=first_birth, room=room)
+        large = sweep.spawn(missing, first_identity=first_identity, room=room)
         if len(large.free) or not config.thin.enabled:
             return SpawnResult(kept, large.free, merged_count=large.merged_count)
         known = {entry.view.index: entry for entry in missing}
         # With all of frame 0's floor: by these low thresholds an eased one would take all that moves for thin content.
         thin_sweep = replace(sweep, floor=floor, rules=config.thin_rules, known=known)
-        thin = _thin_births(thin_sweep, first_birth=first_birth, room=room)
+        thin = _spawn_thin(thin_sweep, first_identity=first_identity, room=room)
     return SpawnResult(kept, thin.free, len(thin.free), thin.refused_count)
 
 
-def _thin_births(sweep: Sweep, *, first_birth: int, room: int) -> Spawned:
+def _spawn_thin(sweep: Sweep, *, first_identity: int, room: int) -> Spawned:
     """Spawn thin content, where nothing large is spawned."""
-    missing = sweep.missing(blames=False)
+    missing = sweep.missing(prunes=False)
     if missing_share(missing) > sweep.rules.max_missing_share:
         return Spawned(FreeGaussians.empty(sweep.dynamic.free.means))
-    return sweep.births(missing, first_birth=first_birth, room=room)
+    return sweep.spawn(missing, first_identity=first_identity, room=room)
 
 
 def _outlier_mask(
@@ -530,7 +529,6 @@ def _outlier_mask(
     missing: Sequence[Missing],
     active_tiles: Mapping[int, ActiveTiles],
     *,
-    min_pixels: float,
     rules: SpawnRules,
     backend: Backend,
 ) -> Tensor:
@@ -550,4 +548,4 @@ def _outlier_mask(
         of_free = sums[len(sums) - len(dynamic.free) :]  # Free Gaussians are the last, and all there.
         coverage.append(of_free[:, 0])
         wrong.append(of_free[:, 1])
-    return outlier_mask(torch.stack(coverage), torch.stack(wrong), min_pixels=min_pixels, rules=rules)
+    return outlier_mask(torch.stack(coverage), torch.stack(wrong), rules=rules)

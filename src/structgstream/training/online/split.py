@@ -91,7 +91,7 @@ def find_active_tiles(
     rows = torch.cat([selection.anchors.repeat_interleave(k), selection.free])  # of the whole scene's Gaussians
     with torch.no_grad():
         found = {
-            view.index: _focus(
+            view.index: _active_tiles(
                 static,
                 dynamic,
                 selection.visible[view.index][rows],
@@ -105,7 +105,7 @@ def find_active_tiles(
     return {index: active for index, active in found.items() if active is not None}
 
 
-def _focus(
+def _active_tiles(
     static: Scene,
     dynamic: Scene,
     visible: Tensor,

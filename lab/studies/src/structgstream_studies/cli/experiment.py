@@ -13,9 +13,8 @@ from rich.text import Text
 
 from structgstream.cli.app import Interrupted, UsageError
 from structgstream.cli.options import CaptureOptions, Device, Folder
-from structgstream.cli.progress import print_lines
-from structgstream.cli.tables import compact_table, literal_cells
-from structgstream.executors.executor import ExecutorName, ExecutorOptions
+from structgstream.cli.progress import compact_table, literal_cells, print_lines
+from structgstream.executors.tasks import ExecutorName, ExecutorOptions
 from structgstream_studies.errors import ExperimentError
 
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from structgstream.evaluation.environment import usable_cores
-from structgstream.executors import task as executors
-from structgstream.executors.executor import ExecutorOptions, TaskQueue, open_executor
+from structgstream.executors import tasks as executors
+from structgstream.executors.tasks import ExecutorOptions, TaskQueue, open_executor
 from structgstream.kernels.backend import BackendName
 from structgstream_studies.experiments.worker import Task, command_of
 
@@ -71,7 +71,7 @@ def sweep(
 
     Args:
         tasks: with distinct names, in an order in which each follows the tasks that it needs.
-        executor: runs them; those that were not begun are left in it if others that they need fail.
+        executor: runs them.
         folder: what tasks print goes to ``logs/NAME.txt`` in it; on other machines it must lie at the same place.
         device: what computes.
         gpus: how many GPUs a task uses, 0 or 1.
@@ -82,25 +82,24 @@ def sweep(
     """
     skipped = {task.name for task in tasks if task.done()}
     begun = {task.name: task for task in tasks if task.name not in skipped}
-    for name in skipped:
-        executor.finished(name)
-    for name, task in begun.items():
-        command = command_of(task, device, folder=folder / "tasks")
-        log = (folder / "logs" / f"{name}.txt").absolute()
-        given = executors.Task(name, command, str(task.stream.absolute()), log, retries=1)
-        executor.submit(given, after=task.needs, gpus=gpus)
-    finished, failed = len(skipped), list[str]()
+    left, done, failed = dict(begun), set(skipped), list[str]()
     while True:
+        for name in [name for name, task in left.items() if done.issuperset(task.needs)]:
+            task = left.pop(name)
+            command = command_of(task, device, folder=folder / "tasks")
+            log = (folder / "logs" / f"{name}.txt").absolute()
+            given = executors.Task(name, command, str(task.stream.absolute()), log, retries=1)
+            executor.submit(given, gpus=gpus)
         for ending in executor.wait(POLL_SECONDS):
             if ending.done:
-                finished += 1
+                done.add(ending.name)
             else:
                 failed.append(ending.name)
         if listener is not None:
             stored = {name: (_stored(begun[name].stream), begun[name].frames) for name in executor.running}
-            listener(Progress(stored, finished, len(tasks), tuple(failed)))
-        if not executor.running:
-            return Outcome(tuple(failed), tuple(executor.waiting), tuple(sorted(skipped)))
+            listener(Progress(stored, len(done), len(tasks), tuple(failed)))
+        if not executor.running and not any(done.issuperset(task.needs) for task in left.values()):
+            return Outcome(tuple(failed), tuple(left), tuple(sorted(skipped)))
 
 
 def _stored(stream: Path) -> int:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Protocol
 
 from structgstream.errors import StorageError, StructGStreamError
-from structgstream.executors.task import PYTHON
+from structgstream.executors.tasks import PYTHON
 from structgstream.kernels.backend import Backend, BackendName
 
 

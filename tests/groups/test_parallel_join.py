@@ -10,26 +10,28 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.errors import ConfigError, TaskError
-from structgstream.executors.task import PYTHON, Task
-from structgstream.groups import join
+from structgstream.executors.tasks import PYTHON, Task
+from structgstream.groups import join, seam_blend
 from structgstream.groups.base import GroupBase, open_for
-from structgstream.groups.blending_run import MAX_GROUPS, BlendedRun, main, runs_of
-from structgstream.groups.join import PURPOSE, join_segments
-from structgstream.groups.seam_blend import OWN_FRAMES, Border
+from structgstream.groups.join import MAX_GROUPS, PURPOSE, join_segments, main, read_run, runs_of
+from structgstream.groups.seam_blend import FADE_FRAMES, OWN_FRAMES, Border
 from structgstream.groups.track_pass import track_capture
 from structgstream.owned_folders import own_folder
 from tests.support.backends import quickest_backend
 from tests.support.clip_groups import CAPTURE, OPTIONS, Made, fit, made, task
+from tests.support.inline_engine import InlineEngine
 from tests.support.shared_folder import made_once
 
-FRAMES = 12
-BORDERS = (2, 2 + OWN_FRAMES)
+LONG = OWN_FRAMES - FADE_FRAMES + 1
+"""What :data:`OWN_FRAMES` is where differences fade in one frame."""
+FRAMES = LONG + 4
+BORDERS = (2, 2 + LONG)
 RANGES = [(0, BORDERS[0]), (BORDERS[0], BORDERS[1]), (BORDERS[1], FRAMES)]
 
 
 @cache
 def long_groups() -> list[Path]:
-    """Groups of 2, of :data:`OWN_FRAMES` and of 2 frames, so that the last border needs nothing of the first."""
+    """Groups of 2, of :data:`LONG` and of 2 frames, so that the last border needs nothing of the first."""
     folder = made_once("long-groups", _make_long_groups)
     return [folder / f"{first}.sgs" for first, _ in RANGES]
 
@@ -45,7 +47,15 @@ def _make_long_groups(folder: Path) -> None:
         fit(folder / f"{first}.sgs", task(of_track, first, end=end), stop_after=FRAMES)
 
 
-def test_workers_give_the_bytes_of_one(tmp_path: Path) -> None:
+@pytest.fixture
+def fading_in_one_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(seam_blend, "FADE_FRAMES", 1)
+    monkeypatch.setattr(join, "OWN_FRAMES", LONG)
+
+
+@pytest.mark.usefixtures("fading_in_one_frame")
+def test_workers_give_the_bytes_of_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(join, "LocalEngine", lambda slots: InlineEngine())
     found = []
     left = tmp_path / "2.sgs.runs" / "run-0"  # By one that was killed.
     own_folder(left.parent, PURPOSE)
@@ -65,14 +75,15 @@ def test_workers_give_the_bytes_of_one(tmp_path: Path) -> None:
 def test_a_run_tells_its_borders_and_records(tmp_path: Path) -> None:
     paths, output = made().segments, tmp_path / "run"
     main([quickest_backend().name, str(output), *map(str, paths)])
-    run = BlendedRun.read(output)
-    assert [border.frame for border in run.borders] == [2, 4]
+    borders, records = read_run(output)
+    assert [border.frame for border in borders] == [2, 4]
     whole = tmp_path / "whole.sgs"
     join_segments(paths, whole, backend=quickest_backend())
-    assert all(record in whole.read_bytes() for record in run.records)
-    assert len(run.records) == 4
+    assert all(record in whole.read_bytes() for record in records)
+    assert len(records) == 4
 
 
+@pytest.mark.usefixtures("fading_in_one_frame")
 def test_a_worker_that_fails_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def failing(paths: list[Path], output: Path, *, device: str) -> Task:
         return Task(output.name, (PYTHON, "-c", "raise SystemExit('no room')"), str(output))

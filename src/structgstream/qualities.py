@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records several qualities of one stream frame by frame, reading the cameras once, with a joint report of each frame.
+"""Several qualities of one stream, fitted to the same frames by one process, which reads the cameras once.
 
 Note [In step]
 ~~~~~~~~~~~~~~
@@ -17,36 +17,179 @@ those of separate runs. Qualities fit a frame one after the other, so only the l
 """
 
 import math
+import re
 import threading
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable, Generator, Hashable, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from structgstream.cameras import CameraRig
 from structgstream.codec.packets import PacketSink
+from structgstream.codec.segments.manifest import MANIFEST
+from structgstream.codec.segments.quality_list import (
+    MAX_QUALITIES,
+    ListedQuality,
+    is_quality_name,
+    read_list,
+    write_list,
+)
 from structgstream.data.denoising import DenoisingConfig, denoised
 from structgstream.data.shared_frames import SharedFrames
 from structgstream.data.source import FrameStream
 from structgstream.data.wrappers import read_ahead
-from structgstream.errors import StorageError
+from structgstream.errors import ConfigError, StorageError, StreamError
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry, read_log
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
-from structgstream.qualities.ladder import BitRates, Quality, configured
 from structgstream.recorder import Storage, log_reports
 from structgstream.run_metrics import RunMetrics
 from structgstream.scene.scene import Scene
 from structgstream.session.frame_report import FrameReport
 from structgstream.session.loop import Session
 from structgstream.session.pipeline import FrameTask, Past, Pipeline, StoredStream
-from structgstream.session.presets import StreamConfig
+from structgstream.session.presets import MAX_QUALITY, StreamConfig, with_budget
 from structgstream.session.struct_gstream import FrameZeroContext, StructGStream, stream_pipeline
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.result import FitResult, StepListener
+
+_GIVEN = re.compile(r"([^=]*)=([^=]*)")
+
+
+@dataclass(frozen=True)
+class Quality:
+    """One of the qualities."""
+
+    name: str  # name of its folder
+    fineness: float  # online.rounding.quality: 0 is the preset's own, 1 halves every quantization step
+
+
+def qualities_in(given: Sequence[str]) -> tuple[Quality, ...]:
+    """The qualities of texts such as ``low=-1``, the coarsest first, which viewers load first.
+
+    Raises:
+        ConfigError: a text is malformed, two qualities have the same name or fineness, or their number is out of range.
+    """
+    qualities = sorted(map(_parsed, given), key=lambda quality: quality.fineness)
+    if not 2 <= len(qualities) <= MAX_QUALITIES:
+        raise ConfigError(
+            f"--qualities takes 2 to {MAX_QUALITIES} qualities, which is what players choose from, got "
+            f"{len(qualities)}; for a single one give --quality."
+        )
+    # Some file systems do not distinguish upper and lower case.
+    for what, values in (("name", [q.name.lower() for q in qualities]), ("Q", [f"{q.fineness:g}" for q in qualities])):
+        if twice := [one for one, other in pairwise(sorted(values)) if one == other]:
+            raise ConfigError(
+                f"--qualities has the {what} {twice[0]} twice; each quality needs a name and a Q of its own."
+            )
+    return tuple(qualities)
+
+
+def configured(config: StreamConfig, quality: Quality) -> StreamConfig:
+    """``config`` with a quality, as set by ``--quality``.
+
+    Raises:
+        ConfigError: the codec does not support qualities.
+    """
+    if config.codec != "compact":
+        raise ConfigError(
+            f"--qualities is for streams with the codec compact, got the codec {config.codec}; add --preset compact."
+        )
+    return with_budget(config, name=None, quality=quality.fineness, mbits=None)
+
+
+def _parsed(text: str) -> Quality:
+    match = _GIVEN.fullmatch(text)
+    try:
+        name, fineness = ("", float("nan")) if match is None else (match[1], float(match[2]))
+    except ValueError:
+        name, fineness = "", float("nan")
+    if not is_quality_name(name) or not abs(fineness) <= MAX_QUALITY:
+        raise ConfigError(
+            f"--qualities {text} is no quality; expected NAME=Q, a name of letters, digits, '-' and '_' and a Q from "
+            f"{-MAX_QUALITY:g} to {MAX_QUALITY:g}, such as low=-1 or high=1."
+        )
+    return Quality(name, fineness)
+
+
+EXPECTED_BITS = 2e6
+"""Estimated bits per second of quality 0, from 1.9 and 2.9 Mbit/s in lab/notes/compact-measured.md. Each further unit
+of quality doubles it."""
+MIN_PACKETS = 5
+MAX_PACKETS = 60
+"""Number of packets over which a rate is measured: two groups of one second, or more if frames are skipped."""
+CHANGE = 0.1
+"""The list is rewritten when a rate differs from the listed one by this share."""
+
+
+class BitRates:
+    """Maintains the list of qualities in a folder."""
+
+    def __init__(self, folder: Path, qualities: Sequence[Quality]) -> None:
+        self._folder = folder
+        self._listed = {quality.name: expected_bits(quality) for quality in qualities}
+        self._packets = {quality.name: deque[tuple[float, int]](maxlen=MAX_PACKETS + 1) for quality in qualities}
+
+    def begin(self, *, resume: bool) -> None:
+        """Writes the list, with the rates of the earlier run if it is resumed.
+
+        Raises:
+            StorageError: it cannot be written.
+        """
+        if resume:
+            self._listed |= {name: bits for name, bits in listed_bits(self._folder).items() if name in self._listed}
+        self._write()
+
+    def add(self, name: str, report: FrameReport) -> None:
+        """Adds a stored frame of a quality to the measurement."""
+        self._packets[name].append((report.pts_seconds, report.bytes))
+
+    def refresh(self, *, last: bool = False) -> None:
+        """Rewrites the list if a measured rate differs from the listed one.
+
+        Raises:
+            StorageError: it cannot be written; the earlier list is not affected.
+        """
+        known = {
+            name: bits
+            for name, packets in self._packets.items()
+            if len(packets) > (1 if last else MIN_PACKETS) and (bits := bits_per_second(packets)) is not None
+        }
+        share = 0.0 if last else CHANGE
+        if any(abs(bits - self._listed[name]) > share * self._listed[name] for name, bits in known.items()):
+            self._listed |= known
+            self._write()
+
+    def _write(self) -> None:
+        listed = [ListedQuality(name, f"{name}/{MANIFEST}", round(bits)) for name, bits in self._listed.items()]
+        write_list(self._folder, listed)
+
+
+def expected_bits(quality: Quality) -> float:
+    """Estimated bits per second of a quality before any measurement; only the order of qualities is reliable."""
+    return EXPECTED_BITS * 2.0**quality.fineness
+
+
+def bits_per_second(packets: Sequence[tuple[float, int]]) -> float | None:
+    """Bits per second of media, at least 1, from times and sizes of packets; None if they have the same time.
+
+    The first packet only marks the start time; its bytes do not count, because frame 0's packet is nearly empty.
+    """
+    seconds = packets[-1][0] - packets[0][0]
+    return max(8 * sum(size for _, size in [*packets][1:]) / seconds, 1.0) if seconds > 0 else None
+
+
+def listed_bits(folder: Path) -> Mapping[str, float]:
+    """Bit rates of the list in a folder, by name; empty if there is no readable list."""
+    try:
+        return {quality.name: quality.bits_per_second for quality in read_list(folder) or ()}
+    except StreamError:
+        return {}
+
 
 Value = TypeVar("Value")
 PICTURES_KEPT = 3
@@ -54,11 +197,7 @@ PICTURES_KEPT = 3
 
 
 class Once(Generic[Value]):
-    """A cache that computes each value at its first request; concurrent requests wait for it. Thread-safe.
-
-    Args:
-        most: largest number of cached values.
-    """
+    """A cache that computes each value at its first request; concurrent requests wait for it. Thread-safe."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -94,26 +233,18 @@ class Once(Generic[Value]):
 
 @dataclass(frozen=True)
 class SharedWork:
-    """Shared results of the qualities of one run.
+    """Shared results of the qualities of one run."""
 
-    Args:
-        pictures: preprocessed pictures, by the numbers of a frame and of the frame before.
-        first: fits of first frames, by frame number.
-    """
-
+    # preprocessed pictures, by the numbers of a frame and of the frame before
     pictures: Once[FramePictures] = field(default_factory=lambda: Once(PICTURES_KEPT))
-    first: Once[FitResult[Scene]] = field(default_factory=lambda: Once(1))
+    first: Once[FitResult[Scene]] = field(default_factory=lambda: Once(1))  # fits of first frames, by frame number
 
 
 @dataclass(frozen=True)
 class SharedMethod(StructGStream):
-    """The method of one of several qualities (Note [Shared work]).
+    """The method of one of several qualities (Note [Shared work])."""
 
-    Args:
-        shared: the shared results.
-    """
-
-    shared: SharedWork = field(default_factory=SharedWork)
+    shared: SharedWork = field(default_factory=SharedWork)  # the shared results
 
     def observe(
         self, frame: MultiViewFrame, before: MultiViewFrame | None, *, rig: CameraRig, backend: Backend
@@ -134,15 +265,6 @@ class SharedMethod(StructGStream):
         if task.begins is None:  # All qualities have the previous frame, so no first frame is needed again.
             self.shared.first.clear()
         return super().next(past, task)
-
-
-def shared_pipeline(config: StreamConfig, shared: SharedWork) -> Pipeline[Scene, Any]:
-    """The pipeline of one of several qualities.
-
-    Raises:
-        ConfigError: see ``stream_pipeline``.
-    """
-    return replace(stream_pipeline(config), method=SharedMethod(config, shared=shared))
 
 
 FIGURES = ("kind", "bytes", "train_psnr", "total_seconds", "cpu_seconds", "anchors", "free", "begins")
@@ -167,7 +289,6 @@ def joint_entry(report: FrameReport, entries: Mapping[str, Mapping[str, Any]]) -
     """One line of the run's log.
 
     Args:
-        report: joint report of all qualities that were fitted now.
         entries: the frame's line in the log of each quality, by name, including qualities that had the frame already.
     """
     each = {name: {key: entry[key] for key in FIGURES if key in entry} for name, entry in entries.items()}
@@ -183,30 +304,19 @@ def joint_entry(report: FrameReport, entries: Mapping[str, Mapping[str, Any]]) -
 
 @dataclass(frozen=True)
 class QualityReport:
-    """Report of a stored frame of a quality.
+    """Report of a stored frame of a quality."""
 
-    Args:
-        quality: name of the quality.
-        report: report of the frame.
-        whole: whether all qualities have the frame now.
-    """
-
-    quality: str
-    report: FrameReport
-    whole: bool
+    quality: str  # name of the quality
+    report: FrameReport  # report of the frame
+    whole: bool  # whether all qualities have the frame now
 
 
 @dataclass(frozen=True)
 class QualitiesRun:
-    """A reconstruction into several qualities.
+    """A reconstruction into several qualities."""
 
-    Args:
-        done: number of frames that all qualities had at the start.
-        reports: reports of the further frames; each step of the generator fits, stores and logs one frame of one
-            quality.
-    """
-
-    done: int
+    done: int  # number of frames that all qualities had at the start
+    # reports of the further frames; each step of the generator fits, stores and logs one frame of one quality
     reports: Generator[QualityReport, None, None]
 
 
@@ -254,15 +364,7 @@ def record_qualities(
 
     Args:
         folder: contains ``qualities.json`` and a folder for each quality; logs are next to these.
-        source: the capture, or live cameras.
-        config: configuration of all qualities, without their fineness.
         qualities: at least one, the coarsest first.
-        backend: the compute back-end.
-        storages: opens the sink of each quality, by name.
-        resume: continue after the last complete frame of each quality.
-        metadata: plain JSON values for the headers.
-        on_step: called after every optimisation step.
-        metrics: receives every frame; has these qualities.
 
     Raises:
         ConfigError: a stream to resume was made with another configuration or from another capture.
@@ -273,8 +375,9 @@ def record_qualities(
     opened = []
     for quality in qualities:
         sink, stored = storages[quality.name](resume)
+        own = configured(config, quality)
         # Frames are denoised below, once for all qualities.
-        pipeline = replace(shared_pipeline(configured(config, quality), work), denoising=DenoisingConfig())
+        pipeline = replace(stream_pipeline(own), method=SharedMethod(own, shared=work), denoising=DenoisingConfig())
         opened.append(_Opened(quality.name, pipeline, sink, stored))
     starts, firsts = [one.start for one in opened], [one.first for one in opened]
     shown = read_ahead(denoised(source, config.denoising))
@@ -295,13 +398,7 @@ def record_qualities(
 def _in_step(
     reports: Mapping[str, Generator[FrameReport, None, None]], done: Mapping[str, int], close: Callable[[], object]
 ) -> Generator[QualityReport, None, None]:
-    """The reports of all sessions; always advances the one with the fewest frames (Note [In step]).
-
-    Args:
-        reports: reports of each session, by name; closed with the result.
-        done: number of frames of each session.
-        close: called after these are closed.
-    """
+    """The reports of all sessions; always advances the one with the fewest frames (Note [In step])."""
     frames, going = dict(done), [*reports]
     with ExitStack() as stack:
         stack.callback(close)
