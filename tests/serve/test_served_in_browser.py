@@ -74,12 +74,6 @@ def test_from_the_list_to_a_picture_with_one_token(tab: Tab, folder: Path) -> No
     assert not tab.complaints
 
 
-def test_without_a_token_nothing_is_shown(tab: Tab, folder: Path) -> None:
-    with hosted(ServerSettings(folder, keys=KEYS)) as server:
-        tab.open(server.address)
-        tab.wait_for('document.body.innerText === "An access token is needed here."')
-
-
 def test_a_page_switches_between_the_qualities_of_a_stream(tab: Tab, tmp_path: Path) -> None:
     """By hand, in the panel, with a token of that stream alone; these two qualities show different scenes."""
     folder = tmp_path / "streams"

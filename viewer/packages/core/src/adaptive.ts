@@ -50,13 +50,13 @@ export class AdaptiveDecoder {
       for (let i = first; i < count; i += step) {
         if (!blocks[(i / BLOCK) | 0]) continue;
         const at = i + PAD;
-        const beside = level ? found[at - first]! + found[at + first]! : 0;
+        const near = level ? found[at - first]! + found[at + first]! : 0;
         const beyond = level ? found[at - 3 * first]! + found[at + 3 * first]! : 0;
         const wide = before[Math.min(i + 9, count)]! - before[Math.max(i - 8, 0)]! - (history[i]! & 1);
         const around = moved[i]! + moved[i + 1]! + moved[i + 3]! + moved[i + 4]!;
-        contexts[0] = (wide * 3 + beside) * 5 + level;
-        contexts[1] = (bitLength(moved[i + 2]!, 5) * 3 + beside) * 6 + bitLength(around, 5);
-        contexts[2] = ((level * 3 + beyond) * 3 + beside) * 8 + history[i]!;
+        contexts[0] = (wide * 3 + near) * 5 + level;
+        contexts[1] = (bitLength(moved[i + 2]!, 5) * 3 + near) * 6 + bitLength(around, 5);
+        contexts[2] = ((level * 3 + beyond) * 3 + near) * 8 + history[i]!;
         code.at(model, contexts, 0);
         found[at] = code.decide(model, 0);
       }
@@ -72,7 +72,7 @@ export class AdaptiveDecoder {
     if (!count) return found;
     const code = this.codeOf(name);
     const model = this.models.get(name, residualContexts(columns), NUMBER_NODES);
-    const told = new Int32Array(count);
+    const totals = new Int32Array(count);
     const moved = new Uint8Array(count);
     for (let i = 0; i < last.length; i++) if (last[i]) moved[(i / columns) | 0] = 1;
     const contexts = new Int32Array(6);
@@ -83,7 +83,7 @@ export class AdaptiveDecoder {
           const own = last[at]!;
           const above = level ? found[at - first * columns]! : 0;
           const below = level && a + first < count ? found[at + first * columns]! : 0;
-          const beside = Math.abs(above) + Math.abs(below);
+          const around = Math.abs(above) + Math.abs(below);
           const left = column ? found[at - 1]! : 0;
           const off = column ? left - last[at - 1]! : 0;
           let led = 8 * (above + below);
@@ -92,8 +92,8 @@ export class AdaptiveDecoder {
           contexts[0] = (limited(own, 8) + 8) * columns + column;
           contexts[1] = (limited(above, 4) + 4) * 9 + limited(below, 4) + 4;
           contexts[2] = ((led < 0 ? -expected : expected) + 15) * 5 + level;
-          contexts[3] = (Math.min(told[a]!, 9) * 6 + Math.min(beside, 5)) * columns + column;
-          contexts[4] = (bitLength(others[a]!, 5) * columns + column) * 16 + sizeClass(2 * Math.abs(own) + beside);
+          contexts[3] = (Math.min(totals[a]!, 9) * 6 + Math.min(around, 5)) * columns + column;
+          contexts[4] = (bitLength(others[a]!, 5) * columns + column) * 16 + sizeClass(2 * Math.abs(own) + around);
           contexts[5] = ((limited(left, 3) + 3) * 7 + limited(off, 3) + 3) * 7 + limited(own, 3) + 3;
           code.at(model, contexts, 0);
           const value = code.number(model);
@@ -101,7 +101,7 @@ export class AdaptiveDecoder {
           found[at] = value;
         }
       }
-      for (let a = 0; a < count; a++) told[a] = Math.min(told[a]! + Math.abs(found[a * columns + column]!), 9);
+      for (let a = 0; a < count; a++) totals[a] = Math.min(totals[a]! + Math.abs(found[a * columns + column]!), 9);
     }
     this.check(name, code);
     return found;
@@ -179,9 +179,9 @@ function decodedBlocks(code: Arithmetic, model: Model, history: Uint8Array): Uin
   const contexts = new Int32Array(2);
   for (const [level, [first, step]] of PASSES.entries()) {
     for (let b = first; b < count; b += step) {
-      const beside = level ? found[b - first]! + found[b + first]! : 0;
-      contexts[0] = (last[b + 1]! * 3 + beside) * 5 + level;
-      contexts[1] = (bitLength(ever[b]!, 5) * 11 + last[b]! + last[b + 2]!) * 3 + beside;
+      const near = level ? found[b - first]! + found[b + first]! : 0;
+      contexts[0] = (last[b + 1]! * 3 + near) * 5 + level;
+      contexts[1] = (bitLength(ever[b]!, 5) * 11 + last[b]! + last[b + 2]!) * 3 + near;
       code.at(model, contexts, 0);
       found[b] = code.decide(model, 0);
     }

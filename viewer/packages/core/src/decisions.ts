@@ -119,7 +119,7 @@ export class Arithmetic {
       sum += Math.imul(weights[first + k]!, logit) >> 16;
     }
     const chance = CHANCES[clamped(sum, -FAR, FAR) + FAR]!;
-    const yes = this.told(chance);
+    const yes = this.decision(chance);
     const target = yes ? 65536 : 0;
     const error = (target - chance) >> 4;
     for (let k = 0; k < inputs; k++) {
@@ -144,13 +144,13 @@ export class Arithmetic {
       let length = 0;
       while (length < LENGTHS && this.decide(model, 2 + NEAR_SIZES + Math.min(length, LENGTH_NODES - 1))) length++;
       let rest = 1;
-      for (; length > 0; length--) rest = 2 * rest + this.told(HALF);
+      for (; length > 0; length--) rest = 2 * rest + this.decision(HALF);
       size = rest + NEAR_SIZES;
     }
     return negative ? -size : size;
   }
 
-  private told(chance: number): number {
+  private decision(chance: number): number {
     if (!this.range) {
       this.range = -1;
       for (let i = 0; i < 4; i++) this.take();

@@ -44,10 +44,10 @@ export function decodedFree(decoder: AdaptiveDecoder, before: FreeBins, where: s
   const change = decodedChange(decoder, kept, GROUPS);
   const stayed = rowsOf(before.bins, alive);
   for (let i = 0; i < stayed.length; i++) stayed[i]! += change.residuals[i]!;
-  const born = decodedBirths(decoder, stayed, where);
-  const births = new BigInt64Array(alive.length + born.births.length);
+  const spawned = decodedBirths(decoder, stayed, where);
+  const births = new BigInt64Array(alive.length + spawned.births.length);
   for (const [i, row] of alive.entries()) births[i] = before.births[row]!;
-  births.set(born.births, alive.length);
+  births.set(spawned.births, alive.length);
   for (let i = 1; i < births.length; i++) {
     if (births[i]! <= births[i - 1]!) {
       throw new StreamError(`${where} has births that do not ascend; it is damaged.`);
@@ -55,7 +55,7 @@ export function decodedFree(decoder: AdaptiveDecoder, before: FreeBins, where: s
   }
   const bins = new Int32Array(births.length * FREE_COLUMNS);
   bins.set(stayed);
-  bins.set(born.bins, alive.length * FREE_COLUMNS);
+  bins.set(spawned.bins, alive.length * FREE_COLUMNS);
   // Spawned Gaussians have no last change.
   const whole = noChange(births.length, FREE_COLUMNS);
   whole.history.set(change.history);

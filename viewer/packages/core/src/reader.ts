@@ -191,7 +191,7 @@ export class StreamReader {
 
   private decoderOf(index: number): SceneDecoder {
     const header = this.begun.filter(({ first }) => first <= index).at(-1)?.header;
-    if (!header) throw new StreamError(`The header of frame ${index} of ${this.name} has been let go of.`);
+    if (!header) throw new StreamError(`The header of frame ${index} of ${this.name} is no longer in memory.`);
     if (this.decoder?.of !== header) this.decoder = { of: header, scenes: new SceneDecoder(header) };
     return this.decoder.scenes;
   }
@@ -209,7 +209,7 @@ export class StreamReader {
 
   private packet(index: number): Packet {
     const [info, payload] = [this.infos[index], this.payloads[index]];
-    if (!info || !payload) throw new StreamError(`Frame ${index} of ${this.name} has been let go of.`);
+    if (!info || !payload) throw new StreamError(`Frame ${index} of ${this.name} is no longer in memory.`);
     return { ...info, payload };
   }
 

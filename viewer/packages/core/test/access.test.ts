@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** What a player takes packets apart with: by place, without numbers in between. */
+/** What a player reads packets with: by place, without numbers in between. */
 
 import { expect, test } from "vitest";
 import { fieldBytes, SceneDecoder } from "../src/decoder.ts";
@@ -22,8 +22,8 @@ test.each([
 test("a packet that was taken is no longer the reader's", () => {
   const reader = readStream(bytesOf(FIXTURES, "paper.sgs"));
   expect(reader.take(2).index).toBe(2);
-  expect(() => reader.take(2)).toThrow("Frame 2 of The stream has been let go of.");
-  expect(() => reader.frame(2)).toThrow("has been let go of");
+  expect(() => reader.take(2)).toThrow("Frame 2 of The stream is no longer in memory.");
+  expect(() => reader.frame(2)).toThrow("is no longer in memory");
 });
 
 test("the bytes of a packet's fields are all of it but index and time", () => {

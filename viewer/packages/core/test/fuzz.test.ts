@@ -12,8 +12,8 @@ import { bytesOf, FIXTURES, joined, piecesOf, record, VECTORS } from "./streams.
 const MAX_BYTES = 2 ** 20;
 /** A stream, and the distance of the bytes that are tried. */
 const STREAMS: [string, Uint8Array, number][] = [
-  ["raw", bytesOf(VECTORS, "version-2.sgs"), 3],
-  ["compact", bytesOf(FIXTURES, "tiny.sgs"), 5],
+  ["raw", bytesOf(VECTORS, "version-2.sgs"), 5],
+  ["compact", bytesOf(FIXTURES, "tiny.sgs"), 7],
 ];
 const ARRAYS = { Uint8Array, Uint16Array, Int32Array, Float32Array, Float64Array, BigInt64Array };
 let largest = 0;

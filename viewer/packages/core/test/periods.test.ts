@@ -73,7 +73,7 @@ test("a flipped bit costs a packet's group, or an init record's period, also whi
     const frame = at < INIT ? at - 2 : at - 3;
     const lost = at === INIT ? without(LATER, FRAMES) : without(frame, GROUP_ENDS[frame]!);
     const start = 8 * OFFSETS[at]!;
-    for (let bit = start; bit < start + 8 * piece.length; bit += bit < start + 160 ? 7 : 997) {
+    for (let bit = start; bit < start + 8 * piece.length; bit += bit < start + 160 ? 23 : 4999) {
       const reader = new StreamReader();
       const bytes = flipped(bit);
       for (let i = 0; i < bytes.length; i += 997) reader.push(bytes.subarray(i, i + 997));
@@ -120,12 +120,12 @@ test("the index says where init records are, and is not believed when it leaves 
   ]);
   expect(entries.length).toBe(FRAMES + 1);
   const payload = PIECES.at(-1)!.slice(8, -4);
-  const told = (change: (bytes: Uint8Array) => Uint8Array) =>
+  const entriesOf = (change: (bytes: Uint8Array) => Uint8Array) =>
     indexEntries(record(RecordType.index, change(payload.slice())), OFFSETS.at(-1)!);
-  expect(told((bytes) => bytes)).toBeDefined();
-  expect(told((bytes) => bytes.subarray(0, 13 * (LATER + 1)))).toBeUndefined(); // ends with an init record
-  expect(told((bytes) => joined(bytes.subarray(13 * LATER, 13 * (LATER + 1)), bytes))).toBeUndefined();
-  expect(told((bytes) => bytes.fill(3, 13 * (LATER + 1) + 4, 13 * (LATER + 1) + 5))).toBeUndefined(); // a delta packet
+  expect(entriesOf((bytes) => bytes)).toBeDefined();
+  expect(entriesOf((bytes) => bytes.subarray(0, 13 * (LATER + 1)))).toBeUndefined(); // ends with an init record
+  expect(entriesOf((bytes) => joined(bytes.subarray(13 * LATER, 13 * (LATER + 1)), bytes))).toBeUndefined();
+  expect(entriesOf((bytes) => bytes.fill(3, 13 * (LATER + 1) + 4, 13 * (LATER + 1) + 5))).toBeUndefined(); // a delta packet
 });
 
 test("a stream of one period is read as before by what stands in its records", () => {
@@ -133,7 +133,7 @@ test("a stream of one period is read as before by what stands in its records", (
   expect(reader.periods).toMatchObject([{ number: 0, first: 0, offset: PREFIX_BYTES }]);
 });
 
-test("headers that nobody needs any more can be let go of", () => {
+test("headers that nobody needs any more can be dropped", () => {
   const reader = readStream(STREAM);
   reader.forgetHeaders();
   expect([reader.headerOf(0), reader.headerOf(1)].every(Boolean)).toBe(true);

@@ -113,10 +113,10 @@ test("nothing can be shown of a stream that is cut or damaged too early", () => 
   expect(() => readStream(damaged)).toThrow("its init record is damaged");
 });
 
-test("what is let go of is whole groups, and is said", () => {
+test("whole groups are dropped, and the error says so", () => {
   const reader = readStream(COMPACT);
   reader.forget(5);
-  expect(() => reader.frame(3)).toThrow("Frame 0 of The stream has been let go of.");
+  expect(() => reader.frame(3)).toThrow("Frame 0 of The stream is no longer in memory.");
   expect(reader.frame(5).index).toBe(5);
   expect(reader.frame(4).index).toBe(4);
 });

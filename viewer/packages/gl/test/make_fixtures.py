@@ -108,7 +108,7 @@ def odd() -> bytes:
 
     free = numbers(ODD_FREE, 14)
     free[:, 3:6] -= 2.0
-    # Large ones beside the picture and close to the cameras: there the projection's limits show.
+    # Large ones outside the picture and close to the cameras: there the projection's limits show.
     free[:4, :3] = torch.tensor([[2.4, 0.5, -0.9], [-2.4, 0.2, -0.8], [0.3, 1.9, -1.0], [0.2, -2.0, -0.7]])
     free[:4, 3:6] = torch.tensor([-0.8, -1.2, -0.5])
     free[:4, 10] = 1.0

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** What a player relies on besides the pixels: order and state together, lost contexts, nothing left behind. */
+/** What a player relies on in addition to the pixels: order and state together, lost contexts, nothing left behind. */
 
 import { fileURLToPath } from "node:url";
 import { afterAll, afterEach, beforeAll, describe, expect, test } from "vitest";

@@ -74,7 +74,7 @@ try {
         player.on("frame", () => {
           given ||= performance.now() - start;
         }),
-        // Told when the seek begins, and when its frame has come from the worker.
+        // Called when the seek begins, and when its frame has come from the worker.
         player.on("state", () => {
           decoded = performance.now() - start;
         }),

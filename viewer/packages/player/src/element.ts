@@ -330,12 +330,12 @@ export class StructgstreamPlayer extends HTMLElement {
     const media = new MediaState(
       player,
       () => performance.now() / 1000,
-      (name) => this.tell(name, {}),
+      (name) => this.dispatch(name, {}),
     );
     this.running = { player, ui, media, observer };
     player.relay = (name, detail) => {
       media.take(name, detail);
-      this.tell(name, detail);
+      this.dispatch(name, detail);
     };
     player.still = matchMedia("(prefers-reduced-motion: reduce)").matches;
     player.setLoop(this.hasAttribute("loop"));
@@ -357,10 +357,10 @@ export class StructgstreamPlayer extends HTMLElement {
     middle.className = "middle bad";
     middle.append(text);
     root.replaceChildren(style, middle);
-    this.tell("error", { message: text.textContent, fatal: true });
+    this.dispatch("error", { message: text.textContent, fatal: true });
   }
 
-  private readonly tell = (name: string, detail: unknown): void => {
+  private readonly dispatch = (name: string, detail: unknown): void => {
     this.dispatchEvent(new CustomEvent(name, { detail }));
   };
 

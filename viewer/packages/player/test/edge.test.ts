@@ -5,11 +5,11 @@ import { expect, test } from "vitest";
 import { Edge } from "../src/engine/edge.ts";
 import { Timeline } from "../src/engine/timeline.ts";
 
-/** The edge of a stream of 30 frames a second, and how to tell of more of them. */
+/** The edge of a stream of 30 frames a second, and a function that reports more of them. */
 function made(targetSeconds: number) {
   const timeline = new Timeline();
   const edge = new Edge(timeline);
-  const told = (count: number, now: number) => {
+  const report = (count: number, now: number) => {
     timeline.take({
       first: 0,
       count,
@@ -21,25 +21,25 @@ function made(targetSeconds: number) {
     });
     edge.changed(now);
   };
-  return { edge, told };
+  return { edge, report };
 }
 
 test("is the target, or one and a half of the longest step of late", () => {
-  const { edge, told } = made(1);
-  told(30, 0);
+  const { edge, report } = made(1);
+  report(30, 0);
   expect(edge.distance).toBe(1);
-  told(60, 1);
-  told(120, 3);
+  report(60, 1);
+  report(120, 3);
   expect(edge.distance).toBe(3.25);
-  for (let i = 0; i < 8; i++) told(125 + i, 3.1 + i / 10);
+  for (let i = 0; i < 8; i++) report(125 + i, 3.1 + i / 10);
   expect(edge.distance).toBe(1);
 });
 
 test("an outage is no step: LIVE does not lead back to before it", () => {
-  const { edge, told } = made(1);
-  told(30, 0);
-  told(60, 1);
-  told(30 * 121, 61);
+  const { edge, report } = made(1);
+  report(30, 0);
+  report(60, 1);
+  report(30 * 121, 61);
   expect(edge.distance).toBeLessThanOrEqual(15.25);
   expect(edge.start).toBeGreaterThanOrEqual(30 * 105);
 });

@@ -3,6 +3,7 @@
 
 import { readStream, type Tensor } from "@structgstream/core";
 import { afterEach, describe, expect, test, vi } from "vitest";
+import { expectSame } from "../../core/test/streams.ts";
 import { CLIP, type Playing, playing, ServedFile, URL_OF_CLIP } from "./served.ts";
 
 vi.setConfig({ testTimeout: 60_000 });
@@ -32,7 +33,7 @@ function expectFrame(fields: Map<string, Tensor>, index: number): void {
   const expected = readStream(CLIP).frame(index).fields;
   for (const name of WHOLE.header!.dynamic) {
     expect(fields.get(name)?.shape).toEqual(expected.get(name)!.shape);
-    expect(fields.get(name)?.data).toEqual(expected.get(name)!.data);
+    expectSame(fields.get(name), expected.get(name)!);
   }
 }
 
@@ -144,7 +145,7 @@ test("loops, at another rate", async () => {
   }).toThrow("expected a positive number");
 });
 
-test("late frames are dropped, and the picture goes on from the next key", async () => {
+test("late frames are dropped, and playback continues at the next key", async () => {
   const play = opened(new ServedFile(CLIP));
   await play.settled();
   play.engine.play();
@@ -210,7 +211,7 @@ describe("a server without ranges", () => {
     expect(play.notices.join()).toContain("range requests");
   });
 
-  test("is read again for what was let go of", async () => {
+  test("packets that left memory are read again", async () => {
     const file = new ServedFile(CLIP);
     file.ranges = false;
     const play = opened(file, 0, { budgetBytes: 3000 });
@@ -248,7 +249,7 @@ test("packets take no more bytes than they may", async () => {
 });
 
 describe("a growing file", () => {
-  test("is followed, and its pace is told", async () => {
+  test("is followed, and its pace is reported", async () => {
     const cut = (frames: number) => CLIP.subarray(0, PACKETS[frames - 1]!.offset + PACKETS[frames - 1]!.bytes + 5);
     const file = new ServedFile(cut(2));
     const play = opened(file);
@@ -297,7 +298,7 @@ describe("a growing file", () => {
 });
 
 describe("damage", () => {
-  test("in a packet costs its group, and is told", async () => {
+  test("in a packet costs its group, and is reported", async () => {
     const bytes = CLIP.slice();
     bytes[PACKETS[4]!.offset + 30]! ^= 4;
     const play = opened(new ServedFile(bytes));
@@ -338,7 +339,7 @@ describe("damage", () => {
     expect(play.errors.join()).toContain("Frames 4 to 5 are lost");
   });
 
-  test("that leaves no frame is told", async () => {
+  test("that leaves no frame is reported", async () => {
     const file = new ServedFile(CLIP.subarray(0, PACKETS[0]!.offset + 20));
     file.lastModified = new Date(0).toUTCString();
     const play = opened(file);
@@ -375,7 +376,7 @@ test.each([
   expect(play.errors).toEqual([sentence]);
 });
 
-test("a server that does not answer is told at once, one that no longer does is asked again", async () => {
+test("a server that does not answer is reported at once; one that stops answering is asked again", async () => {
   const file = new ServedFile(CLIP);
   file.failures = 1;
   const never = opened(file);
@@ -419,7 +420,7 @@ test("what a packet took is known by field", async () => {
   expect([...facts.byField.values()].reduce((sum, bytes) => sum + bytes, 24)).toBe(facts.bytes);
 });
 
-test("a refresh brings every dynamic field", async () => {
+test("a refresh has every dynamic field", async () => {
   const play = opened(new ServedFile(CLIP));
   await play.settled();
   play.engine.refresh();

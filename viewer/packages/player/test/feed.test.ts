@@ -28,7 +28,7 @@ async function followed(
   answer: (asked: Asked, signal: AbortSignal) => Response | Promise<Response>,
 ) {
   const asked: Asked[] = [];
-  const told: string[] = [];
+  const log: string[] = [];
   const began = performance.now();
   const request = async (input: RequestInfo | URL, init?: RequestInit): Promise<Response> => {
     const headers = new Headers(init?.headers);
@@ -39,17 +39,17 @@ async function followed(
   const feed = new ManifestFeed("http://test/m.json?x=1", "m.json", request as typeof fetch, false, own, RETRY_POLICY);
   const abort = new AbortController();
   const events = {
-    manifest: ({ sequence }: { sequence: number }) => void told.push(`manifest ${sequence}`),
-    qualities: () => void told.push("qualities"),
-    waiting: (wait: number, problem: string) => void told.push(`waiting ${wait}: ${problem}`),
-    recovered: () => void told.push("recovered"),
+    manifest: ({ sequence }: { sequence: number }) => void log.push(`manifest ${sequence}`),
+    qualities: () => void log.push("qualities"),
+    waiting: (wait: number, problem: string) => void log.push(`waiting ${wait}: ${problem}`),
+    recovered: () => void log.push("recovered"),
   };
-  const done = feed.follow(events, abort.signal).catch((error: Error) => void told.push(`failed: ${error.message}`));
+  const done = feed.follow(events, abort.signal).catch((error: Error) => void log.push(`failed: ${error.message}`));
   await vi.advanceTimersByTimeAsync(seconds * 1000);
   abort.abort();
   await vi.advanceTimersByTimeAsync(60_000);
   await done;
-  return { asked, told };
+  return { asked, log };
 }
 
 const bodyOf = (live: LiveRun) => live.files.get("manifest.json")!.slice();
@@ -57,8 +57,8 @@ const wait = (seconds: number) => new Promise((resolve) => setTimeout(resolve, 1
 
 test("a host that does not wait is asked a few times a frame, and less often when none comes for long", async () => {
   const live = new LiveRun(CLIP, { frameSeconds: 4 }).write(3);
-  const { asked, told } = await followed(60, true, () => new Response(bodyOf(live), { headers: { ETag: '"1"' } }));
-  expect(told).toEqual(["manifest 3"]);
+  const { asked, log } = await followed(60, true, () => new Response(bodyOf(live), { headers: { ETag: '"1"' } }));
+  expect(log).toEqual(["manifest 3"]);
   expect(asked.slice(0, 3).map(({ after, match }) => [after, match])).toEqual([
     [null, null],
     ["3", '"1"'],
@@ -73,12 +73,12 @@ test("a host that does not wait is asked a few times a frame, and less often whe
 
 test("a host that waits is asked again at once, and no more often", async () => {
   const live = new LiveRun(CLIP, { frameSeconds: 4 }).write(3);
-  const { asked, told } = await followed(30, true, async ({ after }) => {
+  const { asked, log } = await followed(30, true, async ({ after }) => {
     if (after !== null) await wait(4);
     if (after !== null) live.write(1);
     return new Response(bodyOf(live));
   });
-  expect(told.slice(0, 3)).toEqual(["manifest 3", "manifest 4", "manifest 5"]);
+  expect(log.slice(0, 3)).toEqual(["manifest 3", "manifest 4", "manifest 5"]);
   expect(asked.length).toBe(9);
 });
 
@@ -102,8 +102,8 @@ test("nothing new, older manifests of a cache, and trouble", async () => {
     () => new Response(bodyOf(live.write(1))),
     () => new Response(bodyOf(live.finish())),
   ];
-  const { told } = await followed(60, true, () => answers.shift()!());
-  expect(told).toEqual([
+  const { log } = await followed(60, true, () => answers.shift()!());
+  expect(log).toEqual([
     "manifest 5",
     "waiting 0.5: The server answered the request for m.json with 500.",
     "waiting 1: m.json is no JSON: it was cut or changed, or is something else.",
@@ -117,8 +117,8 @@ test("after its end a run is asked for now and then for half an hour, as it may 
   const live = new LiveRun(CLIP).write(3);
   const answers = [() => new Response(bodyOf(live)), () => new Response(bodyOf(live.finish()))];
   const gone = () => new Response("", { status: 503 });
-  const { asked, told } = await followed(3600, true, () => (answers.shift() ?? gone)());
-  expect(told).toEqual(["manifest 3", "manifest 4"]);
+  const { asked, log } = await followed(3600, true, () => (answers.shift() ?? gone)());
+  expect(log).toEqual(["manifest 3", "manifest 4"]);
   expect(asked.at(-1)!.at).toBeGreaterThan(1780);
   expect(asked.at(-1)!.at).toBeLessThan(1820);
   expect(asked.length).toBeLessThan(190);
@@ -126,31 +126,31 @@ test("after its end a run is asked for now and then for half an hour, as it may 
   expect(recording.asked.length).toBe(1);
 });
 
-test("a host that does not answer for hours is asked every 10 s, and gone on with", async () => {
+test("a host that does not answer for hours is asked every 10 s, and playback continues", async () => {
   const live = new LiveRun(CLIP).write(3);
-  const { asked, told } = await followed(2 * 3600 + 60, true, ({ at, after }) => {
+  const { asked, log } = await followed(2 * 3600 + 60, true, ({ at, after }) => {
     if (after !== null && at < 2 * 3600) return new Response("", { status: 503 });
     if (after !== null) live.write(1);
     return new Response(bodyOf(live));
   });
-  expect(told.slice(-3)[0]).toMatch(/^manifest/);
-  expect(told.filter((text) => text.startsWith("failed"))).toEqual([]);
-  expect(told).toContain("recovered");
+  expect(log.slice(-3)[0]).toMatch(/^manifest/);
+  expect(log.filter((text) => text.startsWith("failed"))).toEqual([]);
+  expect(log).toContain("recovered");
   const gaps = asked.slice(1, 700).map(({ at }, i) => at - asked[i]!.at);
   expect(Math.max(...gaps)).toBeCloseTo(10);
 });
 
 test("a host that never answers is given up for this time", async () => {
   const live = new LiveRun(CLIP).write(3);
-  const { told } = await followed(50, true, ({ after }, signal) => {
+  const { log } = await followed(50, true, ({ after }, signal) => {
     if (after === null) return new Response(bodyOf(live));
     return new Promise((_, refuse) => signal.addEventListener("abort", () => refuse(new Error("aborted"))));
   });
-  expect(told.join()).toContain("The server has not answered the request for m.json for 45 s.");
+  expect(log.join()).toContain("The server has not answered the request for m.json for 45 s.");
 });
 
 test("the first manifest must be one", async () => {
-  const { told, asked } = await followed(5, true, () => new Response("", { status: 404 }));
-  expect(told).toEqual(["failed: m.json was not found on the server (404). Check the address."]);
+  const { log, asked } = await followed(5, true, () => new Response("", { status: 404 }));
+  expect(log).toEqual(["failed: m.json was not found on the server (404). Check the address."]);
   expect(asked.length).toBe(1);
 });

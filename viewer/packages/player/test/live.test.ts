@@ -2,8 +2,9 @@
 /** Live streams from segments folders: engine, decoder and fetcher together, without a browser. */
 
 import { existsSync, readdirSync, readFileSync } from "node:fs";
-import { readStream } from "@structgstream/core";
+import { readStream, type Tensor } from "@structgstream/core";
 import { afterEach, describe, expect, test, vi } from "vitest";
+import { expectSame } from "../../core/test/streams.ts";
 import { AbrController } from "../src/decode/abrController.ts";
 import { Throughput } from "../src/decode/throughput.ts";
 import { Host, LiveRun, type RunOptions } from "./liveRun.ts";
@@ -72,7 +73,7 @@ test("frames are exact, those of parts too", async () => {
   await play.settled();
   const expected = readStream(CLIP);
   // What an update leaves out is what the first frame had, which was taken before.
-  const fields = new Map<string, { data: unknown }>(expected.frame(0).fields);
+  const fields = new Map<string, Tensor>(expected.frame(0).fields);
   for (const index of [0, 9, 4, 9, 2]) {
     play.engine.seekFrame(index);
     for (let last = -1; last !== index; ) {
@@ -82,7 +83,7 @@ test("frames are exact, those of parts too", async () => {
       await new Promise((resolve) => setTimeout(resolve, 1));
     }
     const { fields: right } = expected.frame(index);
-    for (const name of expected.header!.dynamic) expect(fields.get(name)?.data).toEqual(right.get(name)!.data);
+    for (const name of expected.header!.dynamic) expectSame(fields.get(name), right.get(name)!);
   }
 });
 
@@ -120,7 +121,7 @@ test("a stream slower than its media: each frame when it comes, and when the nex
   expect(play.errors).toEqual([]);
 });
 
-test("frames that are seconds apart are shown as soon as they are there", async () => {
+test("frames at intervals of seconds are shown as soon as they are there", async () => {
   const live = run(8, { fps: 0.5, frameSeconds: 2, targetSeconds: 6 });
   const play = opened(new Host({ "": live }));
   play.engine.play();
@@ -144,7 +145,7 @@ test("frames that are decoded before the page has heard of them are no reason to
   play.engine.play();
   const on = goingOn(play);
   await play.until(() => on() && play.shown.at(-1) === 7, "newest frame");
-  // The decoder learns of both at once, and the page, which is told ten times a second, of the second one later.
+  // The decoder learns of both at once, and the page, which is informed ten times a second, of the second one later.
   for (let frame = 8; frame < 26; frame += 2) {
     live.write(1);
     await play.until(() => on() && play.shown.at(-1) === frame, `frame ${frame}`);
@@ -232,7 +233,7 @@ test("every frame of a long recording can be reached over pages of pages", async
   expect(play.errors).toEqual([]);
 });
 
-test("what has left the window is gone on after", async () => {
+test("playback continues after what has left the window", async () => {
   const live = run(30, { windowSegments: 8 });
   const play = opened(new Host({ "": live }));
   await play.settled();
@@ -262,7 +263,7 @@ test("the end of the run makes it a recording", async () => {
   await play.until(() => play.shown.at(-1) === 0, "first frame");
 });
 
-test("a run that is resumed after its end is gone on with", async () => {
+test("a run that is resumed after its end is followed again", async () => {
   const live = run(21);
   const play = opened(new Host({ "": live }));
   play.engine.play();
@@ -287,7 +288,7 @@ test("how long ago a picture was filmed is known by the newest frame", async () 
 });
 
 describe("a host in trouble", () => {
-  test.each(["offline", 503, 404] as const)("%s for a while: said once, gone on after", async (trouble) => {
+  test.each(["offline", 503, 404] as const)("%s for a while is reported once", async (trouble) => {
     const live = run(12, { frameSeconds: 1 });
     const host = new Host({ "": live });
     const play = opened(host);
@@ -306,7 +307,7 @@ describe("a host in trouble", () => {
     expect(play.errors).toEqual([]);
   });
 
-  test("a file that is another costs its group, and is told", async () => {
+  test("a file that is another costs its group, and is reported", async () => {
     const live = run(30, {}).finish();
     const host = new Host({ "": live });
     const bad = [...live.files.keys()].find((name) => name.startsWith("segment-00000003"))!;
@@ -321,7 +322,7 @@ describe("a host in trouble", () => {
     expect(play.errors.join()).toMatch(/Frames? 9.* lost/);
   });
 
-  test("a file that is not there is asked for again, and then told", async () => {
+  test("a file that is not there is asked for again, and then reported", async () => {
     const live = run(30, {}).finish();
     const host = new Host({ "": live });
     const gone = [...live.files.keys()].find((name) => name.startsWith("segment-00000003"))!;
@@ -351,7 +352,7 @@ describe("a host in trouble", () => {
     expect(play.errors).toEqual([]);
   });
 
-  test("a replaced stream is told", async () => {
+  test("a replaced stream is reported", async () => {
     const live = run(10);
     const host = new Host({ "": live });
     const play = opened(host);
@@ -404,7 +405,7 @@ test("periods are crossed without a break, in both directions", async () => {
   expect(host.asked("init-0001")).toBe(1);
 });
 
-test("memory is bounded: packets that are far away are let go of", async () => {
+test("memory is bounded: packets that are far away are dropped", async () => {
   const live = run(180, { pageSegments: 8 }).finish();
   const play = opened(new Host({ "": live }), 0, ADDRESS, true, { budgetBytes: 20_000 });
   await play.settled();
@@ -459,8 +460,8 @@ describe("qualities", () => {
     expect(play.errors).toEqual([]);
   });
 
-  test("follow what the connection bears, up and down", async () => {
-    const [high, low] = [run(3000).finish(), run(3000).finish()];
+  test("follow the throughput of the connection, up and down", async () => {
+    const [high, low] = [run(900).finish(), run(900).finish()];
     const host = new Host({ high, low });
     host.instead.set("/qualities.json", listed([{ ...ENTRIES[0], bits_per_second: 5e5 }, ENTRIES[1]]));
     const play = opened(host, 0, LIST);
@@ -541,7 +542,7 @@ describe("qualities", () => {
     expect(play.errors).toEqual([]);
   });
 
-  test("one that cannot be had is told and left alone", async () => {
+  test("one that cannot be read is reported once and left out", async () => {
     const low = run(30).finish();
     const host = new Host({ low });
     host.instead.set("/qualities.json", listed(ENTRIES));
@@ -574,12 +575,12 @@ describe("qualities", () => {
     return { host, play, on };
   }
 
-  test("an outage is told once, and the quality that could not be had in it is taken later", async () => {
+  test("an outage is reported once, and the quality that could not be read in it is taken later", async () => {
     const runs = { high: run(12, { frameSeconds: 1 }), low: run(12, { frameSeconds: 1 }) };
     const { host, play, on } = await high(runs, 1e12);
     await play.until(() => on() && play.shown.at(-1) === 11 && play.engine.stalled, "edge");
     host.trouble = "offline";
-    play.engine.chooseQuality(undefined); // no connection bears the higher one
+    play.engine.chooseQuality(undefined); // no connection is fast enough for the higher one
     await ticks(play, 1500, on);
     host.trouble = undefined;
     let count = 0;
@@ -649,7 +650,7 @@ describe("qualities", () => {
     expect(fatal).toEqual([false]); // what is there can still be seen
   });
 
-  test("are changed by what the connection bears, and not to and fro", () => {
+  test("are changed by throughput, and not back and forth", () => {
     const clock = { seconds: 0 };
     const abr = new AbrController(
       [1e6, 4e6, 2e6].map((bits_per_second) => ({ manifest: "m.json", bits_per_second, name: `${bits_per_second}` })),
@@ -695,12 +696,12 @@ describe("qualities", () => {
     expect(at(49, 0.1)).toBe(1);
     abr.change(1);
     expect(at(50, 0.1, 3e5)).toBe(1);
-    expect(at(52, 0.1)).toBe(0); // it does not bear it
+    expect(at(52, 0.1)).toBe(0); // it is too slow for it
     abr.change(0);
     expect(at(91, 0.1)).toBe(0);
     expect(at(93, 0.1)).toBe(1);
     abr.change(1);
-    expect(at(500, 0.1)).toBe(0); // having borne it for long
+    expect(at(500, 0.1)).toBe(0); // after a long time in it
     abr.change(0);
     expect(at(509, 0.1)).toBe(0);
     expect(at(511, 0.1)).toBe(1);

@@ -92,7 +92,7 @@ export class LiveRun {
     this.at = 0;
   }
 
-  /** Writes so many frames, each with a manifest of its own; a stream that is over begins again. */
+  /** Writes so many frames, and the manifest after the last; a stream that is over begins again. */
   write(frames: number): this {
     for (let i = 0; i < frames; i++) {
       const piece = this.packets[this.at++ % this.packets.length]!;
@@ -106,15 +106,17 @@ export class LiveRun {
       const part = { frame: this.frame, period: this.group.period, kind, pts_seconds: seconds };
       this.parts.push({ ...this.put(`part-${String(this.frame).padStart(8, "0")}`, bytes), ...part });
       this.frame++;
-      this.tell();
+      this.counted();
     }
+    this.publish();
     return this;
   }
 
   finish(): this {
     this.close();
     this.live = false;
-    this.tell();
+    this.counted();
+    this.publish();
     return this;
   }
 
@@ -124,15 +126,20 @@ export class LiveRun {
     return this;
   }
 
-  /** Writes the manifest as it is now. */
-  tell(): void {
+  /** A rewriting of the manifest: its number rises, and the window moves. */
+  private counted(): void {
+    this.sequence++;
     const kept = this.options.windowSegments;
     if (kept !== undefined && this.segment > kept) this.forget(this.segment - kept);
+  }
+
+  /** Writes the manifest as it is now. */
+  private publish(): void {
     const edge = this.edge;
     const manifest = {
       format: "structgstream-segments",
       version: 1,
-      sequence: ++this.sequence,
+      sequence: this.sequence,
       live: this.live,
       fps: this.fps,
       name: "made up",

@@ -5,7 +5,7 @@ import { readFileSync } from "node:fs";
 import { describe, expect, test } from "vitest";
 import { SourceError } from "../src/source/byteSource.ts";
 import { type Manifest, manifestIn, type PageEntry, pageIn } from "../src/source/manifest.ts";
-import { besides, verify } from "../src/source/storedFile.ts";
+import { siblingUrl, verify } from "../src/source/storedFile.ts";
 import { LiveRun } from "./liveRun.ts";
 import { CLIP } from "./served.ts";
 
@@ -137,7 +137,7 @@ test.each([
   for (const path of ["periods.0.file", "segments.0.file", "history.0.file", "parts.0.file"]) {
     const shown = path.replace(/\.0/, "[0]");
     expect(() => parsed(but(path, file))).toThrow(`manifest.json: ${shown} is `);
-    expect(() => parsed(but(path, file))).toThrow("expected the plain name of a file beside it");
+    expect(() => parsed(but(path, file))).toThrow("expected the plain name of a file in its folder");
   }
 });
 
@@ -220,11 +220,11 @@ describe("qualities", () => {
   });
 });
 
-test("files are beside their manifest, and get its token and nothing else", () => {
-  expect(besides("https://a/b/manifest.json?token=x%26y&after=3#z", "part-1.sgs")).toBe(
+test("files are in the folder of their manifest; their addresses have its token and nothing else", () => {
+  expect(siblingUrl("https://a/b/manifest.json?token=x%26y&after=3#z", "part-1.sgs")).toBe(
     "https://a/b/part-1.sgs?token=x%26y",
   );
-  expect(besides("https://a/b/manifest.json", "low/manifest.json")).toBe("https://a/b/low/manifest.json");
+  expect(siblingUrl("https://a/b/manifest.json", "low/manifest.json")).toBe("https://a/b/low/manifest.json");
 });
 
 test("a file is compared with what is stated of it", async () => {

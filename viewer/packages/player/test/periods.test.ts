@@ -3,6 +3,7 @@
 
 import { readStream, type StreamHeader, type Tensor } from "@structgstream/core";
 import { afterEach, expect, test, vi } from "vitest";
+import { expectSame } from "../../core/test/streams.ts";
 import { periodFile } from "./periodFile.ts";
 import { CLIP, type Playing, playing, ServedFile, URL_OF_CLIP } from "./served.ts";
 
@@ -29,7 +30,7 @@ function opened(file: ServedFile, startSeconds = 0): Playing {
   return found;
 }
 
-/** Draws what is due, and tells at which frames another header came; all that was given is in `fields`. */
+/** Draws what is due, and records at which frames another header came; all that was given is in `fields`. */
 function watching(play: Playing) {
   const headers: number[] = [];
   const fields = new Map<string, Tensor>();
@@ -50,7 +51,7 @@ function watching(play: Playing) {
 
 function expectFrame(fields: Map<string, Tensor>, index: number): void {
   const expected = readStream(CLIP).frame(index % EACH).fields;
-  for (const name of WHOLE.header!.dynamic) expect(fields.get(name)?.data, name).toEqual(expected.get(name)!.data);
+  for (const name of WHOLE.header!.dynamic) expectSame(fields.get(name), expected.get(name)!);
 }
 
 /** How many requests after those for head and tail were for these bytes. */

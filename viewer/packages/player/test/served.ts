@@ -116,9 +116,9 @@ export function playing(request: typeof fetch, options: EngineOptions = {}): Pla
     shown: [],
     seconds: 100,
     async until(reached, what = "what was waited for") {
-      const give = performance.now() + 30_000;
+      const give = performance.now() + 50_000;
       while (!reached()) {
-        if (performance.now() > give) throw new Error(`In 30 s there was no ${what}; errors: ${found.errors}`);
+        if (performance.now() > give) throw new Error(`In 50 s there was no ${what}; errors: ${found.errors}`);
         found.engine.tick();
         await new Promise((resolve) => setTimeout(resolve, 1));
       }

@@ -8,11 +8,11 @@ import { Matrix4, PerspectiveCamera, Scene, WebGLRenderer } from "three";
 import { base64, pixelsOf } from "../../gl/test/support/pixels.ts";
 import { StreamSplats } from "../src/index.ts";
 
-/** Spark sorts beside; its order is that of the picture once it has been at rest for so many pictures in a row. */
+/** Spark sorts in a worker; a picture is in order once sorting has been idle for so many pictures in a row. */
 const PICTURES = 4;
 const PAUSE_MILLISECONDS = 100;
 
-export class Beside {
+export class Pair {
   readonly splats: StreamSplats;
   private readonly renderer = new WebGLRenderer({ preserveDrawingBuffer: true });
   private readonly scene = new Scene();
@@ -22,7 +22,7 @@ export class Beside {
   constructor(private readonly reader: StreamReader) {
     this.splats = new StreamSplats(reader.header!);
     this.own = new SplatRenderer(document.createElement("canvas"), { sorter: new URL("/sorter.js", location.href) });
-    // What is behind the scene is not the adapter's.
+    // The package draws no environment.
     const known = [...reader.header!.static].filter(([name]) => name !== "environment");
     this.own.load({ ...reader.header!, static: new Map(known) });
     // The low-pass of the training pictures is in the scales; the order is that of depth.
@@ -93,8 +93,8 @@ export class Beside {
   }
 }
 
-async function open(url: string): Promise<Beside> {
-  return new Beside(readStream(new Uint8Array(await (await fetch(url)).arrayBuffer())));
+async function open(url: string): Promise<Pair> {
+  return new Pair(readStream(new Uint8Array(await (await fetch(url)).arrayBuffer())));
 }
 
 export const stage = { open };

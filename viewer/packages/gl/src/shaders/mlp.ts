@@ -39,8 +39,8 @@ void look(int anchor) {
   for (int i = 0; i < ${layout.appearanceTexels}; i++)
     given[${layout.featureTexels} + i] = texelFetch(appearance, place(anchor * ${layout.appearanceTexels} + i), 0);
   vec3 away = texelFetch(positions, place(anchor), 0).xyz - eye;
-  float apart = max(length(away), 1e-12); // an anchor may sit in the camera
-  given[${layout.inputTexels - 1}] = vec4(away / apart, ${shape.distanceInput ? "apart" : "0.0"});
+  float len = max(length(away), 1e-12); // an anchor may sit in the camera
+  given[${layout.inputTexels - 1}] = vec4(away / len, ${shape.distanceInput ? "len" : "0.0"});
 }
 
 void think(int at) {
@@ -56,13 +56,13 @@ void think(int at) {
   }
 }
 
-float told(int at) {
+float result(int at) {
   float sum = weight(at + ${layout.hiddenTexels}).x;
   for (int i = 0; i < ${layout.hiddenTexels}; i++) sum += dot(weight(at + i), units[i]);
   return sum;
 }
 
-vec3 told3(int at) { return vec3(told(at), told(at + ${layout.outputTexels}), told(at + ${2 * layout.outputTexels})); }
+vec3 result3(int at) { return vec3(result(at), result(at + ${layout.outputTexels}), result(at + ${2 * layout.outputTexels})); }
 vec3 sigmoid(vec3 x) { return 1.0 / (1.0 + exp(-x)); }
 
 void evaluate(int anchor) {
@@ -70,15 +70,15 @@ void evaluate(int anchor) {
   think(${layout.heads.opacity});
   for (int k = 0; k < ${range.count}; k++)
     // tanh of a large number is not a number on some drivers
-    a[k].x = 1.0 - 2.0 / (exp(2.0 * told(${layout.heads.opacity + layout.outputsAt} + (k + ${range.first}) * ${layout.outputTexels})) + 1.0);
+    a[k].x = 1.0 - 2.0 / (exp(2.0 * result(${layout.heads.opacity + layout.outputsAt} + (k + ${range.first}) * ${layout.outputTexels})) + 1.0);
   think(${layout.heads.color});
   for (int k = 0; k < ${range.count}; k++)
-    a[k].yzw = sigmoid(told3(${layout.heads.color + layout.outputsAt} + (k + ${range.first}) * ${3 * layout.outputTexels}));
+    a[k].yzw = sigmoid(result3(${layout.heads.color + layout.outputsAt} + (k + ${range.first}) * ${3 * layout.outputTexels}));
   think(${layout.heads.covariance});
   for (int k = 0; k < ${range.count}; k++) {
     int at = ${layout.heads.covariance + layout.outputsAt} + (k + ${range.first}) * ${7 * layout.outputTexels};
-    b[k].xyz = sigmoid(told3(at));
-    vec4 q = vec4(told(at + ${3 * layout.outputTexels}), told3(at + ${4 * layout.outputTexels}));
+    b[k].xyz = sigmoid(result3(at));
+    vec4 q = vec4(result(at + ${3 * layout.outputTexels}), result3(at + ${4 * layout.outputTexels}));
     q /= max(length(q), 1e-12);
     b[k].w = q.x;
     c[k] = vec4(q.yzw, 0.0);

@@ -45,10 +45,10 @@ void main() {
   conic = vec3(yy, -xy, xx) / (xx * yy - xy * xy);
   paint = vec4(unpackHalf2x16(rest.z), unpackHalf2x16(rest.w).x, opacity);
   // The rectangle along the ellipse's axes, where alpha falls to MIN_ALPHA, and a little more for roundings.
-  float middle = 0.5 * (xx + yy), apart = length(vec2(0.5 * (xx - yy), xy));
-  float large = middle + apart, small = max(middle - apart, 0.0);
+  float middle = 0.5 * (xx + yy), spread = length(vec2(0.5 * (xx - yy), xy));
+  float large = middle + spread, small = max(middle - spread, 0.0);
   vec2 along = xx >= yy ? vec2(large - yy, xy) : vec2(xy, large - xx);
-  along = apart > 1e-6 * large ? normalize(along) : vec2(1.0, 0.0);
+  along = spread > 1e-6 * large ? normalize(along) : vec2(1.0, 0.0);
   float reach = 2.0 * max(log(opacity / MIN_ALPHA), 0.0);
   vec2 corner = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0;
   vec2 from = corner.x * (sqrt(reach * large) + 0.02) * along + corner.y * (sqrt(reach * small) + 0.02) * vec2(-along.y, along.x);

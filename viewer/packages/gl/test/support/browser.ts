@@ -18,7 +18,7 @@ export interface Stage {
 }
 
 /**
- * @param files what the server gives besides the page, by name: paths on this machine
+ * @param files what the server gives in addition to the page, by name: paths on this machine
  * @param script what runs in the page; it sets `globalThis.stage`
  */
 export async function openStage(

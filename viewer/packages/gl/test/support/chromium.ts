@@ -5,10 +5,10 @@ import { existsSync } from "node:fs";
 import { type Browser, chromium } from "playwright-core";
 
 const USUAL_PLACES = [
+  "/usr/bin/chromium-headless-shell",
   "/usr/bin/chromium",
   "/usr/bin/chromium-browser",
   "/usr/bin/google-chrome",
-  "/usr/bin/chromium-headless-shell",
   "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
 ];
 /** Software GL without a window, and no warning that it is. */

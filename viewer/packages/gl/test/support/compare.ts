@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** How far two pictures or two lists of numbers are apart. */
+/** Differences of two pictures or two lists of numbers. */
 
 export interface Difference {
   readonly psnrDecibels: number;

@@ -51,7 +51,7 @@ export class Play {
     document.body.append(this.canvas);
     if (options.device) lessen(this.canvas, options.device);
     this.sorter = new HeldWorker(new Worker(options.sorterPath ?? "/sorter.js", { type: "module" }));
-    // Without one, the renderer starts the file that lies beside its own.
+    // Without one, the renderer starts the file next to its own.
     const sorter = options.ownSorter ? {} : { sorter: this.sorter as unknown as Worker };
     this.renderer = new SplatRenderer(this.canvas, { ...options, ...sorter });
     this.renderer.onContextLost = () => this.events.push("lost");

@@ -57,21 +57,21 @@ export class AbrController {
     if (bitsPerSecond === undefined) return at;
     const now = this.now();
     const since = now - this.changed;
-    const bears = (step: number, factor: number) => bitsPerSecond >= factor * steps[step]!.bits_per_second;
-    if (at > 0 && !bears(at, STAY)) {
+    const sustains = (step: number, factor: number) => bitsPerSecond >= factor * steps[step]!.bits_per_second;
+    if (at > 0 && !sustains(at, STAY)) {
       let lower = at - 1;
-      while (lower > 0 && !bears(lower, STAY)) lower--;
+      while (lower > 0 && !sustains(lower, STAY)) lower--;
       return since >= DOWN_SECONDS ? this.granted(lower) : at;
     }
     const higher = at + 1;
     const enough = since >= (this.fell ? AGAIN_SECONDS : UP_SECONDS);
     if (higher >= steps.length) return at;
-    if (enough && bears(higher, UP)) return this.granted(higher);
+    if (enough && sustains(higher, UP)) return this.granted(higher);
     if (tryingSince !== undefined && now - tryingSince > TRIAL_LIMIT_SECONDS) {
       this.giveUp();
       return at;
     }
-    const maybe = busyShare < IDLE_SHARE && bears(higher, 1 / UNDERESTIMATED);
+    const maybe = busyShare < IDLE_SHARE && sustains(higher, 1 / UNDERESTIMATED);
     const isDue = maybe && now - this.tried >= this.trialSeconds;
     if ((tryingSince === undefined && !isDue) || this.granted(higher) !== higher) return at;
     this.tryingSince = tryingSince ?? now;

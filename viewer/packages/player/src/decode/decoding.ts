@@ -18,7 +18,7 @@ import { Throttle } from "./throttle.js";
 /** Longest interval between pictures on a machine that decodes too slowly. */
 const LATE_PICTURE_MILLISECONDS = 250;
 /** Shortest interval between messages about values that change with every packet. */
-const TELL_MILLISECONDS = 100;
+const POST_MILLISECONDS = 100;
 
 export class Decoding {
   private readonly client: ByteClient;
@@ -34,12 +34,12 @@ export class Decoding {
   /** The chapter of the last decoded packet. */
   private chapter: Chapter | undefined;
   /** The chapter of the last sent frame. */
-  private told: Chapter | undefined;
+  private announced: Chapter | undefined;
   private packets: PacketFacts[] = [];
   private milliseconds = 0;
   private givenAt = 0;
-  private readonly storedTold = new Throttle(TELL_MILLISECONDS, () => this.tellStored());
-  private readonly catalogTold = new Throttle(TELL_MILLISECONDS, () => this.tellCatalog());
+  private readonly storedPosts = new Throttle(POST_MILLISECONDS, () => this.postStored());
+  private readonly catalogPosts = new Throttle(POST_MILLISECONDS, () => this.postCatalog());
   private wake: (() => void) | undefined;
 
   constructor(
@@ -56,7 +56,7 @@ export class Decoding {
     if (message.type === "open") this.open(message);
     else if (message.type === "demand") this.demand = message.demand;
     else if (message.type === "quality") this.segmented?.choose(message.quality);
-    else this.told?.changed.forget();
+    else this.announced?.changed.forget();
     this.wake?.();
   }
 
@@ -64,8 +64,8 @@ export class Decoding {
     this.client.open(source);
     const common = {
       stored: () => this.storeChanged(),
-      waiting: (seconds: number, problem: string | undefined) => this.tell({ type: "waiting", seconds, problem }),
-      failed: (message: string, fatal: boolean) => this.tell({ type: "failed", message, fatal }),
+      waiting: (seconds: number, problem: string | undefined) => this.post({ type: "waiting", seconds, problem }),
+      failed: (message: string, fatal: boolean) => this.post({ type: "failed", message, fatal }),
     };
     if (source.kind === "segments") {
       this.segmented = new SegmentedStreams(this.client, source.url, source.name, budgetBytes, {
@@ -73,18 +73,18 @@ export class Decoding {
         begun: (stream) => this.begin(stream),
         changed: () => this.catalogChanged(),
         lost: (first, end, reason) => this.lose(first, end, reason),
-        notice: (message) => this.tell({ type: "notice", message }),
-        qualities: (names, at) => this.tell({ type: "qualities", names, at }),
+        notice: (message) => this.post({ type: "notice", message }),
+        qualities: (names, at) => this.post({ type: "qualities", names, at }),
       });
       return;
     }
     FileStream.open(this.client, source.name, fromStart, budgetBytes, {
       ...common,
-      opening: (loadedBytes, totalBytes, ended) => this.tell({ type: "opening", loadedBytes, totalBytes, ended }),
+      opening: (loadedBytes, totalBytes, ended) => this.post({ type: "opening", loadedBytes, totalBytes, ended }),
       begun: (stream, header, ranged) => {
         this.begin(stream);
-        this.told = stream.chapter(0, 0);
-        this.tell({ type: "header", header, ranged });
+        this.announced = stream.chapter(0, 0);
+        this.post({ type: "header", header, ranged });
       },
       changed: () => this.catalogChanged(),
       lost: (first, end, reason) => this.lose(first, end, reason),
@@ -178,15 +178,15 @@ export class Decoding {
   }
 
   private give(chapter: Chapter, frame: Frame, exact: boolean): void {
-    const { told } = this;
-    if (chapter !== told) chapter.changed.forget();
-    if (!told) this.tell({ type: "header", header: chapter.header, ranged: true });
-    this.told = chapter;
+    const { announced } = this;
+    if (chapter !== announced) chapter.changed.forget();
+    if (!announced) this.post({ type: "header", header: chapter.header, ranged: true });
+    this.announced = chapter;
     const fields = chapter.changed.of(frame.fields);
     const update = { index: frame.index, ptsSeconds: frame.ptsSeconds, fields };
     const { serial, packets, milliseconds } = this;
     const transfer = [...fields.values()].map(({ data }) => data.buffer as ArrayBuffer);
-    const header = told && chapter !== told ? { header: chapter.header } : {};
+    const header = announced && chapter !== announced ? { header: chapter.header } : {};
     this.port.postMessage(
       { type: "frame", serial, update, exact, packets, decodeMilliseconds: milliseconds, ...header },
       transfer,
@@ -203,7 +203,7 @@ export class Decoding {
     if (end === this.next) return false;
     this.next = end;
     this.seeking = false;
-    this.tell({ type: "gap", serial: demand.serial, end });
+    this.post({ type: "gap", serial: demand.serial, end });
     return true;
   }
 
@@ -213,31 +213,31 @@ export class Decoding {
     catalog.markDamaged(first, end);
     const last = (end ?? catalog.groupEnd(first)) - 1;
     const frames = last === first ? `Frame ${first} is` : `Frames ${first} to ${last} are`;
-    this.tell({ type: "damage", message: `${frames} lost: ${reason}.`, lost: [first, last + 1] });
-    this.catalogTold.call();
+    this.post({ type: "damage", message: `${frames} lost: ${reason}.`, lost: [first, last + 1] });
+    this.catalogPosts.call();
     this.wake?.();
   }
 
   private catalogChanged(): void {
-    this.catalogTold.call();
+    this.catalogPosts.call();
     this.wake?.();
   }
 
   private storeChanged(): void {
-    this.storedTold.call();
+    this.storedPosts.call();
     this.wake?.();
   }
 
-  private tellStored(): void {
+  private postStored(): void {
     if (!this.stream) return;
-    this.tell({ type: "stored", ranges: this.stream.store.ranges(), fetchedBytes: this.client.fetchedBytes });
+    this.post({ type: "stored", ranges: this.stream.store.ranges(), fetchedBytes: this.client.fetchedBytes });
   }
 
-  private tellCatalog(): void {
-    if (this.stream) this.tell({ type: "catalog", facts: this.stream.catalog.facts() });
+  private postCatalog(): void {
+    if (this.stream) this.post({ type: "catalog", facts: this.stream.catalog.facts() });
   }
 
-  private tell(message: FromDecoder): void {
+  private post(message: FromDecoder): void {
     this.port.postMessage(message, []);
   }
 }

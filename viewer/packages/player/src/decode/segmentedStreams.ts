@@ -2,7 +2,7 @@
 /** A stream in a segments folder, or in several renditions, of which one is decoded at a time. */
 
 import type { Quality } from "../source/manifest.js";
-import { besides } from "../source/storedFile.js";
+import { siblingUrl } from "../source/storedFile.js";
 import { AbrController } from "./abrController.js";
 import type { ByteClient } from "./byteClient.js";
 import type { Demand } from "./messages.js";
@@ -100,7 +100,7 @@ export class SegmentedStreams {
     this.active = stream;
     this.pending = undefined;
     this.abr!.change(step);
-    this.tellQualities();
+    this.postQualities();
     return stream;
   }
 
@@ -113,7 +113,7 @@ export class SegmentedStreams {
     let begun = false;
     const { events } = this;
     const isActive = () => stream === this.active;
-    const told: SegmentEvents = {
+    const forwarded: SegmentEvents = {
       changed: () => {
         if (!isActive()) events.stored();
         else {
@@ -125,7 +125,7 @@ export class SegmentedStreams {
       stored: () => events.stored(),
       qualities: (qualities) => {
         if (isActive() && !this.abr) this.begin(qualities);
-        else told.failed(`${name} leads to a list of qualities where a manifest belongs.`);
+        else forwarded.failed(`${name} leads to a list of qualities where a manifest belongs.`);
       },
       lost: (first, end, reason) => {
         if (isActive()) events.lost(first, end, reason);
@@ -142,7 +142,7 @@ export class SegmentedStreams {
         else if (stream === this.pending?.stream) this.refuse(message, temporary);
       },
     };
-    const stream: SegmentStream = new SegmentStream(this.client, url, name, this.budgetBytes, told);
+    const stream: SegmentStream = new SegmentStream(this.client, url, name, this.budgetBytes, forwarded);
     stream.follow();
     return stream;
   }
@@ -152,7 +152,7 @@ export class SegmentedStreams {
     this.listed = performance.now();
     this.active.leave();
     this.active = this.qualityOf(this.abr.steps[0]!);
-    this.tellQualities();
+    this.postQualities();
   }
 
   private listAgain(): void {
@@ -175,10 +175,10 @@ export class SegmentedStreams {
   }
 
   private qualityOf({ manifest }: Quality): SegmentStream {
-    return this.followed(besides(this.url, manifest), manifest);
+    return this.followed(siblingUrl(this.url, manifest), manifest);
   }
 
-  private tellQualities(): void {
+  private postQualities(): void {
     const { steps, at } = this.abr!;
     this.events.qualities(
       steps.map(({ name }) => name),

@@ -11,7 +11,7 @@ import { ManifestFeed } from "./manifestFeed.js";
 import { pause } from "./pause.js";
 import type { Port } from "./port.js";
 import { RETRY_POLICY, type RetryPolicy } from "./retryPolicy.js";
-import { besides, verify } from "./storedFile.js";
+import { siblingUrl, verify } from "./storedFile.js";
 
 /** Largest accepted size of an init record or a packet. */
 const MAX_HELD_BYTES = 2 ** 28;
@@ -123,7 +123,7 @@ export class Fetcher {
 
   private stored({ url, entry }: StoredPlace): ByteSource {
     const { sameOrigin } = this.description as SourceDescription & { kind: "segments" };
-    return new HttpSource(besides(url, entry.file), entry.file, this.request, sameOrigin, true);
+    return new HttpSource(siblingUrl(url, entry.file), entry.file, this.request, sameOrigin, true);
   }
 
   private opened(): ByteSource {

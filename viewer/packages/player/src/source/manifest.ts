@@ -29,7 +29,7 @@ const MAX_LIST_BYTES = 2 ** 16;
 
 const count = whole(1);
 const storedFile = {
-  file: like(/^[\w-][\w.-]{0,127}$/, "the plain name of a file beside it"),
+  file: like(/^[\w-][\w.-]{0,127}$/, "the plain name of a file in its folder"),
   bytes: whole(1, 2 ** 40),
   sha256: like(/^[\da-f]{64}$/, "64 hex digits"),
 };

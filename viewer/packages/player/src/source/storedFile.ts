@@ -5,7 +5,7 @@ import { SourceError } from "./byteSource.js";
 import type { FileEntry } from "./manifest.js";
 
 /** The address of a file next to a manifest, with the manifest's access token. The name was checked before. */
-export function besides(manifest: string, file: string): string {
+export function siblingUrl(manifest: string, file: string): string {
   const found = new URL(file, manifest);
   const token = new URL(manifest).searchParams.get("token");
   if (token !== null) found.searchParams.set("token", token);

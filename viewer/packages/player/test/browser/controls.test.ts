@@ -113,7 +113,7 @@ describe.skipIf(StagedTests.skipped)("controls in a browser", () => {
     const turned = await eye();
     expect(turned).not.toEqual(first);
     await touch("touchStart", [140, 80], [180, 80]);
-    for (const apart of [30, 45, 60]) await touch("touchMove", [160 - apart, 80], [160 + apart, 80]);
+    for (const half of [30, 45, 60]) await touch("touchMove", [160 - half, 80], [160 + half, 80]);
     await touch("touchEnd");
     await page.waitForTimeout(100);
     expect(await eye()).not.toEqual(turned);
@@ -125,7 +125,7 @@ describe.skipIf(StagedTests.skipped)("controls in a browser", () => {
 
   test("the rig's cameras: list, keys, frusta", async () => {
     const page = await stage.open('src="clip.sgs"', "", {
-      viewport: { width: 640, height: 400 },
+      viewport: { width: 480, height: 300 },
       reducedMotion: "reduce",
     });
     await shows(page, 0);

@@ -88,7 +88,7 @@ describe.skipIf(StagedTests.skipped)("a live stream in a browser", () => {
     await page
       .getByText("The server answered the request for manifest.json with 503. The next attempt is in")
       .waitFor();
-    await page.waitForTimeout(1500);
+    await page.waitForTimeout(800);
     expect((await reported(page, "notice")).length).toBe(1);
     write(live, 2);
     await shows(page, 11);

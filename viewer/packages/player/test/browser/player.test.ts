@@ -176,10 +176,10 @@ describe.skipIf(StagedTests.skipped)("the player in a browser", () => {
     stage.expectQuiet();
   });
 
-  // The server is what is slow: Chromium refuses to throttle what workers fetch ("Not supported"). What follows the first
-  // picture takes it 1.5 s, of which 0.4 s are played.
+  // The server is what is slow: Chromium refuses to throttle what workers fetch ("Not supported"). The end of the header
+  // takes it 1 s, and what follows the first picture 3 s, of which 0.4 s are played.
   test("waits on a slow network, and goes on", async () => {
-    stage.server.put("/clip.sgs", CLIP, { bytesPerSecond: 5_000 });
+    stage.server.put("/clip.sgs", CLIP, { bytesPerSecond: 2_500, slowFrom: PACKETS[0]!.offset - 2_500 });
     const page = await stage.open('src="clip.sgs" autoplay');
     await page.getByRole("progressbar").waitFor();
     await page.waitForFunction(() => heard.reported.some(([name]) => name === "ended"), undefined, { timeout: 40_000 });
@@ -189,7 +189,7 @@ describe.skipIf(StagedTests.skipped)("the player in a browser", () => {
     stage.expectQuiet();
   });
 
-  test("what it tells is dispatched as events of the DOM, as a video's are", async () => {
+  test("its events are DOM events, as a video's are", async () => {
     const page = await stage.open("isolated");
     const heard = await ask(
       page,
@@ -280,7 +280,7 @@ describe.skipIf(StagedTests.skipped)("the player in a browser", () => {
   });
 
   test("says that there is no WebGL2", async () => {
-    const page = await stage.open();
+    const page = await stage.open('src="clip.sgs"', "", {});
     await page.addInitScript(() => {
       HTMLCanvasElement.prototype.getContext = () => null;
     });
@@ -298,10 +298,14 @@ describe.skipIf(StagedTests.skipped)("the player in a browser", () => {
     await ask(page, async (player) => {
       const gl = player.shadowRoot!.querySelector("canvas")!.getContext("webgl2")!;
       const loss = gl.getExtension("WEBGL_lose_context")!;
+      const happened = (name: string) =>
+        new Promise<void>((resolve) => gl.canvas.addEventListener(name, () => setTimeout(resolve), { once: true }));
+      const lost = happened("webglcontextlost");
       loss.loseContext();
-      await new Promise((resolve) => setTimeout(resolve, 300));
+      await lost;
+      const restored = happened("webglcontextrestored");
       loss.restoreContext();
-      await new Promise((resolve) => setTimeout(resolve, 500));
+      await restored;
     });
     await ask(page, (player) => player.seek(0.2));
     await shows(page, 6);

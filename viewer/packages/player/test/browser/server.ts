@@ -9,8 +9,9 @@ export interface Served {
   bytes: Uint8Array;
   type?: string;
   ranges?: boolean;
-  /** Bytes of the body in a second. */
+  /** Bytes of the body in a second, from byte `slowFrom` of the file on. */
   bytesPerSecond?: number;
+  slowFrom?: number;
   cors?: boolean;
   status?: number;
   location?: string;
@@ -80,6 +81,8 @@ export class TestServer {
     const headers: Record<string, string> = {
       "Content-Type": file.type ?? "application/octet-stream",
       "Last-Modified": (file.changed ?? new Date(0)).toUTCString(),
+      // A page of another test asks for it again.
+      "Cache-Control": "no-store",
       ...(file.cors ? { "Access-Control-Allow-Origin": "*", "Access-Control-Expose-Headers": "Content-Range" } : {}),
     };
     if (!asked || file.ranges === false) {
@@ -100,11 +103,13 @@ export class TestServer {
 }
 
 async function pour(response: ServerResponse, file: Served, start: number, end: number): Promise<void> {
-  const { bytes, bytesPerSecond } = file;
-  const step = bytesPerSecond ? Math.max(Math.round(bytesPerSecond / 20), 1) : end - start;
-  for (let at = start; at < end && !response.destroyed; at += step) {
+  const { bytes, bytesPerSecond, slowFrom = 0 } = file;
+  const slow = bytesPerSecond ? Math.min(Math.max(slowFrom, start), end) : end;
+  response.write(bytes.subarray(start, slow));
+  const step = bytesPerSecond ? Math.max(Math.round(bytesPerSecond / 20), 1) : 0;
+  for (let at = slow; at < end && !response.destroyed; at += step) {
     response.write(bytes.subarray(at, Math.min(at + step, end)));
-    if (bytesPerSecond) await new Promise((resolve) => setTimeout(resolve, 50));
+    await new Promise((resolve) => setTimeout(resolve, 50));
   }
   response.end();
 }

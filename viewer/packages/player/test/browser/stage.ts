@@ -21,6 +21,10 @@ export function builtPlayer(): string {
   return readFileSync(new URL("../../dist/player.js", import.meta.url), "utf8");
 }
 
+/** Pages are composited without software GL, which takes twice as long for them; WebGL still has it. */
+const FLAGS = ["--js-flags=--expose-gc", "--disable-gpu-compositing", "--disable-gpu-rasterization"];
+const VIEWPORT = { width: 320, height: 240 };
+
 export interface Opened {
   readonly page: Page;
   /** What the console and the page complained of. */
@@ -29,26 +33,45 @@ export interface Opened {
 
 /** One browser, whose garbage can be collected when a test asks for it, and one server for a file of tests. */
 export class Stage {
+  /** The page of all tests that ask for no options of their own. */
+  private usual: Opened | undefined;
+
   private constructor(
     readonly browser: Browser,
     readonly server: TestServer,
   ) {}
 
   static async opened(executablePath: string): Promise<Stage> {
-    const [browser, server] = await Promise.all([
-      launched(executablePath, "--js-flags=--expose-gc"),
-      TestServer.started(),
-    ]);
+    const [browser, server] = await Promise.all([launched(executablePath, ...FLAGS), TestServer.started()]);
     server.put("/player.js", builtPlayer(), { type: "text/javascript" });
     server.put("/clip.sgs", CLIP);
     return new Stage(browser, server);
   }
 
-  /** A page with one player: `attributes` are the element's, written as in HTML. */
-  async open(attributes = 'src="clip.sgs"', query = "", options: BrowserContextOptions = {}): Promise<Opened> {
+  /** A page with one player: `attributes` are the element's, written as in HTML; `options` give it a context of its own. */
+  async open(attributes = 'src="clip.sgs"', query = "", options?: BrowserContextOptions): Promise<Opened> {
     this.server.put("/page.html", pageWith(attributes), { type: "text/html" });
     this.server.requests.length = 0;
-    const context = await this.browser.newContext({ viewport: { width: 320, height: 240 }, ...options });
+    const opened = options ? await this.newPage(options) : await this.usualPage();
+    await opened.page.goto(`${this.server.origin}/page.html${query}`);
+    return opened;
+  }
+
+  /** Ends what the page does. */
+  async leave(opened: Opened): Promise<void> {
+    if (opened === this.usual) await opened.page.goto("about:blank");
+    else await opened.page.context().close();
+  }
+
+  private async usualPage(): Promise<Opened> {
+    this.usual ??= await this.newPage({});
+    this.usual.complaints.length = 0;
+    await this.usual.page.setViewportSize(VIEWPORT);
+    return this.usual;
+  }
+
+  private async newPage(options: BrowserContextOptions): Promise<Opened> {
+    const context = await this.browser.newContext({ viewport: VIEWPORT, ...options });
     const page = await context.newPage();
     const complaints: string[] = [];
     page.on("pageerror", (error) => complaints.push(`page: ${error.message}`));
@@ -57,7 +80,6 @@ export class Stage {
       const usual = text.includes("GPU stall due to ReadPixels");
       if (["error", "warning"].includes(message.type()) && !usual) complaints.push(text);
     });
-    await page.goto(`${this.server.origin}/page.html${query}`);
     return { page, complaints };
   }
 
@@ -96,7 +118,7 @@ export class StagedTests {
   }
 
   async close(): Promise<void> {
-    await this.opened?.page.context().close();
+    if (this.opened) await this.stageOfAll!.leave(this.opened);
     this.opened = undefined;
   }
 
