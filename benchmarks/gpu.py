@@ -78,7 +78,7 @@ def fitted(world: World, backend: Backend) -> FitResult:
         world.rig,
         before=world.previous,
         motion=config.motion,
-        start=config.scene_flow,
+        scene_flow=config.scene_flow,
         backend=backend,
     )
     scene = moved(world.before, backend.device)

@@ -53,7 +53,7 @@ def _fitting(
             world.rig,
             before=world.previous,
             motion=config.motion,
-            start=config.scene_flow,
+            scene_flow=config.scene_flow,
             backend=backend,
         )
         fit = fit_next_frame(

@@ -88,7 +88,7 @@ def test_a_frame_of_recorded_iterations_is_that_of_single_ones(device: str) -> N
                 world.rig,
                 before=world.frames[0],
                 motion=config.motion,
-                start=config.scene_flow,
+                scene_flow=config.scene_flow,
                 backend=backend,
             ),
             steps={str(name): step for name, step in config.rounding.steps(0.01).items()},

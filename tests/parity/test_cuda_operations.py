@@ -30,7 +30,7 @@ def test_an_online_frame(emulation: Callable[[int], KernelLibrary], monkeypatch:
             world.rig,
             before=world.frames[0],
             motion=config.motion,
-            start=config.scene_flow,
+            scene_flow=config.scene_flow,
             backend=backend,
         )
         scene = moved(world.scene, DEVICE)

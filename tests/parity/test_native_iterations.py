@@ -18,9 +18,12 @@ from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import state_of
+from structgstream.session.presets import PRESETS
 from structgstream.training.losses import LossWeights
+from structgstream.training.online import iterations
 from structgstream.training.online.config import MotionConfig, OnlineConfig, PatchingConfig, SmoothnessConfig
-from structgstream.training.online.optimize import FrameOptimizer, StartingPoint
+from structgstream.training.online.iterations import StartingPoint, unknown_natively
+from structgstream.training.online.optimize import FrameOptimizer
 from structgstream.training.online.split import DynamicSplit
 from structgstream.training.parameters import RoundingConfig
 from structgstream.training.result import FitResult, Step, Stopwatch
@@ -122,6 +125,21 @@ class WithSize(LossWeights):
 @pytest.mark.parametrize("size", [0.0, 0.1, 1])
 def test_a_loss_that_they_do_not_know_is_minimised_in_torch(size: float) -> None:
     assert ("iterations" in fitted(cpu_backend(), losses=WithSize(size=size)).seconds) == (size == 0.0)
+
+
+@dataclass(frozen=True)
+class WithPenalty(OnlineConfig):
+    penalty: float = 0.0
+
+
+def test_settings_and_rows_that_they_do_not_know_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain, appearing = (scene_of(appears=appears, free=3) for appears in (False, True))
+    settings = vars(PRESETS["compact"].online)
+    assert unknown_natively(WithPenalty(**settings), appearing) == set()
+    assert unknown_natively(WithPenalty(**settings, penalty=0.1), appearing) == {"penalty"}
+    monkeypatch.setattr(iterations, "LEAVES", tuple(name for name in iterations.LEAVES if name != "appearance"))
+    assert unknown_natively(CONFIG, plain) == set()
+    assert unknown_natively(CONFIG, appearing) == {"appearance"}
 
 
 @pytest.mark.parametrize("oracle", [cpu_backend, reference_backend])

@@ -151,7 +151,7 @@ FOLLOWING = replace(
 def followed(scene, world, index, *, config=FOLLOWING, seed=0, backend: Backend | None = None, **past):
     backend, frame, before = backend or quickest_backend(), world.frames[index], world.frames[index - 1]
     pictures = preprocess(
-        frame, world.rig, before=before, motion=config.motion, start=config.scene_flow, backend=backend
+        frame, world.rig, before=before, motion=config.motion, scene_flow=config.scene_flow, backend=backend
     )
     return fit_next_frame(scene, frame, world.rig, config=config, backend=backend, seed=seed, pictures=pictures, **past)
 

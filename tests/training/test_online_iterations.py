@@ -10,8 +10,8 @@ import torch
 from structgstream.kernels.values import TileSelection, tile_grid
 from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.scene import Scene
-from structgstream.training.losses import GradientStatistics, LossWeights, SceneLoss
-from structgstream.training.online.config import PatchingConfig
+from structgstream.training.losses import GradientStatistics, SceneLoss
+from structgstream.training.online.config import OnlineConfig, PatchingConfig
 from structgstream.training.online.iterations import OnlineHooks, StartingPoint
 from structgstream.training.online.patching import FreeSet
 from structgstream.training.online.split import DynamicSplit
@@ -49,7 +49,7 @@ def hooks_of(start: StartingPoint, *, patch_at: int = 4, patches: bool = True, r
     return OnlineHooks(
         start=start,
         parameters=parameters,
-        losses=LossWeights(),
+        config=OnlineConfig(),
         rate_term=None,
         smoothness=None,
         free_set=free_set,

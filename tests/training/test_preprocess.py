@@ -16,7 +16,7 @@ START = SceneFlowConfig(enabled=True, views=3)
 def pictures(*, motion: MotionConfig = MOTION, start: SceneFlowConfig = START, first: bool = False) -> FramePictures:
     before = None if first else WORLD.frames[0]
     backend = reference_backend()
-    return preprocess(WORLD.frames[1], WORLD.rig, before=before, motion=motion, start=start, backend=backend)
+    return preprocess(WORLD.frames[1], WORLD.rig, before=before, motion=motion, scene_flow=start, backend=backend)
 
 
 def known(found: FramePictures) -> list[PictureChange]:
@@ -47,7 +47,7 @@ def test_what_moves_changes_and_flow_is_looked_for_in_some_views() -> None:
 def test_equal_pictures_are_the_same() -> None:
     backend = reference_backend()
     frozen = replace(WORLD.frames[0], index=1)
-    found = preprocess(frozen, WORLD.rig, before=WORLD.frames[0], motion=MOTION, start=START, backend=backend)
+    found = preprocess(frozen, WORLD.rig, before=WORLD.frames[0], motion=MOTION, scene_flow=START, backend=backend)
     changes = known(found)
     assert all(change.repeated and not change.changed.any() for change in changes)
     assert all(change.flow is None or not change.flow[..., :3].any() for change in changes)

@@ -95,11 +95,11 @@ CAPTURE_LAYOUTS: tuple[tuple[Callable[[Path], bool], Callable[[Path], FrameSourc
 )
 """Whether a folder has a layout, and what opens it. The first that recognises the folder opens it.
 
-A new layout goes among the first five, which are recognised by a file that no other layout has: ahead of ``find_model``
-and what follows, since a capture often has a COLMAP model or another calibration besides (Neural 3D Video does), and
-those entries would open it without what its own file states. ``prepared`` stays first: a folder that
-``structgstream prepare`` wrote into still has the files that it was prepared from. The last entry looks one folder
-below and stays last. ``LAYOUTS_HELP`` lists the layouts for users."""
+A new layout goes ahead of ``find_model``, among those that are recognised by a file that no other layout has: a capture
+often has a COLMAP model or another calibration besides (Neural 3D Video does), and the later entries would open it
+without what its own file states. ``prepared`` stays first: a folder that ``structgstream prepare`` wrote into still has
+the files that it was prepared from. The last entry looks one folder below and stays last.
+``LAYOUTS_HELP`` lists the layouts for users."""
 
 
 def open_capture(

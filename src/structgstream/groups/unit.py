@@ -96,7 +96,7 @@ class GroupMethod:
         online = self.config.online
         without_flow = replace(online.scene_flow, enabled=False)
         first = self.entry.first_pictures()
-        return preprocess(frame, rig, before=first, motion=online.motion, start=without_flow, backend=backend)
+        return preprocess(frame, rig, before=first, motion=online.motion, scene_flow=without_flow, backend=backend)
 
     def first(self, task: FrameTask) -> FitResult[Scene]:
         """Not supported: frame 0 is that of the header. Raises ConfigError always."""

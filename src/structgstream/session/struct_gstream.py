@@ -65,7 +65,9 @@ class StructGStream:
     ) -> FramePictures:
         """The training pictures and their changes."""
         online = self.config.online
-        return preprocess(frame, rig, before=before, motion=online.motion, start=online.scene_flow, backend=backend)
+        return preprocess(
+            frame, rig, before=before, motion=online.motion, scene_flow=online.scene_flow, backend=backend
+        )
 
     def first(self, task: FrameTask) -> FitResult[Scene]:
         """Fit frame 0, with its environment if enabled."""

@@ -67,7 +67,9 @@ def fit_next_frame(
         on_step: called after every iteration.
     """
     if pictures is None:
-        pictures = preprocess(frame, rig, before=None, motion=config.motion, start=config.scene_flow, backend=backend)
+        pictures = preprocess(
+            frame, rig, before=None, motion=config.motion, scene_flow=config.scene_flow, backend=backend
+        )
     views = pictures.views
     if len(views) < min(MIN_CAMERAS, len(rig.training)):
         return held(scene)

@@ -20,21 +20,52 @@ from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import ParameterName
-from structgstream.training.losses import LossWeights, SceneLoss, view_loss, with_term
+from structgstream.training.losses import SceneLoss, view_loss, with_term
+from structgstream.training.online.config import OnlineConfig
 from structgstream.training.online.patching import FreeSet
 from structgstream.training.online.smoothness import MotionSmoothness
 from structgstream.training.online.split import DynamicSplit
 from structgstream.training.optim import BETAS, Adam, Hooks, LastPass, MeanOfSteps, Schedule
-from structgstream.training.parameters import ANCHOR_ROWS, FREE_ROWS, Parameters
+from structgstream.training.parameters import ANCHOR_ROWS, FREE_ROWS, Parameters, values_of_rows
 from structgstream.training.result import Step, StepListener, Stopwatch
 from structgstream.training.views import View
 
-LEAVES: tuple[ParameterName, ...] = (*ANCHOR_ROWS, *FREE_ROWS)
-"""Tensors of a frame's fit (``values.FIT_LEAVES``)."""
+LEAVES: tuple[ParameterName, ...] = (
+    "anchor_positions",
+    "offset_scales",
+    "base_scales",
+    "anchor_offsets",
+    "anchor_features",
+    "appearance",
+    "free_means",
+    "free_log_scales",
+    "free_quats",
+    "free_logit_opacities",
+    "free_colors",
+)
+"""Rows of a scene that back-ends' own iterations know, in their order (``values.FIT_LEAVES``)."""
 NATIVE_LOSSES = frozenset({"l1", "ssim", "volume"})
-"""Weights of a view's loss that back-ends' own iterations know."""
+"""Weights of a view's loss that they know."""
+NATIVE_SETTINGS = frozenset(
+    {
+        *("iterations", "losses", "rates", "smoothness", "rounding", "mean_of_last", "sampling_filter"),
+        *("dynamic", "appearance_rank", "patching", "motion", "scene_flow", "spawn", "motion_prior", "exposure"),
+    }
+)
+"""Fields of :class:`OnlineConfig` that they know, or that do not concern them."""
 REPORT_INTERVAL = 10
 """Iterations between reports of progress, where a back-end runs them."""
+
+
+def unknown_natively(config: OnlineConfig, scene: Scene) -> set[str]:
+    """Names of what only iterations in torch know: settings and weights that are not zero, rows of the scene."""
+    losses = {name: value for name, value in vars(config.losses).items() if not isinstance(value, str)}
+    rows = {*values_of_rows(scene.anchors, ANCHOR_ROWS), *values_of_rows(scene.free, FREE_ROWS)}
+    return {
+        *(name for name, value in vars(config).items() if value and name not in NATIVE_SETTINGS),
+        *(name for name, weight in losses.items() if weight and name not in NATIVE_LOSSES),
+        *rows.difference(LEAVES),
+    }
 
 
 @dataclass(frozen=True)
@@ -89,7 +120,7 @@ class OnlineHooks(Hooks[View, SceneLoss]):
     Args:
         start: the initial state.
         parameters: of the scene.
-        losses: weights of the terms.
+        config: of online frames.
         rate_term: bits of changes; None for none.
         smoothness: of motion; None for none.
         free_set: of the free Gaussians.
@@ -107,7 +138,7 @@ class OnlineHooks(Hooks[View, SceneLoss]):
 
     start: StartingPoint
     parameters: Parameters
-    losses: LossWeights
+    config: OnlineConfig
     rate_term: RateTerm | None
     smoothness: MotionSmoothness | None
     free_set: FreeSet
@@ -128,16 +159,17 @@ class OnlineHooks(Hooks[View, SceneLoss]):
             self.parameters.scene(self.start.scene),
             sample,
             backend=self.backend,
-            weights=self.losses,
+            weights=self.config.losses,
             track_screen=self._tracks_screen(iteration),
             watch=self.watch,
             active=replace(active, tiles=active.changed) if active is not None and self._rests(sample) else active,
             background=None if active is None else active.background,
         )
         # Tiles that are not drawn now hold their last drawing.
-        return self._with_regularizers(replace(loss, active=active))
+        return self._with_regularizers(replace(loss, active=active), sample)
 
-    def _with_regularizers(self, loss: SceneLoss) -> SceneLoss:
+    def _with_regularizers(self, loss: SceneLoss, sample: View) -> SceneLoss:
+        """``loss``, of the view ``sample``, with the terms that do not depend on its picture."""
         values = self.parameters.values
         if self.smoothness is not None:
             difference = self.smoothness.difference(values["anchor_positions"], self.backend)
@@ -233,7 +265,7 @@ def minimize_natively(
             run = None
         if on_step is not None:
             on_step(Step(last, len(views), float(plan.terms[last - 1, 4]), *hooks.counts()))
-    terms = {"l1": 0, "ssim": 1, **({"volume": 2} if hooks.losses.volume else {})}
+    terms = {"l1": 0, "ssim": 1, **({"volume": 2} if hooks.config.losses.volume else {})}
     terms |= {} if hooks.smoothness is None else {"smoothness": 3}
     for i, (view, rests) in enumerate(zip(views, plan.rests.tolist(), strict=True)):
         found = {name: plan.terms[i, column] for name, column in terms.items()}
@@ -261,7 +293,7 @@ def _plan(
 
 def _frame(adam: Adam[ParameterName], plan: FitPlan, hooks: OnlineHooks, done: int) -> FitFrame:
     """The frame from iteration ``done``, with the rows that its leaves have now."""
-    scene, rate_term, smoothness, losses = hooks.start.scene, hooks.rate_term, hooks.smoothness, hooks.losses
+    scene, rate_term, smoothness, losses = hooks.start.scene, hooks.rate_term, hooks.smoothness, hooks.config.losses
     values = hooks.parameters.values
 
     def leaf(name: ParameterName) -> FitLeaf | None:

@@ -2,11 +2,14 @@
 """The iterations of a frame after the first: rendering loss, rate term, smoothness, and patching once (paper, section
 Methods).
 
-::
+As in the paper::
 
     initial state --> [ 50 steps ] --> prune free, spawn free --> [ 50 steps ] --> scene(t)
                            |                   ^
                            '-- view-space gradients by id
+
+With motion selection (``compact``) free Gaussians are spawned before (``spawn.py``); after half of the steps they are
+only pruned.
 """
 
 import math
@@ -18,18 +21,16 @@ import torch
 from structgstream.codec.fields.quantization import RateTerm
 from structgstream.kernels.backend import Backend, nonblocking
 from structgstream.kernels.cuda_tiles import PairBudget, run_with_pair_budget
-from structgstream.kernels.values import FIT_LEAVES
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, ParameterName, fields_of
 from structgstream.training.losses import GradientStatistics
 from structgstream.training.online.config import OnlineConfig, online_rates
 from structgstream.training.online.iterations import (
-    LEAVES,
-    NATIVE_LOSSES,
     OnlineHooks,
     StartingPoint,
     minimize_natively,
+    unknown_natively,
 )
 from structgstream.training.online.measure import slot_count
 from structgstream.training.online.patching import FreeSet
@@ -83,12 +84,11 @@ class FrameOptimizer:
 
     def _runs_natively(self, start: StartingPoint) -> bool:
         """Whether the back-end's own iterations can run these."""
-        patching, losses = self.config.patching, self.config.losses
+        patching = self.config.patching
         tracks_screen = patching.spawn != "off" and patching.collect_from < self._patch_at(start)
-        weights = {name for name, value in vars(losses).items() if not isinstance(value, str) and value}
-        knows = weights <= NATIVE_LOSSES and len(LEAVES) == FIT_LEAVES
         splits = None not in (start.active_tiles, start.split)
-        return self.backend.iterations is not None and splits and not tracks_screen and knows
+        fits = splits and not tracks_screen and not unknown_natively(self.config, start.scene)
+        return self.backend.iterations is not None and fits
 
     def _patch_at(self, start: StartingPoint) -> int:
         return math.ceil(self.config.patching.iteration * len(start.seen) / len(start.views))
@@ -122,7 +122,7 @@ class FrameOptimizer:
         hooks = OnlineHooks(
             start=start,
             parameters=parameters,
-            losses=config.losses,
+            config=config,
             rate_term=rate_term,
             smoothness=MotionSmoothness.of(
                 start.known, [view.camera for view in start.views], config=config.smoothness

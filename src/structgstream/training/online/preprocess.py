@@ -85,7 +85,7 @@ def preprocess(
     *,
     before: MultiViewFrame | None,
     motion: MotionConfig,
-    start: SceneFlowConfig,
+    scene_flow: SceneFlowConfig,
     backend: Backend,
 ) -> FramePictures:
     """The pictures of ``frame``, and their changes since the frame ``before`` (None: without motion selection).
@@ -103,8 +103,8 @@ def preprocess(
     compared = [view for view in views if view.index in known]
     if len(compared) < min(motion.MIN_VOTES, len(rig.training)):
         return FramePictures(views, None)
-    flow_from = flow_views(compared, frame.index, start)
-    changes = detect_changes(views, earlier, config=motion, backend=backend, flow_from=flow_from, flow=start.FLOW)
+    flow_from = flow_views(compared, frame.index, scene_flow)
+    changes = detect_changes(views, earlier, config=motion, backend=backend, flow_from=flow_from, flow=scene_flow.FLOW)
     return FramePictures(views, changes)
 
 

@@ -161,8 +161,9 @@ def apply_scene_flow(
     A replacement returns a :class:`SceneFlow`. The optimisation starts from ``split`` shifted by ``displacements``,
     finite ``[M + F, 3]`` on the device of ``split``; one of 0 leaves a primitive at its last position, from which the
     rate term and smoothness count in any case. Spawning draws ``SceneFlow.split``, which is
-    ``split.displaced(displacements)``, in ``active_tiles``, which are :func:`find_active_tiles` of that split and hold
-    its renderings. From here on only these tiles are drawn. Nothing but the log depends on the counts.
+    ``split.displaced(displacements)``, in ``active_tiles``: :func:`find_active_tiles` of a split that is at most a few
+    pixels from that one, with its renderings (here: before the second round; without flow: at the last positions).
+    From here on only these tiles are drawn. Nothing but the log depends on the counts.
 
     Args:
         split: the scene of the previous frame in two parts, and ``split.selection``. If flow was estimated, that has
