@@ -47,7 +47,7 @@ def test_what_cannot_be_a_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_an_interrupted_demo_says_where_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def interrupted(self: Lines, report: FrameReport) -> None:
+    def interrupted(self: Lines, report: FrameReport, *, quality: str | None = None) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Lines, "frame", interrupted)

@@ -96,7 +96,7 @@ def test_wrong_options_are_reported(
 def test_frame_zero_is_fitted_to_the_part_that_was_chosen() -> None:
     chosen = CaptureOptions(scale=0.5, start=3, every=2)
     unit = _job(Parallel(Path("capture"), Path("out.sgs"), capture=chosen), []).unit
-    assert unit.header == ("--start", "3", "--every", "2", "--scale", "0.5")
+    assert unit.header == ("--scale", "0.5", "--start", "3", "--every", "2")
 
 
 def test_an_output_that_is_no_parallel_run_is_not_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -68,7 +68,7 @@ def test_resuming_with_another_configuration_changes_nothing(stream: Path, capsy
 def test_ctrl_c_keeps_whole_frames_and_resume_gives_the_same_file(
     stream: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def interrupted(self: Lines, report: FrameReport) -> None:
+    def interrupted(self: Lines, report: FrameReport, *, quality: str | None = None) -> None:
         if report.index == 1:
             raise KeyboardInterrupt
 

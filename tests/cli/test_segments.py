@@ -82,7 +82,7 @@ def test_sigterm_finishes_the_frame_and_closes_the_stream_which_is_continued_wit
 ) -> None:
     """Status 143; with --resume it goes on to the same bytes."""
 
-    def terminated(self: Lines, report: FrameReport) -> None:
+    def terminated(self: Lines, report: FrameReport, *, quality: str | None = None) -> None:
         if report.index == 1:
             os.kill(os.getpid(), signal.SIGTERM)
 
