@@ -131,7 +131,7 @@ def test_the_first_frame_is_compared_with_frame_0_and_others_with_the_one_before
     made, before = group(), object()
     options: Any = {"rig": None, "backend": None}
     found: Any = made.observe(task(FIRST).frame, before, **options)  # type: ignore[arg-type]
-    assert (found["before"], found["start"].enabled) == ("frame 0", False)
+    assert (found["before"], found["scene_flow"].enabled) == ("frame 0", False)
     assert made.observe(task(FIRST + 1).frame, before, **options) == "as usual"  # type: ignore[arg-type]
     assert usual.asked == [("observe", before)]
 
