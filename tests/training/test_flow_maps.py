@@ -137,6 +137,7 @@ def test_a_ball_that_crosses_a_share_of_the_width_is_found_at_every_size(width: 
     expected = torch.tensor([round(by * width), 0.0])
     right = (flow - expected).norm(dim=1) < 0.01 * width
     assert right[confidence > 0].float().mean() > 0.95
+    assert found.far_pixels > 0.9 * int((confidence > 0).sum())
     nothing = thrown(width, far=False, by=by)[0].maps[ball]
     assert ((nothing[:, 1:] - expected).norm(dim=1) < 0.01 * width).float().mean() < 0.3, "else this tests nothing"
 

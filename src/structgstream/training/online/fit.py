@@ -129,7 +129,7 @@ def fit_next_frame(
             **flow.counts,
             **spawned.counts,
             "propagated": selection.occluded_count,
-            "far boxes": sum(change.far_boxes for change in pictures.changes if change is not None),
+            **pictures.flow_counts,
             "views left out": len(views) - len(inliers),
             "scene cuts": int(selection.scene_cut),
             **counts,

@@ -10,8 +10,9 @@ large motion are shares of the longer side. The floor of the margin is in pixels
 8 pixels.
 """
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from math import floor, log2
 
 import numpy as np
@@ -56,13 +57,13 @@ class PictureChange:
         repeated: whether it is the previous picture once more, equal or encoded again: a frozen camera's.
         flow: ``[h, w, 6]`` the maps of :func:`flow_map` from the previous picture to this one, and the previous
             picture in 0 ... 1; None if flow was not estimated.
-        far_boxes: number of boxes in which large motion was searched for (:class:`FlowMaps`).
+        flow_counts: what the search for flow did, for the log (:class:`FlowMaps`).
     """
 
     changed: Tensor
     repeated: bool
     flow: Tensor | None = None
-    far_boxes: int = 0
+    flow_counts: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,14 @@ class FramePictures:
 
     views: list[View]
     changes: list[PictureChange | None] | None
+
+    @property
+    def flow_counts(self) -> dict[str, int]:
+        """What the search for flow did in all views, for the log."""
+        counts = Counter[str]()
+        for change in self.changes or []:
+            counts.update(change.flow_counts if change is not None else {})
+        return dict(counts)
 
 
 def preprocess(
@@ -151,15 +160,13 @@ def detect_changes(
             reach = round(config.REACH_PIXELS * view.enlargement)
             changed = backend.changed_pixels(then, now, threshold=config.CHANGE_THRESHOLD, reach_pixels=reach)
             changed = changed if both is None else changed & both
-            small, found, far_boxes = view.evidence(config.picture_scale).camera, None, 0
+            small, found, counts = view.evidence(config.picture_scale).camera, None, dict[str, int]()
             if view.index in flow_from:
                 size = (small.height, small.width)
                 estimated = flow_map(then, now, changed, size, mask=both, config=flow, backend=backend)
-                found, far_boxes = (
-                    torch.cat([estimated.maps, last.evidence(config.picture_scale).colors], dim=-1),
-                    estimated.far_boxes,
-                )
-            changes.append(PictureChange(changed, _is_repeated(then, now, changed, both), found, far_boxes))
+                found = torch.cat([estimated.maps, last.evidence(config.picture_scale).colors], dim=-1)
+                counts = estimated.counts
+            changes.append(PictureChange(changed, _is_repeated(then, now, changed, both), found, counts))
     return changes
 
 
@@ -185,10 +192,23 @@ class FlowMaps:
     Args:
         maps: ``[h, w, 3]``: c, c flow_x and c flow_y (``Backend.confident_flow``).
         far_boxes: number of boxes in which large motion was searched for.
+        far_pixels: number of changed pixels for which that search found a consistent flow.
+        recolored_pixels: number of changed pixels whose flow leads to another colour, in either search.
     """
 
     maps: Tensor
     far_boxes: int = 0
+    far_pixels: int = 0
+    recolored_pixels: int = 0
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """What the search did, for the log."""
+        return {
+            "far boxes": self.far_boxes,
+            "far pixels": self.far_pixels,
+            "recolored pixels": self.recolored_pixels,
+        }
 
 
 def flow_map(
@@ -219,6 +239,7 @@ def flow_map(
         MissingExtraError: OpenCV is not installed.
     """
     maps = torch.zeros(3, *changed.shape)
+    far_pixels = recolored_pixels = 0
     where = changed.numpy(force=True)
     longer, level = max(where.shape), config.level_of(where.shape[1])
     context = max(MIN_CONTEXT_PIXELS, round(CONTEXT_SHARE * longer))
@@ -232,7 +253,9 @@ def flow_map(
         flow: NDArray[np.float32],
         back: NDArray[np.float32],
     ) -> Tensor:
+        nonlocal recolored_pixels
         alike = torch.from_numpy(same_color(earlier, later, flow, radius=radius))
+        recolored_pixels += int(where[box][~alike.numpy()].sum())
         counts = alike if mask is None else alike & mask[box].cpu()
         forward, backward = torch.from_numpy(flow), torch.from_numpy(back)
         return backend.confident_flow(forward, backward, counts, relative=RELATIVE, absolute=ABSOLUTE)
@@ -248,8 +271,10 @@ def flow_map(
         refine = dis_refinement(finest_level=level, coarsest_level=max(level, floor(log2(cell)) - 1))
         found = consistent(box, earlier, later, refine(earlier, later, flows[0]), refine(later, earlier, flows[1]))
         missing = torch.from_numpy(where[box]) & (maps[0][box] == 0.0)
+        far_pixels += int((missing & (found[0] > 0.0)).sum())
         maps[:, *box] = torch.where(missing, found, maps[:, *box])
-    return FlowMaps(area_mean(maps[None], size)[0].permute(1, 2, 0).to(first.device), len(far))
+    small = area_mean(maps[None], size)[0].permute(1, 2, 0).to(first.device)
+    return FlowMaps(small, len(far), far_pixels, recolored_pixels)
 
 
 Box = tuple[slice, slice]
