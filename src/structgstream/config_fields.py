@@ -2,9 +2,9 @@
 """Fields of configurations, which are dataclasses of dataclasses: read from plain JSON, and checked."""
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields, is_dataclass
-from types import SimpleNamespace, UnionType
+from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from structgstream.errors import ConfigError
@@ -50,74 +50,6 @@ def plain_value(value: Any) -> Any:
     if isinstance(value, frozenset | set):
         return sorted(value)
     return [plain_value(item) for item in value] if isinstance(value, list | tuple) else value
-
-
-def constants_of(kind: Any) -> dict[str, Any]:
-    """The upper-case ``ClassVar`` of a configuration class, in lower case: fields of earlier versions.
-
-    Those of a family that is one value, ``RULES``, were fields of the class too.
-    """
-    found = {name.lower(): getattr(kind, name) for name in get_type_hints(kind) if name.isupper()}
-    return found | vars(found.pop("rules", SimpleNamespace()))
-
-
-def constant_at(kind: Any, path: str) -> Any:
-    """The constant that the field at ``path``, as ``online.motion.reach_pixels``, has become; None if there is none."""
-    name, _, rest = path.partition(".")
-    if not isinstance(kind, type) or not is_dataclass(kind):
-        return None
-    if rest:
-        return constant_at(get_type_hints(kind).get(name), rest)
-    return None if name in {item.name for item in fields(kind)} else constants_of(kind).get(name)
-
-
-def without_constants(kind: Any, values: Any, path: str = "", *, off: bool = False) -> Any:
-    """``values`` of an earlier version without the fields that are constants of the dataclass ``kind`` now.
-
-    In a group that is off (``enabled`` is False, or all its numbers are 0) they have no effect, and are not compared.
-
-    Raises:
-        ConfigError: a field has another value than the constant.
-    """
-    if not isinstance(values, Mapping) or not isinstance(kind, type) or not is_dataclass(kind):
-        return values
-    hints, constants, left = get_type_hints(kind), constants_of(kind), {}
-    off = off or values.get("enabled") is False or not any(values.get(item.name) for item in fields(kind))
-    for name, item in values.items():
-        if name in hints:
-            left[name] = without_constants(hints[name], item, f"{path}{name}.", off=off)
-        elif name not in constants:
-            left[name] = item
-        elif not off and not holds(constant := plain_value(constants[name]), item):
-            raise ConfigError(
-                f"The header's configuration has {path}{name} = {item}, which is always {constant} in this version of "
-                "structgstream; continue the stream with the version that began it."
-            )
-    return left
-
-
-def without_fields(values: Mapping[str, Any], paths: Collection[str], path: str = "") -> dict[str, Any]:
-    """``values`` without the fields at ``paths``, such as ``online.motion.tiles``."""
-    left = {name: item for name, item in values.items() if f"{path}{name}" not in paths}
-    return {
-        name: without_fields(item, paths, f"{path}{name}.") if isinstance(item, Mapping) else item
-        for name, item in left.items()
-    }
-
-
-def with_present_names(values: Mapping[str, Any], present_name: Callable[[str], str], path: str = "") -> dict[str, Any]:
-    """``values`` of an earlier version with the present names of fields; ``present_name`` has them by earlier path.
-
-    The ends of a schedule, which had names, are a pair.
-    """
-    found: dict[str, Any] = {}
-    for name, item in values.items():
-        if isinstance(item, Mapping) and item.keys() == {"initial", "final"}:
-            item = [item["initial"], item["final"]]
-        elif isinstance(item, Mapping):
-            item = with_present_names(item, present_name, f"{path}{name}.")
-        found[present_name(f"{path}{name}")] = item
-    return found
 
 
 def check_numbers(config: Any, path: str = "") -> None:

@@ -104,8 +104,6 @@ class Reconstruct:
 
 def main(arguments: list[str]) -> None:
     """Reconstructs with a progress display."""
-    if any(argument == "--init" or argument.startswith("--init=") for argument in arguments):
-        raise UsageError("reconstruct has no --init: a group of frames is fitted by structgstream fit-group.")
     if "--help-config" in arguments:
         _print_config(arguments)
         return

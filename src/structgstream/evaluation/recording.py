@@ -71,7 +71,7 @@ def part_metadata(*, start: int, scale: float, every: int) -> dict[str, object]:
 
     Args:
         scale: size of the pictures relative to the stored ones.
-        every: step between frames; 1 is left out, because older streams have no step.
+        every: step between frames; 1 is left out.
     """
     part: dict[str, object] = {"start": start, "scale": scale}
     return part if every == 1 else part | {"every": every}

@@ -21,24 +21,6 @@ if TYPE_CHECKING:
     from structgstream.session.frame_report import FrameReport
 
 
-RENAMED_COUNTS = {
-    "births merged": "merged",
-    "births refused": "spawning refused",
-    "blamed": "pruned outliers",
-    "born": "spawned",
-    "born thin": "spawned thin",
-    "carried": "propagated",
-    "fast lifted": "fast displaced",
-    "held": "repeated",
-    "in free space": "floaters",
-    "jumps": "scene cuts",
-    "lifted": "displaced",
-    "recalled": "relocated",
-    "thin births refused": "refused thin",
-}
-"""The names that counts in the logs of earlier versions have now."""
-
-
 def log_path(stream: Path) -> Path:
     """The path of a stream's log."""
     return side_path(stream, ".log.jsonl")
@@ -118,17 +100,10 @@ def read_log(stream: Path) -> dict[int, dict[str, Any]]:
     for line in lines:
         try:
             entry = json.loads(line)
-            entries[int(entry["index"])] = _with_present_names(entry)
+            entries[int(entry["index"])] = entry
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
             continue
     return entries
-
-
-def _with_present_names(entry: dict[str, Any]) -> dict[str, Any]:
-    counts = entry.get("counts")
-    if not isinstance(counts, dict):
-        return entry
-    return entry | {"counts": {RENAMED_COUNTS.get(name, name): count for name, count in counts.items()}}
 
 
 def _metrics_in(path: Path) -> list[dict[str, Any]]:

@@ -2,22 +2,12 @@
 """Configurations as values. Paper mode is a preset; the paper's ablations are edits of a preset."""
 
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
 from structgstream.cameras import CameraRig
-from structgstream.config_fields import (
-    check_numbers,
-    holds,
-    plain_value,
-    read_value,
-    unknown_fields,
-    with_present_names,
-    without_constants,
-    without_fields,
-)
+from structgstream.config_fields import check_numbers, holds, plain_value, read_value, unknown_fields
 from structgstream.data.denoising import DenoisingConfig
 from structgstream.data.points import PointsConfig
 from structgstream.errors import ConfigError
@@ -83,69 +73,14 @@ def to_json(config: StreamConfig) -> dict[str, Any]:
     return found
 
 
-WITHDRAWN = frozenset(
-    {
-        "initial.disturbance.view_noise",
-        "initial.disturbance.view_noise_left",
-        "initial.growth.contribution_at",
-        "initial.growth.least_contribution",
-        "initial.rates.positions",
-        "online.least_gain",
-        "online.losses.offset_distance",
-        "online.losses.offset_distance_reading",
-        "online.losses.offset_distance_reduction",
-        "online.motion.full_every_frames",
-        "online.motion.least_views_share",
-        "online.motion.tiles",
-        "online.motion.unseen_pixels",
-    }
-)
-"""Fields of earlier versions whose mechanisms are gone. A stream that has them goes on by this version's method."""
-
-
-RENAMED: Mapping[str, str] = {
-    "initial.disturbance": "perturbation",
-    "initial.free_space": "floaters",
-    "initial.solidity": "depth_distortion",
-    "online.births": "spawn",
-    "online.births.blame_share": "outlier_share",
-    "online.births.blame_views": "outlier_views",
-    "online.births.crowded": "overflow",
-    "online.births.thin.crowded": "overflow",
-    "online.coherence": "smoothness",
-    "online.light": "exposure",
-    "online.motion.carried_share": "occluded_share",
-    "online.motion.moved_ease": "hysteresis",
-    "online.start": "scene_flow",
-}
-"""The names that fields of earlier versions, by their whole path, have now; beside them ``least_`` is ``min_`` and
-``most_`` is ``max_``."""
-
-
-def present_name(path: str) -> str:
-    """The present name of the field or group that had ``path`` in an earlier version."""
-    name = path.rpartition(".")[2]
-    return RENAMED.get(path) or re.sub("^most_", "max_", re.sub("^least_", "min_", name))
-
-
-def renamed(path: str) -> str:
-    """The present path of a field or a group that had ``path`` in an earlier version."""
-    parts = path.split(".")
-    return ".".join(present_name(".".join(parts[: n + 1])) for n in range(len(parts)))
-
-
 def from_json(values: Mapping[str, Any]) -> StreamConfig:
     """The configuration that :func:`to_json` turned into ``values``, such as a stream's header has.
 
-    Fields that ``values`` lacks, as those of an older version do, have their defaults; renamed ones are read by their
-    earlier names (:func:`present_name`). :data:`WITHDRAWN` ones are ignored, and so
-    are those that are constants now and have the constant's value.
+    Fields that ``values`` lacks have their defaults.
 
     Raises:
-        ConfigError: there is a field that this version does not have, another value than that of a constant, or a value
-            that no field can have.
+        ConfigError: there is a field that this version does not have, or a value that no field can have.
     """
-    values = without_constants(StreamConfig, with_present_names(without_fields(values, WITHDRAWN), present_name))
     if unknown := [*unknown_fields(StreamConfig, values)]:
         raise ConfigError(
             f"The header's configuration has the field {unknown[0]}, which this version of structgstream does not "

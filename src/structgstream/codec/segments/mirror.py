@@ -145,7 +145,7 @@ class MirroredStore:
             mine = Owner.new(PURPOSE)
             self._folder.put(MARKER, mine.content)
         theirs = _owner(self._remote)
-        # Copies of before there were markers are known by the stream's first record, whose name is its hash.
+        # A copy by another program has no marker; it is known by the stream's first record, whose name is its hash.
         sent = any(name.startswith("init-") for name in there & self._folder.names())
         if (theirs is None and there and not sent) or (theirs is not None and theirs.identity != mine.identity):
             raise AnotherStreamError(
