@@ -16,23 +16,14 @@ from structgstream.errors import CalibrationError
 
 
 class Viewport(NamedTuple):
-    """A camera in the form that kernels take, with the dtype and device of the drawn tensors.
+    """A camera in the form that kernels take, with the dtype and device of the drawn tensors."""
 
-    Args:
-        viewmat: ``[4, 4]`` world to camera.
-        K: ``[3, 3]`` pixels.
-        center: ``[3]`` position of the camera.
-        width: pixels.
-        height: pixels.
-        near: distance of the near plane along z.
-    """
-
-    viewmat: Tensor
-    K: Tensor
-    center: Tensor
-    width: int
-    height: int
-    near: float
+    viewmat: Tensor  # [4, 4] world to camera
+    K: Tensor  # [3, 3] pixels
+    center: Tensor  # [3] position of the camera
+    width: int  # pixels
+    height: int  # pixels
+    near: float  # distance of the near plane along z
 
 
 REFERENCE_PIXELS = 640

@@ -25,17 +25,11 @@ MARKER = "structgstream-owner.json"
 
 @dataclass(frozen=True)
 class Owner:
-    """The content of a marker.
+    """The content of a marker."""
 
-    Args:
-        purpose: purpose of the folder, in a few words for messages, such as "parts of a parallel run".
-        identity: random, equal in all folders of one run.
-        key: hash of the run's inputs; empty if it does not matter.
-    """
-
-    purpose: str
-    identity: str
-    key: str = ""
+    purpose: str  # purpose of the folder, in a few words for messages, such as "parts of a parallel run"
+    identity: str  # random, equal in all folders of one run
+    key: str = ""  # hash of the run's inputs; empty if it does not matter
 
     @staticmethod
     def new(purpose: str) -> "Owner":

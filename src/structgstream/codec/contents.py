@@ -201,19 +201,12 @@ def differences(first: StreamHeader, later: StreamHeader) -> Sequence[str]:
 
 @dataclass(frozen=True)
 class Contents:
-    """What was found besides packets and periods.
+    """What was found besides packets and periods."""
 
-    Args:
-        runs: the frames that can be decoded, as ranges of consecutive frames.
-        damage: the damaged records that whole records follow.
-        complete: whether the stream ends with its index, and nothing before it is damaged.
-        end: the end of the last whole record before the index.
-    """
-
-    runs: tuple[range, ...]
-    damage: tuple[Damage, ...]
-    complete: bool
-    end: int
+    runs: tuple[range, ...]  # the frames that can be decoded, as ranges of consecutive frames
+    damage: tuple[Damage, ...]  # the damaged records that whole records follow
+    complete: bool  # whether the stream ends with its index, and nothing before it is damaged
+    end: int  # the end of the last whole record before the index
 
 
 def first_run(runs: Sequence[range], index: int) -> int:

@@ -163,25 +163,15 @@ Section Implementations gives one set of them for all data sets; what differs is
 
 @dataclass(frozen=True)
 class PaperData:
-    """The paper's properties of one data set (section Datasets), which are all that differs between its experiments.
+    """The paper's properties of one data set (section Datasets), which are all that differs between its experiments."""
 
-    Args:
-        width: of the pictures that are trained on and scored, pixels, after reduction.
-        height: the same.
-        cameras: number of cameras of the rig.
-        held_out: number of held-out cameras; None if the paper does not state it.
-        held_out_camera: the camera that published results hold out.
-        scale: of the pictures relative to the stored ones; ``--scale`` of ``reconstruct``.
-        undistorted: whether fisheye pictures were undistorted first.
-    """
-
-    width: int
-    height: int
-    cameras: int
-    held_out: int | None
-    held_out_camera: str
-    scale: float = 1.0
-    undistorted: bool = False
+    width: int  # of the pictures that are trained on and scored, pixels, after reduction
+    height: int  # the same
+    cameras: int  # number of cameras of the rig
+    held_out: int | None  # number of held-out cameras; None if the paper does not state it
+    held_out_camera: str  # the camera that published results hold out
+    scale: float = 1.0  # of the pictures relative to the stored ones; --scale of reconstruct
+    undistorted: bool = False  # whether fisheye pictures were undistorted first
 
 
 PAPER_DATA: Mapping[str, PaperData] = {

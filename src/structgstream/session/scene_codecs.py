@@ -26,15 +26,10 @@ from structgstream.training.parameters import pixel_size
 
 @dataclass(frozen=True)
 class QuantizationSteps:
-    """Quantization steps of a stream, as stored in the header; empty with codec ``raw``.
+    """Quantization steps of a stream, as stored in the header; empty with codec ``raw``."""
 
-    Args:
-        steps: steps of packets, by parameter.
-        init_steps: steps of the init record, by field.
-    """
-
-    steps: Mapping[str, float] = field(default_factory=dict)
-    init_steps: Mapping[FieldName, float] = field(default_factory=dict)
+    steps: Mapping[str, float] = field(default_factory=dict)  # steps of packets, by parameter
+    init_steps: Mapping[FieldName, float] = field(default_factory=dict)  # steps of the init record, by field
 
 
 @dataclass(frozen=True)

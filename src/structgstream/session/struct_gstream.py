@@ -26,28 +26,19 @@ from structgstream.training.result import FitResult
 
 @dataclass(frozen=True)
 class FrameZeroContext:
-    """The data of a period's first frame that later frames need in addition to its scene; None if not used.
+    """The data of a period's first frame that later frames need in addition to its scene; None if not used."""
 
-    Args:
-        floor: baseline residuals.
-        light: exposure reference: its pictures and F_c.
-    """
-
-    floor: ResidualFloor | None = None
-    light: ExposureReference | None = None
+    floor: ResidualFloor | None = None  # baseline residuals
+    light: ExposureReference | None = None  # exposure reference: its pictures and F_c
 
 
 @dataclass(frozen=True)
 class StructGStream:
-    """The method. Its memory is :class:`FrameZeroContext`.
+    """The method. Its memory is :class:`FrameZeroContext`."""
 
-    Args:
-        config: configuration of the stream.
-        fitted: returns an earlier fit of frame 0 with the same capture, seed and ``config.initial``, for configurations
-            that differ only in later frames. None: frame 0 is fitted.
-    """
-
-    config: StreamConfig
+    config: StreamConfig  # configuration of the stream
+    # returns an earlier fit of frame 0 with the same capture, seed and config.initial, for configurations that differ
+    # only in later frames. None: frame 0 is fitted.
     fitted: Callable[[], FitResult[Scene]] | None = None
 
     @property

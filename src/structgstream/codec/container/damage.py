@@ -34,32 +34,21 @@ _WORK = 4
 
 @dataclass(frozen=True)
 class Damage:
-    """A damaged record that whole records follow.
+    """A damaged record that whole records follow."""
 
-    Args:
-        offset: its first byte.
-        frames: the frames lost to it: its own, and those up to the next key packet.
-    """
-
-    offset: int
-    frames: range
+    offset: int  # its first byte
+    frames: range  # the frames lost to it: its own, and those up to the next key packet
 
 
 @dataclass(frozen=True)
 class Standing:
-    """What is known of a stream where a record is not whole.
+    """What is known of a stream where a record is not whole."""
 
-    Args:
-        offset: where that record begins; of several in a row without a whole packet between them, where the first does.
-        frames: number of the next frame.
-        seconds: presentation time of the last frame.
-        period: number of the last whole init record.
-    """
-
+    # where that record begins; of several in a row without a whole packet between them, where the first does
     offset: int
-    frames: int
-    seconds: float
-    period: int = 0
+    frames: int  # number of the next frame
+    seconds: float  # presentation time of the last frame
+    period: int = 0  # number of the last whole init record
 
     def last_frame_at(self, offset: int) -> int:
         """The last frame that a packet at ``offset`` may be: frames before it take bytes, too."""

@@ -190,19 +190,12 @@ FRAME = struct.Struct("<Id")  # index, presentation time in seconds
 
 @dataclass(frozen=True)
 class Period:
-    """Where a period begins.
+    """Where a period begins."""
 
-    Args:
-        number: as stated by its records; 0 for the first of a stream.
-        first_frame: its first whole packet's.
-        offset: of its init record.
-        bytes: of its init record.
-    """
-
-    number: int
-    first_frame: int
-    offset: int
-    bytes: int
+    number: int  # as stated by its records; 0 for the first of a stream
+    first_frame: int  # its first whole packet's
+    offset: int  # of its init record
+    bytes: int  # of its init record
 
 
 def period_at(periods: Sequence[Period], frame: int) -> int:
@@ -215,15 +208,10 @@ INDEX_ENTRY = struct.Struct("<IBQ")  # frame index, record type, offset
 
 @dataclass(frozen=True)
 class Index:
-    """What an index says.
+    """What an index says."""
 
-    Args:
-        offsets: of packets, by frame.
-        periods: those after the first.
-    """
-
-    offsets: "array[int]"
-    periods: tuple[Period, ...]
+    offsets: "array[int]"  # of packets, by frame
+    periods: tuple[Period, ...]  # those after the first
 
 
 def pack_index(entries: Iterable[tuple[int, int, int]], offset: int) -> bytes:

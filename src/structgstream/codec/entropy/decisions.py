@@ -70,19 +70,12 @@ class NativeArithmetic(ctypes.Structure):
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """An adaptive model of decisions; each decision updates it.
+    """An adaptive model of decisions; each decision updates it."""
 
-    Args:
-        chances: u16 ``[rows, nodes]``, probability of 1 in units of 1/65536.
-        seen: u8 ``[rows, nodes]``, number of decisions so far, up to 255.
-        weights: i32 ``[nodes, inputs]``, mixing weights in units of 1/65536.
-        starts: i32 ``[inputs]``, the row of each input's first context.
-    """
-
-    chances: NDArray[np.uint16]
-    seen: NDArray[np.uint8]
-    weights: NDArray[np.int32]
-    starts: NDArray[np.int32]
+    chances: NDArray[np.uint16]  # u16 [rows, nodes], probability of 1 in units of 1/65536
+    seen: NDArray[np.uint8]  # u8 [rows, nodes], number of decisions so far, up to 255
+    weights: NDArray[np.int32]  # i32 [nodes, inputs], mixing weights in units of 1/65536
+    starts: NDArray[np.int32]  # i32 [inputs], the row of each input's first context
 
     @classmethod
     def new(cls, counts: Sequence[int], *, nodes: int) -> "Model":

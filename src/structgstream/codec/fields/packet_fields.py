@@ -29,23 +29,14 @@ CODABLE: frozenset[FieldName] = frozenset(quantized_fields("anchor") + quantized
 
 @dataclass(frozen=True)
 class SceneBins:
-    """The quantized dynamic fields of a scene, and their change by the last frame.
+    """The quantized dynamic fields of a scene, and their change by the last frame."""
 
-    Args:
-        anchors: ``[M, columns of the dynamic anchor fields]``.
-        columns: ``(name, first column, end)`` of each of these fields.
-        change: of ``anchors``.
-        weights: of MLPs and other shared fields, by field, ``[P, 1]``.
-        weight_changes: of ``weights``, by field.
-        free: the free Gaussians.
-    """
-
-    anchors: Bins
-    columns: Sequence[tuple[FieldName, int, int]]
-    change: Change
-    weights: Mapping[FieldName, Bins]
-    weight_changes: Mapping[FieldName, Change]
-    free: FreeBins
+    anchors: Bins  # [M, columns of the dynamic anchor fields]
+    columns: Sequence[tuple[FieldName, int, int]]  # (name, first column, end) of each of these fields
+    change: Change  # of anchors
+    weights: Mapping[FieldName, Bins]  # of MLPs and other shared fields, by field, [P, 1]
+    weight_changes: Mapping[FieldName, Change]  # of weights, by field
+    free: FreeBins  # the free Gaussians
 
     def without_change(self) -> "SceneBins":
         """The same bins with zero change."""

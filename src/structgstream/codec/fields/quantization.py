@@ -108,16 +108,11 @@ class RateTerm:
     """An estimate of the bits of changes, as a loss term.
 
     A bit has the same weight in every frame, however much moves: that gives the best pictures for the bytes of all.
-
-    Args:
-        weight: what a kilobyte adds to the loss.
-        before: the last frame's values by name.
-        steps: the quantization steps by name.
     """
 
-    weight: float
-    before: Mapping[ParameterName, Tensor]
-    steps: Mapping[ParameterName, float]
+    weight: float  # what a kilobyte adds to the loss
+    before: Mapping[ParameterName, Tensor]  # the last frame's values by name
+    steps: Mapping[ParameterName, float]  # the quantization steps by name
 
     @classmethod
     def of(

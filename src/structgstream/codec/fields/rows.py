@@ -24,17 +24,11 @@ _MOST = 255  # a residual's magnitude is clamped to this in a size
 
 @dataclass(frozen=True)
 class Change:
-    """The change of rows of bins by a frame, and which rows the two frames before changed.
+    """The change of rows of bins by a frame, and which rows the two frames before changed."""
 
-    Args:
-        residuals: ``[n, C]``, zero in rows that did not change.
-        history: u8 ``[n]``: bit 0 is set if this frame changed the row, bits 1 and 2 if the two before did.
-        sizes: i32 ``[n]``: sum of the magnitudes of each row's residuals.
-    """
-
-    residuals: Bins
-    history: NDArray[np.uint8]
-    sizes: Bins
+    residuals: Bins  # [n, C], zero in rows that did not change
+    history: NDArray[np.uint8]  # u8 [n]: bit 0 is set if this frame changed the row, bits 1 and 2 if the two before did
+    sizes: Bins  # i32 [n]: sum of the magnitudes of each row's residuals
 
     @property
     def active(self) -> Flags:
@@ -119,17 +113,11 @@ _FRAME_BITS = 32  # an identity is frame * 2^32 + number
 
 @dataclass(frozen=True)
 class FreeBins:
-    """Free Gaussians as bins.
+    """Free Gaussians as bins."""
 
-    Args:
-        births: int64 ``[F]`` identities, from the frame in which each was spawned; ascending.
-        bins: ``[F, 14]``.
-        change: by the last frame; zero for Gaussians spawned in it.
-    """
-
-    births: NDArray[np.int64]
-    bins: Bins
-    change: Change
+    births: NDArray[np.int64]  # int64 [F] identities, from the frame in which each was spawned; ascending
+    bins: Bins  # [F, 14]
+    change: Change  # by the last frame; zero for Gaussians spawned in it
 
     @classmethod
     def none(cls) -> "FreeBins":

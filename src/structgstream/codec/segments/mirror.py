@@ -43,17 +43,11 @@ class AnotherStreamError(StorageError):
 
 @dataclass(frozen=True)
 class MirrorOptions:
-    """How the copy is made.
+    """How the copy is made."""
 
-    Args:
-        grace_seconds: how long a file that has left the folder stays in the other store.
-        report: gets a sentence when trouble begins and when it ends.
-        elapsed: seconds that never jump.
-    """
-
-    grace_seconds: float = 120.0
-    report: Callable[[str], object] = lambda text: None
-    elapsed: Callable[[], float] = time.monotonic
+    grace_seconds: float = 120.0  # how long a file that has left the folder stays in the other store
+    report: Callable[[str], object] = lambda text: None  # gets a sentence when trouble begins and when it ends
+    elapsed: Callable[[], float] = time.monotonic  # seconds that never jump
 
 
 class MirroredStore:

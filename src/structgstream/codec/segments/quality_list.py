@@ -25,17 +25,11 @@ _PATH = re.compile(r"([A-Za-z0-9_-][A-Za-z0-9._-]{0,127}/){0,4}[A-Za-z0-9_-][A-Z
 
 @dataclass(frozen=True)
 class ListedQuality:
-    """One of the runs of the same frames.
+    """One of the runs of the same frames."""
 
-    Args:
-        name: what players call it.
-        manifest: path of its manifest below the list.
-        bits_per_second: of media time, as measured, or expected while nothing has been measured.
-    """
-
-    name: str
-    manifest: str
-    bits_per_second: float
+    name: str  # what players call it
+    manifest: str  # path of its manifest below the list
+    bits_per_second: float  # of media time, as measured, or expected while nothing has been measured
 
     @property
     def folder(self) -> str | None:

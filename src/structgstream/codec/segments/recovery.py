@@ -86,16 +86,11 @@ def records_of(entry: SegmentEntry, data: bytes) -> list[bytes]:
 
 @dataclass(frozen=True)
 class Draft:
-    """A manifest to write.
+    """A manifest to write."""
 
-    Args:
-        manifest: with ``parts`` of the group that is being written.
-        records: of each of these parts.
-        files: names and contents of other files that must be there before the manifest.
-    """
-
-    manifest: Manifest
-    records: tuple[bytes, ...] = ()
+    manifest: Manifest  # with parts of the group that is being written
+    records: tuple[bytes, ...] = ()  # of each of these parts
+    # names and contents of other files that must be there before the manifest
     files: tuple[tuple[str, bytes], ...] = ()
 
 

@@ -50,30 +50,19 @@ from structgstream.errors import StorageError, StreamError
 
 @dataclass(frozen=True)
 class SegmentsOptions:
-    """How long files of a stream stay.
+    """How long files of a stream stay."""
 
-    Args:
-        window_seconds: media seconds before the edge that viewers can go back; None for everything.
-        grace_seconds: seconds that a file stays after the last manifest that named it.
-    """
-
-    window_seconds: float | None = None
-    grace_seconds: float = 120.0
+    window_seconds: float | None = None  # media seconds before the edge that viewers can go back; None for everything
+    grace_seconds: float = 120.0  # seconds that a file stays after the last manifest that named it
 
 
 @dataclass(frozen=True)
 class Turnover:
-    """What a manifest changes of a window; nothing without one.
+    """What a manifest changes of a window; nothing without one."""
 
-    Args:
-        stay: segments in the window.
-        leave: those that were in it before.
-        window: of the manifest.
-    """
-
-    stay: tuple[SegmentEntry, ...]
-    leave: tuple[SegmentEntry, ...]
-    window: Window
+    stay: tuple[SegmentEntry, ...]  # segments in the window
+    leave: tuple[SegmentEntry, ...]  # those that were in it before
+    window: Window  # of the manifest
 
 
 class Retention:
@@ -162,16 +151,11 @@ def _unknown(frame: int) -> float | None:
 
 @dataclass(frozen=True)
 class Clocks:
-    """Where times come from.
+    """Where times come from."""
 
-    Args:
-        wall: seconds since 1970.
-        elapsed: seconds that never jump.
-        captured: when a frame was filmed, by its number, in seconds since 1970; None where that is not known.
-    """
-
-    wall: Callable[[], float] = time.time
-    elapsed: Callable[[], float] = time.monotonic
+    wall: Callable[[], float] = time.time  # seconds since 1970
+    elapsed: Callable[[], float] = time.monotonic  # seconds that never jump
+    # when a frame was filmed, by its number, in seconds since 1970; None where that is not known
     captured: Callable[[int], float | None] = _unknown
 
 
