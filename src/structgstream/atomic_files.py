@@ -85,7 +85,6 @@ def atomic_write(
     """Writes or replaces the file ``path`` atomically (Note [Atomic files]).
 
     Args:
-        path: the file.
         content: its bytes, or an iterable of pieces, whose errors are passed on.
         called: name of the file in messages, before its path: "The picture".
         new_folder: create its folder if it is missing.
@@ -106,7 +105,6 @@ def atomic_file(path: Path, *, check: Callable[[Path], object] | None = None) ->
     """A file that is renamed to ``path`` at the end of the block, unless it raises (Note [Atomic files]).
 
     Args:
-        path: the file.
         check: called with the path of the complete partial file before it is renamed; if it raises, an existing file is
             not affected.
 
@@ -125,7 +123,6 @@ def replacing(path: Path, *, partial: Path | None = None, sync: bool = True) -> 
     """As :func:`atomic_file`, but raises errors of the system unchanged.
 
     Args:
-        path: the file.
         partial: its path while it is written; None for that of :func:`partial_path`.
         sync: sync the file to the disk before the block ends.
 
@@ -164,7 +161,6 @@ def open_exclusive(partial: Path, *, of: Path, buffering: int = -1) -> BinaryIO:
     Args:
         partial: the file; created if it is missing.
         of: final path of the file, for the message.
-        buffering: as of :func:`open`.
 
     Raises:
         OSError: it cannot be opened.

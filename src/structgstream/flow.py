@@ -92,18 +92,12 @@ def dis_refinement(*, finest_level: int, coarsest_level: int) -> FlowRefinement:
 def block_search(
     first: NDArray[np.uint8], second: NDArray[np.uint8], *, cell_pixels: int, reach_cells: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Approximate flow ``[H, W, 2]`` from ``first`` to ``second`` and back: block matching of reduced pictures.
+    """Approximate flow ``[H, W, 2]``, pixels, from ``first`` to ``second`` ``[H, W, 3]`` and back: block matching.
 
-    A pixel of a reduced picture is a cell. For each cell p the displacement s of at most ``reach_cells`` cells with the
+    A cell is ``cell_pixels`` wide, a pixel of the reduced pictures. For each cell p the displacement s of at most ``reach_cells`` cells with the
     least cost is chosen. The cost is ``min(sum_c |first(p) - second(p + s)|, 300)``, averaged over 3 x 3 cells, plus
     ``0.6 |s|``. The result is the median over 3 x 3 cells, enlarged. The time is that of ``pi reach_cells^2`` passes
     over the cells.
-
-    Args:
-        first: ``[H, W, 3]``.
-        second: ``[H, W, 3]``.
-        cell_pixels: size of a cell.
-        reach_cells: bound of displacements.
 
     Raises:
         MissingExtraError: OpenCV is not installed.
@@ -195,16 +189,13 @@ def consistency_mask(flow: NDArray[np.float32], back: NDArray[np.float32]) -> ND
 def same_color(
     first: NDArray[np.uint8], second: NDArray[np.uint8], flow: NDArray[np.float32], *, radius: int
 ) -> NDArray[np.bool_]:
-    """Mask ``[H, W]`` of the pixels of ``first`` that have the colour of the pixel of ``second`` to which flow leads.
+    """Mask ``[H, W]`` of the pixels of ``first`` ``[H, W, 3]`` whose colour ``second`` has where flow leads.
 
     A plain object in front of a still background can have flow 0 both ways, which is consistent but wrong: what is
     there next has another colour. Colours are means over squares, and may differ by :data:`COLOR_DIFFERENCE` or by
     :data:`UNEXPLAINED_SHARE` of the difference without flow; a change of all the light is subtracted.
 
     Args:
-        first: ``[H, W, 3]``.
-        second: ``[H, W, 3]``.
-        flow: ``[H, W, 2]`` from ``first`` to ``second``, pixels.
         radius: from the middle of a square to its sides, pixels.
 
     Raises:

@@ -91,8 +91,6 @@ def own_folder(folder: Path, purpose: str, *, owner: Owner | None = None) -> Own
     """Creates and marks a folder unless it is marked already; returns its owner.
 
     Args:
-        folder: missing, empty, or of the same purpose.
-        purpose: see :class:`Owner`.
         owner: owner in a new marker; None for a random identity.
 
     Raises:
@@ -111,8 +109,6 @@ def remove_own(
     """Removes the files of a marked folder whose relative path matches ``names``, and folders that are empty then.
 
     Args:
-        folder: the folder; a missing one is ignored.
-        purpose: see :class:`Owner`.
         names: pattern of relative paths with slashes, matched in full.
         order: priority by path: smaller ones are removed first; the default is 1.
         whole: also remove the marker and the folder if nothing else remains.

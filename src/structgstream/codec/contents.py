@@ -124,11 +124,6 @@ class Packets(PacketInfos):
 class PeriodTable:
     """The periods of one stream, the first of which is always there. One header besides the first is in memory.
 
-    Args:
-        data: the stream.
-        name: of the stream, for messages.
-        init: its first init record.
-
     Attributes:
         first: the header of the first period.
         periods: those of which a packet has been found, in order; always the first.
@@ -226,9 +221,6 @@ class Scan:
     """Verifies every record of a stream, and fills ``packets`` and ``table``.
 
     Args:
-        data: the stream.
-        name: for messages.
-        packets: of the stream, none so far.
         table: its periods, only the first so far.
         gone: frames that are known not to be in ``data`` any more, in order.
     """

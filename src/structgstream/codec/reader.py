@@ -51,12 +51,6 @@ class FrameRenderer:
     ) -> NDArray[np.uint8]:
         """The 8-bit sRGB picture ``[H, W, 3]`` of a frame.
 
-        Args:
-            index: the frame.
-            view: the camera, in the scene's units.
-            decode: returns the scene of a frame.
-            backend: the compute back-end.
-
         Raises:
             BackendError: the back-end is not available.
         """

@@ -83,7 +83,6 @@ def evaluate(
     Args:
         recording: the opened file: a ``StreamReader``, or another method's (``recording.py``).
         source: the capture, cut and scaled as it was for the reconstruction.
-        backend: the compute back-end.
         cameras: names of the cameras to score; None for the held-out ones.
         log: the trainer's log by frame number (``run_log.read_log``).
         observer: called with frame number and comparison for every picture.

@@ -110,7 +110,6 @@ class PeriodPlan:
     """Finds the frames that begin another period, from times and residuals of the frames before them.
 
     Args:
-        config: conditions of a new period.
         most: largest number of periods of a stream; the last one does not end.
 
     Raises:

@@ -118,10 +118,7 @@ def with_budget(config: StreamConfig, *, name: str | None, quality: float | None
     """``config`` with another quality and a target rate, if they are given.
 
     Args:
-        config: of a compact stream.
-        name: of its preset, for messages.
         quality: every quantization step is multiplied by 2^-quality; 0 is the preset's own.
-        mbits: target rate in Mbit/s.
 
     Raises:
         ConfigError: the codec is not ``compact``, or a value is out of range.

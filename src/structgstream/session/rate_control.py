@@ -75,8 +75,6 @@ class RateController:
     about the cube root of lambda, so each step corrects about a third of the excess.
 
     Args:
-        config: the target.
-        fps: frames per second of the media.
         keys: follows the same packets, and must receive each of them before this object does.
 
     A warning is logged when the target starts to be missed.

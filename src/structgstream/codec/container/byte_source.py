@@ -112,8 +112,6 @@ def check_room(free: int | None, *, largest: int, closing: int, where: str, fram
         free: bytes that are left; None if that is not known.
         largest: bytes of the largest packet so far, the next one included.
         closing: bytes that closing the stream takes.
-        where: the stream, for the message.
-        frames: number of frames that it has.
 
     Raises:
         StorageError: they may not fit.

@@ -93,8 +93,6 @@ def packed(kind: int, payload: bytes, *, period: int = 0) -> bytes:
     """A record as bytes: header, payload, CRC-32 of both.
 
     Args:
-        kind: its type.
-        payload: its content.
         period: number of the period that an init record begins, or that a packet belongs to.
 
     Raises:
@@ -231,14 +229,9 @@ def indexed_frames(payload: bytes) -> int:
 
 
 def read_index(data: ByteSource, start: int, *, period: int = 0) -> Index | None:
-    """Offsets, from the index, of the packets from byte ``start`` on; None if the stream must be scanned.
+    """Offsets, from the index, of the packets after the first init record, of ``period``, which ends at ``start``.
 
-    The index is not used if footer or index is damaged, or disagrees with the heads of the records.
-
-    Args:
-        data: the stream.
-        start: the end of its first init record.
-        period: the number that this states.
+    None if the stream must be scanned: footer or index is damaged, or disagrees with the heads of the records.
     """
     end = footer_offset(data)
     if end is None or end < start:

@@ -86,7 +86,6 @@ class BitReader:
 
     Args:
         data: all bytes; the caller bounds their number.
-        where: subject of error messages.
     """
 
     def __init__(self, data: bytes | memoryview, *, where: str) -> None:

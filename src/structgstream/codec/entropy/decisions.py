@@ -359,7 +359,6 @@ def code_activity(
     """Codes which rows are active (docs/bitstream.md, section Rows).
 
     Args:
-        arithmetic: of the field.
         models: of blocks and of rows.
         history: ``[n]``: bit 0 is the row's activity in the last frame, bits 1 and 2 in the two before.
         sizes: ``[n]``, sum of the magnitudes of each row's last residuals.
@@ -421,12 +420,10 @@ def code_residuals(
     """Codes residuals of active rows (docs/bitstream.md, section Rows); returns whether they are within bounds.
 
     Args:
-        arithmetic: of the field.
         model: of the group of columns.
         last: ``[n, c]``, the rows' last residuals.
         others: ``[n]``, sizes of the residuals in earlier groups.
         residuals: ``[n, c]``, read or filled.
-        native: as in :func:`code_activity`.
     """
     arithmetic.reserve(residuals.size)
     if uses_native(native):
@@ -489,12 +486,10 @@ def code_numbers(
     """Codes signed 32-bit numbers, or flags; returns whether they are within bounds.
 
     Args:
-        arithmetic: of the field.
         model: with one input per column of the contexts.
         contexts: ``[n, K]``, each below the model's number of contexts for its input.
         values: ``[n]``, read or filled.
         flags: whether the values are 0 and 1, with a model of one node.
-        native: as in :func:`code_activity`.
     """
     arithmetic.reserve(len(values))
     if uses_native(native):

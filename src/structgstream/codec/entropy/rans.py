@@ -96,7 +96,6 @@ def encode(
     Args:
         symbols: u8 ``[n]``, each below A and with a frequency of 1 or more in its context.
         contexts: u16 ``[n]``, each below C.
-        tables: of encoder and decoder.
         lanes: 1, 4 or 32; None takes :func:`lanes_for`.
         native: C++ or NumPy, which give the same bytes; None takes C++ if available.
 
@@ -131,11 +130,7 @@ def decode(
     """The symbols u8 ``[n]`` of a section that fills ``data``.
 
     Args:
-        data: result of :func:`encode`.
         contexts: u16 ``[n]``, as in encoding; the section must state this number of symbols.
-        tables: as in encoding.
-        where: subject of error messages.
-        native: as in :func:`encode`.
 
     Raises:
         StreamError: the section is damaged, or states another number of symbols.

@@ -127,7 +127,6 @@ class RateTerm:
 
         Args:
             values: tensors by name; those without a step do not count.
-            steps: quantization steps by name.
             weight: what a kilobyte adds to the loss; None is returned unless it is positive.
             free: whether changes of free Gaussians count, too.
         """

@@ -73,9 +73,7 @@ def code_change(
     """Codes a change, with the rows' previous change as context.
 
     Args:
-        coder: an encoder or a decoder.
         change: the change to encode; None when decoding.
-        before: the same rows' previous change.
         groups: ``(name, first column, end)`` of the groups of columns with a model each; they cover all columns in
             order.
     """

@@ -57,10 +57,6 @@ def _max_numbers(coded: Iterable[bytes | memoryview]) -> int:
 def encode_fields(fields: Mapping[FieldName, Tensor], steps: Mapping[FieldName, float]) -> dict[FieldName, bytes]:
     """The bytes of every field that has a coding.
 
-    Args:
-        fields: of the init record, by name.
-        steps: quantization steps, by field.
-
     Raises:
         StreamError: a field has no step, a value is not a multiple of its step, or there are too many numbers, in
             absolute terms or for their bytes.

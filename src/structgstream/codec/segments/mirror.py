@@ -51,13 +51,7 @@ class MirrorOptions:
 
 
 class MirroredStore:
-    """A folder whose files are copied to ``remote`` by a thread (Note [Order of copying]).
-
-    Args:
-        folder: what is read and written.
-        remote: what follows it.
-        options: how.
-    """
+    """A folder whose files are copied to ``remote`` by a thread (Note [Order of copying])."""
 
     def __init__(self, folder: FolderStore, remote: Store, *, options: MirrorOptions | None = None) -> None:
         self._folder = folder

@@ -66,13 +66,7 @@ class Turnover:
 
 
 class Retention:
-    """Follows which files manifests name, and removes those that none has named for the time of grace.
-
-    Args:
-        store: where the files are.
-        options: how long files stay.
-        elapsed: seconds that never jump.
-    """
+    """Follows which files manifests name, and removes those that none has named for the time of grace."""
 
     def __init__(self, store: Store, options: SegmentsOptions, elapsed: Callable[[], float]) -> None:
         self._store, self._options, self._elapsed = store, options, elapsed
@@ -115,8 +109,6 @@ class Retention:
         """Takes in that a manifest is there, and removes what has not been named for long enough.
 
         Args:
-            manifest: that was written.
-            turnover: what it has changed of the window.
             leaving: other files that it is the first not to name.
         """
         needed = running_period(manifest).first_segment  # Its first frame is needed to resume.
@@ -163,10 +155,7 @@ class SegmentsSink:
     """A sink of immutable segments and a manifest. Every packet is durable in the store when ``write`` returns.
 
     Args:
-        store: where the files go.
         overwrite: whether a stream that is there may be replaced.
-        options: how long files stay.
-        clocks: where times come from.
         found: what is there already, to go on after it (``recovery.find``).
     """
 
@@ -296,7 +285,6 @@ class SegmentsSink:
         """Write the files of a draft, then its manifest; then remove what has not been named for long enough.
 
         Args:
-            draft: what to write.
             leaving: files that this manifest is the first not to name.
         """
         self._put(draft.files)

@@ -192,7 +192,6 @@ class CloudStore:
     temporary name and moved. S3 gets content types and cache headers, so that the bucket can be read by browsers.
 
     Args:
-        url: the folder.
         options: of the file system, as fsspec takes them, such as ``endpoint_url`` of an S3 that is not Amazon's.
 
     Raises:

@@ -90,10 +90,6 @@ def segments_from(
     """Every segment from number ``first`` on, those on pages included.
 
     Args:
-        store: has the pages.
-        history: pages of older segments.
-        segments: the segments after them.
-        first: number of the first segment to give.
         held: contents of pages that are not in the store yet.
 
     Raises:
@@ -143,8 +139,6 @@ class StoredBytes:
     are no longer there, are left out: :attr:`gone` has their frames.
 
     Args:
-        store: where the files are.
-        manifest: what the stream consists of.
         held: contents of files that are not in the store yet.
         check: verify the SHA-256 of every file; otherwise only lengths, and readers verify records.
 
@@ -294,9 +288,6 @@ class StoredBytes:
 
 def open_segments(path: Path | str) -> StoredBytes:
     """The bytes of a stream in a folder.
-
-    Args:
-        path: the folder, or its manifest.
 
     Raises:
         StreamError: there is no manifest, or it is not valid, or a file is missing.
