@@ -177,22 +177,16 @@ def open_exclusive(partial: Path, *, of: Path, buffering: int = -1) -> BinaryIO:
 
 
 def give_name(partial: Path, path: Path) -> None:
-    """Syncs the complete file ``partial``, renames it, and syncs the folder (Note [Atomic files]).
-
-    Raises:
-        OSError: one of these operations failed.
-    """
+    """Syncs the complete file ``partial``, renames it, and syncs the folder (Note [Atomic files]). Raises OSError if
+    one of these operations failed."""
     _sync(partial)
     partial.replace(path)
     sync_folder(path.parent)
 
 
 def sync_folder(folder: Path) -> None:
-    """Syncs a folder, which makes new names in it durable, if the file system supports it.
-
-    Raises:
-        OSError: the disk has failed.
-    """
+    """Syncs a folder, which makes new names in it durable, if the file system supports it. Raises OSError if the disk
+    has failed."""
     try:
         _sync(folder)
     except OSError as error:
@@ -228,11 +222,8 @@ def _as_storage_error(path: Path, called: str) -> Iterator[None]:
 
 
 def name_finished(path: Path) -> None:
-    """Renames a complete file whose writer was killed just before it renamed it.
-
-    Raises:
-        StorageError: it cannot be renamed, or another process writes it.
-    """
+    """Renames a complete file whose writer was killed just before it renamed it. Raises StorageError if it cannot be
+    renamed, or another process writes it."""
     partial = partial_path(path)
     GrowingFile(path, keep=partial.stat().st_size if partial.exists() else 0).finish()
 
@@ -270,11 +261,7 @@ class GrowingFile:
         self._file.seek(keep)
 
     def append(self, data: bytes) -> int:
-        """Adds ``data``; returns its length.
-
-        Raises:
-            StorageError: it cannot be written; earlier data stays.
-        """
+        """Adds ``data``; returns its length. Raises StorageError if it cannot be written; earlier data stays."""
         try:
             rest = memoryview(data)
             while rest:
@@ -289,11 +276,7 @@ class GrowingFile:
         return len(data)
 
     def finish(self) -> None:
-        """Renames the file to its final name and closes it.
-
-        Raises:
-            StorageError: it cannot be renamed.
-        """
+        """Renames the file to its final name and closes it. Raises StorageError if it cannot be renamed."""
         try:
             give_name(self.partial, self.path)
         except OSError as error:

@@ -19,11 +19,7 @@ INK, FAINT, OTHER = "#222222", "#dddddd", "#999999"
 
 
 def figure_of(width: float, height: float) -> "Figure":
-    """An empty figure, in inches.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-    """
+    """An empty figure, in inches. Raises MissingExtraError if matplotlib is not installed."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -43,11 +39,8 @@ def without_frame(axis: "Axes") -> None:
 
 
 def save_figure(figure: "Figure", path: Path) -> None:
-    """Writes a picture atomically, and creates its folder if necessary.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Writes a picture atomically, and creates its folder if necessary. Raises StorageError if the file cannot be
+    written."""
     content = BytesIO()
     with warnings.catch_warnings():
         # The font may lack letters of camera names and then draws boxes.

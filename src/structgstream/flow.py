@@ -72,10 +72,7 @@ def dis_search(extra: str, *, refined: bool = True, finest_level: int = 1) -> Fl
 
 def dis_refinement(*, finest_level: int, coarsest_level: int) -> FlowRefinement:
     """As :func:`dis_search` with ``refined=False``, but starts from an approximate flow at level ``coarsest_level``.
-
-    Raises:
-        MissingExtraError: OpenCV is not installed.
-    """
+    Raises MissingExtraError if OpenCV is not installed."""
     cv2 = opencv("capture")
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     search.setFinestScale(finest_level)
@@ -94,10 +91,10 @@ def block_search(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Approximate flow ``[H, W, 2]``, pixels, from ``first`` to ``second`` ``[H, W, 3]`` and back: block matching.
 
-    A cell is ``cell_pixels`` wide, a pixel of the reduced pictures. For each cell p the displacement s of at most ``reach_cells`` cells with the
-    least cost is chosen. The cost is ``min(sum_c |first(p) - second(p + s)|, 300)``, averaged over 3 x 3 cells, plus
-    ``0.6 |s|``. The result is the median over 3 x 3 cells, enlarged. The time is that of ``pi reach_cells^2`` passes
-    over the cells.
+    A cell is ``cell_pixels`` wide, a pixel of the reduced pictures. For each cell p the displacement s of at most
+    ``reach_cells`` cells with the least cost is chosen. The cost is ``min(sum_c |first(p) - second(p + s)|, 300)``,
+    averaged over 3 x 3 cells, plus ``0.6 |s|``. The result is the median over 3 x 3 cells, enlarged. The time is that
+    of ``pi reach_cells^2`` passes over the cells.
 
     Raises:
         MissingExtraError: OpenCV is not installed.

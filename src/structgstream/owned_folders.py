@@ -64,11 +64,8 @@ def owner_of(folder: Path) -> Owner | None:
 
 
 def check_owned(folder: Path, purpose: str) -> Owner | None:
-    """The owner of a folder that may be used for ``purpose``; None if it is missing or empty.
-
-    Raises:
-        StorageError: it is a file, cannot be read, or contains files without a marker of this purpose.
-    """
+    """The owner of a folder that may be used for ``purpose``; None if it is missing or empty. Raises StorageError if it
+    is a file, cannot be read, or contains files without a marker of this purpose."""
     found = owner_of(folder)
     if found is not None and found.purpose == purpose:
         return found

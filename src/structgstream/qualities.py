@@ -69,11 +69,8 @@ class Quality:
 
 
 def qualities_in(given: Sequence[str]) -> tuple[Quality, ...]:
-    """The qualities of texts such as ``low=-1``, the coarsest first, which viewers load first.
-
-    Raises:
-        ConfigError: a text is malformed, two qualities have the same name or fineness, or their number is out of range.
-    """
+    """The qualities of texts such as ``low=-1``, the coarsest first, which viewers load first. Raises ConfigError if a
+    text is malformed, two qualities have the same name or fineness, or their number is out of range."""
     qualities = sorted(map(_parsed, given), key=lambda quality: quality.fineness)
     if not 2 <= len(qualities) <= MAX_QUALITIES:
         raise ConfigError(
@@ -90,11 +87,7 @@ def qualities_in(given: Sequence[str]) -> tuple[Quality, ...]:
 
 
 def configured(config: StreamConfig, quality: Quality) -> StreamConfig:
-    """``config`` with a quality, as set by ``--quality``.
-
-    Raises:
-        ConfigError: the codec does not support qualities.
-    """
+    """``config`` with a quality, as by ``--quality``. Raises ConfigError if the codec does not support qualities."""
     if config.codec != "compact":
         raise ConfigError(
             f"--qualities is for streams with the codec compact, got the codec {config.codec}; add --preset compact."
@@ -135,11 +128,8 @@ class BitRates:
         self._packets = {quality.name: deque[tuple[float, int]](maxlen=MAX_PACKETS + 1) for quality in qualities}
 
     def begin(self, *, resume: bool) -> None:
-        """Writes the list, with the rates of the earlier run if it is resumed.
-
-        Raises:
-            StorageError: it cannot be written.
-        """
+        """Writes the list, with the rates of the earlier run if it is resumed. Raises StorageError if it cannot be
+        written."""
         if resume:
             self._listed |= {name: bits for name, bits in listed_bits(self._folder).items() if name in self._listed}
         self._write()
@@ -149,11 +139,8 @@ class BitRates:
         self._packets[name].append((report.pts_seconds, report.bytes))
 
     def refresh(self, *, last: bool = False) -> None:
-        """Rewrites the list if a measured rate differs from the listed one.
-
-        Raises:
-            StorageError: it cannot be written; the earlier list is not affected.
-        """
+        """Rewrites the list if a measured rate differs from the listed one. Raises StorageError if it cannot be
+        written; the earlier list is not affected."""
         known = {
             name: bits
             for name, packets in self._packets.items()

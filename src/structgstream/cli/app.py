@@ -240,11 +240,8 @@ class Termination:
             signal.signal(signal.SIGTERM, self._before)  # type: ignore[arg-type]
 
     def end(self, *, whole: bool) -> None:
-        """Called between frames: ends the block if that was asked for, unless the run is ``whole`` anyway.
-
-        Raises:
-            Terminated: it was.
-        """
+        """Called between frames: ends the block if that was asked for, unless the run is ``whole`` anyway. Raises
+        Terminated if it was."""
         if self.asked and not whole:
             raise Terminated
 

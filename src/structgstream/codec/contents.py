@@ -144,11 +144,8 @@ class PeriodTable:
         return period_at(self.periods, frame)
 
     def header(self, place: int) -> StreamHeader:
-        """The header of the period at ``place``.
-
-        Raises:
-            StreamError: its init record has been damaged, or does not belong to this stream.
-        """
+        """The header of the period at ``place``. Raises StreamError if its init record has been damaged, or does not
+        belong to this stream."""
         period = self.periods[place]
         if place == 0:
             return self.first
@@ -157,11 +154,7 @@ class PeriodTable:
         return self._last[1]
 
     def check(self, init: Record) -> StreamHeader:
-        """The header of a later init record.
-
-        Raises:
-            StreamError: it is not valid, or is of another stream.
-        """
+        """The header of a later init record. Raises StreamError if it is not valid, or is of another stream."""
         header = unpack_header(init.payload)
         if differing := list(differences(self.first, header)):
             raise StreamError(
@@ -240,11 +233,7 @@ class Scan:
         self._broken: Standing | None = None  # since the last whole packet a record was not whole
 
     def contents(self, end: int) -> Contents:
-        """What there is from byte ``end`` on.
-
-        Raises:
-            StreamError: whole records contradict each other.
-        """
+        """What there is from byte ``end`` on. Raises StreamError if whole records contradict each other."""
         search, offsets = PacketSearch(self._data), self._packets.offsets
         found: list[tuple[int, int]] = []  # damaged records and the frames expected there
         ended = False

@@ -41,11 +41,8 @@ class CompactState:
 
 
 class CompactCoder:
-    """State that encoder and decoder share: the prediction of each packet.
-
-    Raises:
-        StreamError: the header has another codec, dynamic fields that cannot be coded, or no step or reference for one.
-    """
+    """State that encoder and decoder share: the prediction of each packet. Raises StreamError if the header has another
+    codec, dynamic fields that cannot be coded, or no step or reference for one."""
 
     def __init__(self, header: StreamHeader) -> None:
         if header.codec != "compact":
@@ -91,11 +88,8 @@ class CompactDecoder(CompactCoder):
     def decode(
         self, fields: Mapping[FieldName, bytes | memoryview], *, kind: PacketKind, index: int
     ) -> dict[FieldName, Tensor]:
-        """The dynamic fields of a frame.
-
-        Raises:
-            StreamError: the packet is damaged, or does not follow the one before it.
-        """
+        """The dynamic fields of a frame. Raises StreamError if the packet is damaged, or does not follow the one before
+        it."""
         before, models = self._start(kind, index)
         decoder = AdaptiveDecoder(models, fields, where=f"Packet {index}")
         bins = self._code(decoder, None, before, index)
@@ -124,12 +118,8 @@ class SceneDecoder:
         return None if self._compact is None else self._compact.state
 
     def decode(self, packet: Packet) -> Scene:
-        """The scene of one frame, on the CPU, in normalised units.
-
-        Raises:
-            StreamError: the packet's fields are not the header's dynamic ones, their shapes are inconsistent, or the
-                packet before it has not been decoded.
-        """
+        """The scene of one frame, on the CPU, in normalised units. Raises StreamError if the packet's fields are not
+        the header's dynamic ones, their shapes are inconsistent, or the packet before it has not been decoded."""
         header, where = self._header, f"Packet {packet.index}"
         if self._compact is None:
             dynamic = unpack_raw_blocks(packet.payload, FRAME.size, where=where)

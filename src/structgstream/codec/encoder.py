@@ -43,11 +43,8 @@ class CompactEncoder(CompactCoder):
         self.state = state
 
     def encode(self, state: Mapping[FieldName, Tensor], *, kind: PacketKind, index: int) -> dict[FieldName, bytes]:
-        """The bytes of each dynamic field.
-
-        Raises:
-            StreamError: a value is out of range, or a delta packet does not follow the packet before it.
-        """
+        """The bytes of each dynamic field. Raises StreamError if a value is out of range, or a delta packet does not
+        follow the packet before it."""
         before, models = self._start(kind, index)
         after = quantize_state(state, self._header.dynamic, self._header.steps)
         if after.anchors.shape != before.anchors.shape:
@@ -72,10 +69,7 @@ class SceneEncoder:
 
     def replay(self, packet: Packet) -> Scene:
         """Continue after ``packet`` of another encoder, and return its scene; call it for every packet of the group.
-
-        Raises:
-            StreamError: it does not follow the packet before it, or is damaged.
-        """
+        Raises StreamError if it does not follow the packet before it, or is damaged."""
         scene = self._decoder.decode(packet)
         if self._compact is not None:
             self._compact.replay(self._decoder.state)
@@ -83,12 +77,8 @@ class SceneEncoder:
         return scene
 
     def encode(self, scene: Scene, *, index: int, pts_seconds: float, kind: PacketKind) -> Encoded[Scene]:
-        """The packet of one frame.
-
-        Raises:
-            StreamError: the scene's shapes differ from the header's, or the presentation time is not after the
-                previous frame's.
-        """
+        """The packet of one frame. Raises StreamError if the scene's shapes differ from the header's, or the
+        presentation time is not after the previous frame's."""
         if not self._last_pts_seconds < pts_seconds < math.inf:
             raise StreamError(
                 f"Frame {index} is to be presented at {pts_seconds} s, which is not after the frame before it "

@@ -125,11 +125,8 @@ def pack_header(header: StreamHeader) -> bytes:
 
 
 def check_picture_sizes(rig: CameraRig) -> None:
-    """Check that a stream can have these cameras, which costs nothing before training.
-
-    Raises:
-        CalibrationError: the pictures of a camera are larger than the format allows.
-    """
+    """Check that a stream can have these cameras, which costs nothing before training. Raises CalibrationError if the
+    pictures of a camera are larger than the format allows."""
     for name in rig:
         width, height = rig[name].width, rig[name].height
         if max(width, height) > MAX_IMAGE_SIDE or width * height > MAX_IMAGE_PIXELS:
@@ -140,11 +137,7 @@ def check_picture_sizes(rig: CameraRig) -> None:
 
 
 def unpack_header(payload: bytes) -> StreamHeader:
-    """The header of an init record's payload.
-
-    Raises:
-        StreamError: the payload violates the format.
-    """
+    """The header of an init record's payload. Raises StreamError if the payload violates the format."""
     values, coded = unpack_blocks(payload, first_block(payload), where="The init record")
     try:
         description = read_description(payload)

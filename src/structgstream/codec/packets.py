@@ -112,11 +112,8 @@ MAX_FRAMES = 2**31
 def packet_from_blocks(
     blocks: Mapping[FieldName, bytes], *, index: int, pts_seconds: float, kind: PacketKind
 ) -> Packet:
-    """The packet of a frame with these field blocks, in this order.
-
-    Raises:
-        StreamError: the stream is as long as it can be.
-    """
+    """The packet of a frame with these field blocks, in this order. Raises StreamError if the stream is as long as it
+    can be."""
     # Identities of free Gaussians are frame * 2^32 + number, of 63 bits. 2^31 frames are 2.27 years at 30 a second.
     if index >= MAX_FRAMES:
         raise StreamError(f"A stream has at most {MAX_FRAMES} frames; begin another one.")
@@ -125,11 +122,7 @@ def packet_from_blocks(
 
 
 def parse_packet(payload: bytes, kind: PacketKind) -> Packet:
-    """The packet in a key or delta record.
-
-    Raises:
-        StreamError: the payload violates the format.
-    """
+    """The packet in a key or delta record. Raises StreamError if the payload violates the format."""
     if len(payload) < FRAME.size:
         raise StreamError("A packet is too short to hold its index and time.")
     index, pts_seconds = FRAME.unpack_from(payload)

@@ -49,11 +49,7 @@ class FrameRenderer:
     def picture(
         self, index: int, view: Camera, *, decode: Callable[[int], Scene], backend: BackendName | Backend
     ) -> NDArray[np.uint8]:
-        """The 8-bit sRGB picture ``[H, W, 3]`` of a frame.
-
-        Raises:
-            BackendError: the back-end is not available.
-        """
+        """The 8-bit sRGB picture ``[H, W, 3]`` of a frame. Raises BackendError if the back-end is not available."""
         if self._backend is None or backend != self._asked:
             self._backend, self._asked, self._last = select_backend(backend), backend, None
         if self._last is None or self._last[0] != index:

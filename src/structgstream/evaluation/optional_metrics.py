@@ -38,10 +38,7 @@ Flow = Callable[[Picture, Picture, str, int], FlowField]
 
 def dis_flow() -> Flow:
     """Flow by dense inverse search in both directions; consistent pixels (``flow.consistency_mask``) count as seen.
-
-    Raises:
-        MissingExtraError: OpenCV is not installed.
-    """
+    Raises MissingExtraError if OpenCV is not installed."""
     search = dis_search("eval")
 
     def field(before: Picture, now: Picture, camera: str, index: int) -> FlowField:

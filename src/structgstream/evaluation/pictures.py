@@ -31,11 +31,8 @@ def png_bytes(picture: Picture) -> bytes:
 
 
 def write_png(path: Path, picture: Picture) -> None:
-    """Writes ``picture`` ``[H, W, 3]`` atomically; creates the folder if it is missing.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Writes ``picture`` ``[H, W, 3]`` atomically; creates the folder if it is missing. Raises StorageError if the file
+    cannot be written."""
     atomic_write(path, png_bytes(picture), called="The picture", new_folder=True, sync=False)
 
 

@@ -112,11 +112,8 @@ def _part(source: FrameSource, header: StreamHeader, frames: int | None) -> Fram
 
 
 def scored_cameras(header: StreamHeader, cameras: tuple[str, ...] | None) -> tuple[str, ...]:
-    """The cameras to score: the named ones, or all that were held out.
-
-    Raises:
-        ConfigError: a name is unknown, or no camera was held out and none is named.
-    """
+    """The cameras to score: the named ones, or all that were held out. Raises ConfigError if a name is unknown, or no
+    camera was held out and none is named."""
     if cameras is None:
         if not header.rig.testing:
             raise ConfigError(
@@ -130,11 +127,8 @@ def scored_cameras(header: StreamHeader, cameras: tuple[str, ...] | None) -> tup
 
 
 def check_same_rig(header: StreamHeader, source: FrameSource, names: tuple[str, ...]) -> None:
-    """Check that the capture's cameras of these names are equal to those of the stream.
-
-    Raises:
-        CaptureError: one is missing, or has another calibration or picture size.
-    """
+    """Check that the capture's cameras of these names are equal to those of the stream. Raises CaptureError if one is
+    missing, or has another calibration or picture size."""
     for name in names:
         ours = header.rig[name]
         theirs = source.rig.cameras.get(name)
@@ -156,11 +150,8 @@ def check_same_rig(header: StreamHeader, source: FrameSource, names: tuple[str, 
 
 
 def check_same_frames(recording: Recording, source: FrameSource) -> None:
-    """Check that the capture has the frames of the recording.
-
-    Raises:
-        CaptureError: it has fewer, or both state their start frame and step, and differ.
-    """
+    """Check that the capture has the frames of the recording. Raises CaptureError if it has fewer, or both state their
+    start frame and step, and differ."""
     if len(source) < len(recording.packets):
         raise CaptureError(
             f"The stream has {len(recording.packets)} frames and this part of the capture {source.name} only "

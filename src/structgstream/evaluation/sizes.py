@@ -63,11 +63,8 @@ class StoredSize:
     _frame: tuple[int, MultiViewFrame] | None = field(default=None, init=False)
 
     def scores(self, camera: str, scene: Drawable, *, index: int) -> dict[str, float | None]:
-        """PSNR and SSIM by their names in ``Scores``; empty for frames that are not scored.
-
-        Raises:
-            CaptureError: the stored picture does not exist any more.
-        """
+        """PSNR and SSIM by their names in ``Scores``; empty for frames that are not scored. Raises CaptureError if the
+        stored picture does not exist any more."""
         if index not in self.frames:
             return {}
         if self._frame is None or self._frame[0] != index:

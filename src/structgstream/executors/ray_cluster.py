@@ -173,11 +173,8 @@ class CommandKilled(Exception):
 
 
 def run_task(task: Task, environment: Mapping[str, str]) -> TaskResult:
-    """Runs the command in a process of this machine, which is killed when this process ends.
-
-    Raises:
-        CommandKilled: a signal ended it; the message has the signal and the command's output.
-    """
+    """Runs the command in a process of this machine, which is killed when this process ends. Raises CommandKilled if a
+    signal ended it; the message has the signal and the command's output."""
     process = CommandProcess(task, environment=environment)
     try:
         # Ray cancels a task by raising an exception between two Python instructions, so a wait must be short.

@@ -307,11 +307,8 @@ class TaskQueue:
         return tuple(self._ready)
 
     def submit(self, task: Task, *, gpus: int = 0) -> None:
-        """Adds a task with a name of its own, which is started in :meth:`wait`; it may need one GPU.
-
-        Raises:
-            ConfigError: the name is taken, or there is no GPU.
-        """
+        """Adds a task with a name of its own, which is started in :meth:`wait`; it may need one GPU. Raises ConfigError
+        if the name is taken, or there is no GPU."""
         if task.name in self._tasks:
             raise ConfigError(f"There are two tasks with the name {task.name!r}.")
         self.engine.check(gpus)

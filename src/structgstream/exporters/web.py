@@ -75,11 +75,8 @@ LARGEST = 2**23 - 1
 
 
 def fractional_bits(means: Tensor) -> int:
-    """Bits after the binary point with which all of ``means`` fit into 24 bits.
-
-    Raises:
-        ConfigError: they do not fit with none.
-    """
+    """Bits after the binary point with which all of ``means`` fit into 24 bits. Raises ConfigError if they do not fit
+    with none."""
     farthest = float(means.abs().max()) if means.numel() else 0.0
     if not farthest <= LARGEST:
         raise ConfigError(
@@ -89,11 +86,8 @@ def fractional_bits(means: Tensor) -> int:
 
 
 def spz_bytes(gaussians: BakedGaussians, options: FrameOptions | None = None) -> bytes:
-    """A whole ``.spz`` file, in the units of ``gaussians`` (whose axes are OpenCV's) and the axes of the format.
-
-    Raises:
-        ConfigError: a position does not fit.
-    """
+    """A whole ``.spz`` file, in the units of ``gaussians`` (whose axes are OpenCV's) and the axes of the format. Raises
+    ConfigError if a position does not fit."""
     version: SpzVersion = 2 if options is None else options.spz_version
     bits = fractional_bits(gaussians.means)
     gaussians = gaussians.y_up()
@@ -156,11 +150,8 @@ Bytes = NDArray[np.uint8]
 
 
 def sog_bytes(gaussians: BakedGaussians, options: FrameOptions | None = None) -> bytes:
-    """A whole ``.sog`` file, in the units and axes of ``gaussians``.
-
-    Raises:
-        MissingExtraError: Pillow is not installed.
-    """
+    """A whole ``.sog`` file, in the units and axes of ``gaussians``. Raises MissingExtraError if Pillow is not
+    installed."""
     gaussians = gaussians.select(morton_order(gaussians.means))
     count = len(gaussians)
     width = math.ceil(math.sqrt(count) / 4) * 4

@@ -138,11 +138,8 @@ def _save(collected: FramesFile, output: Path) -> None:
 
 
 def check_finite(gaussians: BakedGaussians) -> None:
-    """Check that every value is finite and every scale is positive, because logarithms of scales are stored.
-
-    Raises:
-        StreamError: they are not; the message names the values.
-    """
+    """Check that every value is finite and every scale is positive, because logarithms of scales are stored. Raises
+    StreamError if they are not; the message names the values."""
     for field in fields(gaussians):
         values = getattr(gaussians, field.name)
         good = values.isfinite()
@@ -209,11 +206,8 @@ def write_frames(
 
 
 def selected(gaussians: BakedGaussians, options: FrameOptions) -> BakedGaussians:
-    """The Gaussians inside the box and above the opacity of ``options``, and of these the most important.
-
-    Raises:
-        StreamError: none is left.
-    """
+    """The Gaussians inside the box and above the opacity of ``options``, and of these the most important. Raises
+    StreamError if none is left."""
     good = gaussians.opacities >= options.min_opacity
     if options.box is not None:
         low, high = gaussians.means.new_tensor(options.box).reshape(2, 3)

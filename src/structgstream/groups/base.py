@@ -34,11 +34,8 @@ class GroupBase:
 
     @classmethod
     def read(cls, path: Path | str) -> "GroupBase":
-        """The beginning of the stream file ``path``, which may be longer.
-
-        Raises:
-            StreamError: the file is not a stream, or is damaged or truncated before the end of frame 0.
-        """
+        """The beginning of the stream file ``path``, which may be longer. Raises StreamError if the file is not a
+        stream, or is damaged or truncated before the end of frame 0."""
         data = FileBytes(path)
         check_prefix(data, str(path))
         init = read_record(data, PREFIX.size)
@@ -60,11 +57,8 @@ class GroupBase:
 
     @cached_property
     def config(self) -> StreamConfig:
-        """The configuration of the stream, which is that of every group.
-
-        Raises:
-            ConfigError: it cannot be read, has periods, or was made without scene flow, which groups need.
-        """
+        """The configuration of the stream, which is that of every group. Raises ConfigError if it cannot be read, has
+        periods, or was made without scene flow, which groups need."""
         config = from_json(self.header.config)
         if config.codec != "compact" or not (config.online.motion.enabled and config.online.scene_flow.enabled):
             raise ConfigError(

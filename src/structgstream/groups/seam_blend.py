@@ -297,19 +297,12 @@ class GroupBlender:
 
     def follow(self, segment: Segment) -> None:
         """Start after a group whose last two frames are not blended: the first group, or one of at least
-        :data:`~structgstream.groups.seam_blend.OWN_FRAMES` frames.
-
-        Raises:
-            StreamError: a packet is damaged.
-        """
+        :data:`~structgstream.groups.seam_blend.OWN_FRAMES` frames. Raises StreamError if a packet is damaged."""
         self._shown.extend(scene for _, scene in self._decoded(segment))
 
     def records(self, segment: Segment) -> Iterator[bytes]:
-        """The records of the packets of ``segment``, blended; those of the first group are unchanged.
-
-        Raises:
-            StreamError: a packet is damaged.
-        """
+        """The records of the packets of ``segment``, blended; those of the first group are unchanged. Raises
+        StreamError if a packet is damaged."""
         if not self._shown:
             for data, (_, scene) in zip(segment.records(), self._decoded(segment)):
                 self._shown.append(scene)

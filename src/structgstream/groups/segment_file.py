@@ -90,11 +90,8 @@ class Segment:
 
 
 def open_segment(path: Path) -> Segment:
-    """Reads the segment file ``path`` whole; every byte is verified.
-
-    Raises:
-        StreamError: the file is not a segment, or is damaged before its first packet.
-    """
+    """Reads the segment file ``path`` whole; every byte is verified. Raises StreamError if the file is not a segment,
+    or is damaged before its first packet."""
     with FileBytes(path) as file:
         data, name = file[:], str(path)
     check_prefix(data, name)
@@ -173,11 +170,8 @@ class SegmentSink:
         raise ConfigError("A group cannot begin another period; leave out --period.")
 
     def write(self, packet: Packet) -> int:
-        """Appends one packet; returns its size in bytes.
-
-        Raises:
-            StorageError: it cannot be written, or the disk is nearly full; earlier packets are not affected.
-        """
+        """Appends one packet; returns its size in bytes. Raises StorageError if it cannot be written, or the disk is
+        nearly full; earlier packets are not affected."""
         record = packed(RECORD_TYPES[packet.kind], packet.payload)
         self._largest = max(self._largest, len(record))
         closing = (len(self._entries) + 2) * INDEX_ENTRY.size

@@ -44,11 +44,7 @@ class Costs:
 
 @dataclass(frozen=True)
 class Work:
-    """How much there is to do.
-
-    Raises:
-        ConfigError: less than one of them.
-    """
+    """How much there is to do. Raises ConfigError if one of them is less than 1."""
 
     frames: int  # of the capture
     group: int  # frames of a group
@@ -96,10 +92,7 @@ def serial_seconds(costs: Costs, work: Work) -> float:
 
 def estimate(costs: Costs, work: Work, workers: int) -> Estimate:
     """A run on ``workers``: groups begin in their order, each as soon as a worker is free and the pass has come to it.
-
-    Raises:
-        ConfigError: less than one worker.
-    """
+    Raises ConfigError if there is less than one."""
     if workers < 1:
         raise ConfigError(f"The number of workers must be 1 or more, got {workers}.")
     begin = costs.header_seconds

@@ -39,11 +39,7 @@ def starts_in(track: Path) -> Collection[int]:
 
 
 def cut_track(track: Path, first: int) -> bytes:
-    """An unfinished track with the one start that a group needs.
-
-    Raises:
-        StreamError: there is none, or it is damaged.
-    """
+    """An unfinished track with the start that a group needs. Raises StreamError if it is missing or damaged."""
     from structgstream.groups.track_file import TrackWriter, open_track
 
     found = open_track(track)

@@ -81,11 +81,8 @@ class ObjectFolder:
             atomic_write(path, data, new_folder=True)
 
     def owner(self) -> Owner | None:
-        """The owner of the folder; None if there is nothing in it.
-
-        Raises:
-            StorageError: it holds objects and no marker.
-        """
+        """The owner of the folder; None if there is nothing in it. Raises StorageError if it holds objects and no
+        marker."""
         names = self._all()
         if not names:
             return None
@@ -325,11 +322,8 @@ def run(transfer: Transfer, command: Sequence[str]) -> int:
 
 
 def scratch_folder(transfer: Transfer, url: str) -> Path:
-    """The marked folder of a task on this machine; those of earlier runs of the task are removed.
-
-    Raises:
-        StorageError: it is somebody else's, or cannot be made.
-    """
+    """The marked folder of a task on this machine; those of earlier runs of the task are removed. Raises StorageError
+    if it is somebody else's, or cannot be made."""
     above = Path(os.environ.get(SCRATCH) or tempfile.gettempdir())
     # Names of tasks are unique within a run only.
     task = hashlib.sha256(f"{url}\n{transfer.name}".encode()).hexdigest()[:16]

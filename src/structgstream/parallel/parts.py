@@ -74,11 +74,7 @@ class Parts:
         return self.folder / "logs" / f"{name}.txt"
 
     def check(self) -> Owner | None:
-        """The owner of the folder; None if it is missing or empty.
-
-        Raises:
-            StorageError: it is not one of parts.
-        """
+        """The owner of the folder; None if it is missing or empty. Raises StorageError if it is not one of parts."""
         return check_owned(self.folder, PURPOSE)
 
     @contextmanager
@@ -148,11 +144,8 @@ class Parts:
             return False
 
     def record(self, result: TaskResult, key: str, part: Path, *, frames: int) -> CompletedTask:
-        """Records that a task succeeded; the earlier record stays if the part is the same.
-
-        Raises:
-            StorageError: its part is missing, or the record cannot be written.
-        """
+        """Records that a task succeeded; the earlier record stays if the part is the same. Raises StorageError if its
+        part is missing, or the record cannot be written."""
         try:
             record = CompletedTask(
                 result.name,

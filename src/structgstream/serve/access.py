@@ -87,11 +87,8 @@ def _signature(secret: bytes, expires: int, stream: str) -> str:
 
 
 def read_keys(path: Path) -> TokenKeys:
-    """The secrets of a file, one a line.
-
-    Raises:
-        ConfigError: the file cannot be read, has no secret, or one that can be guessed.
-    """
+    """The secrets of a file, one a line. Raises ConfigError if the file cannot be read, has no secret, or one that can
+    be guessed."""
     advice = f"make one with: (umask 077; openssl rand -hex 32 > {path})"
     try:
         with path.open("rb") as file:
@@ -188,11 +185,8 @@ class Authorizer:
         return self._keys.access(query.token, name, unix_seconds=self._clock())
 
     def check(self, request: "Request", name: str) -> None:
-        """Check that a request has access to the stream ``name``.
-
-        Raises:
-            Refused: it has none, or the query is malformed.
-        """
+        """Check that a request has access to the stream ``name``. Raises Refused if it has none, or the query is
+        malformed."""
         access = self.access(request, name)
         if access is not Access.GRANTED:
             raise refusal(access)

@@ -70,11 +70,8 @@ class ServerSettings:
 
 
 def application(settings: ServerSettings, *, clock: Callable[[], float] = time.time) -> Starlette:
-    """The application (Note [What is served]).
-
-    Raises:
-        PlayerError: the folder cannot be read, or the installation lacks the player.
-    """
+    """The application (Note [What is served]). Raises PlayerError if the folder cannot be read, or the installation
+    lacks the player."""
     metrics = Metrics()
     middleware = [
         Middleware(TrustedHostMiddleware, allowed_hosts=list(settings.hosts), www_redirect=False),

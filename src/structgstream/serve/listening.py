@@ -74,12 +74,8 @@ def checked_origins(origins: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def bound(port: int, *, address: str = LOOPBACK) -> socket.socket:
-    """A listening socket, which queues connections before the server runs.
-
-
-    Raises:
-        PlayerError: the port is taken, or may not be used.
-    """
+    """A listening socket, which queues connections before the server runs. Raises PlayerError if the port is taken, or
+    may not be used."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     # asyncio sets TCP_NODELAY only on a socket with this protocol; without it each further response waits 40 ms.
     listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)

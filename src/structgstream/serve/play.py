@@ -60,11 +60,8 @@ class Truth:
         self.cached_bytes = 0
 
     def jpeg(self, camera: str, frame: int) -> bytes | None:
-        """A camera's picture as JPEG; None if there is no such camera or frame, or the camera is absent from it.
-
-        Raises:
-            CaptureError: the picture cannot be read.
-        """
+        """A camera's picture as JPEG; None if there is no such camera or frame, or the camera is absent from it. Raises
+        CaptureError if the picture cannot be read."""
         if camera not in self.cameras or not 0 <= frame < self.frames:
             return None
         with self._lock:

@@ -320,11 +320,8 @@ def shows_enough(frame: MultiViewFrame, rig: CameraRig) -> bool:
 
 
 def check_enough_pictures(frame: MultiViewFrame, rig: CameraRig, capture: str) -> None:
-    """Check that at least two training cameras have pictures, which in frame 0 must not be blank.
-
-    Raises:
-        CaptureError: they do not; the message names the cameras.
-    """
+    """Check that at least two training cameras have pictures, which in frame 0 must not be blank. Raises CaptureError
+    if they do not; the message names the cameras."""
     present = frame.present(rig.training) if frame.index else frame.showing(rig.training)
     if len(present) < MIN_CAMERAS:
         raise CaptureError(
@@ -351,11 +348,8 @@ def initial_points_of(
 
 
 def check_resumable(header: StreamHeader, facts: StreamFacts) -> None:
-    """Check that a stream was made with the same method, configuration and capture.
-
-    Raises:
-        ConfigError: it was not; the message names the differences.
-    """
+    """Check that a stream was made with the same method, configuration and capture. Raises ConfigError if it was not;
+    the message names the differences."""
     if header.codec != facts.codec:
         raise ConfigError(
             f"The stream was made by another method or codec, {header.codec!r} instead of {facts.codec!r}. "

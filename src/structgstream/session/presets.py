@@ -104,11 +104,7 @@ def completed(values: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def preset_named(name: str) -> StreamConfig:
-    """The configuration of a preset.
-
-    Raises:
-        ConfigError: there is no such preset.
-    """
+    """The configuration of a preset. Raises ConfigError if there is no such preset."""
     if name not in PRESETS:
         raise ConfigError(f"there is no preset {name!r}; there are {', '.join(PRESETS)}.")
     return PRESETS[name]

@@ -107,11 +107,7 @@ def packed(kind: int, payload: bytes, *, period: int = 0) -> bytes:
 
 
 def check_prefix(data: ByteSource, name: str) -> None:
-    """Check that ``data`` is a stream of this major version.
-
-    Raises:
-        StreamError: it is not.
-    """
+    """Check that ``data`` is a stream of this major version. Raises StreamError if it is not."""
     if not prefix().startswith(bytes(data[: len(MAGIC)])):
         raise StreamError(f"{name} is not a structgstream file: its first bytes are not the format's signature.")
     if len(data) < PREFIX.size:

@@ -152,11 +152,8 @@ def decode(
 
 
 def section_bytes(data: bytes | memoryview, *, where: str = "A section of symbols") -> int:
-    """Length in bytes of the section at the start of ``data``, which may be longer.
-
-    Raises:
-        StreamError: the section is longer than the data.
-    """
+    """Length in bytes of the section at the start of ``data``, which may be longer. Raises StreamError if the section
+    is longer than the data."""
     _, word_count, lanes, start = _head(data, where=where)
     end = start + 4 * lanes + 2 * word_count
     if end > len(data):
@@ -195,11 +192,7 @@ def _checked_contexts(contexts: NDArray[np.uint16], tables: FrequencyTables) -> 
 
 
 def uses_native(native: bool | None) -> bool:
-    """Whether to use C++; None uses it if available.
-
-    Raises:
-        StreamError: it is requested and not available.
-    """
+    """Whether to use C++; None uses it if available. Raises StreamError if it is requested and not available."""
     if native and not has_native():
         raise StreamError("The installed native library has no entropy coder; install structgstream again.")
     return has_native() if native is None else native

@@ -152,11 +152,7 @@ class SectionDecoder:
         return found
 
     def end(self) -> None:
-        """Checks that all bytes have been read.
-
-        Raises:
-            StreamError: some have not.
-        """
+        """Checks that all bytes have been read. Raises StreamError if some have not."""
         if left := [name for name, data in self._left.items() if len(data)]:
             raise StreamError(f"{self._where} has more bytes of {left[0]} than it should; it is damaged.")
 

@@ -26,11 +26,7 @@ COST_BITS = 16
 
 @dataclass(frozen=True, eq=False)
 class FrequencyTables:
-    """One row of frequencies per context.
-
-    Raises:
-        StreamError: ``rows`` does not satisfy this.
-    """
+    """One row of frequencies per context. Raises StreamError if ``rows`` does not satisfy this."""
 
     rows: NDArray[np.uint16]  # u16 [C, A], each row summing to 4096; C at most 4096, A at most 32
 
@@ -208,11 +204,8 @@ def top_level(precision: int) -> int:
 def decode_tables(
     data: bytes | memoryview, previous: FrequencyTables, *, where: str = "A table set"
 ) -> FrequencyTables:
-    """The tables coded in ``data`` relative to the previous ones, which have the same contexts and alphabet.
-
-    Raises:
-        StreamError: the set is damaged.
-    """
+    """The tables coded in ``data`` relative to the previous ones, which have the same contexts and alphabet. Raises
+    StreamError if the set is damaged."""
     if len(data) > _MAX_ROW_BYTES * previous.contexts:
         raise StreamError(f"{where} has {len(data)} bytes for {previous.contexts} contexts; it is damaged.")
     if not len(data):

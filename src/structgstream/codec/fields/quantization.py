@@ -37,11 +37,7 @@ def float32(value: float) -> float:
 
 
 def quantize(value: Tensor, step: float | NDArray[np.float32]) -> Bins:
-    """Quantizes a tensor: each value to the nearest bin.
-
-    Raises:
-        StreamError: a bin is beyond :data:`LARGEST`.
-    """
+    """Quantizes a tensor: each value to the nearest bin. Raises StreamError if a bin is beyond :data:`LARGEST`."""
     found = np.rint(value.detach().cpu().numpy().astype(np.float64) / np.asarray(step, np.float32))
     if found.size and not np.abs(found).max() <= LARGEST:
         raise StreamError(f"A value is {np.abs(found).max():g} steps from zero, at most {LARGEST} can be coded.")
@@ -54,21 +50,14 @@ def dequantize(bins: Bins, step: float | NDArray[np.float32]) -> Tensor:
 
 
 def check_range(bins: NDArray[np.integer], where: str) -> None:
-    """Check decoded bins of any shape.
-
-    Raises:
-        StreamError: one is beyond :data:`LARGEST`.
-    """
+    """Check decoded bins of any shape. Raises StreamError if one is beyond :data:`LARGEST`."""
     if bins.size and not -LARGEST <= int(bins.min()) <= int(bins.max()) <= LARGEST:
         raise StreamError(f"{where} has a bin beyond 22 bits, the largest allowed; it is damaged.")
 
 
 def round_to_bins(state: Mapping[FieldName, Tensor], steps: Mapping[FieldName, float]) -> dict[FieldName, Tensor]:
-    """Quantizes and dequantizes the fields that have a step; others are returned as they are.
-
-    Raises:
-        StreamError: a bin is beyond :data:`LARGEST`.
-    """
+    """Quantizes and dequantizes the fields that have a step; others are returned as they are. Raises StreamError if a
+    bin is beyond :data:`LARGEST`."""
     return {
         name: dequantize(quantize(value, steps[name]), steps[name]) if name in steps else value
         for name, value in state.items()

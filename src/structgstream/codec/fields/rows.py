@@ -128,11 +128,8 @@ class FreeBins:
 
     @classmethod
     def quantized(cls, values: Tensor, births: Tensor, steps: Mapping[str, float]) -> "FreeBins":
-        """The bins of ``values`` ``[F, 14]`` with identities ``births`` ``[F]``, and zero change.
-
-        Raises:
-            StreamError: a bin is beyond 22 bits.
-        """
+        """The bins of ``values`` ``[F, 14]`` with identities ``births`` ``[F]``, and zero change. Raises StreamError if
+        a bin is beyond 22 bits."""
         return cls(
             births.cpu().numpy().astype(np.int64),
             quantize(values, _steps_of_columns(steps)),
@@ -151,10 +148,7 @@ def _steps_of_columns(steps: Mapping[str, float]) -> NDArray[np.float32]:
 
 def code_free(coder: AdaptiveCoder, after: FreeBins | None, before: FreeBins, *, where: str) -> FreeBins:
     """Codes pruned, changed and spawned Gaussians from ``before`` to ``after``, whose identities and bins are read.
-
-    Raises:
-        StreamError: identities do not ascend or are out of range, or there are too many.
-    """
+    Raises StreamError if identities do not ascend or are out of range, or there are too many."""
     alive = None if after is None else np.isin(before.births, after.births)
     alive = coder.flags("free_births.alive", alive, [before.change.history], counts=[8])
     old = FreeBins(

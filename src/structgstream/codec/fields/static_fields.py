@@ -55,12 +55,8 @@ def _max_numbers(coded: Iterable[bytes | memoryview]) -> int:
 
 
 def encode_fields(fields: Mapping[FieldName, Tensor], steps: Mapping[FieldName, float]) -> dict[FieldName, bytes]:
-    """The bytes of every field that has a coding.
-
-    Raises:
-        StreamError: a field has no step, a value is not a multiple of its step, or there are too many numbers, in
-            absolute terms or for their bytes.
-    """
+    """The bytes of every field that has a coding. Raises StreamError if a field has no step, a value is not a multiple
+    of its step, or there are too many numbers, in absolute terms or for their bytes."""
     bins: dict[FieldName, Bins] = {}
     for name in _coded_names(fields.keys()):
         if name not in steps:
@@ -82,11 +78,8 @@ def encode_fields(fields: Mapping[FieldName, Tensor], steps: Mapping[FieldName, 
 def decode_fields(
     coded: Mapping[FieldName, bytes | memoryview], steps: Mapping[FieldName, float]
 ) -> dict[FieldName, Tensor]:
-    """The fields that :func:`encode_fields` wrote.
-
-    Raises:
-        StreamError: the bytes are damaged, or there is no step or no coding for a field.
-    """
+    """The fields that :func:`encode_fields` wrote. Raises StreamError if the bytes are damaged, or there is no step or
+    no coding for a field."""
     names = _coded_names(coded.keys())
     if len(names) < len(coded):
         raise StreamError(f"{_WHERE} holds {', '.join(sorted(coded.keys() & UNCODED_FIELDS))} coded; expected raw.")

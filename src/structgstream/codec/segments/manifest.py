@@ -132,11 +132,7 @@ class Fields:
 
 
 def parse_object(data: bytes, where: str, *, max_bytes: int) -> Fields:
-    """The JSON object in ``data``.
-
-    Raises:
-        StreamError: it is longer than ``max_bytes``, or not a JSON object.
-    """
+    """The JSON object in ``data``. Raises StreamError if it is longer than ``max_bytes``, or not a JSON object."""
     if len(data) > max_bytes:
         raise StreamError(f"{where} has {len(data)} bytes; expected at most {max_bytes}.")
     try:
@@ -328,11 +324,8 @@ def manifest_to_json(manifest: Manifest) -> bytes:
 
 
 def manifest_from_json(data: bytes, *, name: str) -> Manifest:
-    """The manifest in ``data``; ``name`` is for messages.
-
-    Raises:
-        StreamError: it is no manifest, of a newer version, or contradicts itself or the format's bounds.
-    """
+    """The manifest in ``data``; ``name`` is for messages. Raises StreamError if it is no manifest, of a newer version,
+    or contradicts itself or the format's bounds."""
     top = parse_object(data, name, max_bytes=MAX_MANIFEST_BYTES)
     if (found := top.text("format")) != FORMAT:
         raise StreamError(f"{name} is no manifest of segments: its format is {found!r}; expected {FORMAT!r}.")
@@ -369,11 +362,8 @@ def page_to_json(entries: Sequence[SegmentEntry] | Sequence[HistoryEntry]) -> by
 
 
 def page_from_json(data: bytes, entry: HistoryEntry) -> tuple[SegmentEntry, ...] | tuple[HistoryEntry, ...]:
-    """The entries of the page that ``entry`` names: pages if its level is above 0, otherwise segments.
-
-    Raises:
-        StreamError: it is no page, or not what ``entry`` announces.
-    """
+    """The entries of the page that ``entry`` names: pages if its level is above 0, otherwise segments. Raises
+    StreamError if it is no page, or not what ``entry`` announces."""
     top = parse_object(data, entry.file, max_bytes=MAX_PAGE_BYTES)
     if top.text("format") != FORMAT or top.whole("version") != VERSION:
         top.refuse(f"is no history page of {FORMAT} {VERSION}")

@@ -44,11 +44,7 @@ from structgstream.errors import StreamError
 
 
 def part_of(record: bytes) -> PartEntry:
-    """The entry of a packet's record.
-
-    Raises:
-        StreamError: it is no whole record of a packet.
-    """
+    """The entry of a packet's record. Raises StreamError if it is no whole record of a packet."""
     found = read_record(record, 0)
     if found is None or found.type not in PACKET_KINDS or len(found.payload) < FRAME.size:
         raise StreamError(f"{len(record)} bytes are no whole record of a packet.")
@@ -144,11 +140,8 @@ def with_segment(draft: Draft) -> Draft:
 
 
 def reopened(draft: Draft, store: Store) -> Draft:
-    """With the last segment, which an orderly stop has closed early, as the group that is being written.
-
-    Raises:
-        StreamError: the segment is missing or damaged.
-    """
+    """With the last segment, which an orderly stop has closed early, as the group that is being written. Raises
+    StreamError if the segment is missing or damaged."""
     manifest = draft.manifest
     *before, last = manifest.segments
     records = records_of(last, verified(store, last))

@@ -76,11 +76,8 @@ class Retention:
         self._leaving: dict[str, float] = {}  # files that no manifest names, and since when; oldest first
 
     def take_up(self, manifest: Manifest) -> None:
-        """Begins with a stream that is there, whose last manifest this is.
-
-        Raises:
-            StreamError: a page of its history is missing or damaged.
-        """
+        """Begins with a stream that is there, whose last manifest this is. Raises StreamError if a page of its history
+        is missing or damaged."""
         there = self._store.names()
         self._periods = manifest.periods
         if self._options.window_seconds is not None:
@@ -178,11 +175,8 @@ class SegmentsSink:
         self._header_bytes = self._largest = 0
 
     def open(self, header: StreamHeader) -> int:
-        """Write the init record, or continue a stream, which already has one; returns the bytes written.
-
-        Raises:
-            StorageError: there is a stream already and it may not be overwritten, or nothing can be written.
-        """
+        """Write the init record, or continue a stream, which already has one; returns the bytes written. Raises
+        StorageError if there is a stream already and it may not be overwritten, or nothing can be written."""
         if self._found is not None:
             self._continue(self._found)
             return 0
@@ -201,11 +195,8 @@ class SegmentsSink:
         return len(data)
 
     def begin(self, header: StreamHeader) -> int:
-        """Begin another period with the next packet; its init record is written and named at once.
-
-        Raises:
-            StorageError: it cannot be written; earlier packets stay.
-        """
+        """Begin another period with the next packet; its init record is written and named at once. Raises StorageError
+        if it cannot be written; earlier packets stay."""
         draft = with_period(self._opened(), header)
         size = draft.manifest.periods[-1].bytes
         self._header_bytes = max(self._header_bytes, size)
@@ -214,11 +205,8 @@ class SegmentsSink:
         return size
 
     def write(self, packet: Packet) -> int:
-        """Write one packet; returns the bytes of its record.
-
-        Raises:
-            StorageError: it cannot be written; earlier packets stay.
-        """
+        """Write one packet; returns the bytes of its record. Raises StorageError if it cannot be written; earlier
+        packets stay."""
         draft = self._opened()
         assert packet.index == draft.manifest.edge.frame + 1, "frames have no gaps"
         period = draft.manifest.periods[-1]

@@ -106,11 +106,8 @@ def segments_from(
 
 
 def verified(store: Store, entry: StoredFile) -> bytes:
-    """The content of the file that an entry names.
-
-    Raises:
-        StreamError: it is missing, or is not what the entry states.
-    """
+    """The content of the file that an entry names. Raises StreamError if it is missing, or is not what the entry
+    states."""
     data = store.get(entry.file)
     if len(data) != entry.bytes or sha256_of(data) != entry.sha256:
         raise StreamError(
@@ -287,11 +284,8 @@ class StoredBytes:
 
 
 def open_segments(path: Path | str) -> StoredBytes:
-    """The bytes of a stream in a folder.
-
-    Raises:
-        StreamError: there is no manifest, or it is not valid, or a file is missing.
-    """
+    """The bytes of a stream in a folder. Raises StreamError if there is no manifest, or it is not valid, or a file is
+    missing."""
     path = Path(path)
     store = FolderStore(path.parent if path.name == MANIFEST else path)
     return StoredBytes(store, read_manifest(store))
@@ -304,11 +298,7 @@ def is_segments(path: Path | str) -> bool:
 
 
 def read_manifest(store: Store) -> Manifest:
-    """The manifest of a stream of segments.
-
-    Raises:
-        StreamError: there is none, or it is not valid.
-    """
+    """The manifest of a stream of segments. Raises StreamError if there is none, or it is not valid."""
     if MANIFEST not in store.names():
         raise StreamError(f"{store.name} has no {MANIFEST}; expected a folder written with --sink segments.")
     return manifest_from_json(store.get(MANIFEST, max_bytes=MAX_MANIFEST_BYTES), name=f"{MANIFEST} in {store.name}")
