@@ -2,7 +2,6 @@
 """What a stream holds: packets and periods, found by reading every record, or by its index."""
 
 import math
-from abc import abstractmethod
 from array import array
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
@@ -46,26 +45,7 @@ class PacketInfo:
     field_bytes: Mapping[str, int]
 
 
-class PacketInfos(Sequence[PacketInfo]):
-    """Facts of packets, each found when it is asked for."""
-
-    @abstractmethod
-    def at(self, index: int) -> PacketInfo:
-        """Facts of the packet of a frame."""
-
-    @overload
-    def __getitem__(self, index: int) -> PacketInfo: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[PacketInfo]: ...
-
-    def __getitem__(self, index: int | slice) -> PacketInfo | list[PacketInfo]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        return self.at(range(len(self))[index])
-
-
-class Packets(PacketInfos):
+class Packets(Sequence[PacketInfo]):
     """The packets of a stream in order, up to the first lost one. Only offsets are in memory; indexing reads the heads
     of the packet's record and fields.
 
@@ -85,6 +65,17 @@ class Packets(PacketInfos):
 
     def __len__(self) -> int:
         return self.whole
+
+    @overload
+    def __getitem__(self, index: int) -> PacketInfo: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[PacketInfo]: ...
+
+    def __getitem__(self, index: int | slice) -> PacketInfo | list[PacketInfo]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        return self.at(range(len(self))[index])
 
     def at(self, index: int) -> PacketInfo:
         """Facts of the packet of a frame that is not lost."""

@@ -3,13 +3,12 @@
 
 Note [Two directions]
 ~~~~~~~~~~~~~~~~~~~~~
-A format is described once, as a function that passes values to a :class:`SectionCoder` and continues with what it
+A format is described once, as a function that passes values to a :data:`SectionCoder` and continues with what it
 returns. An encoder gets the true values and returns them; a decoder gets None and returns the decoded values. So both
 directions use the same order and contexts. This module codes the init record, ``adaptive.py`` packets.
 """
 
 from collections.abc import Mapping
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,50 +36,18 @@ CLASSES = 32
 _FLAT = 128  # the geometric row that a context starts with
 
 
-class SectionCoder(Protocol):
-    """Encodes or decodes arrays of integers, one section after another; the name selects the frequency tables."""
+class SectionEncoder:
+    """Encodes arrays of integers, one section after another; a name selects the frequency tables.
 
-    def residuals(self, name: str, values: Bins | None, contexts: Contexts, *, count: int) -> Bins:
-        """Small signed numbers ``[n]``: entropy-coded symbols from -7 to 7, escape codes for larger ones."""
-        ...
-
-    def naturals(
-        self, name: str, values: NDArray[np.int64] | None, contexts: Contexts, *, count: int
-    ) -> NDArray[np.int64]:
-        """Numbers ``[n]`` from 0 to 2^31 - 1: entropy-coded bit length, then the bits below the highest."""
-        ...
-
-    def number(self, name: str, value: int | None) -> int:
-        """One number from 0 to 2^32 - 1."""
-        ...
-
-
-class Tables:
-    """The frequency tables of encoder and decoder, by name; initially geometric."""
+    The part of a name before the dot is the field of :attr:`fields` that the bytes are appended to.
+    """
 
     def __init__(self) -> None:
-        self._sets: dict[str, FrequencyTables] = {}
-
-    def get(self, name: str, *, contexts: int, alphabet: int) -> FrequencyTables:
-        """The set of this name."""
-        found = self._sets.get(name)
-        if found is None:
-            return FrequencyTables(geometric_family(alphabet)[np.full(contexts, _FLAT)])
-        return found
-
-    def put(self, name: str, tables: FrequencyTables) -> None:
-        """Replaces the set of this name."""
-        self._sets[name] = tables
-
-
-class SectionEncoder:
-    """Encodes; the part of a name before the dot is the field of :attr:`fields` that the bytes are appended to."""
-
-    def __init__(self, tables: Tables) -> None:
-        self._tables = tables
+        self._tables: dict[str, FrequencyTables] = {}
         self.fields: dict[str, bytes] = {}
 
     def residuals(self, name: str, values: Bins | None, contexts: Contexts, *, count: int) -> Bins:
+        """Small signed numbers ``[n]``: entropy-coded symbols from -7 to 7, escape codes for larger ones."""
         assert values is not None
         symbols, escapes = residuals_to_symbols(values)
         self._section(name, symbols, contexts, count=count, alphabet=ALPHABET)
@@ -88,6 +55,7 @@ class SectionEncoder:
         return values
 
     def naturals(self, name: str, values: Naturals | None, contexts: Contexts, *, count: int) -> Naturals:
+        """Numbers ``[n]`` from 0 to 2^31 - 1: entropy-coded bit length, then the bits below the highest."""
         assert values is not None
         if len(values) and not 0 <= int(values.min()) <= int(values.max()) < 2**31:
             raise StreamError("A number is beyond 31 bits; take a larger quantization step.")
@@ -100,16 +68,16 @@ class SectionEncoder:
         return values
 
     def number(self, name: str, value: int | None) -> int:
+        """One number from 0 to 2^32 - 1."""
         assert value is not None
         self._put(name, varint(value))
         return value
 
     def _section(self, name: str, symbols: NDArray[np.uint8], contexts: Contexts, *, count: int, alphabet: int) -> None:
-        before = self._tables.get(name, contexts=count, alphabet=alphabet)
         counts = np.zeros((count, alphabet), np.int64)
         np.add.at(counts, (contexts, symbols), 1)
-        tables, packed = choose_tables(counts, before)
-        self._tables.put(name, tables)
+        tables, packed = choose_tables(counts, _last(self._tables, name, count, alphabet))
+        self._tables[name] = tables
         self._put(name, varint(len(packed)) + packed + encode(symbols, contexts, tables))
 
     def _put(self, name: str, data: bytes) -> None:
@@ -120,8 +88,8 @@ class SectionEncoder:
 class SectionDecoder:
     """Reads what :class:`SectionEncoder` wrote into the fields."""
 
-    def __init__(self, tables: Tables, fields: Mapping[FieldName, bytes | memoryview], *, where: str) -> None:
-        self._tables = tables
+    def __init__(self, fields: Mapping[FieldName, bytes | memoryview], *, where: str) -> None:
+        self._tables: dict[str, FrequencyTables] = {}
         self._left: dict[str, memoryview] = {name: memoryview(data) for name, data in fields.items()}
         self._where = where
 
@@ -158,11 +126,10 @@ class SectionDecoder:
 
     def _section(self, name: str, contexts: Contexts, *, count: int, alphabet: int) -> NDArray[np.uint8]:
         where = f"{self._where}, {name},"
-        before = self._tables.get(name, contexts=count, alphabet=alphabet)
-        tables = decode_tables(self._taken(name, self.number(name, None)), before, where=where)
-        self._tables.put(name, tables)
+        before = _last(self._tables, name, count, alphabet)
+        self._tables[name] = decode_tables(self._taken(name, self.number(name, None)), before, where=where)
         size = section_bytes(self._left[name.partition(".")[0]], where=where)
-        return decode(self._taken(name, size), contexts, tables, where=where)
+        return decode(self._taken(name, size), contexts, self._tables[name], where=where)
 
     def _taken(self, name: str, size: int) -> memoryview:
         field = name.partition(".")[0]
@@ -171,3 +138,12 @@ class SectionDecoder:
             raise StreamError(f"{self._where} ends {size - len(data)} bytes too early in {field}; it is damaged.")
         self._left[field] = data[size:]
         return data[:size]
+
+
+SectionCoder = SectionEncoder | SectionDecoder
+
+
+def _last(tables: Mapping[str, FrequencyTables], name: str, contexts: int, alphabet: int) -> FrequencyTables:
+    """The tables of the last section of this name; initially geometric ones."""
+    found = tables.get(name)
+    return FrequencyTables(geometric_family(alphabet)[np.full(contexts, _FLAT)]) if found is None else found
