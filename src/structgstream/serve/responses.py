@@ -95,10 +95,7 @@ async def _pieces(opened: OpenBytes, wanted: range) -> AsyncIterator[bytes]:
     try:
         for start in range(wanted.start, wanted.stop, PIECE_BYTES):
             end = min(start + PIECE_BYTES, wanted.stop)
-            piece = await to_thread.run_sync(opened.__getitem__, slice(start, end))
-            yield piece
-            if len(piece) < end - start:
-                return
+            yield await to_thread.run_sync(opened.__getitem__, slice(start, end))
     except StreamError:
         return
     finally:
