@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from structgstream.codec.entropy.adaptive import AdaptiveEncoder
 from structgstream.codec.entropy.bits import Bins, Contexts, Naturals
 from structgstream.codec.entropy.decisions import Models
-from structgstream.codec.entropy.section_coder import SectionEncoder
+from structgstream.codec.entropy.rans import SectionEncoder
 from structgstream.codec.fields import static_fields
 from structgstream.codec.reader import open_stream
 

@@ -18,8 +18,7 @@ from structgstream.codec.container.records import (
     read_index,
     scan_records,
 )
-from structgstream.codec.header import pack_header
-from structgstream.codec.packets import PacketKind
+from structgstream.codec.packets import PacketKind, pack_header
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import StreamError

@@ -13,7 +13,7 @@ from structgstream.scene.state import state_of
 from structgstream.session.loop import frame_seed
 from structgstream.session.pipeline import FrameTask, StreamFacts
 from structgstream.session.presets import TINY, StreamConfig, to_json
-from structgstream.session.scene_codecs import scene_codec
+from structgstream.session.struct_gstream import scene_codec
 from structgstream.similarity import Similarity
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.views import training_views

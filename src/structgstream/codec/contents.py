@@ -25,8 +25,7 @@ from structgstream.codec.container.records import (
     read_record,
     scan_records,
 )
-from structgstream.codec.header import unpack_header
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet, unpack_header
 from structgstream.errors import StreamError
 
 LOST = 2**64 - 1

@@ -23,8 +23,7 @@ from structgstream.codec.fields.packet_fields import (
     dequantize_state,
     quantize_state,
 )
-from structgstream.codec.header import check_shapes
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader, check_shapes
 from structgstream.errors import StreamError
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene

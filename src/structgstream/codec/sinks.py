@@ -23,8 +23,7 @@ from structgstream.codec.container.records import (
     prefix,
 )
 from structgstream.codec.contents import LOST, PacketInfo, Packets
-from structgstream.codec.header import pack_header
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader, pack_header
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.segments.recovery import find
 from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsSink

@@ -12,8 +12,7 @@ from structgstream.cameras import CameraRig
 from structgstream.codec.container.byte_source import FileBytes
 from structgstream.codec.container.records import PREFIX, RecordType, check_prefix, read_record
 from structgstream.codec.decoder import SceneDecoder
-from structgstream.codec.header import unpack_header
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet, unpack_header
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import WithRig, section
 from structgstream.errors import CaptureError, ConfigError, StreamError

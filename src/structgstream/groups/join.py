@@ -18,8 +18,7 @@ from typing import cast
 
 from structgstream.atomic_files import atomic_file, atomic_write
 from structgstream.codec.container.records import FRAME, PREFIX, pack_index, read_record
-from structgstream.codec.header import unpack_header
-from structgstream.codec.packets import StreamHeader
+from structgstream.codec.packets import StreamHeader, unpack_header
 from structgstream.codec.reader import open_stream
 from structgstream.errors import ConfigError, StreamError, TaskError
 from structgstream.executors.tasks import PYTHON, LocalEngine, Task, TaskQueue, allocate_slots

@@ -17,8 +17,7 @@ from structgstream.cameras import CameraRig
 from structgstream.codec.container.records import MAX_PERIODS, Period
 from structgstream.codec.contents import PacketInfo
 from structgstream.codec.encoder import Encoded
-from structgstream.codec.header import check_picture_sizes
-from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
+from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader, check_picture_sizes
 from structgstream.data.denoising import denoised
 from structgstream.data.points import PointsConfig, initial_points
 from structgstream.data.source import FrameStream, frame_count, is_recording, retain_frames

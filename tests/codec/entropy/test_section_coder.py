@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.codec.entropy.bits import fixed, pack_bits, unpack_numbers, varint
-from structgstream.codec.entropy.section_coder import SectionDecoder, SectionEncoder
+from structgstream.codec.entropy.rans import SectionDecoder, SectionEncoder
 from structgstream.errors import StreamError
 from tests.support.properties import examples
 

@@ -18,8 +18,15 @@ from structgstream.codec.container.records import FRAME, RECORD, RecordType, sca
 from structgstream.codec.decoder import CompactDecoder, SceneDecoder
 from structgstream.codec.encoder import CompactEncoder, SceneEncoder
 from structgstream.codec.fields.packet_fields import CODABLE
-from structgstream.codec.header import check_shapes, pack_header, unpack_header
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet
+from structgstream.codec.packets import (
+    Packet,
+    PacketKind,
+    StreamHeader,
+    check_shapes,
+    pack_header,
+    parse_packet,
+    unpack_header,
+)
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import MemorySink
 from structgstream.errors import StreamError

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.codec.entropy.bits import varint
-from structgstream.codec.entropy.section_coder import SectionEncoder
+from structgstream.codec.entropy.rans import SectionEncoder
 from structgstream.codec.fields.quantization import round_to_bins
 from structgstream.codec.fields.static_fields import (
     FREE_NUMBERS,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from structgstream.codec.entropy.bits import LARGEST_SYMBOL, Bins, Contexts, Naturals, bit_lengths, unzigzag, zigzag
-from structgstream.codec.entropy.section_coder import SectionCoder, SectionDecoder, SectionEncoder
+from structgstream.codec.entropy.rans import SectionCoder, SectionDecoder, SectionEncoder
 from structgstream.codec.fields.quantization import check_range, dequantize, quantize
 from structgstream.errors import StreamError
 from structgstream.scene.order import CELL_BITS, morton_cells, morton_keys

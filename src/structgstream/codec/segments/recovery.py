@@ -21,8 +21,7 @@ from structgstream.codec.container.records import (
     prefix,
     read_record,
 )
-from structgstream.codec.header import pack_header, unpack_header
-from structgstream.codec.packets import StreamHeader
+from structgstream.codec.packets import StreamHeader, pack_header, unpack_header
 from structgstream.codec.segments.manifest import (
     MANIFEST,
     MAX_MANIFEST_BYTES,
