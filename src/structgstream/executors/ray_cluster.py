@@ -73,7 +73,7 @@ class RayEngine:
             self._counted = (time.monotonic(), int(self._ray.cluster_resources().get("CPU", 0)) // self._cores)
         return self._counted[1]
 
-    def start(self, task: Task, *, gpus: int, attempt: int) -> None:
+    def start(self, task: Task, *, gpus: int) -> None:
         """See ``Engine.start``."""
         options = self._remote.options(
             name=task.name,

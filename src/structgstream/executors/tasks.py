@@ -223,7 +223,7 @@ class LocalEngine:
         """See ``Engine.has_room``."""
         return any(slot.gpu is not None for slot in self._free) if gpus else bool(self._free)
 
-    def start(self, task: Task, *, gpus: int, attempt: int) -> None:
+    def start(self, task: Task, *, gpus: int) -> None:
         """See ``Engine.start``."""
         # A task without a GPU prefers a slot without one.
         order = sorted(self._free, key=lambda slot: (slot.gpu is None) == bool(gpus))
@@ -267,7 +267,7 @@ class Engine(Protocol):
         """Whether a task that needs ``gpus`` GPUs can be started now."""
         ...
 
-    def start(self, task: Task, *, gpus: int, attempt: int) -> None:
+    def start(self, task: Task, *, gpus: int) -> None:
         """Starts a task; there must be room for it."""
         ...
 
@@ -349,7 +349,7 @@ class TaskQueue:
                 continue
             self._attempts[name] = self._attempts.get(name, 0) + 1
             self._running.add(name)
-            self.engine.start(task, gpus=gpus, attempt=self._attempts[name])
+            self.engine.start(task, gpus=gpus)
         self._ready.extendleft(reversed(passed))
 
 

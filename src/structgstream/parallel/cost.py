@@ -11,6 +11,7 @@ the last group after it.
 
 import heapq
 import math
+from bisect import bisect_left
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -115,16 +116,9 @@ def estimate(costs: Costs, work: Work, workers: int) -> Estimate:
 
 def workers_for(costs: Costs, work: Work, seconds: float) -> Estimate | None:
     """The least number of workers that end within ``seconds``; None if no number does."""
-    low, high = 1, len(work.groups) + 1
-    if estimate(costs, work, high).seconds > seconds:
-        return None
-    while low < high:
-        middle = (low + high) // 2
-        if estimate(costs, work, middle).seconds <= seconds:
-            high = middle
-        else:
-            low = middle + 1
-    return estimate(costs, work, low)
+    numbers = range(1, len(work.groups) + 2)
+    place = bisect_left(numbers, True, key=lambda workers: estimate(costs, work, workers).seconds <= seconds)
+    return estimate(costs, work, numbers[place]) if place < len(numbers) else None
 
 
 def stream_bytes(costs: Costs, work: Work) -> float:

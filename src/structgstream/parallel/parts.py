@@ -31,7 +31,6 @@ PART_NAMES = re.compile(
 """Names of parts, here and in a store; nothing else is removed."""
 _RUN = "run"  # key of the plan: a random name, which distinguishes scratch files of one run from those of another
 _LOCK = ".driver"
-_PIECE_BYTES = 2**20
 
 
 @dataclass(frozen=True)
@@ -199,12 +198,9 @@ def key_of(*facts: object) -> str:
 
 
 def sha256_of(path: Path) -> str:
-    """Of a file, which is read in pieces. Raises OSError if it cannot be read."""
-    digest = hashlib.sha256()
+    """Of a file. Raises OSError if it cannot be read."""
     with path.open("rb") as file:
-        while piece := file.read(_PIECE_BYTES):
-            digest.update(piece)
-    return digest.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _json_of(path: Path) -> dict[str, Any] | None:
