@@ -174,7 +174,7 @@ def evaluate(
         observer: called with frame number and comparison for every picture.
         metrics: "basic" leaves out the metrics that take longer than rendering: MS-SSIM, FLIP, LPIPS, temporal ones.
         lpips_weights: folder or file with the weights of LPIPS (``lpips.py``, Note [Weights]).
-        stored: the same frames at the capture's own, larger size (``capture.stored_capture``); None to leave out these
+        stored: the same frames at the capture's own, larger size (``recording.captures_of``); None to leave out these
             scores.
 
     Raises:

@@ -78,7 +78,16 @@ def part_metadata(*, start: int, scale: float, every: int) -> dict[str, object]:
 
 
 def capture_of(header: StreamHeader, folder: Path | str, *, frames: int | None) -> FrameSource:
-    """The part of the capture in ``folder`` that a stream was made from, at the stream's sizes.
+    """The part of a capture that a stream was made from, at the stream's sizes: the first of :func:`captures_of`."""
+    return captures_of(header, folder, frames=frames)[0]
+
+
+def captures_of(
+    header: StreamHeader, folder: Path | str, *, frames: int | None
+) -> tuple[FrameSource, FrameSource | None]:
+    """The part of the capture in ``folder`` that a stream was made from, at the stream's sizes and at the stored size.
+
+    The second is None if the stored pictures are not larger than the stream's.
 
     Args:
         frames: number of frames of the stream; None for all from the stream's first frame on.
@@ -87,17 +96,8 @@ def capture_of(header: StreamHeader, folder: Path | str, *, frames: int | None) 
         CaptureError: the folder contains no capture, or the capture ends before the stream's first frame.
     """
     whole = open_capture(folder)
-    return _part(resized(whole, _scale(header, whole)), header, frames)
-
-
-def stored_capture(header: StreamHeader, folder: Path | str, *, frames: int | None) -> FrameSource | None:
-    """As :func:`capture_of`, at the size of the stored pictures; None if these are not larger than the stream's.
-
-    Raises:
-        CaptureError: see :func:`capture_of`.
-    """
-    whole = open_capture(folder)
-    return _part(whole, header, frames) if _scale(header, whole) < 1.0 else None
+    scale = _scale(header, whole)
+    return _part(resized(whole, scale), header, frames), _part(whole, header, frames) if scale < 1.0 else None
 
 
 def _scale(header: StreamHeader, whole: FrameSource) -> float:

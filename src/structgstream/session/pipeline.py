@@ -52,21 +52,11 @@ class FrameTask:
     on_step: StepListener | None = None  # called after every optimisation step
 
     @property
-    def remarks(self) -> "FrameRemarks":
-        """Remarks for the frame's report, in addition to its fit."""
+    def remarks(self) -> dict[str, Any]:
+        """What ``FrameReport`` states of its pictures; a training camera with a blank one is absent, too."""
         there = {*self.frame.showing(self.rig.training), *self.frame.present(self.rig.testing)}
         absent = tuple(name for name in self.rig if name not in there)
-        return FrameRemarks(absent, self.begins, self.frame.mean_of)
-
-
-@dataclass(frozen=True)
-class FrameRemarks:
-    """Remarks of a frame's report on its pictures."""
-
-    # the cameras without a picture that counts, and training cameras with a blank one, in the rig's order
-    absent: tuple[str, ...]
-    begins: str | None  # see FrameTask
-    mean_of: float  # see MultiViewFrame
+        return {"absent": absent, "begins": self.begins, "mean_of": self.frame.mean_of}
 
 
 EQUAL_INTERVALS = 0.25
