@@ -273,11 +273,8 @@ def joint_report(reports: Mapping[str, FrameReport]) -> FrameReport:
 
 
 def joint_entry(report: FrameReport, entries: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """One line of the run's log.
-
-    Args:
-        entries: the frame's line in the log of each quality, by name, including qualities that had the frame already.
-    """
+    """One line of the run's log, from the frame's line in the log of each quality, also of those that had the frame
+    already."""
     each = {name: {key: entry[key] for key in FIGURES if key in entry} for name, entry in entries.items()}
     return {
         "index": report.index,

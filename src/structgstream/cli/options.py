@@ -189,11 +189,8 @@ COLUMN = 52
 
 
 def config_lines(config: Any, *, width: int | None = None) -> list[str]:
-    """A line for each field of a configuration: its option, its value, and its first sentence.
-
-    Args:
-        width: columns; longer lines are cut. None for no limit.
-    """
+    """A line for each field of a configuration: its option, its value, and its first sentence; cut after ``width``
+    columns."""
     lines = [f"{option:<{COLUMN - 2}}  {sentence}" for option, sentence in _rows(config, "--")]
     return [line if width is None or len(line) <= width else f"{line[: width - 1]}…" for line in lines]
 

@@ -238,12 +238,10 @@ def _largest_by_stage(logs: list[Mapping[str, Any]]) -> dict[str, int]:
 def comparison_facts(
     frames: Sequence[FrameScores], names: Sequence[str], left_out: Mapping[str, Sequence[float]]
 ) -> dict[str, Any]:
-    """Data that was not compared: frames without a picture and mean shares of masked pixels, both by camera.
+    """Data that was not compared, by camera: frames without a picture, and the mean of ``left_out``, the shares of
+    masked pixels of its pictures.
 
     Cameras without such data are left out.
-
-    Args:
-        left_out: share of masked pixels in each of a camera's pictures, by camera name.
     """
     absent = {name: sum(name not in frame.cameras for frame in frames) for name in names}
     masked = {name: float(np.mean(shares)) for name, shares in left_out.items()}

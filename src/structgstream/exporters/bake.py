@@ -128,13 +128,11 @@ def bake(scene: Scene, cameras: Iterable[Camera], backend: Backend, *, degree: i
 
 
 def with_low_pass(gaussians: BakedGaussians, sampling: RigSampling, variance: float) -> BakedGaussians:
-    """``gaussians`` widened by ``variance`` squared sampling intervals (``scene/sampling.py``).
+    """``gaussians`` widened by ``variance`` squared sampling intervals (``scene/sampling.py``), in squared training
+    pixels.
 
     A viewer that draws larger pictures than the training pictures needs this, because its low-pass is that of its own,
-    smaller pixels.
-
-    Args:
-        variance: squared training pixels, at least 0; scenes are trained with 0.3.
+    smaller pixels. Scenes are trained with 0.3.
     """
     intervals = sampling.intervals(gaussians.means)
     return replace(gaussians, scales=(gaussians.scales**2 + variance * intervals[:, None] ** 2).sqrt())

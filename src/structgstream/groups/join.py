@@ -93,11 +93,8 @@ def _records(paths: Sequence[Path], blender: GroupBlender | None) -> Iterator[by
 
 
 def runs_of(lengths: Sequence[int], *, workers: int) -> list[range]:
-    """Independent runs of groups, without the first group, which is not blended.
-
-    Args:
-        workers: number of processes; there are at least as many runs if groups are long enough.
-    """
+    """Independent runs of groups, without the first group, which is not blended; at least one for each of ``workers``
+    processes if groups are long enough."""
     size = min(MAX_GROUPS, -(-(len(lengths) - 1) // workers))
     runs, begin = [], 1
     for number in range(2, len(lengths)):

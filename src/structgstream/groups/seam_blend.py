@@ -280,11 +280,8 @@ class Border:
 
 
 class GroupBlender:
-    """Blends the groups of a stream, which must be given in order; at most four scenes are in memory.
-
-    Args:
-        backend: the compute back-end that renders the frames around borders.
-    """
+    """Blends the groups of a stream, which must be given in order; at most four scenes are in memory. The frames around
+    borders are rendered by ``backend``."""
 
     def __init__(
         self, header: StreamHeader, backend: Backend, *, on_border: Callable[[Border], None] | None = None

@@ -260,11 +260,8 @@ def quiet_groups(frames: int, length: int, changed: Mapping[int, float]) -> list
     """Groups of about ``length`` frames that begin at frames with little motion.
 
     Every group has at least half and at most one and a half times ``length`` frames; the last may be shorter, but has
-    at least two. Among all such divisions, this one minimizes the sum of ``changed`` over the borders, relative to
-    their number.
-
-    Args:
-        changed: share of pixels that changed, by frame at which a group may begin.
+    at least two. Among all such divisions, this one minimizes the sum over the borders of ``changed``, the share of
+    changed pixels by frame at which a group may begin, relative to their number.
     """
     least, most = (length + 1) // 2, length + length // 2
     mean = sum(changed.values()) / max(len(changed), 1)

@@ -167,11 +167,7 @@ def query_of(request: "Request") -> Query:
 
 
 class Authorizer:
-    """Checks the tokens of requests.
-
-    Args:
-        keys: secrets; None gives everyone access.
-    """
+    """Checks the tokens of requests; without keys everyone has access."""
 
     def __init__(self, keys: TokenKeys | None, *, clock: Callable[[], float] = time.time) -> None:
         self._keys = keys

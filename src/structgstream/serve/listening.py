@@ -94,11 +94,7 @@ def bound(port: int, *, address: str = LOOPBACK) -> socket.socket:
 
 
 def server(app: ASGIApp, *, proxies: Sequence[str] = (), connections: int | None = None) -> uvicorn.Server:
-    """A server, not yet running.
-
-    Args:
-        connections: number of connections above which requests are answered with 503; None for no limit.
-    """
+    """A server, not yet running, that answers requests with 503 above this number of connections."""
     config = uvicorn.Config(
         app,
         http="h11",

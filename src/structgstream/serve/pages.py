@@ -85,11 +85,8 @@ def bundle() -> str:
 
 
 def policy(**sources: str) -> str:
-    """A Content-Security-Policy (Note [Own origin only]).
-
-    Args:
-        sources: further directives, with ``_`` for ``-``, as ``connect_src="'self'"``.
-    """
+    """A Content-Security-Policy (Note [Own origin only]); further directives have ``_`` for ``-``, as
+    ``connect_src="'self'"``."""
     directives = _POLICY | {name.replace("_", "-"): value for name, value in sources.items()}
     return "; ".join(f"{name} {value}" for name, value in directives.items())
 

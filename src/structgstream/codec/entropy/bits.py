@@ -79,11 +79,7 @@ def unpack_numbers(data: bytes | memoryview, widths: NDArray[np.int64], *, where
 
 
 class BitReader:
-    """Reads what :func:`pack_bits` wrote.
-
-    Args:
-        data: all bytes; the caller bounds their number.
-    """
+    """Reads what :func:`pack_bits` wrote; the caller bounds the number of bytes."""
 
     def __init__(self, data: bytes | memoryview, *, where: str) -> None:
         self._text = f"{int.from_bytes(data, 'big'):0{8 * len(data)}b}" if len(data) else ""

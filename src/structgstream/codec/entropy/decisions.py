@@ -124,11 +124,7 @@ class Models:
 
 
 class ArithmeticState:
-    """The arithmetic code of one field, in either direction.
-
-    Args:
-        data: the bytes to decode; None to encode.
-    """
+    """The arithmetic code of one field, of bytes to decode, or of none to encode."""
 
     def __init__(self, data: bytes | memoryview | None) -> None:
         self.encodes = data is None

@@ -103,11 +103,8 @@ class Retention:
         return Turnover(present[gone:], present[:gone], window)
 
     def published(self, manifest: Manifest, turnover: Turnover, leaving: Iterable[str]) -> None:
-        """Takes in that a manifest is there, and removes what has not been named for long enough.
-
-        Args:
-            leaving: other files that it is the first not to name.
-        """
+        """Takes in that a manifest is there, the first not to name the files ``leaving``, and removes what has not been
+        named for long enough."""
         needed = running_period(manifest).first_segment  # Its first frame is needed to resume.
         left = (*self._needed, *turnover.leave)
         ended = {period.file for period in self._periods} - {period.file for period in manifest.periods}
@@ -270,11 +267,8 @@ class SegmentsSink:
         return sequence
 
     def _publish(self, draft: Draft, leaving: Iterable[str]) -> None:
-        """Write the files of a draft, then its manifest; then remove what has not been named for long enough.
-
-        Args:
-            leaving: files that this manifest is the first not to name.
-        """
+        """Write the files of a draft, then its manifest, the first not to name the files ``leaving``; then remove what
+        has not been named for long enough."""
         self._put(draft.files)
         turnover = self._retention.turnover(draft.manifest)
         manifest = self._stamped(draft.manifest, turnover.window)
