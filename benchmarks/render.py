@@ -9,9 +9,8 @@ import torch
 from benchmarks.benchmark import Benchmark, Growth, Variant
 from benchmarks.contest import Contestant, Quantity, Results
 from benchmarks.world import HELD_OUT, moved, wall_rig, wall_scene
-from structgstream.codec.decoder import SceneDecoder
-from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.codec.scene_coder import SceneDecoder, SceneEncoder
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import render

@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
+from structgstream.codec.scene_coder import SceneDecoder
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsSink
 from structgstream.codec.segments.store import FolderStore, Store

@@ -20,11 +20,11 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig
-from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.fields.quantization import float32
 from structgstream.codec.fields.rows import MAX_FREE
 from structgstream.codec.fields.static_fields import UNCODED_FIELDS
 from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.codec.scene_coder import SceneEncoder
 from structgstream.codec.sinks import FileSink
 from structgstream.errors import CaptureError
 from structgstream.evaluation.camera_path import look_at

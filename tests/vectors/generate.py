@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig
-from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.codec.reader import open_stream
+from structgstream.codec.scene_coder import SceneEncoder
 from structgstream.codec.segments.sink import Clocks, SegmentsSink
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.sinks import MemorySink

@@ -28,8 +28,8 @@ from structgstream.codec.container.records import (
     read_record,
 )
 from structgstream.codec.contents import PacketInfo, Packets, PeriodTable, Scan, contents_by_index, first_run
-from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.codec.scene_coder import SceneDecoder
 from structgstream.codec.segments.stored_bytes import is_segments, open_segments
 from structgstream.errors import StreamError
 from structgstream.kernels.backend import Backend, BackendName, select_backend

@@ -11,8 +11,8 @@ import numpy as np
 from structgstream.cameras import CameraRig
 from structgstream.codec.container.byte_source import FileBytes
 from structgstream.codec.container.records import PREFIX, RecordType, check_prefix, read_record
-from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet, unpack_header
+from structgstream.codec.scene_coder import SceneDecoder
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import WithRig, section
 from structgstream.errors import CaptureError, ConfigError, StreamError

@@ -28,9 +28,8 @@ from torch import Tensor
 
 from structgstream.cameras import CameraRig, enlargement
 from structgstream.codec.container.records import PACKET_KINDS, RECORD_TYPES, packed, read_record
-from structgstream.codec.decoder import SceneDecoder
-from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, StreamHeader, parse_packet
+from structgstream.codec.scene_coder import SceneDecoder, SceneEncoder
 from structgstream.groups.segment_file import Segment
 from structgstream.kernels.backend import Backend
 from structgstream.scene.render import render, to_8bit_image

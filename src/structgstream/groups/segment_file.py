@@ -32,9 +32,9 @@ from structgstream.codec.container.records import (
     packed,
     read_record,
 )
-from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet
 from structgstream.codec.reader import PacketInfo
+from structgstream.codec.scene_coder import SceneDecoder
 from structgstream.errors import ConfigError, StreamError
 from structgstream.groups.base import GroupBase
 from structgstream.scene.scene import Scene

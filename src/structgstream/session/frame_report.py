@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 
 import torch
 
-from structgstream.codec.encoder import Encoded
 from structgstream.codec.packets import PacketKind
+from structgstream.codec.scene_coder import Encoded
 from structgstream.memory import PeakKind, PeakMeter
 from structgstream.scene.render import Drawable
 from structgstream.scene.scene import Scene

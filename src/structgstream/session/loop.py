@@ -16,8 +16,8 @@ import torch
 from structgstream.cameras import CameraRig
 from structgstream.codec.container.records import MAX_PERIODS, Period
 from structgstream.codec.contents import PacketInfo
-from structgstream.codec.encoder import Encoded
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader, check_picture_sizes
+from structgstream.codec.scene_coder import Encoded
 from structgstream.data.denoising import denoised
 from structgstream.data.points import PointsConfig, initial_points
 from structgstream.data.source import FrameStream, frame_count, is_recording, retain_frames

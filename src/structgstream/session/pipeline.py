@@ -16,8 +16,8 @@ from torch import Tensor
 from structgstream.cameras import CameraRig
 from structgstream.codec.container.records import Period
 from structgstream.codec.contents import PacketInfo
-from structgstream.codec.encoder import Encoded
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
+from structgstream.codec.scene_coder import Encoded
 from structgstream.data.denoising import DenoisingConfig
 from structgstream.data.points import PointsConfig
 from structgstream.frames import MultiViewFrame
@@ -69,7 +69,7 @@ MAX_INTERVALS = 3.0
 class Past(Generic[State, Memory]):
     """The state from which a frame is fitted."""
 
-    state: State  # the previous decoded frame (codec.encoder, Note [Closed loop])
+    state: State  # the previous decoded frame (codec.scene_coder, Note [Closed loop])
     memory: Memory  # see Method.prepare
     # the decoded frame before that, if the method needs it and it is of the same period. Frames that show nothing,
     # whose scene is that of the frame before them, do not count for either.

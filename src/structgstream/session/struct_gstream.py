@@ -10,10 +10,10 @@ from pathlib import Path
 import torch
 
 from structgstream.cameras import CameraRig
-from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.fields.quantization import float32, round_to_bins
 from structgstream.codec.packets import StreamHeader
 from structgstream.codec.reader import StreamReader
+from structgstream.codec.scene_coder import SceneEncoder
 from structgstream.codec.sinks import FileSink
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.frames import MultiViewFrame
