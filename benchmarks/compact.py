@@ -9,14 +9,13 @@ from torch import Tensor
 
 from benchmarks.benchmark import Benchmark, Growth, Target, Variant
 from benchmarks.contest import Contestant, Quantity, Results
-from structgstream.cameras import Camera, CameraRig
+from structgstream.cameras import Camera, CameraRig, Similarity
 from structgstream.codec.container.blocks import pack_raw_block, unpack_raw_blocks
 from structgstream.codec.fields.packet_fields import dequantize_state, quantize_state
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.codec.scene_coder import CompactCoder, CompactState
 from structgstream.scene.order import morton_order
 from structgstream.scene.state import FieldName
-from structgstream.similarity import Similarity
 
 STEPS = {
     "anchor_positions": 1 / 512,

@@ -16,7 +16,7 @@ from structgstream.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from structgstream.api import check, evaluate, example_clip, export, prepare, reconstruct
-    from structgstream.cameras import Camera, CameraRig
+    from structgstream.cameras import Camera, CameraRig, Similarity
     from structgstream.codec.contents import PacketInfo
     from structgstream.codec.packets import Packet, PacketKind, StreamHeader
     from structgstream.codec.reader import StreamReader, open_stream
@@ -40,11 +40,10 @@ if TYPE_CHECKING:
     from structgstream.session.pipeline import Pipeline
     from structgstream.session.presets import PRESETS, StreamConfig
     from structgstream.session.struct_gstream import stream_pipeline
-    from structgstream.similarity import Similarity
 
 _NAMES = {
     "api": "check evaluate example_clip export prepare reconstruct",
-    "cameras": "Camera CameraRig",
+    "cameras": "Camera CameraRig Similarity",
     "codec.contents": "PacketInfo",
     "codec.packets": "Packet PacketKind StreamHeader",
     "codec.reader": "StreamReader open_stream",
@@ -68,7 +67,6 @@ _NAMES = {
     "session.pipeline": "Pipeline",
     "session.presets": "PRESETS StreamConfig",
     "session.struct_gstream": "stream_pipeline",
-    "similarity": "Similarity",
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
 

@@ -46,8 +46,7 @@ from structgstream.errors import ConfigError, StorageError, StreamError
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry, read_log
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
-from structgstream.recorder import Run, Storage, log_reports
-from structgstream.run_metrics import RunMetrics
+from structgstream.recorder import Run, RunMetrics, Storage, log_reports
 from structgstream.scene.scene import Scene
 from structgstream.session.frame_report import FrameReport
 from structgstream.session.loop import Session

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.codec.container.damage import readable_part
 from structgstream.codec.container.records import PREFIX, RecordType, packed, prefix, scan_records
+from structgstream.codec.contents import readable_part
 from structgstream.codec.packets import PacketKind, pack_header
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.scene_coder import SceneEncoder

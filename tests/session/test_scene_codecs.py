@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from structgstream.cameras import Similarity
 from structgstream.codec.packets import StreamHeader
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.scene import Scene
@@ -14,7 +15,6 @@ from structgstream.session.loop import frame_seed
 from structgstream.session.pipeline import FrameTask, StreamFacts
 from structgstream.session.presets import TINY, StreamConfig, to_json
 from structgstream.session.struct_gstream import scene_codec
-from structgstream.similarity import Similarity
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.views import training_views
 from tests.support.rigs import random_scene

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from structgstream.cameras import Camera, CameraRig
+from structgstream.cameras import Camera, CameraRig, Similarity
 from structgstream.codec.container.blocks import (
     first_block,
     iterate_blocks,
@@ -25,7 +25,6 @@ from structgstream.codec.container.records import FRAME, PacketKind
 from structgstream.codec.fields.static_fields import UNCODED_FIELDS, decode_fields, encode_fields
 from structgstream.errors import CalibrationError, ConfigError, StreamError
 from structgstream.scene.state import FIELDS, STATE_TABLE, FieldName
-from structgstream.similarity import Similarity
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.codec.container.byte_source import ByteSource, FileBytes
-from structgstream.codec.container.damage import Damage
 from structgstream.codec.container.records import (
     PREFIX,
     Period,
@@ -27,7 +26,7 @@ from structgstream.codec.container.records import (
     read_index,
     read_record,
 )
-from structgstream.codec.contents import PacketInfo, Packets, PeriodTable, Scan, contents_by_index, first_run
+from structgstream.codec.contents import Damage, PacketInfo, Packets, PeriodTable, Scan, contents_by_index, first_run
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.scene_coder import SceneDecoder
 from structgstream.codec.segments.stored_bytes import is_segments, open_segments

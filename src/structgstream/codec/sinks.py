@@ -11,7 +11,6 @@ from typing import BinaryIO
 
 from structgstream.atomic_files import lock_file, sync_folder
 from structgstream.codec.container.byte_source import ByteSlice, ByteSource, FileBytes, check_room, free_bytes
-from structgstream.codec.container.damage import readable_part
 from structgstream.codec.container.records import (
     INDEX_ENTRY,
     RECORD_TYPES,
@@ -22,7 +21,7 @@ from structgstream.codec.container.records import (
     period_at,
     prefix,
 )
-from structgstream.codec.contents import LOST, PacketInfo, Packets
+from structgstream.codec.contents import LOST, PacketInfo, Packets, readable_part
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader, pack_header
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.segments.recovery import find

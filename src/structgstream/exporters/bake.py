@@ -19,14 +19,13 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
-from structgstream.cameras import Camera
+from structgstream.cameras import Camera, Similarity
 from structgstream.errors import StreamError
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
 from structgstream.scene.harmonics import sh_basis
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
-from structgstream.similarity import Similarity
 
 HALF_TURN_SIGNS = (1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
 """Signs of the spherical harmonics up to degree 3 under half a turn around x."""

@@ -13,7 +13,7 @@ from typing import Generic
 
 import torch
 
-from structgstream.cameras import CameraRig
+from structgstream.cameras import CameraRig, Similarity, normalizing_similarity
 from structgstream.codec.container.records import MAX_PERIODS, Period
 from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader, check_picture_sizes
@@ -39,7 +39,6 @@ from structgstream.session.pipeline import (
 )
 from structgstream.session.presets import completed
 from structgstream.session.rate_control import RateController
-from structgstream.similarity import Similarity, normalizing_similarity
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.result import StepListener
 

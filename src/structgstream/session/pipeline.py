@@ -13,7 +13,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import torch
 from torch import Tensor
 
-from structgstream.cameras import CameraRig
+from structgstream.cameras import CameraRig, Similarity
 from structgstream.codec.container.records import Period
 from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
@@ -25,7 +25,6 @@ from structgstream.kernels.backend import Backend
 from structgstream.scene.render import Drawable
 from structgstream.session.periods import PeriodConfig
 from structgstream.session.rate_control import RateConfig
-from structgstream.similarity import Similarity
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.result import FitResult, StepListener
 
