@@ -4,10 +4,10 @@
 import warnings
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from structgstream.atomic_files import atomic_write
-from structgstream.errors import MissingExtraError
+from structgstream.errors import import_extra
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,14 +18,15 @@ COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#F0
 INK, FAINT, OTHER = "#222222", "#dddddd", "#999999"
 
 
-def figure_of(width: float, height: float) -> "Figure":
+def figure_of(
+    width: float, height: float, *, dpi: int = 110, layout: Literal["constrained"] | None = "constrained"
+) -> "Figure":
     """An empty figure, in inches. Raises MissingExtraError if matplotlib is not installed."""
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingExtraError("matplotlib", "report") from None
-    figure = Figure(figsize=(width, height), dpi=110, facecolor="white", layout="constrained")
+    import_extra("matplotlib.figure", "report")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=dpi, facecolor="white", layout=layout)
     FigureCanvasAgg(figure)
     return figure
 

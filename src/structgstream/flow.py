@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from structgstream.errors import MissingExtraError
+from structgstream.errors import import_extra
 
 RELATIVE, ABSOLUTE = 0.01, 0.5  # thresholds of the consistency check: share of squared lengths; squared pixels
 
@@ -145,11 +145,7 @@ def _displacements(reach: int, columns: int, rows: int) -> list[tuple[int, int]]
 
 def opencv(extra: str) -> Any:
     """The module ``cv2``. Raises MissingExtraError, which names the extra, if it is not installed."""
-    try:
-        import cv2
-    except ImportError:
-        raise MissingExtraError("cv2", extra) from None
-    return cv2
+    return import_extra("cv2", extra)
 
 
 def picture_shift(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[float, float]:

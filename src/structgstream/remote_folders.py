@@ -4,7 +4,7 @@
 import re
 from typing import Any
 
-from structgstream.errors import MissingExtraError, StorageError
+from structgstream.errors import MissingExtraError, StorageError, import_extra
 
 HIDDEN = "***"
 """Replacement of a secret in messages."""
@@ -30,12 +30,9 @@ def open_url(url: str, **options: Any) -> tuple[Any, str]:
         MissingExtraError: fsspec, or the package for this scheme, is not installed.
         StorageError: the URL is not supported.
     """
+    core = import_extra("fsspec.core", "cloud")
     try:
-        from fsspec.core import url_to_fs
-    except ModuleNotFoundError:
-        raise MissingExtraError("fsspec", "cloud") from None
-    try:
-        return url_to_fs(url, use_listings_cache=False, **options)
+        return core.url_to_fs(url, use_listings_cache=False, **options)
     except ImportError as error:
         raise MissingExtraError(str(error.name or "s3fs"), "cloud") from None
     except Exception as error:  # Each file system has its own errors; all mean that it cannot be used.

@@ -15,7 +15,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from structgstream.errors import ConfigError, MissingExtraError
+from structgstream.errors import ConfigError, import_extra
 from structgstream.executors.tasks import CommandProcess, Task, TaskResult, thread_environment, waited_for
 
 OLDEST = (2, 52)
@@ -133,10 +133,7 @@ def _protect(*, begins_one: bool) -> None:
 
 
 def _imported() -> Any:
-    try:
-        import ray  # pyright: ignore[reportMissingImports] -- an extra that tests do without
-    except ModuleNotFoundError:
-        raise MissingExtraError("ray", "cluster") from None
+    ray = import_extra("ray", "cluster")
     if tuple(int(part) for part in ray.__version__.split(".")[:2]) < OLDEST:
         oldest = ".".join(map(str, OLDEST))
         raise ConfigError(f"Ray {ray.__version__} has no token authentication; {oldest} is the first that has.")

@@ -38,7 +38,7 @@ import zstandard
 from numpy.typing import NDArray
 from torch import Tensor
 
-from structgstream.errors import ConfigError, MissingExtraError
+from structgstream.errors import ConfigError, import_extra
 from structgstream.exporters.bake import BakedGaussians
 from structgstream.exporters.formats import FrameOptions, SpzVersion
 from structgstream.scene.harmonics import Y0
@@ -272,13 +272,9 @@ def _picture(rows: Bytes, width: int, height: int) -> Bytes:
 
 
 def _webp(picture: Bytes) -> bytes:
-    try:
-        from PIL import Image
-    except ImportError:
-        raise MissingExtraError("PIL", "export") from None
     data = io.BytesIO()
     # exact: the colour of transparent pixels matters.
-    Image.fromarray(picture).save(data, "WEBP", lossless=True, exact=True)
+    import_extra("PIL.Image", "export").fromarray(picture).save(data, "WEBP", lossless=True, exact=True)
     return data.getvalue()
 
 

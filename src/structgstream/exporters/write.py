@@ -26,7 +26,7 @@ import torch
 from structgstream.atomic_files import atomic_file, atomic_write, give_name
 from structgstream.cameras import Camera
 from structgstream.codec.reader import StreamReader
-from structgstream.errors import MissingExtraError, StorageError, StreamError
+from structgstream.errors import StorageError, StreamError, import_extra
 from structgstream.exporters.bake import BakedGaussians, bake, with_low_pass
 from structgstream.exporters.formats import FORMATS, Format, FrameOptions, is_one_file
 from structgstream.exporters.ply import ply_bytes
@@ -48,10 +48,9 @@ class UsdFile:
 
     def __init__(self, *, fps: float) -> None:
         """Begin a file. Raises MissingExtraError if usd-core is not installed."""
-        try:
-            from pxr import Sdf, Usd, UsdGeom
-        except ImportError:
-            raise MissingExtraError("pxr", "export") from None
+        import_extra("pxr", "export")
+        from pxr import Sdf, Usd, UsdGeom
+
         self._stage = Usd.Stage.CreateInMemory()
         UsdGeom.SetStageUpAxis(self._stage, UsdGeom.Tokens.y)
         UsdGeom.SetStageMetersPerUnit(self._stage, 1.0)
@@ -112,10 +111,7 @@ class FourDgsFile:
 
     def __init__(self, *, fps: float) -> None:
         """Begin a file. Raises MissingExtraError if fourdgs is not installed."""
-        try:
-            import fourdgs  # noqa: F401
-        except ImportError:
-            raise MissingExtraError("fourdgs", "export") from None
+        import_extra("fourdgs", "export")
         self._fps = fps
         self._frames: list[dict[str, np.ndarray]] = []
         self._degree = 0

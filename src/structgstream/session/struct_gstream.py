@@ -2,7 +2,6 @@
 """Struct-GStream: frame 0 from initial points, each later frame from the decoded previous one; and its two codecs of
 scenes, ``raw`` and ``compact``, with their headers."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -54,8 +53,9 @@ class QuantizationSteps:
 
 
 @dataclass(frozen=True)
-class SceneCodec(ABC):
-    """Common part of both codecs: the file, the coder and the header."""
+class SceneCodec:
+    """Stores scenes: with codec ``raw`` every number as float32; with ``compact`` all values are quantized
+    (``codec/fields/quantization.py``, Note [Bins]), and anchors are in Z-order."""
 
     config: StreamConfig
 
@@ -105,31 +105,10 @@ class SceneCodec(ABC):
         )
         return scene, header
 
-    @abstractmethod
     def _initialize_stream(self, scene: Scene, task: FrameTask) -> tuple[Scene, QuantizationSteps]:
         """The reconstruction of frame 0, as a receiver decodes it, and its steps."""
-
-    def _with_dynamic_fields(self, scene: Scene) -> Scene:
-        """``scene`` with all dynamic fields; dynamic appearance gets its basis."""
-        online = self.config.online
-        if "appearance" in online.dynamic:
-            scene = with_appearance(scene, online.appearance_rank)
-        return with_dynamic_fields(scene, online.dynamic)
-
-
-@dataclass(frozen=True)
-class RawCodec(SceneCodec):
-    """Stores every number as float32."""
-
-    def _initialize_stream(self, scene: Scene, task: FrameTask) -> tuple[Scene, QuantizationSteps]:
-        return self._with_dynamic_fields(scene), QuantizationSteps()
-
-
-@dataclass(frozen=True)
-class CompactCodec(SceneCodec):
-    """All values are quantized (``codec/fields/quantization.py``, Note [Bins]); anchors are in Z-order."""
-
-    def _initialize_stream(self, scene: Scene, task: FrameTask) -> tuple[Scene, QuantizationSteps]:
+        if self.config.codec == "raw":
+            return self._with_dynamic_fields(scene), QuantizationSteps()
         dynamic, rounding = self.config.online.dynamic, self.config.online.rounding
         scene, sensitivity = regauge(scene, estimate_sensitivity(scene, task.rig, backend=task.backend, seed=task.seed))
         scene = self._with_dynamic_fields(scene)
@@ -149,14 +128,15 @@ class CompactCodec(SceneCodec):
         if scene.environment is not None:
             init_steps["environment"] = float32(self.config.environment.STEP)
         rounded = round_to_bins(state_of(in_morton_order(scene, step=init_steps["anchor_positions"])), init_steps)
-        return scene_of(rounded, distance_input=scene.distance_input, sampling=scene.sampling), QuantizationSteps(
-            steps, init_steps
-        )
+        scene = scene_of(rounded, distance_input=scene.distance_input, sampling=scene.sampling)
+        return scene, QuantizationSteps(steps, init_steps)
 
-
-def scene_codec(config: StreamConfig) -> SceneCodec:
-    """The codec of the configuration."""
-    return RawCodec(config) if config.codec == "raw" else CompactCodec(config)
+    def _with_dynamic_fields(self, scene: Scene) -> Scene:
+        """``scene`` with all dynamic fields; dynamic appearance gets its basis."""
+        online = self.config.online
+        if "appearance" in online.dynamic:
+            scene = with_appearance(scene, online.appearance_rank)
+        return with_dynamic_fields(scene, online.dynamic)
 
 
 @dataclass(frozen=True)
@@ -297,7 +277,7 @@ def stream_pipeline(
     method = StructGStream(config, fitted)
     return Pipeline(
         method,
-        scene_codec(config),
+        SceneCodec(config),
         config=to_json(config),
         seed=config.seed,
         normalised_radius=config.NORMALISED_RADIUS,
