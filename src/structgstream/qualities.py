@@ -235,7 +235,6 @@ class SharedMethod(StructGStream):
     def observe(
         self, frame: MultiViewFrame, before: MultiViewFrame | None, *, rig: CameraRig, backend: Backend
     ) -> FramePictures:
-        """See ``StructGStream``."""
         key = frame.index, None if before is None else before.index
         observe = super().observe
         return self.shared.pictures.value(key, lambda: observe(frame, before, rig=rig, backend=backend))[0]
@@ -247,7 +246,6 @@ class SharedMethod(StructGStream):
         return fit if mine else replace(fit, seconds={})
 
     def next(self, past: Past[Scene, FrameZeroContext], task: FrameTask) -> FitResult[Scene]:
-        """See ``StructGStream``."""
         if task.begins is None:  # All qualities have the previous frame, so no first frame is needed again.
             self.shared.first.clear()
         return super().next(past, task)

@@ -64,7 +64,6 @@ class RayEngine:
         """See ``Engine.check``; the cluster may get GPUs later."""
 
     def has_room(self, gpus: int) -> bool:
-        """See ``Engine.has_room``."""
         return len(self._pending) < IN_FLIGHT * max(1, self.workers())
 
     def workers(self) -> int:
@@ -74,7 +73,6 @@ class RayEngine:
         return self._counted[1]
 
     def start(self, task: Task, *, gpus: int) -> None:
-        """See ``Engine.start``."""
         options = self._remote.options(
             name=task.name,
             num_cpus=self._cores,
@@ -89,7 +87,6 @@ class RayEngine:
         self._pending[options.remote(sent, environment)] = (task.name, time.monotonic())
 
     def ended(self, seconds: float) -> list[TaskResult]:
-        """See ``Engine.ended``."""
         ready, _ = self._ray.wait(list(self._pending), num_returns=1, timeout=seconds)
         return [self._ending(reference) for reference in ready]
 

@@ -215,16 +215,13 @@ class LocalEngine:
         return {name: process.pid for name, (process, _) in self._running.items()}
 
     def check(self, gpus: int) -> None:
-        """See ``Engine.check``."""
         if gpus > 1 or (gpus and not self._has_gpu):
             raise ConfigError(f"A task needs {gpus} GPUs, and a worker here has {int(self._has_gpu)}.")
 
     def has_room(self, gpus: int) -> bool:
-        """See ``Engine.has_room``."""
         return any(slot.gpu is not None for slot in self._free) if gpus else bool(self._free)
 
     def start(self, task: Task, *, gpus: int) -> None:
-        """See ``Engine.start``."""
         # A task without a GPU prefers a slot without one.
         order = sorted(self._free, key=lambda slot: (slot.gpu is None) == bool(gpus))
         slot = order[0]
@@ -232,7 +229,6 @@ class LocalEngine:
         self._running[task.name] = (CommandProcess(task, environment=slot.environment(gpus=gpus)), slot)
 
     def ended(self, seconds: float) -> list[TaskResult]:
-        """See ``Engine.ended``."""
         waited_for([process for process, _ in self._running.values()], seconds)
         results = []
         for name, (process, slot) in list(self._running.items()):

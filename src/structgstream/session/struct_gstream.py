@@ -163,7 +163,6 @@ class StructGStream:
 
     @property
     def needs_older(self) -> bool:
-        """See ``training.online.needs_older``."""
         return needs_older(self.config.online)
 
     def observe(

@@ -117,7 +117,6 @@ class FolderStore:
         weakref.finalize(self, file.close)
 
     def put(self, name: str, data: bytes) -> None:
-        """See :meth:`Store.put`."""
         try:
             with replacing(self.folder / name, partial=self.folder / f"{_TEMPORARY}{name}") as file:
                 file.write(data)
@@ -127,18 +126,15 @@ class FolderStore:
             ) from error
 
     def get(self, name: str, *, max_bytes: int | None = None) -> bytes:
-        """See :meth:`Store.get`."""
         return read_bounded(self.folder / name, max_bytes=MAX_FILE_BYTES if max_bytes is None else max_bytes)
 
     def delete(self, name: str) -> None:
-        """See :meth:`Store.delete`."""
         try:
             (self.folder / name).unlink(missing_ok=True)
         except OSError as error:
             raise StorageError(f"Cannot remove {self.folder / name} ({error.strerror}).") from error
 
     def names(self) -> frozenset[str]:
-        """See :meth:`Store.names`."""
         try:
             return frozenset(filter(is_ours, os.listdir(self.folder)))
         except FileNotFoundError:
@@ -180,7 +176,6 @@ class CloudStore:
         self._scheme = protocols if isinstance(protocols, str) else protocols[0]
 
     def put(self, name: str, data: bytes) -> None:
-        """See ``Store.put``."""
         path = f"{self._root}/{name}"
         with self._writing(f"write {len(data)} bytes to {name}"):
             if self._scheme in _ATOMIC:
@@ -192,7 +187,6 @@ class CloudStore:
                 self._files.mv(temporary, path)
 
     def get(self, name: str, *, max_bytes: int | None = None) -> bytes:
-        """See ``Store.get``."""
         end = None if max_bytes is None else max_bytes + 1
         try:
             data = self._files.cat_file(f"{self._root}/{name}", end=end)
@@ -203,7 +197,6 @@ class CloudStore:
         return data
 
     def delete(self, name: str) -> None:
-        """See ``Store.delete``."""
         with self._writing(f"remove {name}"):
             try:
                 self._files.rm_file(f"{self._root}/{name}")
@@ -211,7 +204,6 @@ class CloudStore:
                 return
 
     def names(self) -> frozenset[str]:
-        """See ``Store.names``."""
         try:
             self._files.invalidate_cache()
             found = self._files.ls(self._root, detail=False)
