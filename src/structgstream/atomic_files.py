@@ -104,12 +104,8 @@ def atomic_write(
 def atomic_file(path: Path, *, check: Callable[[Path], object] | None = None) -> Iterator[BinaryIO]:
     """A file that is renamed to ``path`` at the end of the block, unless it raises (Note [Atomic files]).
 
-    Args:
-        check: called with the path of the complete partial file before it is renamed; if it raises, an existing file is
-            not affected.
-
-    Raises:
-        StorageError: see :func:`atomic_write`.
+    Before that ``check`` is called with the path of the complete partial file; if it raises, an existing file is not
+    affected. Raises StorageError as :func:`atomic_write`.
     """
     with _as_storage_error(path, ""), replacing(path) as file:
         yield file
@@ -120,16 +116,8 @@ def atomic_file(path: Path, *, check: Callable[[Path], object] | None = None) ->
 
 @contextmanager
 def replacing(path: Path, *, partial: Path | None = None, sync: bool = True) -> Iterator[BinaryIO]:
-    """As :func:`atomic_file`, but raises errors of the system unchanged.
-
-    Args:
-        partial: its path while it is written; None for that of :func:`partial_path`.
-        sync: sync the file to the disk before the block ends.
-
-    Raises:
-        OSError: it cannot be written; an existing file is not affected.
-        StorageError: another process writes it.
-    """
+    """As :func:`atomic_file`, but raises errors of the system unchanged; the file may have another name than that of
+    :func:`partial_path` while it is written, and need not be synced to the disk before the block ends."""
     if path.exists() and not path.is_file() and not path.is_dir():
         with path.open("wb") as file:  # a pipe or a device, such as /dev/stdout, which must not become a file
             yield file
@@ -156,16 +144,8 @@ def replacing(path: Path, *, partial: Path | None = None, sync: bool = True) -> 
 
 
 def open_exclusive(partial: Path, *, of: Path, buffering: int = -1) -> BinaryIO:
-    """Opens the file ``partial`` exclusively for writing, at its beginning and without truncation.
-
-    Args:
-        partial: the file; created if it is missing.
-        of: final path of the file, for the message.
-
-    Raises:
-        OSError: it cannot be opened.
-        StorageError: another process writes it.
-    """
+    """Opens the file ``partial`` of ``of``, created if it is missing, exclusively for writing, at its beginning and
+    without truncation. Raises StorageError if another process writes it, OSError if it cannot be opened."""
     while True:
         file = open_lockable(partial, buffering=buffering)
         if not lock_file(file):

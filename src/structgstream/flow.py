@@ -185,14 +185,9 @@ def same_color(
     """Mask ``[H, W]`` of the pixels of ``first`` ``[H, W, 3]`` whose colour ``second`` has where flow leads.
 
     A plain object in front of a still background can have flow 0 both ways, which is consistent but wrong: what is
-    there next has another colour. Colours are means over squares, and may differ by :data:`COLOR_DIFFERENCE` or by
-    :data:`UNEXPLAINED_SHARE` of the difference without flow; a change of all the light is subtracted.
-
-    Args:
-        radius: from the middle of a square to its sides, pixels.
-
-    Raises:
-        MissingExtraError: OpenCV is not installed.
+    there next has another colour. Colours are means over squares that reach ``radius`` pixels to each side, and may
+    differ by :data:`COLOR_DIFFERENCE` or by :data:`UNEXPLAINED_SHARE` of the difference without flow; a change of all
+    the light is subtracted. Raises MissingExtraError without OpenCV.
     """
     cv2 = opencv("capture")
     side = (2 * radius + 1, 2 * radius + 1)

@@ -85,14 +85,8 @@ def check_owned(folder: Path, purpose: str) -> Owner | None:
 
 
 def own_folder(folder: Path, purpose: str, *, owner: Owner | None = None) -> Owner:
-    """Creates and marks a folder unless it is marked already; returns its owner.
-
-    Args:
-        owner: owner in a new marker; None for a random identity.
-
-    Raises:
-        StorageError: see :func:`check_owned`, or it cannot be created.
-    """
+    """Creates and marks a folder unless it is marked already; returns its owner, by default with a random identity.
+    Raises StorageError as :func:`check_owned`, or if it cannot be created."""
     found = check_owned(folder, purpose)
     if found is None:
         found = Owner.new(purpose) if owner is None else owner

@@ -99,14 +99,8 @@ def record(
 def log_reports(
     reports: Generator[FrameReport, None, None], path: Path, *, done: int, remarks: LogExtras | None = None
 ) -> Generator[FrameReport, None, None]:
-    """The reports of a session, each written to the log next to ``path`` before it is yielded.
-
-    Args:
-        done: number of existing frames, whose lines of the log are retained.
-
-    Raises:
-        StorageError: the log cannot be written.
-    """
+    """The reports of a session, each written to the log next to ``path`` before it is yielded; lines of the ``done``
+    existing frames are retained. Raises StorageError if the log cannot be written."""
     begin_log(path, frames=done)
     return _append_reports(reports, path, remarks)
 

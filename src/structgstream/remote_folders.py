@@ -20,15 +20,11 @@ _LONGEST_REASON = 200  # characters; some services answer with whole pages
 
 
 def open_url(url: str, **options: Any) -> tuple[Any, str]:
-    """The file system of a URL, without a cache of listings, and the folder's path in it.
+    """The file system of a URL in the syntax of fsspec, such as ``s3://bucket/streams/studio``, without a cache of
+    listings, and the folder's path in it; ``options`` are the file system's, such as ``endpoint_url``.
 
-    Args:
-        url: URL in the syntax of fsspec, such as ``s3://bucket/streams/studio``.
-        options: options of the file system, such as ``endpoint_url``.
-
-    Raises:
-        MissingExtraError: fsspec, or the package for this scheme, is not installed.
-        StorageError: the URL is not supported.
+    Raises MissingExtraError if fsspec, or the package for this scheme, is not installed, StorageError if the URL is not
+    supported.
     """
     core = import_extra("fsspec.core", "cloud")
     try:

@@ -96,16 +96,9 @@ def thread_environment(threads: int) -> dict[str, str]:
 def allocate_slots(
     *, workers: int | None, cores: int, gpus: int = 0, threads: int | None = None
 ) -> tuple[WorkerSlot, ...]:
-    """Slots for ``workers`` concurrent tasks, which use GPUs in turn.
-
-    Args:
-        workers: number of slots; None for one per GPU, or one per core without GPUs.
-        cores: number of cores that may be used; each slot gets its share, at least one.
-        threads: threads of each slot; None for its share of the cores.
-
-    Raises:
-        ConfigError: there is less than one worker or thread.
-    """
+    """Slots for ``workers`` concurrent tasks, which use GPUs in turn; by default one per GPU, or one per core without
+    GPUs. Each has ``threads``, or its share of the cores, at least one. Raises ConfigError if there is less than one of
+    either."""
     for name, value in (("workers", workers), ("threads", threads)):
         if value is not None and value < 1:
             raise ConfigError(f"The number of {name} must be 1 or more, got {value}.")
@@ -364,15 +357,10 @@ class ExecutorOptions:
 
 
 def open_executor(options: ExecutorOptions, *, cores: int, gpus: int = 0) -> TaskQueue:
-    """The executor; use it as a context manager.
+    """The executor, on this many cores and GPUs of this machine; use it as a context manager.
 
-    Args:
-        cores: number of cores of this machine that may be used.
-        gpus: number of GPUs of this machine that may be used.
-
-    Raises:
-        ConfigError: there is less than one worker or thread, or the cluster cannot be joined.
-        MissingExtraError: a package is missing.
+    Raises ConfigError if there is less than one worker or thread, or the cluster cannot be joined, and
+    MissingExtraError if a package is missing.
     """
     slots = allocate_slots(workers=options.workers, cores=cores, gpus=gpus, threads=options.threads)
     if options.name == "local":

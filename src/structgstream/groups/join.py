@@ -205,15 +205,12 @@ def _in_order(paths: Sequence[Path]) -> tuple[bytes, list[Path], list[int]]:
 
 
 def check_births(path: Path, firsts: Sequence[int]) -> None:
-    """Decode a stream of groups, and check that free Gaussians were spawned in their own group.
+    """Decode a stream of groups, which begin at frames ``firsts``, and check that free Gaussians were spawned in their
+    own group.
 
     The identity of a spawned Gaussian is its frame times 2^32 plus a number, so identities of groups do not collide.
-
-    Args:
-        firsts: the first frame of each group, ascending.
-
-    Raises:
-        StreamError: a frame cannot be decoded, or has a Gaussian that was spawned in another group or a later frame.
+    Raises StreamError if a frame cannot be decoded, or has a Gaussian that was spawned in another group or a later
+    frame.
     """
     with open_stream(path) as reader:
         group = 0

@@ -200,14 +200,9 @@ class ObjectStore(SharedFolder):
             self._fetched_bytes = size
 
     def check_owner(self, key: str) -> Owner | None:
-        """Check that the store may be used for the parts; returns its owner, None if it is empty.
-
-        Args:
-            key: hash of the plan. A run of the same key whose folder of parts was lost is continued.
-
-        Raises:
-            StorageError: it has parts of another run, or other files.
-        """
+        """Check that the store may be used for the parts; returns its owner, None if it is empty. A run of the same
+        ``key``, the hash of its plan, whose folder of parts was lost is continued. Raises StorageError if it has parts
+        of another run, or other files."""
         local, remote = self._parts.check(), self._store.owner()
         if remote is None or (remote.identity == local.identity if local is not None else remote.key == key):
             return remote

@@ -78,14 +78,8 @@ class Parts:
 
     @contextmanager
     def locked(self, *, owner: Owner | None = None) -> Iterator[None]:
-        """Creates and marks the folder, and locks it for other drivers within the block.
-
-        Args:
-            owner: of a folder that is created; None for a new one.
-
-        Raises:
-            StorageError: another process uses it, or the folder is not one of parts, or cannot be made.
-        """
+        """Creates and marks the folder, by default for a new owner, and locks it for other drivers within the block.
+        Raises StorageError if another process uses it, or the folder is not one of parts, or cannot be made."""
         try:
             own_folder(self.folder, PURPOSE, owner=owner)
             (self.folder / "segments").mkdir(exist_ok=True)

@@ -139,14 +139,8 @@ class Query:
 
 
 def parsed_query(raw: bytes, headers: Mapping[str, str]) -> Query:
-    """The query of a request; a token in the header ``Authorization`` takes precedence over one in the query.
-
-    Args:
-        raw: the query as the client wrote it, without question mark.
-
-    Raises:
-        Refused: it has too many parameters, one of them twice, or ``after`` is not a number.
-    """
+    """The query of a request as the client wrote it; a token in the header ``Authorization`` takes precedence. Raises
+    Refused if it has too many parameters, one of them twice, or ``after`` is not a number."""
     try:
         pairs = parse_qsl(raw.decode("ascii"), keep_blank_values=True, max_num_fields=MAX_PARAMETERS, errors="strict")
     except ValueError:  # also for bytes that are not UTF-8

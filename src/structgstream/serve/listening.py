@@ -24,16 +24,8 @@ SEND_BUFFER_BYTES: Final = 256 * 1024
 
 
 def checked_address(host: str, *, tokens: bool, public: bool) -> str:
-    """The address to listen on.
-
-    Args:
-        host: an IP address of this machine, or ``localhost``.
-        tokens: whether access tokens are required.
-        public: whether the user allows access without tokens.
-
-    Raises:
-        ConfigError: it is not an address, or others could see the streams without a token and ``public`` is False.
-    """
+    """The IP address to listen on. Raises ConfigError if it is none, or others could see the streams without a token
+    and ``public`` is False."""
     try:
         address = ipaddress.ip_address(LOOPBACK if host == "localhost" else host)
     except ValueError:
@@ -115,14 +107,8 @@ def server(app: ASGIApp, *, proxies: Sequence[str] = (), connections: int | None
 
 
 def run(server: uvicorn.Server, *, port: int, address: str = LOOPBACK, on_start: Callable[[str], None]) -> None:
-    """Serve until Ctrl-C or SIGTERM.
-
-    Args:
-        on_start: called with the server's address once the port is bound.
-
-    Raises:
-        PlayerError: the port is taken, or may not be used.
-    """
+    """Serve until Ctrl-C or SIGTERM; ``on_start`` is called with the server's address once the port is bound. Raises
+    PlayerError if the port is taken, or may not be used."""
     with bound(port, address=address) as listening:
         name = f"[{address}]" if ":" in address else address
         on_start(f"http://{name}:{listening.getsockname()[1]}/")

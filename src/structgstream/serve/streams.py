@@ -75,15 +75,8 @@ class OpenedFile(FileBytes):
 
 
 def open_below(folder: Path, *parts: str) -> OpenedFile | None:
-    """The regular file ``folder/parts[0]/...``; None if there is none that may be read (Note [No links]).
-
-    Args:
-        folder: may itself be a link, because the user named it.
-        parts: at least one plain name.
-
-    Raises:
-        OSError: the system cannot open files now.
-    """
+    """The regular file ``folder/parts[0]/...``; None if there is none that may be read (Note [No links]). The folder
+    may itself be a link, because the user named it. Raises OSError if the system cannot open files now."""
     try:
         handle = _opened(folder, parts)
     except OSError as error:

@@ -103,15 +103,10 @@ def free_bytes(path: Path) -> int | None:
 
 
 def check_room(free: int | None, *, largest: int, closing: int, where: str, frames: int) -> None:
-    """Check that the next packet and the end of the stream fit.
+    """Check that the next packet and the end of the stream fit. Raises StorageError if they may not.
 
-    Args:
-        free: bytes that are left; None if that is not known.
-        largest: bytes of the largest packet so far, the next one included.
-        closing: bytes that closing the stream takes.
-
-    Raises:
-        StorageError: they may not fit.
+    All sizes are bytes: ``free`` ones are left (None if that is not known), the ``largest`` packet so far has, the next
+    one included, and ``closing`` the stream takes.
     """
     needed = MARGIN_PACKETS * largest + closing
     if free is not None and free < needed:

@@ -90,14 +90,9 @@ def may_be_prefix(data: bytes | memoryview) -> bool:
 
 
 def packed(kind: int, payload: bytes, *, period: int = 0) -> bytes:
-    """A record as bytes: header, payload, CRC-32 of both.
-
-    Args:
-        period: number of the period that an init record begins, or that a packet belongs to.
-
-    Raises:
-        StreamError: the payload is longer than a record can hold, or there are too many periods.
-    """
+    """A record as bytes: header, payload, CRC-32 of both; ``period`` is the one that an init record begins, or that a
+    packet belongs to. Raises StreamError if the payload is longer than a record can hold, or there are too many
+    periods."""
     if period >= MAX_PERIODS:
         raise StreamError(f"A stream has at most {MAX_PERIODS} periods; begin another one.")
     if len(payload) > MAX_RECORD_BYTES:

@@ -127,14 +127,8 @@ _MAX_ZEROS = 28
 
 
 def residuals_to_symbols(residuals: NDArray[np.integer]) -> tuple[NDArray[np.uint8], bytes]:
-    """Symbols u8 ``[n]`` (0, -1, 1, -2, 2 ... 7 are 0 to 14; 15 is any other) and the others' values.
-
-    Args:
-        residuals: integers ``[n]`` that int32 can hold.
-
-    Raises:
-        StreamError: one is out of int32's range.
-    """
+    """Symbols u8 ``[n]`` of residuals ``[n]`` (0, -1, 1, -2, 2 ... 7 are 0 to 14; 15 is any other) and the others'
+    values. Raises StreamError if a residual is out of int32's range."""
     values = residuals.astype(np.int64)
     if len(values) and (int(values.min()) < -(2**31) or int(values.max()) >= 2**31):
         raise StreamError("A residual is beyond 32 bits; take a larger quantization step.")

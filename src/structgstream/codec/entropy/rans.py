@@ -158,14 +158,8 @@ def decode(
     where: str = "A section of symbols",
     native: bool | None = None,
 ) -> NDArray[np.uint8]:
-    """The symbols u8 ``[n]`` of a section that fills ``data``.
-
-    Args:
-        contexts: u16 ``[n]``, as in encoding; the section must state this number of symbols.
-
-    Raises:
-        StreamError: the section is damaged, or states another number of symbols.
-    """
+    """The symbols u8 ``[n]`` of a section that fills ``data``, with the contexts u16 ``[n]`` of its encoding. Raises
+    StreamError if the section is damaged, or states another number of symbols."""
     contexts = _checked_contexts(contexts, tables)
     count, word_count, lanes, start = _head(data, where=where)
     if count != len(contexts):

@@ -87,14 +87,8 @@ def segments_from(
     first: int = 0,
     held: Mapping[str, bytes] | None = None,
 ) -> Iterator[SegmentEntry]:
-    """Every segment from number ``first`` on, those on pages included.
-
-    Args:
-        held: contents of pages that are not in the store yet.
-
-    Raises:
-        StreamError: a page is missing, damaged, or not what is announced.
-    """
+    """Every segment from number ``first`` on, those on pages included; ``held`` are contents of pages that are not in
+    the store yet. Raises StreamError if a page is missing, damaged, or not what is announced."""
     for entry in history:
         if entry.first_segment + entry.segments > first:
             data = held[entry.file] if held and entry.file in held else verified(store, entry)
