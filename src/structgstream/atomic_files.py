@@ -23,14 +23,11 @@ _HELD = (errno.EACCES, errno.EAGAIN)  # the errors that POSIX allows for a lock 
 
 
 def lock_file(file: IO[Any], *, holder: Literal["file", "process"] = "file") -> bool:
-    """Acquires the lock of ``file``, which must be open for writing; returns False if it is held already.
+    """Acquires the lock of ``file``, which must be open for writing, until it is closed; returns False if it is held
+    already.
 
-    On a file system without locks, such as some network file systems, it always succeeds.
-
-    Args:
-        file: holds the lock until it is closed.
-        holder: the owner of the lock: the open file, so that a second one in the same process is refused, or the
-            process.
+    The holder is the open file, so that a second one in the same process is refused, or the process. On a file system
+    without locks, such as some network file systems, it always succeeds.
     """
     take = fcntl.flock if holder == "file" else fcntl.lockf
     try:
@@ -209,16 +206,11 @@ def name_finished(path: Path) -> None:
 
 
 class GrowingFile:
-    """A locked file that grows under the name ``PATH.partial`` and is renamed at the end.
+    """A locked file that grows under the name ``PATH.partial``, after ``keep`` existing bytes, and is renamed at the
+    end.
 
-    Data is on the disk when :meth:`append` returns; a failed write is truncated.
-
-    Args:
-        path: of the finished file.
-        keep: existing bytes to retain; the file is truncated after them.
-
-    Raises:
-        StorageError: it cannot be written, another process writes it, or has changed it since ``keep`` was found.
+    Data is on the disk when :meth:`append` returns; a failed write is truncated. Raises StorageError if it cannot be
+    written, another process writes it, or has changed it since ``keep`` was found.
     """
 
     def __init__(self, path: Path, *, keep: int = 0) -> None:

@@ -276,12 +276,8 @@ class Figures:
 
 
 class RunMetrics:
-    """Collects and writes the metrics of a run.
-
-    Args:
-        captured: returns the time of capture of a frame by its index, Unix time; None if unknown.
-        qualities: names of the qualities of each frame; empty for a single stream.
-    """
+    """Collects and writes the metrics of a run, of several qualities if they are named; ``captured`` returns the time
+    of capture of a frame by its index, Unix time, None if unknown."""
 
     def __init__(
         self,

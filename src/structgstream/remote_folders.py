@@ -64,12 +64,8 @@ def shown_address(address: str) -> str:
 
 
 def without_secrets(text: str, *addresses: str) -> str:
-    """A text for a message or a log, with :func:`shown_address` applied to all addresses in it.
-
-    Args:
-        text: the text, such as an error message of FFmpeg.
-        addresses: addresses that it may contain, with any characters in their passwords.
-    """
+    """A text for a message or a log, such as an error of FFmpeg, with :func:`shown_address` applied to all addresses in
+    it, of which those given may have any characters in their passwords."""
     for address in sorted(filter(None, addresses), key=len, reverse=True):
         text = text.replace(address, shown_address(address))
     return _NAMED.sub(rf"\1{HIDDEN}", _ADDRESS.sub(lambda match: shown_address(match[0]), text))

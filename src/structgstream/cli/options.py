@@ -72,12 +72,8 @@ STANDARD_OUTPUT = "-"
 
 
 def check_ending(output: Path | None, *endings: str, command: str, option: str = "-o", folder: bool = False) -> None:
-    """Check that a name does not ask for a kind of file that the command does not write.
-
-    Args:
-        endings: of :data:`KNOWN_ENDINGS`, those that the command writes.
-        folder: whether another name gives a folder.
-    """
+    """Check that a name has none of :data:`KNOWN_ENDINGS` except those that the command writes; another may name a
+    ``folder``."""
     if output is not None and (ending := output.suffix.lower()) in KNOWN_ENDINGS.difference(endings):
         written = " or ".join([*endings, *(["a folder of another name"] if folder else [])])
         raise UsageError(f"{command} writes no {ending}, got {option} {output}; it writes {written}.")

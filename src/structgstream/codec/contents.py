@@ -339,12 +339,8 @@ def contents_by_index(index: Index, packets: Packets, table: PeriodTable, end: i
 
 
 class Scan:
-    """Verifies every record of a stream, and fills ``packets`` and ``table``.
-
-    Args:
-        table: its periods, only the first so far.
-        gone: frames that are known not to be in ``data`` any more, in order.
-    """
+    """Verifies every record of a stream, and fills ``packets``, and ``table``, which has the first period only. Frames
+    of ``gone``, in order, are known not to be in ``data`` any more."""
 
     def __init__(
         self, data: ByteSource, name: str, packets: Packets, table: PeriodTable, *, gone: Sequence[range]

@@ -75,13 +75,8 @@ def halved(camera: Camera) -> Camera:
 def half_scores(
     scene: Drawable, camera: Camera, truth: Picture, *, backend: Backend, mask: Mask | None = None
 ) -> dict[str, float | None]:
-    """PSNR and SSIM, by their names in ``Scores``, of a rendering at half size against the area mean of the truth.
-
-    Args:
-        camera: camera of the whole picture, or the result of :func:`halved` if the caller has it; scene units.
-        truth: the camera's picture ``[H, W, 3]``, black outside ``mask``.
-        mask: ``[H, W]``, the pixels that count; None for all.
-    """
+    """PSNR and SSIM, by their names in ``Scores``, of a rendering by ``camera`` (:func:`halved`, scene units) against
+    the area mean of the truth ``[H, W, 3]``, which is black outside ``mask`` ``[H, W]``, the pixels that count."""
     small = None if mask is None else block_mask(mask, 2)
     psnr, similarity = _psnr_and_ssim(scene, camera, block_means(truth, 2), small, backend)
     return {"psnr_half": psnr, "ssim_half": similarity}

@@ -67,12 +67,8 @@ def to_device(drawable: Drawable, device: torch.device) -> Drawable:
 
 
 def part_metadata(*, start: int, scale: float, every: int) -> dict[str, object]:
-    """Metadata of a header on the part of a capture that a stream is made from; :func:`capture_of` reads it.
-
-    Args:
-        scale: size of the pictures relative to the stored ones.
-        every: step between frames; 1 is left out.
-    """
+    """Metadata of a header on the part of a capture that a stream is made from, for :func:`capture_of`; ``scale`` is
+    relative to the stored pictures, and a step of 1 is left out."""
     part: dict[str, object] = {"start": start, "scale": scale}
     return part if every == 1 else part | {"every": every}
 

@@ -224,15 +224,9 @@ def codebook(values: Floats) -> tuple[Floats, Bytes]:
 
 
 def vector_palette(rows: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """At most 2^16 means of similar rows, and the mean of each row.
+    """At most 2^16 means ``[P, C]`` of similar rows ``[N, C]``, and the index of the mean of each row ``[N]``.
 
     Rows are halved at the median of the component that varies most within a group until there are enough groups.
-
-    Args:
-        rows: ``[N, C]``.
-
-    Returns:
-        the means ``[P, C]``, and the index of its mean for each row ``[N]``.
     """
     group = np.zeros(len(rows), np.int64)
     if len(rows) <= 1 << _MAX_PALETTE_BITS:

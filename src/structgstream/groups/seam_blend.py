@@ -191,16 +191,13 @@ def moving_at_border(
     earlier: Scene | None = None,
     second: Scene | None = None,
 ) -> Tensor | None:
-    """Mask ``[M]`` of the anchors of ``first`` that move; None if everything changes, as at a cut.
+    """Mask ``[M]`` of the anchors of ``first`` that move; None if everything changes, as at a cut. The rig is in the
+    units of the scene.
 
-    An anchor moves if the selection of an online frame finds it between the renderings of ``before`` and ``first``,
-    or if it changed from ``earlier`` to ``before`` or from ``first`` to ``second``. The second test is needed because
-    slow motion, and fast motion of an untextured surface, change the pictures by less than the two fits differ.
-
-    Args:
-        rig: in the units of the scene.
-        earlier: the last but one frame of the group before; None if that group has one frame only.
-        second: the second frame of the group; None if it has one frame only.
+    An anchor moves if the selection of an online frame finds it between the renderings of ``before`` and ``first``, or
+    if it changed from ``earlier`` to ``before`` or from ``first`` to ``second``, which groups of one frame lack. The
+    second test is needed because slow motion, and fast motion of an untextured surface, change the pictures by less
+    than the two fits differ.
     """
     config = MotionConfig(enabled=True, picture_scale=0.5)
     views, earlier_views = (_as_views(drawn, rig, backend) for drawn in (pictures.first, pictures.before))
@@ -233,13 +230,10 @@ _SCALE = 0.5  # relative to pictures of the reference size
 
 
 def visible_mixtures(mixed: Scene, pictures: BorderPictures, rig: CameraRig, backend: Backend) -> Tensor:
-    """Mask ``[M]`` of the anchors of ``mixed`` that cover pixels that differ from both frames of the border.
+    """Mask ``[M]`` of the anchors of ``mixed`` that cover pixels that differ from both ``pictures`` of the border; the
+    rig is in the units of the scene.
 
     A pixel may have any colour between those of the two.
-
-    Args:
-        pictures: renderings of the last frame of the group before and of the group's own first frame.
-        rig: in the units of the scene.
     """
     folded, count = mixed.with_folded_appearance(), len(mixed.anchors)
     sums = torch.zeros(count, 2).to(mixed.anchors.positions)

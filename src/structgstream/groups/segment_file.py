@@ -141,14 +141,8 @@ def _identity(note: Record, name: str) -> SegmentIdentity:
 
 
 class SegmentSink:
-    """Appends the packets of a group; the file is renamed after the last one.
-
-    Args:
-        found: existing part that is retained; None for a new segment.
-
-    Raises:
-        StorageError: it cannot be written, or another process writes it.
-    """
+    """Appends the packets of a group to the existing part; the file is renamed after the last one. Raises StorageError
+    if it cannot be written, or another process writes it."""
 
     def __init__(self, path: Path, base: GroupBase, identity: SegmentIdentity, found: Segment | None) -> None:
         self._identity = identity

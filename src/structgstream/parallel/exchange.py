@@ -38,18 +38,11 @@ LONGEST_DELAY_SECONDS = 10.0
 
 
 class ObjectFolder:
-    """Objects by name, with the bytes of the files that they are copies of.
+    """The objects of a URL, in the syntax of fsspec, by name, with the bytes of the files that they are copies of.
 
-    A request that fails is made again, :data:`TRIES` times in all, with growing, varied pauses; then it is a
-    ``StorageError``.
-
-    Args:
-        url: of the folder, as fsspec takes it. Addresses and credentials come from the environment, as the scheme's
-            package reads them (``AWS_ENDPOINT_URL``, ``AWS_ACCESS_KEY_ID``, ...).
-
-    Raises:
-        MissingExtraError: fsspec, or the package for this scheme, is not installed.
-        StorageError: the URL is not understood.
+    Addresses and credentials come from the environment, as the scheme's package reads them (``AWS_ENDPOINT_URL``,
+    ``AWS_ACCESS_KEY_ID``, ...). A request that fails is made again, :data:`TRIES` times in all, with growing, varied
+    pauses; then it is a ``StorageError``.
     """
 
     def __init__(self, url: str) -> None:

@@ -98,13 +98,8 @@ SERVED_POLICY: Final = {"script_src": "'self' blob:", "connect_src": "'self' blo
 def linked_page(
     title: str, *, stream: str, module: str = "player.js", attributes: Mapping[str, str] | None = None
 ) -> str:
-    """A page that loads the player and the stream, for a server.
-
-    Args:
-        stream: address of the stream, relative to the page.
-        module: address of the player, relative to the page.
-        attributes: further attributes of the element.
-    """
+    """A page that loads the player and the stream, both by addresses relative to the page, for a server; the element
+    gets further ``attributes``."""
     script = f'<script type="module" src="{html.escape(module)}"></script>'
     body = f"{_element({'src': stream, **(attributes or {})})}\n{_NO_SCRIPT}"
     return html_page(title, head=_PLAYER_STYLE + script, body=body, rules=policy(**SERVED_POLICY))

@@ -34,16 +34,11 @@ MAX_SKIPPED = 8  # decoding and skipping up to this many frames costs less than 
 
 
 class Truth:
-    """Pictures of a capture, one camera and frame at a time.
+    """Pictures of a capture at the stream's size, one camera and frame at a time; ``cameras`` are in both capture and
+    stream.
 
-    They are decoded on demand and cached. Consecutive frames of one camera are decoded without seeking.
-
-    Args:
-        source: the part of the capture that the stream was made from, at the stream's size.
-        cameras: names of the cameras that are in both capture and stream.
-
-    Raises:
-        MissingExtraError: OpenCV, which encodes pictures, is not installed.
+    They are decoded on demand and cached. Consecutive frames of one camera are decoded without seeking. Raises
+    MissingExtraError without OpenCV, which encodes pictures.
     """
 
     def __init__(

@@ -204,12 +204,8 @@ class Index:
 
 
 def pack_index(entries: Iterable[tuple[int, int, int]], offset: int) -> bytes:
-    """Index record, to be written at byte ``offset``, and footer.
-
-    Args:
-        entries: frame index, record type and offset of each packet, and of each init record after the first.
-        offset: where the index record begins.
-    """
+    """Index record, to be written at byte ``offset``, and footer. Entries are frame index, record type and offset of
+    each packet, and of each init record after the first."""
     index = b"".join(INDEX_ENTRY.pack(*entry) for entry in entries)
     return packed(RecordType.INDEX, index) + FOOTER.pack(offset, FOOTER_MAGIC)
 

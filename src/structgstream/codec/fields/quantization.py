@@ -112,13 +112,9 @@ class RateTerm:
         weight: float,
         free: bool,
     ) -> "RateTerm | None":
-        """The rate term of changes of anchors' parameters from ``values``, their present ones; None without any.
-
-        Args:
-            values: tensors by name; those without a step do not count.
-            weight: what a kilobyte adds to the loss; None is returned unless it is positive.
-            free: whether changes of free Gaussians count, too.
-        """
+        """The rate term of changes of anchors' parameters, and of free Gaussians' if they count, from their present
+        ``values`` by name; those without a step do not count. None without any, and unless ``weight``, what a kilobyte
+        adds to the loss, is positive."""
         names = (*trainable("anchor"), *trainable("free")) if free else trainable("anchor")
         counted: dict[ParameterName, float] = {name: steps[name] for name in names if name in steps and name in values}
         if not counted or weight <= 0.0:

@@ -70,13 +70,8 @@ _REMEMBERED = 7  # activity of three frames
 def code_change(
     coder: AdaptiveCoder, change: Change | None, before: Change, *, groups: Sequence[tuple[str, int, int]]
 ) -> Change:
-    """Codes a change, with the rows' previous change as context.
-
-    Args:
-        change: the change to encode; None when decoding.
-        groups: ``(name, first column, end)`` of the groups of columns with a model each; they cover all columns in
-            order.
-    """
+    """Codes a change (None when decoding), with the rows' previous change as context. Each group of columns ``(name,
+    first, end)`` has a model; they cover all columns in order."""
     if not groups:
         return before
     active = coder.activity(

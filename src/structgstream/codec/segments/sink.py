@@ -146,12 +146,8 @@ class Clocks:
 
 
 class SegmentsSink:
-    """A sink of immutable segments and a manifest. Every packet is durable in the store when ``write`` returns.
-
-    Args:
-        overwrite: whether a stream that is there may be replaced.
-        found: what is there already, to go on after it (``recovery.find``).
-    """
+    """A sink of immutable segments and a manifest, which goes on after what was ``found`` (``recovery.find``), or
+    replaces it. Every packet is durable in the store when ``write`` returns."""
 
     def __init__(
         self,

@@ -155,17 +155,10 @@ _ATOMIC = ("s3", "s3a", "gcs", "gs", "abfs", "az", "adl", "memory")
 
 
 class CloudStore:
-    """A folder of a URL such as ``s3://bucket/streams/studio``.
+    """A folder of a URL such as ``s3://bucket/streams/studio``, with options of the file system (``open_url``).
 
     Object stores write an object in one step and durably. Elsewhere (sftp and the like) a file is written under a
     temporary name and moved. S3 gets content types and cache headers, so that the bucket can be read by browsers.
-
-    Args:
-        options: of the file system, as fsspec takes them, such as ``endpoint_url`` of an S3 that is not Amazon's.
-
-    Raises:
-        MissingExtraError: fsspec, or the package for this scheme, is not installed.
-        StorageError: the URL is not understood.
     """
 
     def __init__(self, url: str, **options: Any) -> None:
