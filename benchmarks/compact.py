@@ -9,15 +9,13 @@ from torch import Tensor
 
 from benchmarks.benchmark import Benchmark, Growth, Target, Variant
 from benchmarks.contest import Contestant, Quantity, Results
-from structgstream.cameras import Camera, CameraRig
+from structgstream.cameras import Camera, CameraRig, Similarity
 from structgstream.codec.container.blocks import pack_raw_block, unpack_raw_blocks
-from structgstream.codec.decoder import CompactDecoder, CompactState
-from structgstream.codec.encoder import CompactEncoder
 from structgstream.codec.fields.packet_fields import dequantize_state, quantize_state
 from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.codec.scene_coder import CompactCoder, CompactState
 from structgstream.scene.order import morton_order
 from structgstream.scene.state import FieldName
-from structgstream.similarity import Similarity
 
 STEPS = {
     "anchor_positions": 1 / 512,
@@ -73,7 +71,7 @@ def workload(anchors: int) -> Work:
         steps=STEPS,
         reference=_rounded(state, ROWS),
     )
-    encoder = CompactEncoder(header)
+    encoder = CompactCoder(header)
     encoder.encode(state, kind=PacketKind.KEY, index=0)
     state = _moved(state, active, 1, g)
     encoder.encode(state, kind=PacketKind.DELTA, index=1)
@@ -117,7 +115,7 @@ def _values(state: State) -> Results:
 def contestants(*, anchors: int) -> list[Contestant]:
     """Reading float32, decoding, encoding: all three end with the same numbers."""
     work = workload(anchors)
-    encoder, decoder = CompactEncoder(work.header), CompactDecoder(work.header)
+    encoder, decoder = CompactCoder(work.header), CompactCoder(work.header)
     sizes = {"raw": float(len(work.raw)), "compact": float(sum(map(len, work.coded.values())))}
 
     def decode() -> Results:
@@ -125,7 +123,7 @@ def contestants(*, anchors: int) -> list[Contestant]:
         return _values(decoder.decode(work.coded, kind=PacketKind.DELTA, index=2))
 
     def encode() -> Results:
-        encoder.replay(work.before)
+        encoder.state = work.before
         encoder.encode(work.frame, kind=PacketKind.DELTA, index=2)
         return _values(_rounded(work.frame, DYNAMIC))
 

@@ -9,12 +9,12 @@ import torch
 from benchmarks.benchmark import Benchmark, Variant
 from benchmarks.contenders import torch_but_raster
 from benchmarks.contest import Contestant, Quantity, Results
+from structgstream.cameras import normalizing_similarity
 from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.data.points import initial_points
 from structgstream.data.wrappers import resized
 from structgstream.kernels.backend import Backend, cpu_backend
 from structgstream.session.presets import FAST, TINY
-from structgstream.similarity import normalizing_similarity
 from structgstream.training.frame0.fit import fit_first_frame
 from structgstream.training.result import FitResult
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from structgstream.codec.entropy.adaptive import AdaptiveEncoder
 from structgstream.codec.entropy.bits import Bins, Contexts, Naturals
 from structgstream.codec.entropy.decisions import Models
-from structgstream.codec.entropy.section_coder import SectionEncoder, Tables
+from structgstream.codec.entropy.rans import SectionEncoder
 from structgstream.codec.fields import static_fields
 from structgstream.codec.reader import open_stream
 
@@ -28,8 +28,8 @@ from structgstream.codec.reader import open_stream
 class Both(SectionEncoder):
     """Encodes sections, and every array with adaptive decisions."""
 
-    def __init__(self, tables: Tables) -> None:
-        super().__init__(tables)
+    def __init__(self) -> None:
+        super().__init__()
         self.adaptive = AdaptiveEncoder(Models(), where="The init record")
         self.arrays: list[tuple[str, NDArray[np.uint8], int]] = []
 
@@ -50,8 +50,8 @@ class Both(SectionEncoder):
 
 def main(file: str, out: str) -> None:
     header = open_stream(file).header
-    both = Both(Tables())
-    with patch.object(static_fields, "SectionEncoder", lambda tables: both):
+    both = Both()
+    with patch.object(static_fields, "SectionEncoder", lambda: both):
         sections = static_fields.encode_fields({**header.static, **header.reference}, header.init_steps)
     fields = both.adaptive.fields()
     arrays = [{"name": name, "values": len(contexts), "contexts": count} for name, contexts, count in both.arrays]

@@ -9,15 +9,14 @@ import torch
 from benchmarks.benchmark import Benchmark, Growth, Variant
 from benchmarks.contest import Contestant, Quantity, Results
 from benchmarks.world import HELD_OUT, moved, wall_rig, wall_scene
-from structgstream.codec.decoder import SceneDecoder
-from structgstream.codec.encoder import SceneEncoder
+from structgstream.cameras import Similarity
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.codec.scene_coder import SceneDecoder, SceneEncoder
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import render
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
-from structgstream.similarity import Similarity
 
 FRAMES = 4
 SHIFT = (0.004, 0.002, 0.0)

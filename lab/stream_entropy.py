@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from structgstream.codec.entropy.adaptive import AdaptiveDecoder
 from structgstream.codec.entropy.bits import Contexts
-from structgstream.codec.entropy.section_coder import SectionDecoder
+from structgstream.codec.entropy.rans import SectionDecoder
 from structgstream.codec.reader import open_stream
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from structgstream.cli.app import Terminated
 from structgstream.data.live.status import CameraStatus, LiveStatus
-from structgstream.run_metrics import RunMetrics, free_bytes, metrics_path
+from structgstream.recorder import RunMetrics, free_bytes, metrics_path
 from tests.support.reports import frame_report
 
 CAMERAS = {"a": CameraStatus(True, 40, 1, {"jump": 1}), "b": CameraStatus()}

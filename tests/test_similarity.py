@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import torch
 
-from structgstream.similarity import Similarity, normalizing_similarity, rig_radius
+from structgstream.cameras import Similarity, normalizing_similarity, rig_radius
 from tests.support.rigs import arc_rig
 
 

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from benchmarks.machine import load_average, machine
-from structgstream.cameras import Camera
+from structgstream.cameras import Camera, normalizing_similarity
 from structgstream.codec.reader import open_stream
 from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.data.source import FrameSource
@@ -36,7 +36,6 @@ from structgstream.session.loop import frame_seed, initial_points_of
 from structgstream.session.periods import PeriodConfig
 from structgstream.session.presets import FAST, StreamConfig
 from structgstream.session.struct_gstream import stream_pipeline
-from structgstream.similarity import normalizing_similarity
 from structgstream.training.frame0.fit import fit_first_frame
 from structgstream.training.result import FitResult
 

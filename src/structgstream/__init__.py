@@ -16,7 +16,7 @@ from structgstream.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from structgstream.api import check, evaluate, example_clip, export, prepare, reconstruct
-    from structgstream.cameras import Camera, CameraRig
+    from structgstream.cameras import Camera, CameraRig, Similarity
     from structgstream.codec.contents import PacketInfo
     from structgstream.codec.packets import Packet, PacketKind, StreamHeader
     from structgstream.codec.reader import StreamReader, open_stream
@@ -40,51 +40,35 @@ if TYPE_CHECKING:
     from structgstream.session.pipeline import Pipeline
     from structgstream.session.presets import PRESETS, StreamConfig
     from structgstream.session.struct_gstream import stream_pipeline
-    from structgstream.similarity import Similarity
 
-_HOMES = {
-    "Backend": "kernels.backend",
-    "Camera": "cameras",
-    "CameraRig": "cameras",
-    "CheckReport": "preparation.checking.check",
-    "FileSink": "codec.sinks",
-    "Finding": "pose_check.findings",
-    "FrameOptions": "exporters.formats",
-    "FrameReport": "session.frame_report",
-    "FrameScores": "evaluation.report",
-    "FrameSource": "data.source",
-    "MemorySink": "codec.sinks",
-    "MultiViewFrame": "frames",
-    "PRESETS": "session.presets",
-    "Packet": "codec.packets",
-    "PacketInfo": "codec.contents",
-    "PacketKind": "codec.packets",
-    "PeakKind": "memory",
-    "Pipeline": "session.pipeline",
-    "Preparation": "preparation.prepare",
-    "PrepareOptions": "preparation.options",
-    "Rendering": "scene.render",
-    "Report": "evaluation.report",
-    "Scene": "scene.scene",
-    "Scores": "evaluation.report",
-    "Session": "session.loop",
-    "Similarity": "similarity",
-    "StreamConfig": "session.presets",
-    "StreamHeader": "codec.packets",
-    "StreamReader": "codec.reader",
-    "StructGStreamError": "errors",
-    "check": "api",
-    "evaluate": "api",
-    "example_clip": "api",
-    "export": "api",
-    "open_capture": "data.open",
-    "open_stream": "codec.reader",
-    "prepare": "api",
-    "reconstruct": "api",
-    "render": "scene.render",
-    "select_backend": "kernels.backend",
-    "stream_pipeline": "session.struct_gstream",
+_NAMES = {
+    "api": "check evaluate example_clip export prepare reconstruct",
+    "cameras": "Camera CameraRig Similarity",
+    "codec.contents": "PacketInfo",
+    "codec.packets": "Packet PacketKind StreamHeader",
+    "codec.reader": "StreamReader open_stream",
+    "codec.sinks": "FileSink MemorySink",
+    "data.open": "open_capture",
+    "data.source": "FrameSource",
+    "errors": "StructGStreamError",
+    "evaluation.report": "FrameScores Report Scores",
+    "exporters.formats": "FrameOptions",
+    "frames": "MultiViewFrame",
+    "kernels.backend": "Backend select_backend",
+    "memory": "PeakKind",
+    "pose_check.findings": "Finding",
+    "preparation.checking.check": "CheckReport",
+    "preparation.options": "PrepareOptions",
+    "preparation.prepare": "Preparation",
+    "scene.render": "Rendering render",
+    "scene.scene": "Scene",
+    "session.frame_report": "FrameReport",
+    "session.loop": "Session",
+    "session.pipeline": "Pipeline",
+    "session.presets": "PRESETS StreamConfig",
+    "session.struct_gstream": "stream_pipeline",
 }
+_HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 __all__ = [
     "PRESETS",

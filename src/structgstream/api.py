@@ -19,7 +19,7 @@ from structgstream.data.source import FrameSource, FrameStream
 from structgstream.errors import ConfigError
 from structgstream.evaluation.evaluate import evaluate as evaluate_recording
 from structgstream.evaluation.optional_metrics import MetricSelection
-from structgstream.evaluation.recording import capture_of, part_metadata, stored_capture
+from structgstream.evaluation.recording import captures_of, part_metadata
 from structgstream.evaluation.report import Report
 from structgstream.evaluation.run_log import read_log
 from structgstream.exporters.formats import Format, FrameOptions, PageFormat, check_page, choose_frames, destination
@@ -218,8 +218,7 @@ def evaluate(
     with open_stream(path) as reader:
         stored = None
         if isinstance(capture, Path | str):
-            stored = stored_capture(reader.header, capture, frames=len(reader.packets))
-            capture = capture_of(reader.header, capture, frames=len(reader.packets))
+            capture, stored = captures_of(reader.header, capture, frames=len(reader.packets))
         return evaluate_recording(
             reader,
             capture,

@@ -23,14 +23,11 @@ _HELD = (errno.EACCES, errno.EAGAIN)  # the errors that POSIX allows for a lock 
 
 
 def lock_file(file: IO[Any], *, holder: Literal["file", "process"] = "file") -> bool:
-    """Acquires the lock of ``file``, which must be open for writing; returns False if it is held already.
+    """Acquires the lock of ``file``, which must be open for writing, until it is closed; returns False if it is held
+    already.
 
-    On a file system without locks, such as some network file systems, it always succeeds.
-
-    Args:
-        file: holds the lock until it is closed.
-        holder: the owner of the lock: the open file, so that a second one in the same process is refused, or the
-            process.
+    The holder is the open file, so that a second one in the same process is refused, or the process. On a file system
+    without locks, such as some network file systems, it always succeeds.
     """
     take = fcntl.flock if holder == "file" else fcntl.lockf
     try:
@@ -85,7 +82,6 @@ def atomic_write(
     """Writes or replaces the file ``path`` atomically (Note [Atomic files]).
 
     Args:
-        path: the file.
         content: its bytes, or an iterable of pieces, whose errors are passed on.
         called: name of the file in messages, before its path: "The picture".
         new_folder: create its folder if it is missing.
@@ -105,13 +101,8 @@ def atomic_write(
 def atomic_file(path: Path, *, check: Callable[[Path], object] | None = None) -> Iterator[BinaryIO]:
     """A file that is renamed to ``path`` at the end of the block, unless it raises (Note [Atomic files]).
 
-    Args:
-        path: the file.
-        check: called with the path of the complete partial file before it is renamed; if it raises, an existing file is
-            not affected.
-
-    Raises:
-        StorageError: see :func:`atomic_write`.
+    Before that ``check`` is called with the path of the complete partial file; if it raises, an existing file is not
+    affected. Raises StorageError as :func:`atomic_write`.
     """
     with _as_storage_error(path, ""), replacing(path) as file:
         yield file
@@ -122,17 +113,8 @@ def atomic_file(path: Path, *, check: Callable[[Path], object] | None = None) ->
 
 @contextmanager
 def replacing(path: Path, *, partial: Path | None = None, sync: bool = True) -> Iterator[BinaryIO]:
-    """As :func:`atomic_file`, but raises errors of the system unchanged.
-
-    Args:
-        path: the file.
-        partial: its path while it is written; None for that of :func:`partial_path`.
-        sync: sync the file to the disk before the block ends.
-
-    Raises:
-        OSError: it cannot be written; an existing file is not affected.
-        StorageError: another process writes it.
-    """
+    """As :func:`atomic_file`, but raises errors of the system unchanged; the file may have another name than that of
+    :func:`partial_path` while it is written, and need not be synced to the disk before the block ends."""
     if path.exists() and not path.is_file() and not path.is_dir():
         with path.open("wb") as file:  # a pipe or a device, such as /dev/stdout, which must not become a file
             yield file
@@ -159,17 +141,8 @@ def replacing(path: Path, *, partial: Path | None = None, sync: bool = True) -> 
 
 
 def open_exclusive(partial: Path, *, of: Path, buffering: int = -1) -> BinaryIO:
-    """Opens the file ``partial`` exclusively for writing, at its beginning and without truncation.
-
-    Args:
-        partial: the file; created if it is missing.
-        of: final path of the file, for the message.
-        buffering: as of :func:`open`.
-
-    Raises:
-        OSError: it cannot be opened.
-        StorageError: another process writes it.
-    """
+    """Opens the file ``partial`` of ``of``, created if it is missing, exclusively for writing, at its beginning and
+    without truncation. Raises StorageError if another process writes it, OSError if it cannot be opened."""
     while True:
         file = open_lockable(partial, buffering=buffering)
         if not lock_file(file):
@@ -181,22 +154,16 @@ def open_exclusive(partial: Path, *, of: Path, buffering: int = -1) -> BinaryIO:
 
 
 def give_name(partial: Path, path: Path) -> None:
-    """Syncs the complete file ``partial``, renames it, and syncs the folder (Note [Atomic files]).
-
-    Raises:
-        OSError: one of these operations failed.
-    """
+    """Syncs the complete file ``partial``, renames it, and syncs the folder (Note [Atomic files]). Raises OSError if
+    one of these operations failed."""
     _sync(partial)
     partial.replace(path)
     sync_folder(path.parent)
 
 
 def sync_folder(folder: Path) -> None:
-    """Syncs a folder, which makes new names in it durable, if the file system supports it.
-
-    Raises:
-        OSError: the disk has failed.
-    """
+    """Syncs a folder, which makes new names in it durable, if the file system supports it. Raises OSError if the disk
+    has failed."""
     try:
         _sync(folder)
     except OSError as error:
@@ -232,26 +199,18 @@ def _as_storage_error(path: Path, called: str) -> Iterator[None]:
 
 
 def name_finished(path: Path) -> None:
-    """Renames a complete file whose writer was killed just before it renamed it.
-
-    Raises:
-        StorageError: it cannot be renamed, or another process writes it.
-    """
+    """Renames a complete file whose writer was killed just before it renamed it. Raises StorageError if it cannot be
+    renamed, or another process writes it."""
     partial = partial_path(path)
     GrowingFile(path, keep=partial.stat().st_size if partial.exists() else 0).finish()
 
 
 class GrowingFile:
-    """A locked file that grows under the name ``PATH.partial`` and is renamed at the end.
+    """A locked file that grows under the name ``PATH.partial``, after ``keep`` existing bytes, and is renamed at the
+    end.
 
-    Data is on the disk when :meth:`append` returns; a failed write is truncated.
-
-    Args:
-        path: of the finished file.
-        keep: existing bytes to retain; the file is truncated after them.
-
-    Raises:
-        StorageError: it cannot be written, another process writes it, or has changed it since ``keep`` was found.
+    Data is on the disk when :meth:`append` returns; a failed write is truncated. Raises StorageError if it cannot be
+    written, another process writes it, or has changed it since ``keep`` was found.
     """
 
     def __init__(self, path: Path, *, keep: int = 0) -> None:
@@ -274,11 +233,7 @@ class GrowingFile:
         self._file.seek(keep)
 
     def append(self, data: bytes) -> int:
-        """Adds ``data``; returns its length.
-
-        Raises:
-            StorageError: it cannot be written; earlier data stays.
-        """
+        """Adds ``data``; returns its length. Raises StorageError if it cannot be written; earlier data stays."""
         try:
             rest = memoryview(data)
             while rest:
@@ -293,11 +248,7 @@ class GrowingFile:
         return len(data)
 
     def finish(self) -> None:
-        """Renames the file to its final name and closes it.
-
-        Raises:
-            StorageError: it cannot be renamed.
-        """
+        """Renames the file to its final name and closes it. Raises StorageError if it cannot be renamed."""
         try:
             give_name(self.partial, self.path)
         except OSError as error:

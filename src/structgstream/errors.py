@@ -19,6 +19,9 @@ Each message states in one or two sentences what was found, what was expected, a
 it without a traceback and exits with status 1.
 """
 
+import importlib
+import typing
+
 
 class StructGStreamError(Exception):
     """Base class of the package's exceptions."""
@@ -71,3 +74,11 @@ class MissingExtraError(StructGStreamError):
             f"The module {module!r} is needed here and is not installed; "
             f"install it with: pip install 'structgstream[{extra}]'"
         )
+
+
+def import_extra(module: str, extra: str) -> typing.Any:
+    """An optional module. Raises MissingExtraError, which names the ``extra`` that installs it, if it is missing."""
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise MissingExtraError(module.partition(".")[0], extra) from None

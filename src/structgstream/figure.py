@@ -4,10 +4,10 @@
 import warnings
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from structgstream.atomic_files import atomic_write
-from structgstream.errors import MissingExtraError
+from structgstream.errors import import_extra
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,18 +18,15 @@ COLORS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#F0
 INK, FAINT, OTHER = "#222222", "#dddddd", "#999999"
 
 
-def figure_of(width: float, height: float) -> "Figure":
-    """An empty figure, in inches.
+def figure_of(
+    width: float, height: float, *, dpi: int = 110, layout: Literal["constrained"] | None = "constrained"
+) -> "Figure":
+    """An empty figure, in inches. Raises MissingExtraError if matplotlib is not installed."""
+    import_extra("matplotlib.figure", "report")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
 
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-    """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingExtraError("matplotlib", "report") from None
-    figure = Figure(figsize=(width, height), dpi=110, facecolor="white", layout="constrained")
+    figure = Figure(figsize=(width, height), dpi=dpi, facecolor="white", layout=layout)
     FigureCanvasAgg(figure)
     return figure
 
@@ -43,11 +40,8 @@ def without_frame(axis: "Axes") -> None:
 
 
 def save_figure(figure: "Figure", path: Path) -> None:
-    """Writes a picture atomically, and creates its folder if necessary.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Writes a picture atomically, and creates its folder if necessary. Raises StorageError if the file cannot be
+    written."""
     content = BytesIO()
     with warnings.catch_warnings():
         # The font may lack letters of camera names and then draws boxes.

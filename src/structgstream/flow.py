@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from structgstream.errors import MissingExtraError
+from structgstream.errors import import_extra
 
 RELATIVE, ABSOLUTE = 0.01, 0.5  # thresholds of the consistency check: share of squared lengths; squared pixels
 
@@ -72,10 +72,7 @@ def dis_search(extra: str, *, refined: bool = True, finest_level: int = 1) -> Fl
 
 def dis_refinement(*, finest_level: int, coarsest_level: int) -> FlowRefinement:
     """As :func:`dis_search` with ``refined=False``, but starts from an approximate flow at level ``coarsest_level``.
-
-    Raises:
-        MissingExtraError: OpenCV is not installed.
-    """
+    Raises MissingExtraError if OpenCV is not installed."""
     cv2 = opencv("capture")
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     search.setFinestScale(finest_level)
@@ -92,18 +89,12 @@ def dis_refinement(*, finest_level: int, coarsest_level: int) -> FlowRefinement:
 def block_search(
     first: NDArray[np.uint8], second: NDArray[np.uint8], *, cell_pixels: int, reach_cells: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Approximate flow ``[H, W, 2]`` from ``first`` to ``second`` and back: block matching of reduced pictures.
+    """Approximate flow ``[H, W, 2]``, pixels, from ``first`` to ``second`` ``[H, W, 3]`` and back: block matching.
 
-    A pixel of a reduced picture is a cell. For each cell p the displacement s of at most ``reach_cells`` cells with the
-    least cost is chosen. The cost is ``min(sum_c |first(p) - second(p + s)|, 300)``, averaged over 3 x 3 cells, plus
-    ``0.6 |s|``. The result is the median over 3 x 3 cells, enlarged. The time is that of ``pi reach_cells^2`` passes
-    over the cells.
-
-    Args:
-        first: ``[H, W, 3]``.
-        second: ``[H, W, 3]``.
-        cell_pixels: size of a cell.
-        reach_cells: bound of displacements.
+    A cell is ``cell_pixels`` wide, a pixel of the reduced pictures. For each cell p the displacement s of at most
+    ``reach_cells`` cells with the least cost is chosen. The cost is ``min(sum_c |first(p) - second(p + s)|, 300)``,
+    averaged over 3 x 3 cells, plus ``0.6 |s|``. The result is the median over 3 x 3 cells, enlarged. The time is that
+    of ``pi reach_cells^2`` passes over the cells.
 
     Raises:
         MissingExtraError: OpenCV is not installed.
@@ -154,11 +145,7 @@ def _displacements(reach: int, columns: int, rows: int) -> list[tuple[int, int]]
 
 def opencv(extra: str) -> Any:
     """The module ``cv2``. Raises MissingExtraError, which names the extra, if it is not installed."""
-    try:
-        import cv2
-    except ImportError:
-        raise MissingExtraError("cv2", extra) from None
-    return cv2
+    return import_extra("cv2", extra)
 
 
 def picture_shift(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[float, float]:
@@ -195,20 +182,12 @@ def consistency_mask(flow: NDArray[np.float32], back: NDArray[np.float32]) -> ND
 def same_color(
     first: NDArray[np.uint8], second: NDArray[np.uint8], flow: NDArray[np.float32], *, radius: int
 ) -> NDArray[np.bool_]:
-    """Mask ``[H, W]`` of the pixels of ``first`` that have the colour of the pixel of ``second`` to which flow leads.
+    """Mask ``[H, W]`` of the pixels of ``first`` ``[H, W, 3]`` whose colour ``second`` has where flow leads.
 
     A plain object in front of a still background can have flow 0 both ways, which is consistent but wrong: what is
-    there next has another colour. Colours are means over squares, and may differ by :data:`COLOR_DIFFERENCE` or by
-    :data:`UNEXPLAINED_SHARE` of the difference without flow; a change of all the light is subtracted.
-
-    Args:
-        first: ``[H, W, 3]``.
-        second: ``[H, W, 3]``.
-        flow: ``[H, W, 2]`` from ``first`` to ``second``, pixels.
-        radius: from the middle of a square to its sides, pixels.
-
-    Raises:
-        MissingExtraError: OpenCV is not installed.
+    there next has another colour. Colours are means over squares that reach ``radius`` pixels to each side, and may
+    differ by :data:`COLOR_DIFFERENCE` or by :data:`UNEXPLAINED_SHARE` of the difference without flow; a change of all
+    the light is subtracted. Raises MissingExtraError without OpenCV.
     """
     cv2 = opencv("capture")
     side = (2 * radius + 1, 2 * radius + 1)

@@ -38,11 +38,8 @@ class Lookahead(Generic[T]):
         return self
 
     def __next__(self) -> T:
-        """Returns the next item, waiting for it if necessary, and starts another one.
-
-        Raises:
-            StopIteration: there is none.
-        """
+        """Returns the next item, waiting for it if necessary, and starts another one. Raises StopIteration if there is
+        none."""
         if not self._depth:
             return next(self._items)
         if not self._pending:

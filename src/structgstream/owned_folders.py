@@ -25,17 +25,11 @@ MARKER = "structgstream-owner.json"
 
 @dataclass(frozen=True)
 class Owner:
-    """The content of a marker.
+    """The content of a marker."""
 
-    Args:
-        purpose: purpose of the folder, in a few words for messages, such as "parts of a parallel run".
-        identity: random, equal in all folders of one run.
-        key: hash of the run's inputs; empty if it does not matter.
-    """
-
-    purpose: str
-    identity: str
-    key: str = ""
+    purpose: str  # purpose of the folder, in a few words for messages, such as "parts of a parallel run"
+    identity: str  # random, equal in all folders of one run
+    key: str = ""  # hash of the run's inputs; empty if it does not matter
 
     @staticmethod
     def new(purpose: str) -> "Owner":
@@ -70,11 +64,8 @@ def owner_of(folder: Path) -> Owner | None:
 
 
 def check_owned(folder: Path, purpose: str) -> Owner | None:
-    """The owner of a folder that may be used for ``purpose``; None if it is missing or empty.
-
-    Raises:
-        StorageError: it is a file, cannot be read, or contains files without a marker of this purpose.
-    """
+    """The owner of a folder that may be used for ``purpose``; None if it is missing or empty. Raises StorageError if it
+    is a file, cannot be read, or contains files without a marker of this purpose."""
     found = owner_of(folder)
     if found is not None and found.purpose == purpose:
         return found
@@ -94,16 +85,8 @@ def check_owned(folder: Path, purpose: str) -> Owner | None:
 
 
 def own_folder(folder: Path, purpose: str, *, owner: Owner | None = None) -> Owner:
-    """Creates and marks a folder unless it is marked already; returns its owner.
-
-    Args:
-        folder: missing, empty, or of the same purpose.
-        purpose: see :class:`Owner`.
-        owner: owner in a new marker; None for a random identity.
-
-    Raises:
-        StorageError: see :func:`check_owned`, or it cannot be created.
-    """
+    """Creates and marks a folder unless it is marked already; returns its owner, by default with a random identity.
+    Raises StorageError as :func:`check_owned`, or if it cannot be created."""
     found = check_owned(folder, purpose)
     if found is None:
         found = Owner.new(purpose) if owner is None else owner
@@ -117,8 +100,6 @@ def remove_own(
     """Removes the files of a marked folder whose relative path matches ``names``, and folders that are empty then.
 
     Args:
-        folder: the folder; a missing one is ignored.
-        purpose: see :class:`Owner`.
         names: pattern of relative paths with slashes, matched in full.
         order: priority by path: smaller ones are removed first; the default is 1.
         whole: also remove the marker and the folder if nothing else remains.

@@ -46,8 +46,7 @@ from structgstream.errors import ConfigError, StorageError, StreamError
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry, read_log
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
-from structgstream.recorder import Run, Storage, log_reports
-from structgstream.run_metrics import RunMetrics
+from structgstream.recorder import Run, RunMetrics, Storage, log_reports
 from structgstream.scene.scene import Scene
 from structgstream.session.frame_report import FrameReport
 from structgstream.session.loop import Session
@@ -69,11 +68,8 @@ class Quality:
 
 
 def qualities_in(given: Sequence[str]) -> tuple[Quality, ...]:
-    """The qualities of texts such as ``low=-1``, the coarsest first, which viewers load first.
-
-    Raises:
-        ConfigError: a text is malformed, two qualities have the same name or fineness, or their number is out of range.
-    """
+    """The qualities of texts such as ``low=-1``, the coarsest first, which viewers load first. Raises ConfigError if a
+    text is malformed, two qualities have the same name or fineness, or their number is out of range."""
     qualities = sorted(map(_parsed, given), key=lambda quality: quality.fineness)
     if not 2 <= len(qualities) <= MAX_QUALITIES:
         raise ConfigError(
@@ -90,11 +86,7 @@ def qualities_in(given: Sequence[str]) -> tuple[Quality, ...]:
 
 
 def configured(config: StreamConfig, quality: Quality) -> StreamConfig:
-    """``config`` with a quality, as set by ``--quality``.
-
-    Raises:
-        ConfigError: the codec does not support qualities.
-    """
+    """``config`` with a quality, as by ``--quality``. Raises ConfigError if the codec does not support qualities."""
     if config.codec != "compact":
         raise ConfigError(
             f"--qualities is for streams with the codec compact, got the codec {config.codec}; add --preset compact."
@@ -135,11 +127,8 @@ class BitRates:
         self._packets = {quality.name: deque[tuple[float, int]](maxlen=MAX_PACKETS + 1) for quality in qualities}
 
     def begin(self, *, resume: bool) -> None:
-        """Writes the list, with the rates of the earlier run if it is resumed.
-
-        Raises:
-            StorageError: it cannot be written.
-        """
+        """Writes the list, with the rates of the earlier run if it is resumed. Raises StorageError if it cannot be
+        written."""
         if resume:
             self._listed |= {name: bits for name, bits in listed_bits(self._folder).items() if name in self._listed}
         self._write()
@@ -149,11 +138,8 @@ class BitRates:
         self._packets[name].append((report.pts_seconds, report.bytes))
 
     def refresh(self, *, last: bool = False) -> None:
-        """Rewrites the list if a measured rate differs from the listed one.
-
-        Raises:
-            StorageError: it cannot be written; the earlier list is not affected.
-        """
+        """Rewrites the list if a measured rate differs from the listed one. Raises StorageError if it cannot be
+        written; the earlier list is not affected."""
         known = {
             name: bits
             for name, packets in self._packets.items()
@@ -249,7 +235,6 @@ class SharedMethod(StructGStream):
     def observe(
         self, frame: MultiViewFrame, before: MultiViewFrame | None, *, rig: CameraRig, backend: Backend
     ) -> FramePictures:
-        """See ``StructGStream``."""
         key = frame.index, None if before is None else before.index
         observe = super().observe
         return self.shared.pictures.value(key, lambda: observe(frame, before, rig=rig, backend=backend))[0]
@@ -261,7 +246,6 @@ class SharedMethod(StructGStream):
         return fit if mine else replace(fit, seconds={})
 
     def next(self, past: Past[Scene, FrameZeroContext], task: FrameTask) -> FitResult[Scene]:
-        """See ``StructGStream``."""
         if task.begins is None:  # All qualities have the previous frame, so no first frame is needed again.
             self.shared.first.clear()
         return super().next(past, task)
@@ -286,11 +270,8 @@ def joint_report(reports: Mapping[str, FrameReport]) -> FrameReport:
 
 
 def joint_entry(report: FrameReport, entries: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """One line of the run's log.
-
-    Args:
-        entries: the frame's line in the log of each quality, by name, including qualities that had the frame already.
-    """
+    """One line of the run's log, from the frame's line in the log of each quality, also of those that had the frame
+    already."""
     each = {name: {key: entry[key] for key in FIGURES if key in entry} for name, entry in entries.items()}
     return {
         "index": report.index,

@@ -4,7 +4,7 @@
 import re
 from typing import Any
 
-from structgstream.errors import MissingExtraError, StorageError
+from structgstream.errors import MissingExtraError, StorageError, import_extra
 
 HIDDEN = "***"
 """Replacement of a secret in messages."""
@@ -20,22 +20,15 @@ _LONGEST_REASON = 200  # characters; some services answer with whole pages
 
 
 def open_url(url: str, **options: Any) -> tuple[Any, str]:
-    """The file system of a URL, without a cache of listings, and the folder's path in it.
+    """The file system of a URL in the syntax of fsspec, such as ``s3://bucket/streams/studio``, without a cache of
+    listings, and the folder's path in it; ``options`` are the file system's, such as ``endpoint_url``.
 
-    Args:
-        url: URL in the syntax of fsspec, such as ``s3://bucket/streams/studio``.
-        options: options of the file system, such as ``endpoint_url``.
-
-    Raises:
-        MissingExtraError: fsspec, or the package for this scheme, is not installed.
-        StorageError: the URL is not supported.
+    Raises MissingExtraError if fsspec, or the package for this scheme, is not installed, StorageError if the URL is not
+    supported.
     """
+    core = import_extra("fsspec.core", "cloud")
     try:
-        from fsspec.core import url_to_fs
-    except ModuleNotFoundError:
-        raise MissingExtraError("fsspec", "cloud") from None
-    try:
-        return url_to_fs(url, use_listings_cache=False, **options)
+        return core.url_to_fs(url, use_listings_cache=False, **options)
     except ImportError as error:
         raise MissingExtraError(str(error.name or "s3fs"), "cloud") from None
     except Exception as error:  # Each file system has its own errors; all mean that it cannot be used.
@@ -71,12 +64,8 @@ def shown_address(address: str) -> str:
 
 
 def without_secrets(text: str, *addresses: str) -> str:
-    """A text for a message or a log, with :func:`shown_address` applied to all addresses in it.
-
-    Args:
-        text: the text, such as an error message of FFmpeg.
-        addresses: addresses that it may contain, with any characters in their passwords.
-    """
+    """A text for a message or a log, such as an error of FFmpeg, with :func:`shown_address` applied to all addresses in
+    it, of which those given may have any characters in their passwords."""
     for address in sorted(filter(None, addresses), key=len, reverse=True):
         text = text.replace(address, shown_address(address))
     return _NAMED.sub(rf"\1{HIDDEN}", _ADDRESS.sub(lambda match: shown_address(match[0]), text))

@@ -19,12 +19,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from structgstream.cameras import Camera, CameraRig
-from structgstream.codec.encoder import SceneEncoder
+from structgstream.cameras import Camera, CameraRig, normalizing_similarity
 from structgstream.codec.fields.quantization import float32
 from structgstream.codec.fields.rows import MAX_FREE
 from structgstream.codec.fields.static_fields import UNCODED_FIELDS
 from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.codec.scene_coder import SceneEncoder
 from structgstream.codec.sinks import FileSink
 from structgstream.errors import CaptureError
 from structgstream.evaluation.camera_path import look_at
@@ -41,7 +41,6 @@ from structgstream.scene.order import morton_order
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, state_of
-from structgstream.similarity import normalizing_similarity
 
 DYNAMIC: frozenset[FieldName] = frozenset({"free", "free_births"})
 POSITION_PIXELS = 0.125

@@ -7,8 +7,8 @@ import subprocess
 import sys
 from dataclasses import fields
 from pathlib import Path
+from typing import get_type_hints
 
-from structgstream.config_fields import constants_of
 from structgstream.scene.state import PARAMETERS, STATE_TABLE
 from structgstream.training.frame0.fit import InitialRates
 from structgstream.training.online.config import OnlineRates
@@ -16,6 +16,10 @@ from structgstream.training.parameters import RoundingConfig
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "src" / "structgstream"
+
+
+def constants_of(config: type) -> set[str]:
+    return {name.lower() for name in get_type_hints(config) if name.isupper()}
 
 
 def test_rows_name_settings_that_there_are() -> None:
@@ -27,9 +31,9 @@ def test_rows_name_settings_that_there_are() -> None:
         ({p.online_rate for p in PARAMETERS}, OnlineRates),
         ({p.first_rate for p in PARAMETERS}, InitialRates),
     ):
-        named = {field.name for field in fields(config)} | constants_of(config).keys()
+        named = {field.name for field in fields(config)} | constants_of(config)
         assert keys - {None} <= named, config.__name__
-    assert constants_of(OnlineRates).keys() == {p.online_rate for p in PARAMETERS} - {None}
+    assert constants_of(OnlineRates) == {p.online_rate for p in PARAMETERS} - {None}
     assert {field.name for field in fields(InitialRates)} == {p.first_rate for p in PARAMETERS} - {None}
 
 

@@ -10,7 +10,7 @@ from rich.console import Console
 from structgstream.cli.live_run import Dashboard, live_display
 from structgstream.cli.progress import Lines
 from structgstream.data.live.status import CameraStatus, LiveStatus
-from structgstream.run_metrics import RunMetrics
+from structgstream.recorder import RunMetrics
 from structgstream.training.result import Step
 from tests.support.reports import frame_report
 

@@ -128,11 +128,6 @@ def test_ranges_and_numbers_that_mean_nothing_are_refused(
     assert not asked
 
 
-def test_the_former_spelling_names_the_command(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    error = error_of(["reconstruct", *words[1:], "--frames", "0:4"], capsys, status=2)
-    assert "reconstruct has no --init: a group of frames is fitted by structgstream fit-group." in error
-
-
 def test_a_group_without_a_track_and_a_header_that_is_none_are_reported(
     words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

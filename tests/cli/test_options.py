@@ -9,7 +9,6 @@ import pytest
 from structgstream.cli.app import UsageError, main
 from structgstream.cli.groups import Join
 from structgstream.cli.options import (
-    RENAMED,
     CaptureOptions,
     check_ending,
     open_selected_capture,
@@ -117,12 +116,6 @@ def test_json_to_standard_output_is_nothing_else(capsys: pytest.CaptureFixture[s
     printed = capsys.readouterr()
     assert json.loads(printed.out).keys() == {"environment", "backends", "packages"}
     assert "back-end" in printed.err
-
-
-@pytest.mark.parametrize(("old", "new"), RENAMED.items())
-def test_an_option_of_before_is_refused_with_its_new_name(old: str, new: str) -> None:
-    with pytest.raises(UsageError, match=f"{old} is called {new} now"):
-        parse_options(Join, "join", arguments=["a.sgs", "-o", "b.sgs", old])
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.PNG", "folder", "take.2026-11-27"])

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from structgstream.cameras import Similarity
 from structgstream.codec.container.records import (
     INDEX_ENTRY,
     MINOR_WITH_PERIODS,
@@ -18,13 +19,11 @@ from structgstream.codec.container.records import (
     read_index,
     scan_records,
 )
-from structgstream.codec.header import pack_header
-from structgstream.codec.packets import PacketKind
+from structgstream.codec.packets import PacketKind, pack_header
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import StreamError
 from structgstream.scene.scene import Scene
-from structgstream.similarity import Similarity
 from tests.support.period_streams import (
     FIRSTS,
     FRAMES,

@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.codec.container.blocks import pack_raw_block
-from structgstream.codec.decoder import SceneDecoder
-from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, PacketKind, parse_packet
+from structgstream.codec.scene_coder import SceneDecoder, SceneEncoder
 from structgstream.errors import StreamError
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, state_of
 from tests.support.properties import examples

@@ -6,10 +6,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.codec.decoder import SceneDecoder
-from structgstream.codec.encoder import SceneEncoder
-from structgstream.codec.header import pack_header, unpack_header
-from structgstream.codec.packets import PacketKind, parse_packet
+from structgstream.codec.packets import PacketKind, pack_header, parse_packet, unpack_header
+from structgstream.codec.scene_coder import SceneDecoder, SceneEncoder
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, state_of

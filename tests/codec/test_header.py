@@ -10,7 +10,7 @@ import torch
 import zstandard
 
 from structgstream.codec.container.blocks import MAX_JSON_BYTES, pack_raw_block
-from structgstream.codec.header import check_picture_sizes, pack_header, unpack_header
+from structgstream.codec.packets import check_picture_sizes, pack_header, unpack_header
 from structgstream.errors import CalibrationError, StreamError
 from structgstream.scene.state import STATE_TABLE
 from tests.support.streams import header_for, small_scene

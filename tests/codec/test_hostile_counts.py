@@ -13,14 +13,12 @@ import pytest
 import torch
 
 from structgstream.codec.container.blocks import BLOCK, LENGTH, iterate_blocks, unpack_blocks
-from structgstream.codec.decoder import CompactDecoder
-from structgstream.codec.encoder import CompactEncoder
-from structgstream.codec.entropy import rans, section_coder
-from structgstream.codec.entropy.section_coder import SectionDecoder, varint
+from structgstream.codec.entropy import rans
+from structgstream.codec.entropy.rans import SectionDecoder, varint
 from structgstream.codec.fields.packet_fields import CODABLE
 from structgstream.codec.fields.static_fields import decode_fields
-from structgstream.codec.header import pack_header, unpack_header
-from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.codec.packets import PacketKind, StreamHeader, pack_header, unpack_header
+from structgstream.codec.scene_coder import CompactCoder
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import FieldName, state_of
@@ -52,7 +50,7 @@ def header_with_all() -> StreamHeader:
 def counts_of(fields: Fields, decode: Callable[[Fields], object]) -> list[Count]:
     """Where decoding reads counts: numbers, and those in the heads of sections."""
     found: set[Count] = set()
-    number, section_bytes, read = SectionDecoder.number, section_coder.section_bytes, rans._read_varint
+    number, section_bytes, read = SectionDecoder.number, rans.section_bytes, rans._read_varint
     sections: list[tuple[FieldName, int]] = []
 
     def logged_number(self: SectionDecoder, name: str, value: int | None) -> int:
@@ -76,7 +74,7 @@ def counts_of(fields: Fields, decode: Callable[[Fields], object]) -> list[Count]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(SectionDecoder, "number", logged_number)
-        patch.setattr(section_coder, "section_bytes", logged_section)
+        patch.setattr(rans, "section_bytes", logged_section)
         patch.setattr(rans, "_read_varint", logged_read)
         decode(fields)
     return sorted(found)
@@ -139,10 +137,10 @@ def test_as_many_free_gaussians_as_a_scene_may_have_take_bounded_memory() -> Non
     header = compact_header(first)
     state = dict(state_of(first))
     state["free"], state["free_births"] = torch.zeros(2**18, 14), torch.arange(2**18)
-    fields = CompactEncoder(header).encode(state, kind=PacketKind.KEY, index=0)
+    fields = CompactCoder(header).encode(state, kind=PacketKind.KEY, index=0)
     assert sum(map(len, fields.values())) < 800
     tracemalloc.start()
-    found = CompactDecoder(header).decode(fields, kind=PacketKind.KEY, index=0)
+    found = CompactCoder(header).decode(fields, kind=PacketKind.KEY, index=0)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert np.array_equal(found["free_births"].numpy(), np.arange(2**18))

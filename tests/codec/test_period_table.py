@@ -8,12 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from structgstream.cameras import Similarity
 from structgstream.codec.container.records import Period, Record, RecordType, packed, scan_records
 from structgstream.codec.contents import PeriodTable, differences
-from structgstream.codec.header import pack_header
-from structgstream.codec.packets import StreamHeader
+from structgstream.codec.packets import StreamHeader, pack_header
 from structgstream.errors import StreamError
-from structgstream.similarity import Similarity
 from tests.support.period_streams import FIRSTS, FRAMES, LENGTHS, period_header, period_of, period_stream
 from tests.support.properties import examples
 from tests.support.rigs import arc_rig

@@ -6,12 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.codec.container.damage import readable_part
 from structgstream.codec.container.records import PREFIX, RecordType, packed, prefix, scan_records
-from structgstream.codec.encoder import SceneEncoder
-from structgstream.codec.header import pack_header
-from structgstream.codec.packets import PacketKind
+from structgstream.codec.contents import readable_part
+from structgstream.codec.packets import PacketKind, pack_header
 from structgstream.codec.reader import StreamReader, open_stream
+from structgstream.codec.scene_coder import SceneEncoder
 from structgstream.codec.sinks import MemorySink
 from structgstream.errors import StreamError
 from tests.support.properties import THOROUGH

@@ -11,9 +11,9 @@ import pytest
 
 from structgstream.codec.container import byte_source
 from structgstream.codec.container.records import RecordType, scan_records
-from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, PacketKind
 from structgstream.codec.reader import StreamReader, open_stream
+from structgstream.codec.scene_coder import SceneEncoder
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import StorageError, StreamError
 from tests.support.killed import folders_of_the_killed

@@ -4,10 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from structgstream.cameras import Camera
+from structgstream.cameras import Camera, rig_radius
 from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_names, listed
 from structgstream.errors import CalibrationError, CaptureError
-from structgstream.similarity import rig_radius
 from tests.support.captures import small_rig
 
 WHERE = Path("take/cameras.json")

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 import torch
 
+from structgstream.cameras import rig_radius
 from structgstream.data.dataset_layouts import open_json_videos
 from structgstream.errors import CalibrationError, CaptureError
-from structgstream.similarity import rig_radius
 from tests.support.captures import all_numbers, picture, write_clip, write_shared_intrinsics, write_video
 
 

@@ -8,7 +8,7 @@ import pytest
 from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.data.open import open_capture
 from structgstream.errors import CaptureError
-from structgstream.evaluation.recording import capture_of, stored_capture
+from structgstream.evaluation.recording import capture_of, captures_of
 from tests.support.streams import header_for, small_scene
 
 
@@ -37,7 +37,7 @@ def test_every_third_frame_is_found_again(frames: int | None, expected: int) -> 
 def test_stored_pictures_are_found_where_they_are_larger() -> None:
     made_from = open_capture(bundled_clip_path(), start=3, scale=0.5, every=2)
     header = replace(header_for(small_scene()), rig=made_from.rig, metadata={"start": 3, "every": 2})
-    found = stored_capture(header, bundled_clip_path(), frames=3)
+    _, found = captures_of(header, bundled_clip_path(), frames=3)
     assert found is not None
     assert len(found) == 3
     assert (found.rig["cam01"].width, found.rig["cam01"].height) == (320, 240)
@@ -45,7 +45,7 @@ def test_stored_pictures_are_found_where_they_are_larger() -> None:
     for frame, number in zip(found.frames(), (3, 5, 7), strict=True):
         assert (frame.images["cam01"] == wanted[number]).all()
     whole = replace(header, rig=open_capture(bundled_clip_path()).rig)
-    assert stored_capture(whole, bundled_clip_path(), frames=3) is None
+    assert captures_of(whole, bundled_clip_path(), frames=3)[1] is None
 
 
 def test_a_capture_that_ends_before_the_stream_begins_is_reported() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from structgstream.cameras import Similarity
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.data.images import ImageSource
 from structgstream.data.wrappers import section
@@ -25,7 +26,6 @@ from structgstream.gaussians import Gaussians
 from structgstream.memory import resident_bytes
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC
-from structgstream.similarity import Similarity
 from tests.support.backends import quickest_backend
 from tests.support.memory_captures import MemoryCapture
 from tests.support.reports import mean_of

@@ -46,7 +46,7 @@ def test_a_large_picture_is_made_small_in_its_proportions(monkeypatch: pytest.Mo
     with StreamReader(sink.data) as reader:
         (packet,) = reader.group(0)
         camera = header.rig[middle_camera(reader)]
-    monkeypatch.setattr(module, "WIDTH", camera.width // 2)
+    monkeypatch.setattr(module, "PREVIEW_WIDTH", camera.width // 2)
     width = camera.width // 2
     assert preview(header, packet).shape == (round(camera.height * width / camera.width), width, 3)
 

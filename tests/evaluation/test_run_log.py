@@ -21,12 +21,6 @@ def test_lines_come_back_by_frame(tmp_path: Path) -> None:
     assert read_log(stream)[1]["seconds"] == {"render": 0.5}
 
 
-def test_counts_of_earlier_versions_have_their_present_names(tmp_path: Path) -> None:
-    stream = tmp_path / "ball.sgs"
-    append_log(stream, {"index": 1, "counts": {"born": 3, "blamed": 2, "spawned thin": 1}})
-    assert read_log(stream)[1]["counts"] == {"spawned": 3, "pruned outliers": 2, "spawned thin": 1}
-
-
 def test_a_cut_line_is_dropped_and_a_resumed_run_goes_on_after_it(tmp_path: Path) -> None:
     stream = tmp_path / "ball.sgs"
     begin_log(stream)

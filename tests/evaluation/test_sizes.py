@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 
+from structgstream.evaluation.evaluate import half_scores, halved, stored_size
 from structgstream.evaluation.metrics import PSNR_OF_EQUALS
 from structgstream.evaluation.pictures import block_mask, block_means
-from structgstream.evaluation.sizes import half_scores, halved, stored_size
 from structgstream.frames import MultiViewFrame
 from structgstream.scene.render import render, to_8bit_image
 from tests.support.backends import quickest_backend

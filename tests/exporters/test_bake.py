@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from structgstream.cameras import Similarity
 from structgstream.errors import StreamError
 from structgstream.exporters.bake import BakedGaussians, bake, with_low_pass
 from structgstream.geometry import quaternion_matrices
@@ -14,7 +15,6 @@ from structgstream.scene.harmonics import MAX_DEGREE, sh_basis
 from structgstream.scene.render import Drawable, render
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
-from structgstream.similarity import Similarity
 from tests.support.backends import quickest_backend
 from tests.support.rigs import arc_rig, random_scene
 

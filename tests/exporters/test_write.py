@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from structgstream.cameras import Similarity
 from structgstream.errors import StorageError, StreamError
 from structgstream.exporters.formats import Format
 from structgstream.exporters.write import FORMAT_BYTES, write_gaussians
-from structgstream.similarity import Similarity
 from tests.support.plain import some
 
 

@@ -52,8 +52,8 @@ def test_notes_say_what_each_task_took(undisturbed: Path) -> None:
 class ElsewhereEngine(InlineEngine):
     """Logs stay on another machine; what tasks print comes with their endings."""
 
-    def start(self, task: Task, *, gpus: int, attempt: int) -> None:
-        super().start(replace(task, log=None), gpus=gpus, attempt=attempt)
+    def start(self, task: Task, *, gpus: int) -> None:
+        super().start(replace(task, log=None), gpus=gpus)
 
     def ended(self, seconds: float) -> list[TaskResult]:
         return [replace(ending, output=f"{ending.name} says: {ending.output}") for ending in super().ended(seconds)]

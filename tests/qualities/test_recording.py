@@ -24,8 +24,7 @@ from structgstream.errors import ConfigError, StorageError
 from structgstream.evaluation.run_log import read_log
 from structgstream.frames import MultiViewFrame
 from structgstream.qualities import QualityReport, configured, qualities_in, record_qualities
-from structgstream.recorder import Run, record, segments_at, segments_folder
-from structgstream.run_metrics import RunMetrics
+from structgstream.recorder import Run, RunMetrics, record, segments_at, segments_folder
 from structgstream.session import loop, struct_gstream
 from structgstream.session.loop import Session
 from structgstream.session.presets import StreamConfig

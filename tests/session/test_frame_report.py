@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from structgstream.cameras import Camera
-from structgstream.codec.encoder import Encoded
 from structgstream.codec.packets import Packet, PacketKind
+from structgstream.codec.scene_coder import Encoded
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
 from structgstream.session import frame_report

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 import torch
 
+from structgstream.cameras import Similarity
 from structgstream.data.points import PointsConfig
 from structgstream.session import loop
 from structgstream.session.loop import frame_seed, initial_points_of
-from structgstream.similarity import Similarity
 from tests.support.memory_captures import MemoryCapture
 from tests.support.worlds import moving_world
 

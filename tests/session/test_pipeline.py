@@ -21,7 +21,8 @@ TRAINING, (HELD_OUT, *_) = WORLD.rig.training, WORLD.rig.testing
 def absent(images: Mapping[str, NDArray[np.uint8]]) -> tuple[str, ...]:
     frame = replace(WORLD.frames[0], images=images)
     none = torch.zeros(0, 3)
-    return FrameTask(frame, FramePictures([], None), WORLD.rig, lambda: none, quickest_backend(), seed=0).remarks.absent
+    task = FrameTask(frame, FramePictures([], None), WORLD.rig, lambda: none, quickest_backend(), seed=0)
+    return task.remarks["absent"]
 
 
 def test_cameras_without_a_picture_are_absent() -> None:

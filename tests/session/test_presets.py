@@ -7,19 +7,15 @@ from typing import Any
 
 import pytest
 
-from structgstream.data.plane_sweep import DEFAULT_LEVELS
 from structgstream.errors import ConfigError
 from structgstream.session.presets import (
     DEFAULT_PRESET,
     DEMO_PRESET,
     PAPER_METHOD_PRESET,
     PRESETS,
-    RENAMED,
-    WITHDRAWN,
     StreamConfig,
     completed,
     from_json,
-    renamed,
     to_json,
 )
 from structgstream.training.frame0.fit import InitialRates
@@ -69,7 +65,7 @@ def test_a_configuration_comes_back_from_a_header(name: str) -> None:
     assert from_json(json.loads(json.dumps(to_json(PRESETS[name])))) == PRESETS[name]
 
 
-def test_a_configuration_of_an_older_version_has_the_defaults_of_what_it_lacks() -> None:
+def test_a_configuration_has_the_defaults_of_what_a_header_lacks() -> None:
     values = to_json(PRESETS["compact"])
     del values["rate"], values["online"]["motion_prior"], values["initial"]["rates"]
     found = from_json(values)
@@ -79,60 +75,6 @@ def test_a_configuration_of_an_older_version_has_the_defaults_of_what_it_lacks()
     assert completed(values) == to_json(found)
     other = {"method": "another", "seed": 1}
     assert completed(other) == other
-
-
-def with_former_names(config: StreamConfig) -> dict[str, Any]:
-    """The configuration as an earlier version wrote it: a field that had another name has that."""
-    values = json.loads(json.dumps(to_json(config)))
-    for path, name in sorted(RENAMED.items(), key=lambda item: -item[0].count(".")):
-        *parents, former = path.split(".")
-        group = group_at(values, renamed(".".join(parents)))
-        if name in group:
-            group[former] = group.pop(name)
-    rates = values["initial"]["rates"]
-    # Headers are stored with sorted keys.
-    values["initial"]["rates"] = {name: {"final": last, "initial": first} for name, (first, last) in rates.items()}
-    return values
-
-
-def group_at(values: dict[str, Any], path: str) -> dict[str, Any]:
-    for part in path.split("."):
-        values = values[part]
-    return values
-
-
-@pytest.mark.parametrize("name", PRESETS)
-def test_former_names_of_fields_are_read(name: str) -> None:
-    values = with_former_names(PRESETS[name])
-    assert {"births", "start"} < values["online"].keys()
-    assert from_json(values) == PRESETS[name]
-
-
-def test_fields_of_mechanisms_that_are_gone_are_ignored() -> None:
-    values = with_former_names(PRESETS["compact"])
-    for path in WITHDRAWN:
-        group, _, name = path.rpartition(".")
-        group_at(values, group)[name] = 0.5
-    assert from_json(values) == PRESETS["compact"]
-
-
-def test_a_former_field_is_ignored_if_it_has_the_value_of_its_constant_or_its_group_is_off() -> None:
-    values = json.loads(json.dumps(to_json(PRESETS["compact"])))
-    values["denoising"] |= {"threshold": 0.024, "reach_pixels": 3}
-    values["rate"]["window_seconds"] = 1
-    values["points"]["sweep_levels"] = [
-        {**vars(level), "agreement": [1.0, 0.01], "planes": [48, 128]} for level in DEFAULT_LEVELS
-    ]
-    assert from_json(values) == PRESETS["compact"]
-    values["initial"]["rates"]["offsets"] = {"initial": 0.02, "final": 0.001}
-    values["initial"]["rates"]["positions"] = {"initial": 0.0, "final": 0.0}
-    values["initial"]["depth_distortion"]["every"] = 4
-    assert from_json(values) == PRESETS["compact"]
-    values["environment"]["degree"] = 1
-    with pytest.raises(ConfigError, match=r"environment.degree = 1, which is always 2 in this version"):
-        from_json(values)
-    values["environment"]["enabled"] = False
-    assert not from_json(values).environment.enabled
 
 
 @pytest.mark.parametrize(

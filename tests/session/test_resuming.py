@@ -3,13 +3,12 @@ from dataclasses import replace
 
 import pytest
 
-from structgstream.cameras import CameraRig
+from structgstream.cameras import CameraRig, Similarity
 from structgstream.errors import ConfigError
 from structgstream.session.loop import check_resumable
 from structgstream.session.pipeline import StreamFacts
 from structgstream.session.presets import TINY, to_json
 from structgstream.session.rate_control import RateConfig
-from structgstream.similarity import Similarity
 from tests.support.rigs import arc_rig
 from tests.support.streams import header_for, small_scene
 

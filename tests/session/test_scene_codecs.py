@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from structgstream.cameras import Similarity
 from structgstream.codec.packets import StreamHeader
 from structgstream.kernels.backend import reference_backend
 from structgstream.scene.scene import Scene
@@ -13,8 +14,7 @@ from structgstream.scene.state import state_of
 from structgstream.session.loop import frame_seed
 from structgstream.session.pipeline import FrameTask, StreamFacts
 from structgstream.session.presets import TINY, StreamConfig, to_json
-from structgstream.session.scene_codecs import scene_codec
-from structgstream.similarity import Similarity
+from structgstream.session.struct_gstream import SceneCodec
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.views import training_views
 from tests.support.rigs import random_scene
@@ -37,7 +37,7 @@ def begin(config: StreamConfig, scene: Scene) -> tuple[Scene, StreamHeader]:
         backend=reference_backend(),
         seed=frame_seed(config.seed, 0),
     )
-    codec = scene_codec(config)
+    codec = SceneCodec(config)
     facts = StreamFacts(codec.name, WORLD.rig, SIMILARITY, 25.0, to_json(config), {"capture": "world"})
     return codec.prepare(scene, task, facts)
 

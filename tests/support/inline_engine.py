@@ -35,7 +35,7 @@ class InlineEngine:
         """See ``Engine.has_room``."""
         return self._next is None
 
-    def start(self, task: Task, *, gpus: int, attempt: int) -> None:
+    def start(self, task: Task, *, gpus: int) -> None:
         """See ``Engine.start``; it runs in :meth:`ended`."""
         self._next = task
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
-from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
+from structgstream.codec.scene_coder import SceneEncoder
 from structgstream.codec.sinks import MemorySink
 from structgstream.scene.scene import Scene
 from tests.support.streams import compact_header, header_for, moved, small_scene

@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.codec.scene_coder import SceneEncoder
 from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsSink
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.codec.sinks import MemorySink, StoredSegments, resume_segments

@@ -7,9 +7,8 @@ from functools import cache
 from pathlib import Path
 
 from structgstream.codec.container.records import PREFIX, read_record
-from structgstream.codec.encoder import SceneEncoder
-from structgstream.codec.header import unpack_header
-from structgstream.codec.packets import Packet, PacketKind, parse_packet
+from structgstream.codec.packets import Packet, PacketKind, parse_packet, unpack_header
+from structgstream.codec.scene_coder import SceneEncoder
 from structgstream.groups.base import GroupBase
 from structgstream.groups.segment_file import SegmentIdentity, SegmentSink
 from structgstream.scene.scene import Scene

@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import torch
 
-from structgstream.codec.encoder import SceneEncoder
+from structgstream.cameras import Similarity
 from structgstream.codec.fields.packet_fields import FREE_FIELDS, dequantize_state, quantize_state
 from structgstream.codec.fields.quantization import round_to_bins
 from structgstream.codec.fields.static_fields import UNCODED_FIELDS
 from structgstream.codec.packets import PacketKind, PacketSink, StreamHeader
+from structgstream.codec.scene_coder import SceneEncoder
 from structgstream.codec.sinks import MemorySink
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, STATE_TABLE, FieldName, parameters_of, scene_of, state_of
-from structgstream.similarity import Similarity
 from tests.support.rigs import arc_rig, random_scene
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from lab.stream_entropy import counted_init, packet_bytes, reported
 from structgstream.codec.entropy.adaptive import AdaptiveDecoder
-from structgstream.codec.entropy.section_coder import SectionDecoder
+from structgstream.codec.entropy.rans import SectionDecoder
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
 from tests.support.streams import compact_header, moved, small_scene, write_stream

@@ -212,15 +212,10 @@ class Terminated(KeyboardInterrupt):
 
 
 class Termination:
-    """Within its ``with`` block the first SIGTERM only sets :attr:`asked`; a second one ends the block at once.
+    """Within its ``with`` block the first SIGTERM only sets :attr:`asked`; a second one raises Terminated at once.
 
-    Only the main thread receives signals, so elsewhere the block changes nothing.
-
-    Args:
-        on_ask: called, in the signal's handler, at the first one: to wake what waits for frames.
-
-    Raises:
-        Terminated: at the second SIGTERM, wherever the block is.
+    At the first one the signal's handler calls ``on_ask``, to wake what waits for frames. Only the main thread receives
+    signals, so elsewhere the block changes nothing.
     """
 
     def __init__(self, on_ask: Callable[[], object] = lambda: None) -> None:
@@ -240,11 +235,8 @@ class Termination:
             signal.signal(signal.SIGTERM, self._before)  # type: ignore[arg-type]
 
     def end(self, *, whole: bool) -> None:
-        """Called between frames: ends the block if that was asked for, unless the run is ``whole`` anyway.
-
-        Raises:
-            Terminated: it was.
-        """
+        """Called between frames: ends the block if that was asked for, unless the run is ``whole`` anyway. Raises
+        Terminated if it was."""
         if self.asked and not whole:
             raise Terminated
 
@@ -264,15 +256,8 @@ def interruptible(*, again_seconds: float = AGAIN_SECONDS) -> Iterator[None]:
 
     Libraries lose it: one that is loaded at the moment makes an error of its own of it (pycolmap does), a callback from
     C drops it. So an error after Ctrl-C counts as Ctrl-C, and a block that goes on is interrupted again. Only for work
-    whose results are there whole or not at all, as what cleans up is interrupted again, too.
-
-    Outside of the main thread, and where Ctrl-C is ignored (``nohup``), the block changes nothing.
-
-    Args:
-        again_seconds: after which a block that goes on is interrupted again.
-
-    Raises:
-        KeyboardInterrupt: Ctrl-C was pressed.
+    whose results are there whole or not at all, as what cleans up is interrupted again, too. Outside of the main
+    thread, and where Ctrl-C is ignored (``nohup``), the block changes nothing.
     """
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(before):

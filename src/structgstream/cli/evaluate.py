@@ -74,12 +74,12 @@ def main(arguments: list[str]) -> None:
     check_ending(options.json, ".json", command="evaluate", option="--json")
     check_ending(options.report, command="evaluate", option="--report", folder=True)
     from structgstream.codec.reader import open_stream
-    from structgstream.evaluation.recording import capture_of, stored_capture
+    from structgstream.evaluation.recording import captures_of
     from structgstream.evaluation.report import as_json
     from structgstream.kernels.backend import select_backend
 
     reader = open_stream(options.stream)
-    source = capture_of(reader.header, options.scene, frames=len(reader.packets))
+    source, stored = captures_of(reader.header, options.scene, frames=len(reader.packets))
     report = run_evaluation(
         reader,
         source,
@@ -89,7 +89,7 @@ def main(arguments: list[str]) -> None:
         folder=options.report,
         metrics=options.metrics,
         lpips_weights=options.lpips_weights,
-        stored=stored_capture(reader.header, options.scene, frames=len(reader.packets)),
+        stored=stored,
     )
     console = write_json_output(options.json, as_json(report))
     console.print(report_tables(report, title=options.stream.name))

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from structgstream.data.denoising import DenoisingConfig
     from structgstream.data.live.source import LiveSource
     from structgstream.data.source import FrameStream
-    from structgstream.run_metrics import RunMetrics
+    from structgstream.recorder import RunMetrics
     from structgstream.session.frame_report import FrameReport
     from structgstream.training.result import Step
 
@@ -80,7 +80,7 @@ def run_metrics(source: "FrameStream", stream: Path, *, qualities: Sequence[str]
     """The metrics of a run that writes ``stream``, in several ``qualities`` if there are names of some."""
     from structgstream.data.live.source import LiveSource
     from structgstream.data.source import frame_count
-    from structgstream.run_metrics import RunMetrics
+    from structgstream.recorder import RunMetrics
 
     if isinstance(source, LiveSource):
         live, captured = source.status, source.captured

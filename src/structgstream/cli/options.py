@@ -67,19 +67,13 @@ VIDEOS = (".mp4", ".m4v", ".mov", ".webm", ".mkv", ".avi", ".mpg", ".ts")
 EXPORTS = tuple(f".{name}" for name in SUFFIXES)
 KNOWN_ENDINGS = frozenset({*PICTURES, *VIDEOS, *EXPORTS, ".html", ".json", ".pdf", ".sgs", ".zip"})
 """Endings of pictures, videos, exports and streams, of which a command writes some."""
-RENAMED = {"--quiet": "--split-at-low-motion", "--odd": "--allow-unaligned"}
-"""Options of before, and what they are called now."""
 STANDARD_OUTPUT = "-"
 """As the value of ``--json``."""
 
 
 def check_ending(output: Path | None, *endings: str, command: str, option: str = "-o", folder: bool = False) -> None:
-    """Check that a name does not ask for a kind of file that the command does not write.
-
-    Args:
-        endings: of :data:`KNOWN_ENDINGS`, those that the command writes.
-        folder: whether another name gives a folder.
-    """
+    """Check that a name has none of :data:`KNOWN_ENDINGS` except those that the command writes; another may name a
+    ``folder``."""
     if output is not None and (ending := output.suffix.lower()) in KNOWN_ENDINGS.difference(endings):
         written = " or ".join([*endings, *(["a folder of another name"] if folder else [])])
         raise UsageError(f"{command} writes no {ending}, got {option} {output}; it writes {written}.")
@@ -130,13 +124,11 @@ def write_json_output(path: Path | None, content: Mapping[str, Any]) -> Console:
 
 def parse_options(kind: type[Options], command: str, *, arguments: list[str]) -> Options:
     """The options of a command; prints and exits on ``--help`` or wrong usage."""
-    _check_renamed(arguments)
     return checked_paths(tyro.cli(kind, prog=f"structgstream {command}", args=arguments, config=STYLE))
 
 
 def parse_known_options(kind: type[Options], command: str, *, arguments: list[str]) -> tuple[Options, list[str]]:
     """As :func:`parse_options`, and the arguments that are no options of the command itself."""
-    _check_renamed(arguments)
     options, rest = tyro.cli(
         kind, prog=f"structgstream {command}", args=arguments, config=STYLE, return_unknown_args=True
     )
@@ -154,36 +146,19 @@ def as_arguments(options: Any, *names: str) -> list[str]:
     return words
 
 
-def _check_renamed(arguments: list[str]) -> None:
-    for argument in arguments:
-        if (name := argument.partition("=")[0]) in RENAMED:
-            raise UsageError(f"{name} is called {RENAMED[name]} now.")
-
-
 def resolve_config(
     preset: str | None, overrides: list[str], *, command: str, seed: int | None
 ) -> tuple["StreamConfig", str]:
     """The preset with the fields set on the command line by their path (``--online.iterations 50``), and its name."""
-    from structgstream.config_fields import constant_at
-    from structgstream.session.presets import DEFAULT_PRESET, StreamConfig, preset_named, renamed
+    from structgstream.session.presets import DEFAULT_PRESET, StreamConfig, preset_named
 
-    for option in (override.partition("=")[0] for override in overrides if override.startswith("--")):
-        path = option.removeprefix("--").replace("-", "_")
-        now = renamed(path)
-        if (value := constant_at(StreamConfig, now)) is not None:
-            raise UsageError(f"{option} is no option any more: it is always {value}.")
-        if now != path:
-            raise UsageError(f"{option} is called --{now.replace('_', '-')} now.")
     name = DEFAULT_PRESET if preset is None else preset
-    with usage_errors():
-        default = preset_named(name)
-    description = f"Fields of the configuration, with the values of the preset {name!r} as defaults."
     with usage_errors():
         config = tyro.cli(
             StreamConfig,
             prog=f"structgstream {command}",
-            description=description,
-            default=default,
+            description=f"Fields of the configuration, with the values of the preset {name!r} as defaults.",
+            default=preset_named(name),
             args=overrides,
             config=(tyro.conf.FlagConversionOff,),
         )
@@ -210,11 +185,8 @@ COLUMN = 52
 
 
 def config_lines(config: Any, *, width: int | None = None) -> list[str]:
-    """A line for each field of a configuration: its option, its value, and its first sentence.
-
-    Args:
-        width: columns; longer lines are cut. None for no limit.
-    """
+    """A line for each field of a configuration: its option, its value, and its first sentence; cut after ``width``
+    columns."""
     lines = [f"{option:<{COLUMN - 2}}  {sentence}" for option, sentence in _rows(config, "--")]
     return [line if width is None or len(line) <= width else f"{line[: width - 1]}…" for line in lines]
 

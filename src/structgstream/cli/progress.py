@@ -83,11 +83,8 @@ QUIET_SECONDS = 15.0  # without a terminal, interval of progress lines within a 
 
 
 def display(frames: int | None, *, done: int = 0, console: Console | None = None) -> "Bars | Lines":
-    """Bars when ``console`` (default: standard output) is a terminal, else plain lines.
-
-    Args:
-        frames: number of frames of the stream when it is finished; None where that is unknown.
-    """
+    """Bars when ``console`` (default: standard output) is a terminal, else plain lines, of ``frames`` in all if that is
+    known."""
     console = Console() if console is None else console
     return Bars(frames, done, console=console) if console.is_terminal else Lines(frames, done, console=console)
 

@@ -34,8 +34,7 @@ if TYPE_CHECKING:
     from structgstream.cli.options import Captured
     from structgstream.data.source import FrameStream
     from structgstream.kernels.backend import Backend
-    from structgstream.recorder import Storage
-    from structgstream.run_metrics import RunMetrics
+    from structgstream.recorder import RunMetrics, Storage
     from structgstream.scene.scene import Scene
     from structgstream.session.frame_report import FrameReport
     from structgstream.session.presets import StreamConfig
@@ -104,8 +103,6 @@ class Reconstruct:
 
 def main(arguments: list[str]) -> None:
     """Reconstructs with a progress display."""
-    if any(argument == "--init" or argument.startswith("--init=") for argument in arguments):
-        raise UsageError("reconstruct has no --init: a group of frames is fitted by structgstream fit-group.")
     if "--help-config" in arguments:
         _print_config(arguments)
         return

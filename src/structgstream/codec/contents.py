@@ -1,34 +1,170 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a stream holds: packets and periods, found by reading every record, or by its index."""
+"""What a stream holds: packets and periods, found by reading every record, or by its index; and after damage, where
+whole records go on, and a writer may (docs/bitstream.md, section Damage)."""
 
 import math
-from abc import abstractmethod
+import re
 from array import array
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import overload
 
-from structgstream.codec.container.blocks import field_sizes, iterate_blocks
+from structgstream.codec.container.blocks import LENGTH, field_sizes, iterate_blocks
 from structgstream.codec.container.byte_source import ByteSlice, ByteSource
-from structgstream.codec.container.damage import Damage, PacketSearch, Standing
 from structgstream.codec.container.records import (
+    CHECKSUM,
     FRAME,
+    INDEX_ENTRY,
     PACKET_KINDS,
+    PREFIX,
     RECORD,
+    Head,
     Index,
     Period,
     Record,
     RecordType,
+    check_prefix,
+    incomplete_reason,
     indexed_frames,
+    may_be_prefix,
     period_at,
     read_head,
     read_record,
     scan_records,
 )
-from structgstream.codec.header import unpack_header
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet, unpack_header
 from structgstream.errors import StreamError
+
+MIN_PACKET_BYTES = RECORD.size + FRAME.size + CHECKSUM.size
+_ZSTD = bytes.fromhex("28b52ffd")  # which an init record's description begins with
+_CHUNK_BYTES = 2**20
+_WORK = 4
+
+
+@dataclass(frozen=True)
+class Damage:
+    """A damaged record that whole records follow."""
+
+    offset: int  # its first byte
+    frames: range  # the frames lost to it: its own, and those up to the next key packet
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What is known of a stream where a record is not whole."""
+
+    # where that record begins; of several in a row without a whole packet between them, where the first does
+    offset: int
+    frames: int  # number of the next frame
+    seconds: float  # presentation time of the last frame
+    period: int = 0  # number of the last whole init record
+
+    def last_frame_at(self, offset: int) -> int:
+        """The last frame that a packet at ``offset`` may be: frames before it take bytes, too."""
+        return self.frames + (offset - self.offset) // MIN_PACKET_BYTES
+
+
+class PacketSearch:
+    """Finds whole records after damage in ``data``.
+
+    Use one object per stream: all its calls together verify checksums of at most four times the stream's bytes, which
+    bounds the work that a malicious file can cause.
+    """
+
+    def __init__(self, data: ByteSource) -> None:
+        self._data = data
+        self._left = _WORK * len(data)
+
+    def next(self, damaged: int, standing: Standing) -> Record | None:
+        """The first whole packet, init record or index after byte ``damaged``, where a record is not whole."""
+        for offset, head in self._heads(damaged + 1, standing.period):
+            if not self._may_follow(head, offset, standing):
+                continue
+            self._left -= head.length
+            if self._left < 0:
+                return None
+            record = read_record(self._data, offset)
+            if record is not None and _fits(record, standing):
+                return record
+        return None
+
+    def _heads(self, start: int, period: int) -> Iterator[tuple[int, Head]]:
+        """What may be heads of such records from ``start`` on, and where; all of each record is there."""
+        number = re.escape(period.to_bytes(2, "little"))
+        pattern = re.compile(rb"\x01|[\x02\x03].%b|\x04.\x00\x00" % number, re.DOTALL)
+        while start + RECORD.size <= len(self._data):
+            chunk = bytes(self._data[start : start + _CHUNK_BYTES])
+            at = 0
+            while (match := pattern.search(chunk, at)) is not None and match.start() + RECORD.size <= len(chunk):
+                offset, at = start + match.start(), match.start() + 1
+                kind, _, of, length = RECORD.unpack_from(chunk, match.start())
+                head = Head(kind, of, length)
+                if offset + head.bytes <= len(self._data):
+                    yield offset, head
+            start += max(len(chunk) - RECORD.size + 1, 1)
+
+    def _may_follow(self, head: Head, offset: int, standing: Standing) -> bool:
+        """Whether a record at ``offset`` is, by its head, consistent with what is known before the damage."""
+        last = standing.last_frame_at(offset)
+        if head.type == RecordType.INIT:
+            start = offset + RECORD.size + LENGTH.size
+            return head.period > standing.period and bytes(self._data[start : start + len(_ZSTD)]) == _ZSTD
+        if head.type == RecordType.INDEX:
+            entries = head.length // INDEX_ENTRY.size
+            return head.length % INDEX_ENTRY.size == 0 and standing.frames <= entries <= 2 * last
+        if head.length < FRAME.size:
+            return False
+        start = offset + RECORD.size
+        index, pts_seconds = FRAME.unpack(self._data[start : start + FRAME.size])
+        return standing.frames <= index <= last and standing.seconds < pts_seconds < math.inf
+
+
+def _fits(record: Record, standing: Standing) -> bool:
+    """Whether an index lists as many frames as there may be; True for other records."""
+    if record.type != RecordType.INDEX:
+        return True
+    return standing.frames <= indexed_frames(record.payload) <= standing.last_frame_at(record.offset)
+
+
+def readable_part(data: ByteSource, *, name: str) -> int | None:
+    """End of the last whole packet, before the index; None if the file is truncated within the init record.
+
+    Raises:
+        StreamError: not a stream, another major version, or a damaged init record, after which restarting would
+            destroy frames.
+    """
+    if may_be_prefix(data[: PREFIX.size + 1]):
+        return None  # Cut within the prefix, or empty.
+    check_prefix(data, name)
+    end, standing, complete = PREFIX.size, Standing(PREFIX.size, 0, -math.inf), False
+    for record in scan_records(data):
+        if complete := record.type == RecordType.INDEX:
+            break
+        standing = replace(standing, offset=record.end)
+        if record.type == RecordType.INIT and record.offset > PREFIX.size:
+            standing = replace(standing, period=record.period)
+            continue  # What a period begins with is written with its first packet, and again when that is cut.
+        end = record.end
+        if record.type == RecordType.INIT:
+            standing = replace(standing, period=record.period)
+        elif record.type in (RecordType.KEY, RecordType.DELTA):
+            standing = replace(standing, frames=standing.frames + 1)
+    # A crash cannot leave whole frames after a damaged one; a failing disk can.
+    lost = not complete and PacketSearch(data).next(standing.offset, standing) is not None
+    if end > PREFIX.size:
+        if lost:
+            raise StreamError(
+                f"Cannot continue {name}: {incomplete_reason(data, standing.offset)}, and continuing would overwrite "
+                f"the whole frames after it. Keep a copy, then truncate the file to {end} bytes and use --resume to "
+                "fit them again."
+            )
+        return end
+    reason = incomplete_reason(data, end)
+    if lost or "damaged" in reason:
+        raise StreamError(f"Cannot continue {name}: {reason}. Keep a copy; then start again with --overwrite.")
+    return None
+
 
 LOST = 2**64 - 1
 """Offset of a packet that is lost."""
@@ -46,26 +182,7 @@ class PacketInfo:
     field_bytes: Mapping[str, int]
 
 
-class PacketInfos(Sequence[PacketInfo]):
-    """Facts of packets, each found when it is asked for."""
-
-    @abstractmethod
-    def at(self, index: int) -> PacketInfo:
-        """Facts of the packet of a frame."""
-
-    @overload
-    def __getitem__(self, index: int) -> PacketInfo: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[PacketInfo]: ...
-
-    def __getitem__(self, index: int | slice) -> PacketInfo | list[PacketInfo]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        return self.at(range(len(self))[index])
-
-
-class Packets(PacketInfos):
+class Packets(Sequence[PacketInfo]):
     """The packets of a stream in order, up to the first lost one. Only offsets are in memory; indexing reads the heads
     of the packet's record and fields.
 
@@ -85,6 +202,17 @@ class Packets(PacketInfos):
 
     def __len__(self) -> int:
         return self.whole
+
+    @overload
+    def __getitem__(self, index: int) -> PacketInfo: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[PacketInfo]: ...
+
+    def __getitem__(self, index: int | slice) -> PacketInfo | list[PacketInfo]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        return self.at(range(len(self))[index])
 
     def at(self, index: int) -> PacketInfo:
         """Facts of the packet of a frame that is not lost."""
@@ -124,11 +252,6 @@ class Packets(PacketInfos):
 class PeriodTable:
     """The periods of one stream, the first of which is always there. One header besides the first is in memory.
 
-    Args:
-        data: the stream.
-        name: of the stream, for messages.
-        init: its first init record.
-
     Attributes:
         first: the header of the first period.
         periods: those of which a packet has been found, in order; always the first.
@@ -149,11 +272,8 @@ class PeriodTable:
         return period_at(self.periods, frame)
 
     def header(self, place: int) -> StreamHeader:
-        """The header of the period at ``place``.
-
-        Raises:
-            StreamError: its init record has been damaged, or does not belong to this stream.
-        """
+        """The header of the period at ``place``. Raises StreamError if its init record has been damaged, or does not
+        belong to this stream."""
         period = self.periods[place]
         if place == 0:
             return self.first
@@ -162,11 +282,7 @@ class PeriodTable:
         return self._last[1]
 
     def check(self, init: Record) -> StreamHeader:
-        """The header of a later init record.
-
-        Raises:
-            StreamError: it is not valid, or is of another stream.
-        """
+        """The header of a later init record. Raises StreamError if it is not valid, or is of another stream."""
         header = unpack_header(init.payload)
         if differing := list(differences(self.first, header)):
             raise StreamError(
@@ -201,19 +317,12 @@ def differences(first: StreamHeader, later: StreamHeader) -> Sequence[str]:
 
 @dataclass(frozen=True)
 class Contents:
-    """What was found besides packets and periods.
+    """What was found besides packets and periods."""
 
-    Args:
-        runs: the frames that can be decoded, as ranges of consecutive frames.
-        damage: the damaged records that whole records follow.
-        complete: whether the stream ends with its index, and nothing before it is damaged.
-        end: the end of the last whole record before the index.
-    """
-
-    runs: tuple[range, ...]
-    damage: tuple[Damage, ...]
-    complete: bool
-    end: int
+    runs: tuple[range, ...]  # the frames that can be decoded, as ranges of consecutive frames
+    damage: tuple[Damage, ...]  # the damaged records that whole records follow
+    complete: bool  # whether the stream ends with its index, and nothing before it is damaged
+    end: int  # the end of the last whole record before the index
 
 
 def first_run(runs: Sequence[range], index: int) -> int:
@@ -230,15 +339,8 @@ def contents_by_index(index: Index, packets: Packets, table: PeriodTable, end: i
 
 
 class Scan:
-    """Verifies every record of a stream, and fills ``packets`` and ``table``.
-
-    Args:
-        data: the stream.
-        name: for messages.
-        packets: of the stream, none so far.
-        table: its periods, only the first so far.
-        gone: frames that are known not to be in ``data`` any more, in order.
-    """
+    """Verifies every record of a stream, and fills ``packets``, and ``table``, which has the first period only. Frames
+    of ``gone``, in order, are known not to be in ``data`` any more."""
 
     def __init__(
         self, data: ByteSource, name: str, packets: Packets, table: PeriodTable, *, gone: Sequence[range]
@@ -255,11 +357,7 @@ class Scan:
         self._broken: Standing | None = None  # since the last whole packet a record was not whole
 
     def contents(self, end: int) -> Contents:
-        """What there is from byte ``end`` on.
-
-        Raises:
-            StreamError: whole records contradict each other.
-        """
+        """What there is from byte ``end`` on. Raises StreamError if whole records contradict each other."""
         search, offsets = PacketSearch(self._data), self._packets.offsets
         found: list[tuple[int, int]] = []  # damaged records and the frames expected there
         ended = False

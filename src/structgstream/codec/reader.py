@@ -9,7 +9,7 @@ checksum is verified then. With the ``raw`` codec packets are independent, so ra
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.codec.container.byte_source import ByteSource, FileBytes
-from structgstream.codec.container.damage import Damage
 from structgstream.codec.container.records import (
     PREFIX,
     Period,
@@ -27,46 +26,15 @@ from structgstream.codec.container.records import (
     read_index,
     read_record,
 )
-from structgstream.codec.contents import PacketInfo, Packets, PeriodTable, Scan, contents_by_index, first_run
-from structgstream.codec.decoder import SceneDecoder
+from structgstream.codec.contents import Damage, PacketInfo, Packets, PeriodTable, Scan, contents_by_index, first_run
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.codec.scene_coder import SceneDecoder
 from structgstream.codec.segments.stored_bytes import is_segments, open_segments
 from structgstream.errors import StreamError
 from structgstream.kernels.backend import Backend, BackendName, select_backend
 from structgstream.scene.render import render, to_8bit_image
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
-
-
-class FrameRenderer:
-    """Renders frames of one stream; keeps the last scene and back-end between calls."""
-
-    def __init__(self) -> None:
-        self._asked: BackendName | Backend | None = None
-        self._backend: Backend | None = None
-        self._last: tuple[int, Scene] | None = None
-
-    def picture(
-        self, index: int, view: Camera, *, decode: Callable[[int], Scene], backend: BackendName | Backend
-    ) -> NDArray[np.uint8]:
-        """The 8-bit sRGB picture ``[H, W, 3]`` of a frame.
-
-        Args:
-            index: the frame.
-            view: the camera, in the scene's units.
-            decode: returns the scene of a frame.
-            backend: the compute back-end.
-
-        Raises:
-            BackendError: the back-end is not available.
-        """
-        if self._backend is None or backend != self._asked:
-            self._backend, self._asked, self._last = select_backend(backend), backend, None
-        if self._last is None or self._last[0] != index:
-            self._last = None  # So that two scenes are not in memory at once.
-            self._last = index, on_device(decode(index), self._backend.device)
-        return to_8bit_image(render(self._last[1], view, self._backend).image)
-
 
 NOTHING = -2  # index of the last decoded frame if there is none: no frame follows it
 
@@ -131,7 +99,7 @@ class StreamReader:
         self.cut_reason = None if self.complete else self._reason(contents.end)
         self._decoder: tuple[int, SceneDecoder] = 0, SceneDecoder(self.header)
         self._decoded = NOTHING
-        self._renderer = FrameRenderer()
+        self._drawn: tuple[tuple[int, BackendName | Backend], Scene, Backend] | None = None  # the scene rendered last
 
     @property
     def header(self) -> StreamHeader:
@@ -236,7 +204,13 @@ class StreamReader:
             ConfigError: the rig has no camera of that name.
             BackendError: the back-end is not available.
         """
-        return self._renderer.picture(index, self.header.camera(camera), decode=self.scene, backend=backend)
+        view = self.header.camera(camera)
+        if self._drawn is None or self._drawn[0] != (index, backend):
+            self._drawn = None  # So that two scenes are not in memory at once.
+            chosen = select_backend(backend)
+            self._drawn = (index, backend), on_device(self.scene(index), chosen.device), chosen
+        _, scene, chosen = self._drawn
+        return to_8bit_image(render(scene, view, chosen).image)
 
     def _decoder_of(self, index: int) -> SceneDecoder:
         """The decoder of the period of a frame; a new one unless that is the period of the last decoded frame."""

@@ -3,7 +3,7 @@
 
 import io
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -11,7 +11,6 @@ from typing import BinaryIO
 
 from structgstream.atomic_files import lock_file, sync_folder
 from structgstream.codec.container.byte_source import ByteSlice, ByteSource, FileBytes, check_room, free_bytes
-from structgstream.codec.container.damage import readable_part
 from structgstream.codec.container.records import (
     INDEX_ENTRY,
     RECORD_TYPES,
@@ -22,16 +21,14 @@ from structgstream.codec.container.records import (
     period_at,
     prefix,
 )
-from structgstream.codec.contents import LOST, PacketInfo, PacketInfos
-from structgstream.codec.header import pack_header
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.codec.contents import LOST, PacketInfo, Packets, readable_part
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader, pack_header
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.segments.recovery import find
 from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsSink
 from structgstream.codec.segments.store import Store
 from structgstream.codec.segments.stored_bytes import StoredBytes
 from structgstream.errors import StorageError
-from structgstream.scene.scene import Scene
 
 
 class _Writer:
@@ -283,61 +280,33 @@ class MemorySink:
             self._writer.finish()
 
 
-class StoredPackets(PacketInfos):
-    """Facts of all packets; of those that have left the window size and kind, and the time as interpolated."""
+class StoredPackets(Packets):
+    """All packets; of those that have left the window size and kind are known, and the time as interpolated."""
 
-    def __init__(self, stored: StoredBytes, reader: StreamReader) -> None:
+    def __init__(self, stored: StoredBytes, found: Packets, *, name: str) -> None:
+        super().__init__(stored, name)
         self._stored = stored
-        self._reader = reader
-
-    def __len__(self) -> int:
-        return len(self._stored.sizes)
+        self.offsets, self.whole = found.offsets, len(stored.sizes)
 
     def at(self, index: int) -> PacketInfo:
         """Facts of the packet of a frame."""
-        if self._reader.packets.offsets[index] != LOST:
-            return self._reader.packets.at(index)
+        if self.offsets[index] != LOST:
+            return super().at(index)
         stored = self._stored
         return PacketInfo(stored.kinds[index], index, stored.seconds[index], LOST, stored.sizes[index], {})
 
 
-class StoredSegments:
-    """The existing frames of a stream of segments, some of which may have left the window.
-
-    Attributes:
-        packets: facts of all frames from 0 on.
-        complete: whether the run had ended.
-    """
+class StoredSegments(StreamReader):
+    """The existing frames of a stream of segments, some of which may have left the window; its packets are of all."""
 
     def __init__(self, stored: StoredBytes, *, name: str) -> None:
-        self._reader = StreamReader(stored, name=name, gone=stored.gone)
+        super().__init__(stored, name=name, gone=stored.gone)
         self._periods = stored.periods
-        self.packets: Sequence[PacketInfo] = StoredPackets(stored, self._reader)
-        self.complete = self._reader.complete
-
-    @property
-    def header(self) -> StreamHeader:
-        """Content of the init record."""
-        return self._reader.header
-
-    def __len__(self) -> int:
-        return len(self.packets)
-
-    def header_of(self, index: int) -> StreamHeader:
-        """The header of the period of a frame, see :meth:`StreamReader.header_of`."""
-        return self._reader.header_of(index)
+        self.packets = StoredPackets(stored, self.packets, name=name)
 
     def period(self, index: int) -> Period:
         """The period of a frame, also of one that has left the window."""
         return self._periods[period_at(self._periods, index)]
-
-    def group(self, index: int) -> Iterator[Packet]:
-        """The packets needed to decode frame ``index``, see :meth:`StreamReader.group`."""
-        return self._reader.group(index)
-
-    def scene(self, index: int) -> Scene:
-        """The scene of one frame, see :meth:`StreamReader.scene`."""
-        return self._reader.scene(index)
 
 
 def resume_segments(

@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from torch import from_numpy
 
-from structgstream.cameras import Camera, CameraRig
+from structgstream.cameras import Camera, CameraRig, rig_radius
 from structgstream.data.lenses import Lens, LensCamera, Pinhole
 from structgstream.data.text_files import BROKEN, Unreadable, number, reason
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.geometry import Floats
-from structgstream.similarity import rig_radius
 
 
 @dataclass(frozen=True)

@@ -110,17 +110,9 @@ LABELLED_SHARE = 0.06  # smaller shares of a part are not labelled
 
 
 def write_byte_plot(path: Path, rows: Sequence[Row], parts: Parts, *, title: str) -> None:
-    """Bars over the frames, stacked by field, above the composition of each part of the stream.
-
-    Args:
-        path: the picture; its suffix is a format that matplotlib writes.
-        rows: all packets of the stream, at least one.
-        parts: bytes by field of its parts; the last ones determine the order of the fields.
-
-    Raises:
-        MissingExtraError: matplotlib is not installed.
-        StorageError: the file cannot be written.
-    """
+    """Bars over the frames, at least one, stacked by field, above the composition of each part of the stream, the last
+    of which determine the order of the fields. Raises MissingExtraError without matplotlib, StorageError if the picture
+    cannot be written."""
     colours = field_colors(parts)
     across = 0.34 * len(parts) + 0.3
     figure = figure_of(10.0, 4.4 + across)

@@ -38,15 +38,9 @@ def focus_point(rig: CameraRig) -> Tensor:
 
 
 def orbit(rig: CameraRig, frames: int, *, around: str | None = None) -> list[Camera]:
-    """A flat ellipse around a camera of the rig, directed at the point in the centre of that camera's picture.
-
-    Args:
-        frames: number of cameras on the path; the last is one step before the first.
-        around: the camera in the middle; None for the one nearest to the mean of the rig.
-
-    Raises:
-        ConfigError: an unknown camera.
-    """
+    """A flat ellipse of ``frames`` cameras around a camera of the rig, by default the one nearest to its mean, directed
+    at the point in the centre of that camera's picture; the last is one step before the first. Raises ConfigError if
+    the camera is unknown."""
     name = central_camera(rig) if around is None else _known(rig, around)
     camera = rig[name]
     right, down, forward = camera.viewmat[:3, :3]
@@ -63,14 +57,8 @@ def orbit(rig: CameraRig, frames: int, *, around: str | None = None) -> list[Cam
 
 
 def arc(rig: CameraRig, frames: int, *, between: tuple[str, str] | None = None) -> list[Camera]:
-    """A path from one camera of the rig to another, at interpolated distances from the focus point.
-
-    Args:
-        between: the ends; None for the two most distant cameras within 50 degrees of the middle camera.
-
-    Raises:
-        ConfigError: an unknown camera.
-    """
+    """A path from one camera of the rig to another, at interpolated distances from the focus point; by default between
+    the two most distant cameras within 50 degrees of the middle camera. Raises ConfigError if a camera is unknown."""
     focus = focus_point(rig)
     names = _ends(rig, focus) if between is None else (_known(rig, between[0]), _known(rig, between[1]))
     first, last = (rig[name] for name in names)

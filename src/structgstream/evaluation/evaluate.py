@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluates a stream from its file: decodes it, renders held-out views, and compares them with the capture."""
+"""Evaluates a stream from its file: decodes it, renders held-out views, and compares them with the capture, also at
+other sizes than that of training, because a player shows streams at the size of its screen."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -18,7 +19,21 @@ from structgstream.data.wrappers import select_cameras
 from structgstream.errors import CaptureError
 from structgstream.evaluation.environment import environment
 from structgstream.evaluation.ghosts import Ghosts, GhostSearch
-from structgstream.evaluation.metrics import ChannelFit, Mask, Picture, blackened, both, channel_fit, counting, score
+from structgstream.evaluation.metrics import (
+    ChannelFit,
+    Mask,
+    Picture,
+    blackened,
+    both,
+    channel_fit,
+    counting,
+    decibels,
+    masked_ssim,
+    mean_of_squares,
+    score,
+    squared_errors,
+    ssim,
+)
 from structgstream.evaluation.optional_metrics import (
     OF_WHOLE_PICTURES,
     ComparedFrame,
@@ -27,8 +42,8 @@ from structgstream.evaluation.optional_metrics import (
     load_optional_metrics,
     optional_scores,
 )
+from structgstream.evaluation.pictures import block_mask, block_means, spread_indices
 from structgstream.evaluation.recording import (
-    Drawable,
     Recording,
     check_same_frames,
     check_same_rig,
@@ -39,12 +54,78 @@ from structgstream.evaluation.recording import (
     training_facts,
 )
 from structgstream.evaluation.report import FrameScores, Report, Scores, drawing_facts, mean_scores, psnr_trend
-from structgstream.evaluation.sizes import StoredSize, half_scores, halved, stored_size
 from structgstream.evaluation.worst import worst_facts
+from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
 from structgstream.memory import PeakMeter
-from structgstream.scene.render import render, to_8bit_image
+from structgstream.scene.render import Drawable, render, to_8bit_image
 from structgstream.session.frame_report import counts
+
+STORED_FRAMES, STORED_SHARE = 5, 4
+"""At most five frames, and at most one in four, are scored at the stored size: twice the size has four times the
+pixels."""
+
+
+def halved(camera: Camera) -> Camera:
+    """The camera of a picture at exactly half the size, without a last row or column that is odd."""
+    half = torch.diag(torch.tensor([0.5, 0.5, 1.0], dtype=torch.float64))
+    return replace(camera, K=half @ camera.K, width=camera.width // 2, height=camera.height // 2)
+
+
+def half_scores(
+    scene: Drawable, camera: Camera, truth: Picture, *, backend: Backend, mask: Mask | None = None
+) -> dict[str, float | None]:
+    """PSNR and SSIM, by their names in ``Scores``, of a rendering by ``camera`` (:func:`halved`, scene units) against
+    the area mean of the truth ``[H, W, 3]``, which is black outside ``mask`` ``[H, W]``, the pixels that count."""
+    small = None if mask is None else block_mask(mask, 2)
+    psnr, similarity = _psnr_and_ssim(scene, camera, block_means(truth, 2), small, backend)
+    return {"psnr_half": psnr, "ssim_half": similarity}
+
+
+@dataclass
+class StoredSize:
+    """Scores at the size of the capture's stored pictures, which are larger than those that a stream was made from."""
+
+    source: FrameSource  # the capture at that size, the same frames
+    views: Mapping[str, Camera]  # cameras of the stream by name, scene units
+    backend: Backend
+    frames: frozenset[int]  # numbers of the scored frames
+    _frame: tuple[int, MultiViewFrame] | None = field(default=None, init=False)
+
+    def scores(self, camera: str, scene: Drawable, *, index: int) -> dict[str, float | None]:
+        """PSNR and SSIM by their names in ``Scores``; empty for frames that are not scored. Raises CaptureError if the
+        stored picture does not exist any more."""
+        if index not in self.frames:
+            return {}
+        if self._frame is None or self._frame[0] != index:
+            self._frame = index, next(self.source.frames(index))
+        truth, mask = self._frame[1].images.get(camera), self._frame[1].masks.get(camera)
+        if truth is None:
+            raise CaptureError(
+                f"The stored picture of camera {camera!r} in frame {index} of {self.source.name} has gone."
+            )
+        view = self.views[camera].resized(truth.shape[1], truth.shape[0])
+        psnr, similarity = _psnr_and_ssim(scene, view, blackened(truth, mask), mask, self.backend)
+        return {"psnr_stored": psnr, "ssim_stored": similarity}
+
+
+def stored_size(source: FrameSource, views: Mapping[str, Camera], *, backend: Backend, frames: int) -> StoredSize:
+    """Scores at the size of ``source``, for evenly spread frames among the first ``frames``."""
+    count = max(1, min(STORED_FRAMES, frames // STORED_SHARE))
+    chosen = frozenset(spread_indices(frames, count) if count > 1 else [frames - 1])
+    return StoredSize(select_cameras(source, tuple(views)), views, backend, chosen)
+
+
+def _psnr_and_ssim(
+    scene: Drawable, camera: Camera, truth: Picture, mask: Mask | None, backend: Backend
+) -> tuple[float | None, float | None]:
+    if not truth.size or (mask is not None and not mask.any()):
+        return None, None
+    picture = blackened(to_8bit_image(render(scene, camera, backend).image), mask)
+    errors = squared_errors(picture, truth)
+    errors = errors if mask is None else errors[mask]
+    similarity = ssim(picture, truth, backend) if mask is None else masked_ssim(picture, truth, mask)
+    return decibels(mean_of_squares(int(errors.sum(dtype=np.int64)), errors.size)), similarity
 
 
 @dataclass(frozen=True)
@@ -83,13 +164,12 @@ def evaluate(
     Args:
         recording: the opened file: a ``StreamReader``, or another method's (``recording.py``).
         source: the capture, cut and scaled as it was for the reconstruction.
-        backend: the compute back-end.
         cameras: names of the cameras to score; None for the held-out ones.
         log: the trainer's log by frame number (``run_log.read_log``).
         observer: called with frame number and comparison for every picture.
         metrics: "basic" leaves out the metrics that take longer than rendering: MS-SSIM, FLIP, LPIPS, temporal ones.
         lpips_weights: folder or file with the weights of LPIPS (``lpips.py``, Note [Weights]).
-        stored: the same frames at the capture's own, larger size (``capture.stored_capture``); None to leave out these
+        stored: the same frames at the capture's own, larger size (``recording.captures_of``); None to leave out these
             scores.
 
     Raises:

@@ -95,12 +95,8 @@ class GhostFinder:
         self.background = background
 
     def find(self, picture: Picture, truth: Picture, *, index: int, mask: Mask | None = None) -> Ghosts:
-        """The ghosts of the rendering of frame ``index``; call :meth:`begin` first, then this in order of frames.
-
-        Args:
-            picture: the rendering, ``[H, W, 3]``, as large as the truth.
-            mask: ``[H, W]``, the pixels that count; None for all.
-        """
+        """The ghosts of the rendering ``[H, W, 3]`` of frame ``index`` in the pixels ``[H, W]`` that count; call
+        :meth:`begin` first, then this in order of frames."""
         assert self.background is not None
         factor = reduction(truth)
         drawn, true = block_means(picture, factor), block_means(truth, factor)

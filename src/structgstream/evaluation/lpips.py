@@ -133,11 +133,8 @@ def published_heads(trunk: Trunk) -> tuple[Tensor, ...]:
 
 
 def weights_file(trunk: Trunk, given: Path | None = None) -> Path | None:
-    """The file with the trunk's weights (Note [Weights]), or None.
-
-    Raises:
-        ConfigError: the given path, or the environment variable's, does not exist.
-    """
+    """The file with the trunk's weights (Note [Weights]), or None. Raises ConfigError if the given path, or the
+    environment variable's, does not exist."""
     named = os.environ.get(ENVIRONMENT)
     for path, source in ((given, "the path given"), (Path(named) if named else None, ENVIRONMENT)):
         if path is None:
@@ -158,11 +155,8 @@ def how_to_get(trunk: Trunk) -> str:
 
 
 def load_lpips(trunk: Trunk, path: Path, device: torch.device) -> Lpips:
-    """LPIPS with the trunk's weights from a file, and the published heads.
-
-    Raises:
-        ConfigError: the file is damaged, is not a file of weights, or is of another network.
-    """
+    """LPIPS with the trunk's weights from a file, and the published heads. Raises ConfigError if the file is damaged,
+    is not a file of weights, or is of another network."""
     _check_digest(path)
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)

@@ -38,10 +38,7 @@ Flow = Callable[[Picture, Picture, str, int], FlowField]
 
 def dis_flow() -> Flow:
     """Flow by dense inverse search in both directions; consistent pixels (``flow.consistency_mask``) count as seen.
-
-    Raises:
-        MissingExtraError: OpenCV is not installed.
-    """
+    Raises MissingExtraError if OpenCV is not installed."""
     search = dis_search("eval")
 
     def field(before: Picture, now: Picture, camera: str, index: int) -> FlowField:
@@ -114,15 +111,8 @@ class ComparedFrame:
 def load_optional_metrics(
     cameras: Iterable[tuple[str, Camera]], *, frames: int, device: torch.device, lpips_weights: Path | None = None
 ) -> OptionalMetrics:
-    """The metrics that are available here for these cameras (by name) and this number of frames.
-
-    Args:
-        cameras: the scored cameras; a metric that needs larger pictures than one of them has is left out.
-        frames: number of frames; temporal metrics need two.
-
-    Raises:
-        ConfigError: a file of weights is invalid.
-    """
+    """The metrics that are available here for these cameras (by name) and this number of frames: pictures must be large
+    enough, and temporal metrics need two frames. Raises ConfigError if a file of weights is invalid."""
     missing: dict[str, str] = {}
     measure = None
     try:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from structgstream.atomic_files import atomic_write
-from structgstream.errors import MissingExtraError
 from structgstream.evaluation.metrics import Mask, Picture
+from structgstream.figure import figure_of
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 RGB, FILTER_UP = 2, 2
@@ -31,11 +31,8 @@ def png_bytes(picture: Picture) -> bytes:
 
 
 def write_png(path: Path, picture: Picture) -> None:
-    """Writes ``picture`` ``[H, W, 3]`` atomically; creates the folder if it is missing.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Writes ``picture`` ``[H, W, 3]`` atomically; creates the folder if it is missing. Raises StorageError if the file
+    cannot be written."""
     atomic_write(path, png_bytes(picture), called="The picture", new_folder=True, sync=False)
 
 
@@ -104,11 +101,6 @@ def contact_sheet(path: Path, pictures: Mapping[str, Mapping[int, tuple[Picture,
     Raises:
         MissingExtraError: matplotlib, which writes the labels, is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingExtraError("matplotlib", "report") from None
     side = 110  # for the row labels
     bands = {name: _tiles(cells) for name, cells in pictures.items()}
     columns = sorted({index for cells in pictures.values() for index in cells})
@@ -116,8 +108,7 @@ def contact_sheet(path: Path, pictures: Mapping[str, Mapping[int, tuple[Picture,
     tile_width = max(next(iter(tiles.values()))[0].shape[1] for tiles in bands.values())
     width = side + len(columns) * (tile_width + GAP) + MARGIN
     height = 2 * LABEL + MARGIN + sum(3 * (h + GAP) + LABEL // 2 for h in heights.values())
-    figure = Figure(figsize=(width / 100, height / 100), dpi=100, facecolor="white")
-    FigureCanvasAgg(figure)
+    figure = figure_of(width / 100, height / 100, dpi=100, layout=None)
 
     def label(x: float, y: float, text: str, **style: Any) -> None:
         figure.text(x / width, 1 - y / height, text, va="center", **style)

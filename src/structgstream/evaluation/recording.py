@@ -67,18 +67,23 @@ def to_device(drawable: Drawable, device: torch.device) -> Drawable:
 
 
 def part_metadata(*, start: int, scale: float, every: int) -> dict[str, object]:
-    """Metadata of a header on the part of a capture that a stream is made from; :func:`capture_of` reads it.
-
-    Args:
-        scale: size of the pictures relative to the stored ones.
-        every: step between frames; 1 is left out, because older streams have no step.
-    """
+    """Metadata of a header on the part of a capture that a stream is made from, for :func:`capture_of`; ``scale`` is
+    relative to the stored pictures, and a step of 1 is left out."""
     part: dict[str, object] = {"start": start, "scale": scale}
     return part if every == 1 else part | {"every": every}
 
 
 def capture_of(header: StreamHeader, folder: Path | str, *, frames: int | None) -> FrameSource:
-    """The part of the capture in ``folder`` that a stream was made from, at the stream's sizes.
+    """The part of a capture that a stream was made from, at the stream's sizes: the first of :func:`captures_of`."""
+    return captures_of(header, folder, frames=frames)[0]
+
+
+def captures_of(
+    header: StreamHeader, folder: Path | str, *, frames: int | None
+) -> tuple[FrameSource, FrameSource | None]:
+    """The part of the capture in ``folder`` that a stream was made from, at the stream's sizes and at the stored size.
+
+    The second is None if the stored pictures are not larger than the stream's.
 
     Args:
         frames: number of frames of the stream; None for all from the stream's first frame on.
@@ -87,17 +92,8 @@ def capture_of(header: StreamHeader, folder: Path | str, *, frames: int | None) 
         CaptureError: the folder contains no capture, or the capture ends before the stream's first frame.
     """
     whole = open_capture(folder)
-    return _part(resized(whole, _scale(header, whole)), header, frames)
-
-
-def stored_capture(header: StreamHeader, folder: Path | str, *, frames: int | None) -> FrameSource | None:
-    """As :func:`capture_of`, at the size of the stored pictures; None if these are not larger than the stream's.
-
-    Raises:
-        CaptureError: see :func:`capture_of`.
-    """
-    whole = open_capture(folder)
-    return _part(whole, header, frames) if _scale(header, whole) < 1.0 else None
+    scale = _scale(header, whole)
+    return _part(resized(whole, scale), header, frames), _part(whole, header, frames) if scale < 1.0 else None
 
 
 def _scale(header: StreamHeader, whole: FrameSource) -> float:
@@ -112,11 +108,8 @@ def _part(source: FrameSource, header: StreamHeader, frames: int | None) -> Fram
 
 
 def scored_cameras(header: StreamHeader, cameras: tuple[str, ...] | None) -> tuple[str, ...]:
-    """The cameras to score: the named ones, or all that were held out.
-
-    Raises:
-        ConfigError: a name is unknown, or no camera was held out and none is named.
-    """
+    """The cameras to score: the named ones, or all that were held out. Raises ConfigError if a name is unknown, or no
+    camera was held out and none is named."""
     if cameras is None:
         if not header.rig.testing:
             raise ConfigError(
@@ -130,11 +123,8 @@ def scored_cameras(header: StreamHeader, cameras: tuple[str, ...] | None) -> tup
 
 
 def check_same_rig(header: StreamHeader, source: FrameSource, names: tuple[str, ...]) -> None:
-    """Check that the capture's cameras of these names are equal to those of the stream.
-
-    Raises:
-        CaptureError: one is missing, or has another calibration or picture size.
-    """
+    """Check that the capture's cameras of these names are equal to those of the stream. Raises CaptureError if one is
+    missing, or has another calibration or picture size."""
     for name in names:
         ours = header.rig[name]
         theirs = source.rig.cameras.get(name)
@@ -156,11 +146,8 @@ def check_same_rig(header: StreamHeader, source: FrameSource, names: tuple[str, 
 
 
 def check_same_frames(recording: Recording, source: FrameSource) -> None:
-    """Check that the capture has the frames of the recording.
-
-    Raises:
-        CaptureError: it has fewer, or both state their start frame and step, and differ.
-    """
+    """Check that the capture has the frames of the recording. Raises CaptureError if it has fewer, or both state their
+    start frame and step, and differ."""
     if len(source) < len(recording.packets):
         raise CaptureError(
             f"The stream has {len(recording.packets)} frames and this part of the capture {source.name} only "
@@ -247,12 +234,10 @@ def _largest_by_stage(logs: list[Mapping[str, Any]]) -> dict[str, int]:
 def comparison_facts(
     frames: Sequence[FrameScores], names: Sequence[str], left_out: Mapping[str, Sequence[float]]
 ) -> dict[str, Any]:
-    """Data that was not compared: frames without a picture and mean shares of masked pixels, both by camera.
+    """Data that was not compared, by camera: frames without a picture, and the mean of ``left_out``, the shares of
+    masked pixels of its pictures.
 
     Cameras without such data are left out.
-
-    Args:
-        left_out: share of masked pixels in each of a camera's pictures, by camera name.
     """
     absent = {name: sum(name not in frame.cameras for frame in frames) for name in names}
     masked = {name: float(np.mean(shares)) for name, shares in left_out.items()}

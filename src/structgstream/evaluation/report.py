@@ -204,11 +204,8 @@ def as_json(report: Report) -> dict[str, Any]:
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Writes ``content`` as JSON atomically; creates the folder if it is missing.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Writes ``content`` as JSON atomically; creates the folder if it is missing. Raises StorageError if the file
+    cannot be written."""
     atomic_write(path, json_text(content).encode(), new_folder=True)
 
 

@@ -21,24 +21,6 @@ if TYPE_CHECKING:
     from structgstream.session.frame_report import FrameReport
 
 
-RENAMED_COUNTS = {
-    "births merged": "merged",
-    "births refused": "spawning refused",
-    "blamed": "pruned outliers",
-    "born": "spawned",
-    "born thin": "spawned thin",
-    "carried": "propagated",
-    "fast lifted": "fast displaced",
-    "held": "repeated",
-    "in free space": "floaters",
-    "jumps": "scene cuts",
-    "lifted": "displaced",
-    "recalled": "relocated",
-    "thin births refused": "refused thin",
-}
-"""The names that counts in the logs of earlier versions have now."""
-
-
 def log_path(stream: Path) -> Path:
     """The path of a stream's log."""
     return side_path(stream, ".log.jsonl")
@@ -46,22 +28,15 @@ def log_path(stream: Path) -> Path:
 
 def begin_log(stream: Path, *, frames: int = 0) -> None:
     """Removes the entries from frame ``frames`` on: all for a new run, those of frames that were not stored for a
-    resumed one.
-
-    Raises:
-        StorageError: the file cannot be written, or it, or the metrics, are of another stream.
-    """
+    resumed one. Raises StorageError if the file cannot be written, or it, or the metrics, are of another stream."""
     check_side_files(stream)
     entries = [entry for index, entry in sorted(read_log(stream).items()) if index < frames]
     atomic_write(log_path(stream), _lines(entries), called="The log")
 
 
 def check_side_files(stream: Path) -> None:
-    """Check that the log and the metrics next to a stream do not belong to another stream.
-
-    Raises:
-        StorageError: they do; nothing was changed.
-    """
+    """Check that the log and the metrics next to a stream do not belong to another stream. Raises StorageError if they
+    do; nothing was changed."""
     metrics = side_path(stream, ".metrics.json")
     for path, entries in ((log_path(stream), read_log(stream).values()), (metrics, _metrics_in(metrics))):
         for name in {str(entry.get("stream", stream.name)) for entry in entries} - {stream.name}:
@@ -74,11 +49,7 @@ def check_side_files(stream: Path) -> None:
 
 
 def append_log(stream: Path, entry: Mapping[str, Any]) -> None:
-    """Adds one frame; ``entry`` has an ``index`` and plain values.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Adds a frame; ``entry`` has an ``index`` and plain values. Raises StorageError if the file cannot be written."""
     path = log_path(stream)
     try:
         with path.open("ab") as file:
@@ -118,17 +89,10 @@ def read_log(stream: Path) -> dict[int, dict[str, Any]]:
     for line in lines:
         try:
             entry = json.loads(line)
-            entries[int(entry["index"])] = _with_present_names(entry)
+            entries[int(entry["index"])] = entry
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
             continue
     return entries
-
-
-def _with_present_names(entry: dict[str, Any]) -> dict[str, Any]:
-    counts = entry.get("counts")
-    if not isinstance(counts, dict):
-        return entry
-    return entry | {"counts": {RENAMED_COUNTS.get(name, name): count for name, count in counts.items()}}
 
 
 def _metrics_in(path: Path) -> list[dict[str, Any]]:

@@ -148,11 +148,8 @@ img.wide { max-width: 100%; }
 
 
 def write_page(folder: Path, crops: Sequence[Crop], *, title: str, pictures: Sequence[str]) -> None:
-    """Writes ``index.html``, and each crop at full size as a PNG file, into the folder of a report.
-
-    Raises:
-        StorageError: a file cannot be written.
-    """
+    """Writes ``index.html``, and each crop at full size as a PNG file, into the folder of a report. Raises StorageError
+    if a file cannot be written."""
     parts = [
         f"<!doctype html>\n<html lang=en><meta charset=utf-8><title>{escape(title)}</title>",
         f"<meta name=viewport content='width=device-width'><style>{STYLE}</style><h1>{escape(title)}</h1>",

@@ -15,7 +15,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from structgstream.errors import ConfigError, MissingExtraError
+from structgstream.errors import ConfigError, import_extra
 from structgstream.executors.tasks import CommandProcess, Task, TaskResult, thread_environment, waited_for
 
 OLDEST = (2, 52)
@@ -64,7 +64,6 @@ class RayEngine:
         """See ``Engine.check``; the cluster may get GPUs later."""
 
     def has_room(self, gpus: int) -> bool:
-        """See ``Engine.has_room``."""
         return len(self._pending) < IN_FLIGHT * max(1, self.workers())
 
     def workers(self) -> int:
@@ -73,8 +72,7 @@ class RayEngine:
             self._counted = (time.monotonic(), int(self._ray.cluster_resources().get("CPU", 0)) // self._cores)
         return self._counted[1]
 
-    def start(self, task: Task, *, gpus: int, attempt: int) -> None:
-        """See ``Engine.start``."""
+    def start(self, task: Task, *, gpus: int) -> None:
         options = self._remote.options(
             name=task.name,
             num_cpus=self._cores,
@@ -89,7 +87,6 @@ class RayEngine:
         self._pending[options.remote(sent, environment)] = (task.name, time.monotonic())
 
     def ended(self, seconds: float) -> list[TaskResult]:
-        """See ``Engine.ended``."""
         ready, _ = self._ray.wait(list(self._pending), num_returns=1, timeout=seconds)
         return [self._ending(reference) for reference in ready]
 
@@ -133,10 +130,7 @@ def _protect(*, begins_one: bool) -> None:
 
 
 def _imported() -> Any:
-    try:
-        import ray  # pyright: ignore[reportMissingImports] -- an extra that tests do without
-    except ModuleNotFoundError:
-        raise MissingExtraError("ray", "cluster") from None
+    ray = import_extra("ray", "cluster")
     if tuple(int(part) for part in ray.__version__.split(".")[:2]) < OLDEST:
         oldest = ".".join(map(str, OLDEST))
         raise ConfigError(f"Ray {ray.__version__} has no token authentication; {oldest} is the first that has.")
@@ -173,11 +167,8 @@ class CommandKilled(Exception):
 
 
 def run_task(task: Task, environment: Mapping[str, str]) -> TaskResult:
-    """Runs the command in a process of this machine, which is killed when this process ends.
-
-    Raises:
-        CommandKilled: a signal ended it; the message has the signal and the command's output.
-    """
+    """Runs the command in a process of this machine, which is killed when this process ends. Raises CommandKilled if a
+    signal ended it; the message has the signal and the command's output."""
     process = CommandProcess(task, environment=environment)
     try:
         # Ray cancels a task by raising an exception between two Python instructions, so a wait must be short.

@@ -96,16 +96,9 @@ def thread_environment(threads: int) -> dict[str, str]:
 def allocate_slots(
     *, workers: int | None, cores: int, gpus: int = 0, threads: int | None = None
 ) -> tuple[WorkerSlot, ...]:
-    """Slots for ``workers`` concurrent tasks, which use GPUs in turn.
-
-    Args:
-        workers: number of slots; None for one per GPU, or one per core without GPUs.
-        cores: number of cores that may be used; each slot gets its share, at least one.
-        threads: threads of each slot; None for its share of the cores.
-
-    Raises:
-        ConfigError: there is less than one worker or thread.
-    """
+    """Slots for ``workers`` concurrent tasks, which use GPUs in turn; by default one per GPU, or one per core without
+    GPUs. Each has ``threads``, or its share of the cores, at least one. Raises ConfigError if there is less than one of
+    either."""
     for name, value in (("workers", workers), ("threads", threads)):
         if value is not None and value < 1:
             raise ConfigError(f"The number of {name} must be 1 or more, got {value}.")
@@ -215,16 +208,13 @@ class LocalEngine:
         return {name: process.pid for name, (process, _) in self._running.items()}
 
     def check(self, gpus: int) -> None:
-        """See ``Engine.check``."""
         if gpus > 1 or (gpus and not self._has_gpu):
             raise ConfigError(f"A task needs {gpus} GPUs, and a worker here has {int(self._has_gpu)}.")
 
     def has_room(self, gpus: int) -> bool:
-        """See ``Engine.has_room``."""
         return any(slot.gpu is not None for slot in self._free) if gpus else bool(self._free)
 
-    def start(self, task: Task, *, gpus: int, attempt: int) -> None:
-        """See ``Engine.start``."""
+    def start(self, task: Task, *, gpus: int) -> None:
         # A task without a GPU prefers a slot without one.
         order = sorted(self._free, key=lambda slot: (slot.gpu is None) == bool(gpus))
         slot = order[0]
@@ -232,7 +222,6 @@ class LocalEngine:
         self._running[task.name] = (CommandProcess(task, environment=slot.environment(gpus=gpus)), slot)
 
     def ended(self, seconds: float) -> list[TaskResult]:
-        """See ``Engine.ended``."""
         waited_for([process for process, _ in self._running.values()], seconds)
         results = []
         for name, (process, slot) in list(self._running.items()):
@@ -267,7 +256,7 @@ class Engine(Protocol):
         """Whether a task that needs ``gpus`` GPUs can be started now."""
         ...
 
-    def start(self, task: Task, *, gpus: int, attempt: int) -> None:
+    def start(self, task: Task, *, gpus: int) -> None:
         """Starts a task; there must be room for it."""
         ...
 
@@ -307,11 +296,8 @@ class TaskQueue:
         return tuple(self._ready)
 
     def submit(self, task: Task, *, gpus: int = 0) -> None:
-        """Adds a task with a name of its own, which is started in :meth:`wait`; it may need one GPU.
-
-        Raises:
-            ConfigError: the name is taken, or there is no GPU.
-        """
+        """Adds a task with a name of its own, which is started in :meth:`wait`; it may need one GPU. Raises ConfigError
+        if the name is taken, or there is no GPU."""
         if task.name in self._tasks:
             raise ConfigError(f"There are two tasks with the name {task.name!r}.")
         self.engine.check(gpus)
@@ -352,7 +338,7 @@ class TaskQueue:
                 continue
             self._attempts[name] = self._attempts.get(name, 0) + 1
             self._running.add(name)
-            self.engine.start(task, gpus=gpus, attempt=self._attempts[name])
+            self.engine.start(task, gpus=gpus)
         self._ready.extendleft(reversed(passed))
 
 
@@ -371,15 +357,10 @@ class ExecutorOptions:
 
 
 def open_executor(options: ExecutorOptions, *, cores: int, gpus: int = 0) -> TaskQueue:
-    """The executor; use it as a context manager.
+    """The executor, on this many cores and GPUs of this machine; use it as a context manager.
 
-    Args:
-        cores: number of cores of this machine that may be used.
-        gpus: number of GPUs of this machine that may be used.
-
-    Raises:
-        ConfigError: there is less than one worker or thread, or the cluster cannot be joined.
-        MissingExtraError: a package is missing.
+    Raises ConfigError if there is less than one worker or thread, or the cluster cannot be joined, and
+    MissingExtraError if a package is missing.
     """
     slots = allocate_slots(workers=options.workers, cores=cores, gpus=gpus, threads=options.threads)
     if options.name == "local":

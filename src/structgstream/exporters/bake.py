@@ -19,14 +19,13 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
-from structgstream.cameras import Camera
+from structgstream.cameras import Camera, Similarity
 from structgstream.errors import StreamError
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
 from structgstream.scene.harmonics import sh_basis
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
-from structgstream.similarity import Similarity
 
 HALF_TURN_SIGNS = (1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
 """Signs of the spherical harmonics up to degree 3 under half a turn around x."""
@@ -128,13 +127,11 @@ def bake(scene: Scene, cameras: Iterable[Camera], backend: Backend, *, degree: i
 
 
 def with_low_pass(gaussians: BakedGaussians, sampling: RigSampling, variance: float) -> BakedGaussians:
-    """``gaussians`` widened by ``variance`` squared sampling intervals (``scene/sampling.py``).
+    """``gaussians`` widened by ``variance`` squared sampling intervals (``scene/sampling.py``), in squared training
+    pixels.
 
     A viewer that draws larger pictures than the training pictures needs this, because its low-pass is that of its own,
-    smaller pixels.
-
-    Args:
-        variance: squared training pixels, at least 0; scenes are trained with 0.3.
+    smaller pixels. Scenes are trained with 0.3.
     """
     intervals = sampling.intervals(gaussians.means)
     return replace(gaussians, scales=(gaussians.scales**2 + variance * intervals[:, None] ** 2).sqrt())

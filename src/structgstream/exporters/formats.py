@@ -114,15 +114,9 @@ def destination(
     frame: int | None,
     frames: tuple[int, int] | None,
 ) -> tuple[Path, Format | PageFormat]:
-    """The path to write to, and the format.
-
-    Args:
-        output: the file or folder to write; None for one next to the stream.
-        format: the format; None for the suffix of ``output``, else ``ply``.
-
-    Raises:
-        ConfigError: the suffix is not a format or differs from ``format``, or both ``frame`` and ``frames`` are given.
-    """
+    """The path to write to, by default next to the stream, and the format, by default that of the suffix, else ``ply``.
+    Raises ConfigError if the suffix is no format or differs from ``format``, or both ``frame`` and ``frames`` are
+    given."""
     if frame is not None and frames is not None:
         raise ConfigError("--frame names one frame, --frames the first and the last; give one of them.")
     if output is None:
@@ -160,15 +154,8 @@ def check_page(*, frame: int | None, frames: tuple[int, int] | None, options: Fr
 def choose_frames(
     runs: Sequence[range], output: Path, *, frame: int | None, frames: tuple[int, int] | None
 ) -> list[int]:
-    """Numbers of the frames to write.
-
-    Args:
-        runs: the frames of the stream that can be decoded.
-        output: the destination; a file whose suffix is a format contains one frame.
-
-    Raises:
-        ConfigError: there is no such frame, it is lost, or several would be written into one file.
-    """
+    """Numbers of the frames to write, of the ``runs`` that can be decoded. Raises ConfigError if there is no such
+    frame, it is lost, or several would be written into a file that contains one."""
     if not runs:
         raise ConfigError("the stream has no whole frame.")
     if frame is None and frames is None:

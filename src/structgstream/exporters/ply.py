@@ -77,11 +77,8 @@ class PlyHeader:
 
 
 def find_sequence(folder: Path) -> list[Path]:
-    """The ``.ply`` files of ``folder`` in the order of the last number of their names.
-
-    Raises:
-        CaptureError: there are none, names have several prefixes or no number, or numbers are missing.
-    """
+    """The ``.ply`` files of ``folder`` in the order of the last number of their names. Raises CaptureError if there are
+    none, names have several prefixes or no number, or numbers are missing."""
     files = sorted(folder.glob("*.ply")) if folder.is_dir() else []
     if not files:
         raise CaptureError(f"{folder} is no folder with numbered .ply files, such as frame_000000.ply.")
@@ -143,11 +140,8 @@ def read_header(path: Path) -> PlyHeader:
 
 
 def read_ply(path: Path) -> BakedGaussians:
-    """The Gaussians of a ``.ply``, in its units and axes; quaternions are normalised.
-
-    Raises:
-        CaptureError: the file is not a ``.ply`` of Gaussians, is cut, or has values that are not finite.
-    """
+    """The Gaussians of a ``.ply``, in its units and axes; quaternions are normalised. Raises CaptureError if the file
+    is not a ``.ply`` of Gaussians, is cut, or has values that are not finite."""
     header = read_header(path)
     with path.open("rb") as file:
         file.seek(header.offset)

@@ -38,7 +38,7 @@ import zstandard
 from numpy.typing import NDArray
 from torch import Tensor
 
-from structgstream.errors import ConfigError, MissingExtraError
+from structgstream.errors import ConfigError, import_extra
 from structgstream.exporters.bake import BakedGaussians
 from structgstream.exporters.formats import FrameOptions, SpzVersion
 from structgstream.scene.harmonics import Y0
@@ -75,11 +75,8 @@ LARGEST = 2**23 - 1
 
 
 def fractional_bits(means: Tensor) -> int:
-    """Bits after the binary point with which all of ``means`` fit into 24 bits.
-
-    Raises:
-        ConfigError: they do not fit with none.
-    """
+    """Bits after the binary point with which all of ``means`` fit into 24 bits. Raises ConfigError if they do not fit
+    with none."""
     farthest = float(means.abs().max()) if means.numel() else 0.0
     if not farthest <= LARGEST:
         raise ConfigError(
@@ -89,11 +86,8 @@ def fractional_bits(means: Tensor) -> int:
 
 
 def spz_bytes(gaussians: BakedGaussians, options: FrameOptions | None = None) -> bytes:
-    """A whole ``.spz`` file, in the units of ``gaussians`` (whose axes are OpenCV's) and the axes of the format.
-
-    Raises:
-        ConfigError: a position does not fit.
-    """
+    """A whole ``.spz`` file, in the units of ``gaussians`` (whose axes are OpenCV's) and the axes of the format. Raises
+    ConfigError if a position does not fit."""
     version: SpzVersion = 2 if options is None else options.spz_version
     bits = fractional_bits(gaussians.means)
     gaussians = gaussians.y_up()
@@ -156,11 +150,8 @@ Bytes = NDArray[np.uint8]
 
 
 def sog_bytes(gaussians: BakedGaussians, options: FrameOptions | None = None) -> bytes:
-    """A whole ``.sog`` file, in the units and axes of ``gaussians``.
-
-    Raises:
-        MissingExtraError: Pillow is not installed.
-    """
+    """A whole ``.sog`` file, in the units and axes of ``gaussians``. Raises MissingExtraError if Pillow is not
+    installed."""
     gaussians = gaussians.select(morton_order(gaussians.means))
     count = len(gaussians)
     width = math.ceil(math.sqrt(count) / 4) * 4
@@ -233,15 +224,9 @@ def codebook(values: Floats) -> tuple[Floats, Bytes]:
 
 
 def vector_palette(rows: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """At most 2^16 means of similar rows, and the mean of each row.
+    """At most 2^16 means ``[P, C]`` of similar rows ``[N, C]``, and the index of the mean of each row ``[N]``.
 
     Rows are halved at the median of the component that varies most within a group until there are enough groups.
-
-    Args:
-        rows: ``[N, C]``.
-
-    Returns:
-        the means ``[P, C]``, and the index of its mean for each row ``[N]``.
     """
     group = np.zeros(len(rows), np.int64)
     if len(rows) <= 1 << _MAX_PALETTE_BITS:
@@ -281,13 +266,9 @@ def _picture(rows: Bytes, width: int, height: int) -> Bytes:
 
 
 def _webp(picture: Bytes) -> bytes:
-    try:
-        from PIL import Image
-    except ImportError:
-        raise MissingExtraError("PIL", "export") from None
     data = io.BytesIO()
     # exact: the colour of transparent pixels matters.
-    Image.fromarray(picture).save(data, "WEBP", lossless=True, exact=True)
+    import_extra("PIL.Image", "export").fromarray(picture).save(data, "WEBP", lossless=True, exact=True)
     return data.getvalue()
 
 

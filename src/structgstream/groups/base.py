@@ -11,9 +11,8 @@ import numpy as np
 from structgstream.cameras import CameraRig
 from structgstream.codec.container.byte_source import FileBytes
 from structgstream.codec.container.records import PREFIX, RecordType, check_prefix, read_record
-from structgstream.codec.decoder import SceneDecoder
-from structgstream.codec.header import unpack_header
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet, unpack_header
+from structgstream.codec.scene_coder import SceneDecoder
 from structgstream.data.source import FrameSource
 from structgstream.data.wrappers import WithRig, section
 from structgstream.errors import CaptureError, ConfigError, StreamError
@@ -34,11 +33,8 @@ class GroupBase:
 
     @classmethod
     def read(cls, path: Path | str) -> "GroupBase":
-        """The beginning of the stream file ``path``, which may be longer.
-
-        Raises:
-            StreamError: the file is not a stream, or is damaged or truncated before the end of frame 0.
-        """
+        """The beginning of the stream file ``path``, which may be longer. Raises StreamError if the file is not a
+        stream, or is damaged or truncated before the end of frame 0."""
         data = FileBytes(path)
         check_prefix(data, str(path))
         init = read_record(data, PREFIX.size)
@@ -60,11 +56,8 @@ class GroupBase:
 
     @cached_property
     def config(self) -> StreamConfig:
-        """The configuration of the stream, which is that of every group.
-
-        Raises:
-            ConfigError: it cannot be read, has periods, or was made without scene flow, which groups need.
-        """
+        """The configuration of the stream, which is that of every group. Raises ConfigError if it cannot be read, has
+        periods, or was made without scene flow, which groups need."""
         config = from_json(self.header.config)
         if config.codec != "compact" or not (config.online.motion.enabled and config.online.scene_flow.enabled):
             raise ConfigError(

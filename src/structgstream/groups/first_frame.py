@@ -60,15 +60,9 @@ def relocate_lost_anchors(
     rules: SpawnRules,
     backend: Backend,
 ) -> tuple[Scene, int]:
-    """``dynamic`` with its lost anchors moved to their neighbours, and the number of lost anchors.
-
-    Args:
-        first: its anchors in frame 0, in the same order.
-        active_tiles: by view index, with up-to-date renderings; views without an entry are skipped.
-
-    Raises:
-        MissingExtraError: SciPy is not installed.
-    """
+    """``dynamic`` with its lost anchors moved to their neighbours, and the number of lost anchors; ``first`` are its
+    anchors in frame 0, in the same order. Views without up-to-date renderings in ``active_tiles`` are skipped. Raises
+    MissingExtraError without SciPy."""
     pixel = pixel_size(first.positions, [view.camera for view in views])
     if pixel is None or len(first) < 2:
         return dynamic, 0

@@ -18,8 +18,7 @@ from typing import cast
 
 from structgstream.atomic_files import atomic_file, atomic_write
 from structgstream.codec.container.records import FRAME, PREFIX, pack_index, read_record
-from structgstream.codec.header import unpack_header
-from structgstream.codec.packets import StreamHeader
+from structgstream.codec.packets import StreamHeader, unpack_header
 from structgstream.codec.reader import open_stream
 from structgstream.errors import ConfigError, StreamError, TaskError
 from structgstream.executors.tasks import PYTHON, LocalEngine, Task, TaskQueue, allocate_slots
@@ -94,11 +93,8 @@ def _records(paths: Sequence[Path], blender: GroupBlender | None) -> Iterator[by
 
 
 def runs_of(lengths: Sequence[int], *, workers: int) -> list[range]:
-    """Independent runs of groups, without the first group, which is not blended.
-
-    Args:
-        workers: number of processes; there are at least as many runs if groups are long enough.
-    """
+    """Independent runs of groups, without the first group, which is not blended; at least one for each of ``workers``
+    processes if groups are long enough."""
     size = min(MAX_GROUPS, -(-(len(lengths) - 1) // workers))
     runs, begin = [], 1
     for number in range(2, len(lengths)):
@@ -209,15 +205,12 @@ def _in_order(paths: Sequence[Path]) -> tuple[bytes, list[Path], list[int]]:
 
 
 def check_births(path: Path, firsts: Sequence[int]) -> None:
-    """Decode a stream of groups, and check that free Gaussians were spawned in their own group.
+    """Decode a stream of groups, which begin at frames ``firsts``, and check that free Gaussians were spawned in their
+    own group.
 
     The identity of a spawned Gaussian is its frame times 2^32 plus a number, so identities of groups do not collide.
-
-    Args:
-        firsts: the first frame of each group, ascending.
-
-    Raises:
-        StreamError: a frame cannot be decoded, or has a Gaussian that was spawned in another group or a later frame.
+    Raises StreamError if a frame cannot be decoded, or has a Gaussian that was spawned in another group or a later
+    frame.
     """
     with open_stream(path) as reader:
         group = 0

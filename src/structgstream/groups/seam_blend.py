@@ -28,9 +28,8 @@ from torch import Tensor
 
 from structgstream.cameras import CameraRig, enlargement
 from structgstream.codec.container.records import PACKET_KINDS, RECORD_TYPES, packed, read_record
-from structgstream.codec.decoder import SceneDecoder
-from structgstream.codec.encoder import SceneEncoder
 from structgstream.codec.packets import Packet, StreamHeader, parse_packet
+from structgstream.codec.scene_coder import SceneDecoder, SceneEncoder
 from structgstream.groups.segment_file import Segment
 from structgstream.kernels.backend import Backend
 from structgstream.scene.render import render, to_8bit_image
@@ -192,16 +191,13 @@ def moving_at_border(
     earlier: Scene | None = None,
     second: Scene | None = None,
 ) -> Tensor | None:
-    """Mask ``[M]`` of the anchors of ``first`` that move; None if everything changes, as at a cut.
+    """Mask ``[M]`` of the anchors of ``first`` that move; None if everything changes, as at a cut. The rig is in the
+    units of the scene.
 
-    An anchor moves if the selection of an online frame finds it between the renderings of ``before`` and ``first``,
-    or if it changed from ``earlier`` to ``before`` or from ``first`` to ``second``. The second test is needed because
-    slow motion, and fast motion of an untextured surface, change the pictures by less than the two fits differ.
-
-    Args:
-        rig: in the units of the scene.
-        earlier: the last but one frame of the group before; None if that group has one frame only.
-        second: the second frame of the group; None if it has one frame only.
+    An anchor moves if the selection of an online frame finds it between the renderings of ``before`` and ``first``, or
+    if it changed from ``earlier`` to ``before`` or from ``first`` to ``second``, which groups of one frame lack. The
+    second test is needed because slow motion, and fast motion of an untextured surface, change the pictures by less
+    than the two fits differ.
     """
     config = MotionConfig(enabled=True, picture_scale=0.5)
     views, earlier_views = (_as_views(drawn, rig, backend) for drawn in (pictures.first, pictures.before))
@@ -234,13 +230,10 @@ _SCALE = 0.5  # relative to pictures of the reference size
 
 
 def visible_mixtures(mixed: Scene, pictures: BorderPictures, rig: CameraRig, backend: Backend) -> Tensor:
-    """Mask ``[M]`` of the anchors of ``mixed`` that cover pixels that differ from both frames of the border.
+    """Mask ``[M]`` of the anchors of ``mixed`` that cover pixels that differ from both ``pictures`` of the border; the
+    rig is in the units of the scene.
 
     A pixel may have any colour between those of the two.
-
-    Args:
-        pictures: renderings of the last frame of the group before and of the group's own first frame.
-        rig: in the units of the scene.
     """
     folded, count = mixed.with_folded_appearance(), len(mixed.anchors)
     sums = torch.zeros(count, 2).to(mixed.anchors.positions)
@@ -280,11 +273,8 @@ class Border:
 
 
 class GroupBlender:
-    """Blends the groups of a stream, which must be given in order; at most four scenes are in memory.
-
-    Args:
-        backend: the compute back-end that renders the frames around borders.
-    """
+    """Blends the groups of a stream, which must be given in order; at most four scenes are in memory. The frames around
+    borders are rendered by ``backend``."""
 
     def __init__(
         self, header: StreamHeader, backend: Backend, *, on_border: Callable[[Border], None] | None = None
@@ -297,19 +287,12 @@ class GroupBlender:
 
     def follow(self, segment: Segment) -> None:
         """Start after a group whose last two frames are not blended: the first group, or one of at least
-        :data:`~structgstream.groups.seam_blend.OWN_FRAMES` frames.
-
-        Raises:
-            StreamError: a packet is damaged.
-        """
+        :data:`~structgstream.groups.seam_blend.OWN_FRAMES` frames. Raises StreamError if a packet is damaged."""
         self._shown.extend(scene for _, scene in self._decoded(segment))
 
     def records(self, segment: Segment) -> Iterator[bytes]:
-        """The records of the packets of ``segment``, blended; those of the first group are unchanged.
-
-        Raises:
-            StreamError: a packet is damaged.
-        """
+        """The records of the packets of ``segment``, blended; those of the first group are unchanged. Raises
+        StreamError if a packet is damaged."""
         if not self._shown:
             for data, (_, scene) in zip(segment.records(), self._decoded(segment)):
                 self._shown.append(scene)

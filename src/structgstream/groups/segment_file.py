@@ -32,9 +32,9 @@ from structgstream.codec.container.records import (
     packed,
     read_record,
 )
-from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet
 from structgstream.codec.reader import PacketInfo
+from structgstream.codec.scene_coder import SceneDecoder
 from structgstream.errors import ConfigError, StreamError
 from structgstream.groups.base import GroupBase
 from structgstream.scene.scene import Scene
@@ -90,11 +90,8 @@ class Segment:
 
 
 def open_segment(path: Path) -> Segment:
-    """Reads the segment file ``path`` whole; every byte is verified.
-
-    Raises:
-        StreamError: the file is not a segment, or is damaged before its first packet.
-    """
+    """Reads the segment file ``path`` whole; every byte is verified. Raises StreamError if the file is not a segment,
+    or is damaged before its first packet."""
     with FileBytes(path) as file:
         data, name = file[:], str(path)
     check_prefix(data, name)
@@ -144,14 +141,8 @@ def _identity(note: Record, name: str) -> SegmentIdentity:
 
 
 class SegmentSink:
-    """Appends the packets of a group; the file is renamed after the last one.
-
-    Args:
-        found: existing part that is retained; None for a new segment.
-
-    Raises:
-        StorageError: it cannot be written, or another process writes it.
-    """
+    """Appends the packets of a group to the existing part; the file is renamed after the last one. Raises StorageError
+    if it cannot be written, or another process writes it."""
 
     def __init__(self, path: Path, base: GroupBase, identity: SegmentIdentity, found: Segment | None) -> None:
         self._identity = identity
@@ -173,11 +164,8 @@ class SegmentSink:
         raise ConfigError("A group cannot begin another period; leave out --period.")
 
     def write(self, packet: Packet) -> int:
-        """Appends one packet; returns its size in bytes.
-
-        Raises:
-            StorageError: it cannot be written, or the disk is nearly full; earlier packets are not affected.
-        """
+        """Appends one packet; returns its size in bytes. Raises StorageError if it cannot be written, or the disk is
+        nearly full; earlier packets are not affected."""
         record = packed(RECORD_TYPES[packet.kind], packet.payload)
         self._largest = max(self._largest, len(record))
         closing = (len(self._entries) + 2) * INDEX_ENTRY.size

@@ -142,11 +142,8 @@ class TrackFile:
         return offset
 
     def start(self, frame: int) -> TrackStart:
-        """The start record of ``frame``.
-
-        Raises:
-            StreamError: the pass has stored no start at this frame, or it is damaged.
-        """
+        """The start record of ``frame``. Raises StreamError if the pass has stored no start at this frame, or it is
+        damaged."""
         if frame not in self._offsets:
             near = ", ".join(map(str, self.starts[:8])) or "none"
             raise StreamError(
@@ -171,22 +168,15 @@ class TrackFile:
 
 
 def open_track(path: Path) -> TrackFile:
-    """Opens the track at ``path``, or its unfinished file while the pass runs.
-
-    Raises:
-        StreamError: there is no file, or it is not a track.
-    """
+    """Opens the track at ``path``, or its unfinished file while the pass runs. Raises StreamError if there is no file,
+    or it is not a track."""
     partial = partial_path(path)
     found = partial if not path.exists() and partial.exists() else path
     return TrackFile(FileBytes(found), str(found))
 
 
 class TrackWriter:
-    """Writes the track ``path``.
-
-    Raises:
-        StorageError: it cannot be written.
-    """
+    """Writes the track ``path``. Raises StorageError if it cannot be written."""
 
     def __init__(self, path: Path, head: TrackHead, *, keep: int = 0) -> None:
         self._file = GrowingFile(path, keep=keep)
@@ -224,11 +214,8 @@ def write_groups(track: Path, groups: Groups) -> None:
 
 
 def read_groups(track: Path) -> Groups | None:
-    """The groups of a track of a whole capture; None while the pass has not chosen them.
-
-    Raises:
-        StreamError: the list has gaps or does not follow the format.
-    """
+    """The groups of a track of a whole capture; None while the pass has not chosen them. Raises StreamError if the list
+    has gaps or does not follow the format."""
     path = groups_path(track)
     try:
         text = path.read_text(errors="replace")
@@ -247,11 +234,8 @@ def read_groups(track: Path) -> Groups | None:
 
 
 def check_length(length: int, *, key_interval: int) -> None:
-    """Check that groups of ``length`` frames begin at frames that are key packets anyway.
-
-    Raises:
-        ConfigError: they do not, so every group would cost an additional key packet.
-    """
+    """Check that groups of ``length`` frames begin at frames that are key packets anyway. Raises ConfigError if they do
+    not, so every group would cost an additional key packet."""
     if length < 1 or length % key_interval:
         near = max(1, round(length / key_interval)) * key_interval
         raise ConfigError(
@@ -276,11 +260,8 @@ def quiet_groups(frames: int, length: int, changed: Mapping[int, float]) -> list
     """Groups of about ``length`` frames that begin at frames with little motion.
 
     Every group has at least half and at most one and a half times ``length`` frames; the last may be shorter, but has
-    at least two. Among all such divisions, this one minimizes the sum of ``changed`` over the borders, relative to
-    their number.
-
-    Args:
-        changed: share of pixels that changed, by frame at which a group may begin.
+    at least two. Among all such divisions, this one minimizes the sum over the borders of ``changed``, the share of
+    changed pixels by frame at which a group may begin, relative to their number.
     """
     least, most = (length + 1) // 2, length + length // 2
     mean = sum(changed.values()) / max(len(changed), 1)

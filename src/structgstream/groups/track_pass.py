@@ -131,11 +131,8 @@ def _groups(options: TrackOptions, frames: int, changed: Mapping[int, float]) ->
 
 
 def start_after(group: Segment, base: GroupBase) -> TrackStart:
-    """Start at the last frame of a finished group: displacements of frame 0's primitives, without spawned ones.
-
-    Raises:
-        ConfigError: the group is not finished, or has another header.
-    """
+    """Start at the last frame of a finished group: displacements of frame 0's primitives, without spawned ones. Raises
+    ConfigError if the group is not finished, or has another header."""
     if not group.complete or group.init != base.init:
         what = "is not finished" if not group.complete else "has another header"
         raise ConfigError(f"{group.name} {what}; track on from a finished group of the same header.")

@@ -202,12 +202,10 @@ def _measure_view(tracker: Tracker, scene: Scene, view: View, change: PictureCha
 
 
 def _occluded(motion: MotionConfig, scene: Scene, seen: Sequence[_ViewEvidence], moving: Tensor) -> Tensor:
-    """Mask ``[M]`` of the anchors that are occluded in changed tiles and whose neighbours are dynamic.
+    """Mask ``[M]`` of the anchors that are occluded in changed tiles and whose neighbours are dynamic by votes
+    (``moving`` ``[M]``).
 
     Anchors outside these tiles are neither selected nor used as neighbours, because nothing is measured there.
-
-    Args:
-        moving: mask ``[M]`` of the anchors that are dynamic by votes.
     """
     anchors, occluded = len(moving), torch.zeros_like(moving)
     drawn, shown = (torch.zeros_like(moving, dtype=torch.int32) for _ in range(2))

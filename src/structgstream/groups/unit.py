@@ -79,12 +79,10 @@ class GroupMethod:
 
     @property
     def needs_before(self) -> bool:
-        """See ``StructGStream.needs_before``."""
         return self._usual.needs_before
 
     @property
     def needs_older(self) -> bool:
-        """See ``StructGStream.needs_older``."""
         return self._usual.needs_older
 
     def observe(
@@ -103,7 +101,6 @@ class GroupMethod:
         raise ConfigError("A group needs a header with frame 0; give one with --init.")
 
     def prepare(self, state: Scene, task: Callable[[], FrameTask]) -> FrameZeroContext:
-        """See ``StructGStream.prepare``."""
         return self._usual.prepare(state, task)
 
     def next(self, past: Past[Scene, FrameZeroContext], task: FrameTask) -> FitResult[Scene]:

@@ -11,6 +11,7 @@ the last group after it.
 
 import heapq
 import math
+from bisect import bisect_left
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -44,11 +45,7 @@ class Costs:
 
 @dataclass(frozen=True)
 class Work:
-    """How much there is to do.
-
-    Raises:
-        ConfigError: less than one of them.
-    """
+    """How much there is to do. Raises ConfigError if one of them is less than 1."""
 
     frames: int  # of the capture
     group: int  # frames of a group
@@ -96,10 +93,7 @@ def serial_seconds(costs: Costs, work: Work) -> float:
 
 def estimate(costs: Costs, work: Work, workers: int) -> Estimate:
     """A run on ``workers``: groups begin in their order, each as soon as a worker is free and the pass has come to it.
-
-    Raises:
-        ConfigError: less than one worker.
-    """
+    Raises ConfigError if there is less than one."""
     if workers < 1:
         raise ConfigError(f"The number of workers must be 1 or more, got {workers}.")
     begin = costs.header_seconds
@@ -122,16 +116,9 @@ def estimate(costs: Costs, work: Work, workers: int) -> Estimate:
 
 def workers_for(costs: Costs, work: Work, seconds: float) -> Estimate | None:
     """The least number of workers that end within ``seconds``; None if no number does."""
-    low, high = 1, len(work.groups) + 1
-    if estimate(costs, work, high).seconds > seconds:
-        return None
-    while low < high:
-        middle = (low + high) // 2
-        if estimate(costs, work, middle).seconds <= seconds:
-            high = middle
-        else:
-            low = middle + 1
-    return estimate(costs, work, low)
+    numbers = range(1, len(work.groups) + 2)
+    place = bisect_left(numbers, True, key=lambda workers: estimate(costs, work, workers).seconds <= seconds)
+    return estimate(costs, work, numbers[place]) if place < len(numbers) else None
 
 
 def stream_bytes(costs: Costs, work: Work) -> float:

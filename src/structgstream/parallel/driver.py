@@ -20,7 +20,7 @@ from structgstream.executors.tasks import (
     WorkerSlot,
     thread_environment,
 )
-from structgstream.groups.track_file import Groups, groups_path, read_groups
+from structgstream.groups.track_file import Groups, TrackWriter, groups_path, open_track, read_groups
 from structgstream.parallel.exchange import SharedFolder
 from structgstream.parallel.parts import Parts, group_name, key_of, sha256_of
 
@@ -30,8 +30,6 @@ PROGRAM = (PYTHON, "-m", "structgstream")
 
 def starts_in(track: Path) -> Collection[int]:
     """The starts in a file of ``structgstream track``; none before its head is written."""
-    from structgstream.groups.track_file import open_track
-
     try:
         return open_track(track).starts
     except StreamError:
@@ -39,13 +37,7 @@ def starts_in(track: Path) -> Collection[int]:
 
 
 def cut_track(track: Path, first: int) -> bytes:
-    """An unfinished track with the one start that a group needs.
-
-    Raises:
-        StreamError: there is none, or it is damaged.
-    """
-    from structgstream.groups.track_file import TrackWriter, open_track
-
+    """An unfinished track with the start that a group needs. Raises StreamError if it is missing or damaged."""
     found = open_track(track)
     start = found.start(first)
     with tempfile.TemporaryDirectory() as folder:

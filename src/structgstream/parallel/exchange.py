@@ -38,18 +38,11 @@ LONGEST_DELAY_SECONDS = 10.0
 
 
 class ObjectFolder:
-    """Objects by name, with the bytes of the files that they are copies of.
+    """The objects of a URL, in the syntax of fsspec, by name, with the bytes of the files that they are copies of.
 
-    A request that fails is made again, :data:`TRIES` times in all, with growing, varied pauses; then it is a
-    ``StorageError``.
-
-    Args:
-        url: of the folder, as fsspec takes it. Addresses and credentials come from the environment, as the scheme's
-            package reads them (``AWS_ENDPOINT_URL``, ``AWS_ACCESS_KEY_ID``, ...).
-
-    Raises:
-        MissingExtraError: fsspec, or the package for this scheme, is not installed.
-        StorageError: the URL is not understood.
+    Addresses and credentials come from the environment, as the scheme's package reads them (``AWS_ENDPOINT_URL``,
+    ``AWS_ACCESS_KEY_ID``, ...). A request that fails is made again, :data:`TRIES` times in all, with growing, varied
+    pauses; then it is a ``StorageError``.
     """
 
     def __init__(self, url: str) -> None:
@@ -81,11 +74,8 @@ class ObjectFolder:
             atomic_write(path, data, new_folder=True)
 
     def owner(self) -> Owner | None:
-        """The owner of the folder; None if there is nothing in it.
-
-        Raises:
-            StorageError: it holds objects and no marker.
-        """
+        """The owner of the folder; None if there is nothing in it. Raises StorageError if it holds objects and no
+        marker."""
         names = self._all()
         if not names:
             return None
@@ -203,14 +193,9 @@ class ObjectStore(SharedFolder):
             self._fetched_bytes = size
 
     def check_owner(self, key: str) -> Owner | None:
-        """Check that the store may be used for the parts; returns its owner, None if it is empty.
-
-        Args:
-            key: hash of the plan. A run of the same key whose folder of parts was lost is continued.
-
-        Raises:
-            StorageError: it has parts of another run, or other files.
-        """
+        """Check that the store may be used for the parts; returns its owner, None if it is empty. A run of the same
+        ``key``, the hash of its plan, whose folder of parts was lost is continued. Raises StorageError if it has parts
+        of another run, or other files."""
         local, remote = self._parts.check(), self._store.owner()
         if remote is None or (remote.identity == local.identity if local is not None else remote.key == key):
             return remote
@@ -325,11 +310,8 @@ def run(transfer: Transfer, command: Sequence[str]) -> int:
 
 
 def scratch_folder(transfer: Transfer, url: str) -> Path:
-    """The marked folder of a task on this machine; those of earlier runs of the task are removed.
-
-    Raises:
-        StorageError: it is somebody else's, or cannot be made.
-    """
+    """The marked folder of a task on this machine; those of earlier runs of the task are removed. Raises StorageError
+    if it is somebody else's, or cannot be made."""
     above = Path(os.environ.get(SCRATCH) or tempfile.gettempdir())
     # Names of tasks are unique within a run only.
     task = hashlib.sha256(f"{url}\n{transfer.name}".encode()).hexdigest()[:16]

@@ -31,7 +31,6 @@ PART_NAMES = re.compile(
 """Names of parts, here and in a store; nothing else is removed."""
 _RUN = "run"  # key of the plan: a random name, which distinguishes scratch files of one run from those of another
 _LOCK = ".driver"
-_PIECE_BYTES = 2**20
 
 
 @dataclass(frozen=True)
@@ -74,23 +73,13 @@ class Parts:
         return self.folder / "logs" / f"{name}.txt"
 
     def check(self) -> Owner | None:
-        """The owner of the folder; None if it is missing or empty.
-
-        Raises:
-            StorageError: it is not one of parts.
-        """
+        """The owner of the folder; None if it is missing or empty. Raises StorageError if it is not one of parts."""
         return check_owned(self.folder, PURPOSE)
 
     @contextmanager
     def locked(self, *, owner: Owner | None = None) -> Iterator[None]:
-        """Creates and marks the folder, and locks it for other drivers within the block.
-
-        Args:
-            owner: of a folder that is created; None for a new one.
-
-        Raises:
-            StorageError: another process uses it, or the folder is not one of parts, or cannot be made.
-        """
+        """Creates and marks the folder, by default for a new owner, and locks it for other drivers within the block.
+        Raises StorageError if another process uses it, or the folder is not one of parts, or cannot be made."""
         try:
             own_folder(self.folder, PURPOSE, owner=owner)
             (self.folder / "segments").mkdir(exist_ok=True)
@@ -148,11 +137,8 @@ class Parts:
             return False
 
     def record(self, result: TaskResult, key: str, part: Path, *, frames: int) -> CompletedTask:
-        """Records that a task succeeded; the earlier record stays if the part is the same.
-
-        Raises:
-            StorageError: its part is missing, or the record cannot be written.
-        """
+        """Records that a task succeeded; the earlier record stays if the part is the same. Raises StorageError if its
+        part is missing, or the record cannot be written."""
         try:
             record = CompletedTask(
                 result.name,
@@ -206,12 +192,9 @@ def key_of(*facts: object) -> str:
 
 
 def sha256_of(path: Path) -> str:
-    """Of a file, which is read in pieces. Raises OSError if it cannot be read."""
-    digest = hashlib.sha256()
+    """Of a file. Raises OSError if it cannot be read."""
     with path.open("rb") as file:
-        while piece := file.read(_PIECE_BYTES):
-            digest.update(piece)
-    return digest.hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _json_of(path: Path) -> dict[str, Any] | None:

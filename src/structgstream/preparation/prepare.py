@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.atomic_files import atomic_file
-from structgstream.cameras import CameraRig
+from structgstream.cameras import CameraRig, rig_radius
 from structgstream.data.calibration import NEAR_IN_RIG_RADII, Calibration, listed
 from structgstream.data.camera_files import REPORT
 from structgstream.data.masks import FOLDER as MASKS
@@ -67,7 +67,6 @@ from structgstream.preparation.solvers import (
     unpacked,
 )
 from structgstream.preparation.steps import FOLDER, Job, Listener, Silent, Steps, Stored, fingerprint
-from structgstream.similarity import rig_radius
 
 MIN_SOLVED = 3  # cameras, for poses that can be checked
 

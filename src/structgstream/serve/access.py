@@ -87,11 +87,8 @@ def _signature(secret: bytes, expires: int, stream: str) -> str:
 
 
 def read_keys(path: Path) -> TokenKeys:
-    """The secrets of a file, one a line.
-
-    Raises:
-        ConfigError: the file cannot be read, has no secret, or one that can be guessed.
-    """
+    """The secrets of a file, one a line. Raises ConfigError if the file cannot be read, has no secret, or one that can
+    be guessed."""
     advice = f"make one with: (umask 077; openssl rand -hex 32 > {path})"
     try:
         with path.open("rb") as file:
@@ -142,14 +139,8 @@ class Query:
 
 
 def parsed_query(raw: bytes, headers: Mapping[str, str]) -> Query:
-    """The query of a request; a token in the header ``Authorization`` takes precedence over one in the query.
-
-    Args:
-        raw: the query as the client wrote it, without question mark.
-
-    Raises:
-        Refused: it has too many parameters, one of them twice, or ``after`` is not a number.
-    """
+    """The query of a request as the client wrote it; a token in the header ``Authorization`` takes precedence. Raises
+    Refused if it has too many parameters, one of them twice, or ``after`` is not a number."""
     try:
         pairs = parse_qsl(raw.decode("ascii"), keep_blank_values=True, max_num_fields=MAX_PARAMETERS, errors="strict")
     except ValueError:  # also for bytes that are not UTF-8
@@ -170,11 +161,7 @@ def query_of(request: "Request") -> Query:
 
 
 class Authorizer:
-    """Checks the tokens of requests.
-
-    Args:
-        keys: secrets; None gives everyone access.
-    """
+    """Checks the tokens of requests; without keys everyone has access."""
 
     def __init__(self, keys: TokenKeys | None, *, clock: Callable[[], float] = time.time) -> None:
         self._keys = keys
@@ -188,11 +175,8 @@ class Authorizer:
         return self._keys.access(query.token, name, unix_seconds=self._clock())
 
     def check(self, request: "Request", name: str) -> None:
-        """Check that a request has access to the stream ``name``.
-
-        Raises:
-            Refused: it has none, or the query is malformed.
-        """
+        """Check that a request has access to the stream ``name``. Raises Refused if it has none, or the query is
+        malformed."""
         access = self.access(request, name)
         if access is not Access.GRANTED:
             raise refusal(access)

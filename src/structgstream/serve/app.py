@@ -31,6 +31,7 @@ from starlette.routing import Route
 from structgstream.codec.container.records import footer_offset
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.quality_list import MAX_LIST_BYTES, QUALITIES
+from structgstream.errors import StreamError
 from structgstream.serve.access import EVERY_STREAM, Access, Authorizer, Refused, TokenKeys, query_of, refusal
 from structgstream.serve.listening import LOOPBACK_NAMES
 from structgstream.serve.manifest_watch import BrokenManifest, Manifests, Snapshot
@@ -70,11 +71,8 @@ class ServerSettings:
 
 
 def application(settings: ServerSettings, *, clock: Callable[[], float] = time.time) -> Starlette:
-    """The application (Note [What is served]).
-
-    Raises:
-        PlayerError: the folder cannot be read, or the installation lacks the player.
-    """
+    """The application (Note [What is served]). Raises PlayerError if the folder cannot be read, or the installation
+    lacks the player."""
     metrics = Metrics()
     middleware = [
         Middleware(TrustedHostMiddleware, allowed_hosts=list(settings.hosts), www_redirect=False),
@@ -93,7 +91,13 @@ def application(settings: ServerSettings, *, clock: Callable[[], float] = time.t
     application = Starlette(
         routes=_Routes(settings, metrics, clock).all(),
         middleware=middleware,
-        exception_handlers={HTTPException: _unrouted, Refused: _refused, BrokenManifest: _broken, OSError: _unreadable},
+        exception_handlers={
+            HTTPException: _unrouted,
+            Refused: _refused,
+            BrokenManifest: _broken,
+            OSError: _unreadable,
+            StreamError: _unreadable,
+        },
     )
     application.router.redirect_slashes = False  # A redirect would name this server's host, also behind a proxy.
     return application
@@ -308,7 +312,7 @@ def _run_numbers(stream: ServedStream) -> dict[str, float]:
     if opened is None:
         return {}
     with opened:
-        return run_numbers(opened.read(0, min(len(opened), MAX_RUN_BYTES)))
+        return run_numbers(opened[:MAX_RUN_BYTES])
 
 
 async def _content(opened: OpenedFile | None, max_bytes: int) -> bytes | None:
@@ -316,7 +320,7 @@ async def _content(opened: OpenedFile | None, max_bytes: int) -> bytes | None:
     if opened is None:
         return None
     with opened:
-        return await to_thread.run_sync(opened.read, 0, len(opened)) if len(opened) <= max_bytes else None
+        return await to_thread.run_sync(opened.__getitem__, slice(None)) if len(opened) <= max_bytes else None
 
 
 async def _while_connected(waiting: Coroutine[None, None, Snapshot | None], request: Request) -> Snapshot | None:

@@ -24,16 +24,8 @@ SEND_BUFFER_BYTES: Final = 256 * 1024
 
 
 def checked_address(host: str, *, tokens: bool, public: bool) -> str:
-    """The address to listen on.
-
-    Args:
-        host: an IP address of this machine, or ``localhost``.
-        tokens: whether access tokens are required.
-        public: whether the user allows access without tokens.
-
-    Raises:
-        ConfigError: it is not an address, or others could see the streams without a token and ``public`` is False.
-    """
+    """The IP address to listen on. Raises ConfigError if it is none, or others could see the streams without a token
+    and ``public`` is False."""
     try:
         address = ipaddress.ip_address(LOOPBACK if host == "localhost" else host)
     except ValueError:
@@ -74,12 +66,8 @@ def checked_origins(origins: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def bound(port: int, *, address: str = LOOPBACK) -> socket.socket:
-    """A listening socket, which queues connections before the server runs.
-
-
-    Raises:
-        PlayerError: the port is taken, or may not be used.
-    """
+    """A listening socket, which queues connections before the server runs. Raises PlayerError if the port is taken, or
+    may not be used."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     # asyncio sets TCP_NODELAY only on a socket with this protocol; without it each further response waits 40 ms.
     listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
@@ -98,11 +86,7 @@ def bound(port: int, *, address: str = LOOPBACK) -> socket.socket:
 
 
 def server(app: ASGIApp, *, proxies: Sequence[str] = (), connections: int | None = None) -> uvicorn.Server:
-    """A server, not yet running.
-
-    Args:
-        connections: number of connections above which requests are answered with 503; None for no limit.
-    """
+    """A server, not yet running, that answers requests with 503 above this number of connections."""
     config = uvicorn.Config(
         app,
         http="h11",
@@ -123,14 +107,8 @@ def server(app: ASGIApp, *, proxies: Sequence[str] = (), connections: int | None
 
 
 def run(server: uvicorn.Server, *, port: int, address: str = LOOPBACK, on_start: Callable[[str], None]) -> None:
-    """Serve until Ctrl-C or SIGTERM.
-
-    Args:
-        on_start: called with the server's address once the port is bound.
-
-    Raises:
-        PlayerError: the port is taken, or may not be used.
-    """
+    """Serve until Ctrl-C or SIGTERM; ``on_start`` is called with the server's address once the port is bound. Raises
+    PlayerError if the port is taken, or may not be used."""
     with bound(port, address=address) as listening:
         name = f"[{address}]" if ":" in address else address
         on_start(f"http://{name}:{listening.getsockname()[1]}/")

@@ -104,7 +104,7 @@ class ManifestWatch:
     async def _watch(self) -> None:
         while self.waiters:
             async with self._lock:
-                with suppress(OSError):  # The next request raises it.
+                with suppress(OSError, StreamError):  # The next request raises it.
                     await self._poll()
             await asyncio.sleep(POLL_SECONDS)
 
@@ -129,7 +129,7 @@ class ManifestWatch:
                 return self._stamp, self._found
             if len(file) > MAX_MANIFEST_BYTES:
                 raise BrokenManifest(f"{MANIFEST} has {len(file)} bytes; expected at most {MAX_MANIFEST_BYTES}.")
-            content = file.read(0, len(file))
+            content = file[:]
         sure = time.time_ns() - file.stamp.modified_ns > TICK_NS
         same = isinstance(self._found, Snapshot) and self._found.content == content
         return file.stamp if sure else None, self._found if same else snapshot(content)

@@ -85,11 +85,8 @@ def bundle() -> str:
 
 
 def policy(**sources: str) -> str:
-    """A Content-Security-Policy (Note [Own origin only]).
-
-    Args:
-        sources: further directives, with ``_`` for ``-``, as ``connect_src="'self'"``.
-    """
+    """A Content-Security-Policy (Note [Own origin only]); further directives have ``_`` for ``-``, as
+    ``connect_src="'self'"``."""
     directives = _POLICY | {name.replace("_", "-"): value for name, value in sources.items()}
     return "; ".join(f"{name} {value}" for name, value in directives.items())
 
@@ -101,24 +98,16 @@ SERVED_POLICY: Final = {"script_src": "'self' blob:", "connect_src": "'self' blo
 def linked_page(
     title: str, *, stream: str, module: str = "player.js", attributes: Mapping[str, str] | None = None
 ) -> str:
-    """A page that loads the player and the stream, for a server.
-
-    Args:
-        stream: address of the stream, relative to the page.
-        module: address of the player, relative to the page.
-        attributes: further attributes of the element.
-    """
+    """A page that loads the player and the stream, both by addresses relative to the page, for a server; the element
+    gets further ``attributes``."""
     script = f'<script type="module" src="{html.escape(module)}"></script>'
     body = f"{_element({'src': stream, **(attributes or {})})}\n{_NO_SCRIPT}"
     return html_page(title, head=_PLAYER_STYLE + script, body=body, rules=policy(**SERVED_POLICY))
 
 
 def single_page(title: str, *, module: str, stream: ByteSource) -> bytes:
-    """A page that contains player and stream, and can be opened from a disk without a server.
-
-    Raises:
-        PlayerError: the stream is too long for a page.
-    """
+    """A page that contains player and stream, and can be opened from a disk without a server. Raises PlayerError if the
+    stream is too long for a page."""
     if len(stream) > MAX_PAGE_STREAM_BYTES:
         raise PlayerError(
             f"The stream has {len(stream) / 1e6:.0f} MB, and a page can contain up to "
@@ -204,11 +193,8 @@ class StreamFile:
     path: Path
 
     def opened(self) -> FileBytes | StoredBytes:
-        """The open stream at its present length.
-
-        Raises:
-            StreamError: it cannot be read, or its first frames have been removed from the window.
-        """
+        """The open stream at its present length. Raises StreamError if it cannot be read, or its first frames have been
+        removed from the window."""
         if not is_segments(self.path):
             return FileBytes(self.path)
         stored = open_segments(self.path)
@@ -220,11 +206,8 @@ class StreamFile:
         return stored
 
     def state(self) -> tuple[int, bool]:
-        """Length of the file in bytes, and whether it is complete (has its index).
-
-        Raises:
-            StreamError: it cannot be read.
-        """
+        """Length of the file in bytes, and whether it is complete (has its index). Raises StreamError if it cannot be
+        read."""
         with self.opened() as data:
             return len(data), footer_offset(data) is not None
 
@@ -234,11 +217,7 @@ class StreamFile:
             check_has_header(data, str(self.path))
 
     def has_header(self) -> bool:
-        """Whether the file exists and has a whole header.
-
-        Raises:
-            StreamError: it is no stream, or of another version.
-        """
+        """Whether the file exists and has a whole header. Raises StreamError if it is no stream of this version."""
         manifest = self.path if self.path.name == MANIFEST else self.path / MANIFEST
         if not (manifest if is_segments(self.path) else self.path).exists():
             return False
@@ -250,11 +229,8 @@ class StreamFile:
 
 
 def check_has_header(data: ByteSource, name: str) -> None:
-    """Check that a stream has a whole header.
-
-    Raises:
-        StreamError: it is empty, no stream, of another version, or truncated within its header.
-    """
+    """Check that a stream has a whole header. Raises StreamError if it is empty, no stream, of another version, or
+    truncated within its header."""
     if not len(data):
         raise StreamError(f"{name} is empty; expected a stream made by structgstream reconstruct.")
     check_prefix(data, name)

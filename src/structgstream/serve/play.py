@@ -34,16 +34,11 @@ MAX_SKIPPED = 8  # decoding and skipping up to this many frames costs less than 
 
 
 class Truth:
-    """Pictures of a capture, one camera and frame at a time.
+    """Pictures of a capture at the stream's size, one camera and frame at a time; ``cameras`` are in both capture and
+    stream.
 
-    They are decoded on demand and cached. Consecutive frames of one camera are decoded without seeking.
-
-    Args:
-        source: the part of the capture that the stream was made from, at the stream's size.
-        cameras: names of the cameras that are in both capture and stream.
-
-    Raises:
-        MissingExtraError: OpenCV, which encodes pictures, is not installed.
+    They are decoded on demand and cached. Consecutive frames of one camera are decoded without seeking. Raises
+    MissingExtraError without OpenCV, which encodes pictures.
     """
 
     def __init__(
@@ -60,11 +55,8 @@ class Truth:
         self.cached_bytes = 0
 
     def jpeg(self, camera: str, frame: int) -> bytes | None:
-        """A camera's picture as JPEG; None if there is no such camera or frame, or the camera is absent from it.
-
-        Raises:
-            CaptureError: the picture cannot be read.
-        """
+        """A camera's picture as JPEG; None if there is no such camera or frame, or the camera is absent from it. Raises
+        CaptureError if the picture cannot be read."""
         if camera not in self.cameras or not 0 <= frame < self.frames:
             return None
         with self._lock:

@@ -4,12 +4,14 @@
 import hashlib
 import re
 from collections.abc import AsyncIterator, Mapping
-from typing import Final, Protocol
+from typing import Final
 
 from anyio import to_thread
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 
+from structgstream.codec.container.byte_source import FileBytes
+from structgstream.codec.segments.stored_bytes import StoredBytes
 from structgstream.errors import StreamError
 
 PIECE_BYTES: Final = 256 * 1024
@@ -47,18 +49,8 @@ def etag_matches(headers: Mapping[str, str], etag: str) -> bool:
     return given.strip() == "*" or etag in names
 
 
-class OpenBytes(Protocol):
-    """An open file, or a file stored as segments."""
-
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, key: slice, /) -> bytes: ...
-
-    def close(self) -> None: ...
-
-
 def file_response(
-    opened: OpenBytes,
+    opened: FileBytes | StoredBytes,
     request: Request,
     headers: Mapping[str, str],
     *,
@@ -90,15 +82,12 @@ def file_response(
     return StreamingResponse(_pieces(opened, wanted), status, headers, media_type)
 
 
-async def _pieces(opened: OpenBytes, wanted: range) -> AsyncIterator[bytes]:
+async def _pieces(opened: FileBytes | StoredBytes, wanted: range) -> AsyncIterator[bytes]:
     """The bytes ``wanted`` of a file, which is closed afterwards; fewer if the file becomes shorter."""
     try:
         for start in range(wanted.start, wanted.stop, PIECE_BYTES):
             end = min(start + PIECE_BYTES, wanted.stop)
-            piece = await to_thread.run_sync(opened.__getitem__, slice(start, end))
-            yield piece
-            if len(piece) < end - start:
-                return
+            yield await to_thread.run_sync(opened.__getitem__, slice(start, end))
     except StreamError:
         return
     finally:

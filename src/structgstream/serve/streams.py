@@ -19,16 +19,15 @@ import re
 import stat
 import threading
 import time
-import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from io import FileIO
 from itertools import islice
 from pathlib import Path
 from typing import Final
 
 from structgstream.atomic_files import side_path
+from structgstream.codec.container.byte_source import FileBytes
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.quality_list import MAX_LIST_BYTES, QUALITIES, list_from_json
 from structgstream.codec.segments.store import is_ours
@@ -66,64 +65,28 @@ class FileStamp:
     size_bytes: int
 
 
-@dataclass(frozen=True)
-class OpenedFile:
-    """A regular file at its length when it was opened; closed by :meth:`close` or when the object is collected."""
+class OpenedFile(FileBytes):
+    """A regular file at its length when it was opened."""
 
-    file: FileIO
-    stamp: FileStamp
-
-    def __len__(self) -> int:
-        return self.stamp.size_bytes
-
-    def __getitem__(self, key: slice, /) -> bytes:
-        start, stop, _ = key.indices(len(self))
-        return self.read(start, max(stop - start, 0))
-
-    def read(self, start: int, count: int) -> bytes:
-        """Up to ``count`` bytes from ``start`` on; fewer if the file has become shorter."""
-        pieces = []
-        while count and (piece := os.pread(self.file.fileno(), count, start)):
-            pieces.append(piece)
-            start, count = start + len(piece), count - len(piece)
-        return pieces[0] if len(pieces) == 1 else b"".join(pieces)
-
-    def close(self) -> None:
-        """Closes the file."""
-        self.file.close()
-
-    def __enter__(self) -> "OpenedFile":
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        self.close()
+    def __init__(self, handle: int, name: str) -> None:
+        super().__init__(handle, name=name)
+        status = os.fstat(handle)
+        self.stamp = FileStamp(status.st_ino, status.st_mtime_ns, status.st_size)
 
 
 def open_below(folder: Path, *parts: str) -> OpenedFile | None:
-    """The regular file ``folder/parts[0]/...``; None if there is none that may be read (Note [No links]).
-
-    Args:
-        folder: may itself be a link, because the user named it.
-        parts: at least one plain name.
-
-    Raises:
-        OSError: the system cannot open files now.
-    """
+    """The regular file ``folder/parts[0]/...``; None if there is none that may be read (Note [No links]). The folder
+    may itself be a link, because the user named it. Raises OSError if the system cannot open files now."""
     try:
         handle = _opened(folder, parts)
     except OSError as error:
         if error.errno in _MISSING:
             return None
         raise
-    status = os.fstat(handle)
-    if not stat.S_ISREG(status.st_mode):
-        os.close(handle)
-        return None
-    file = FileIO(handle, "rb")
-    opened = OpenedFile(file, FileStamp(status.st_ino, status.st_mtime_ns, status.st_size))
-    # A request may be cancelled between the opening in a thread and the receipt of its result.
-    weakref.finalize(opened, file.close)
-    return opened
+    if stat.S_ISREG(os.fstat(handle).st_mode):
+        return OpenedFile(handle, parts[-1])
+    os.close(handle)
+    return None
 
 
 def _opened(folder: Path, parts: tuple[str, ...]) -> int:
@@ -256,7 +219,7 @@ def _renditions(root: Path, name: str) -> list[str | None]:
     if opened is None:
         return []
     with opened:
-        listed = list_from_json(opened.read(0, min(len(opened), MAX_LIST_BYTES + 1)), name=name)
+        listed = list_from_json(opened[: MAX_LIST_BYTES + 1], name=name)
     return [one.folder for one in sorted(listed, key=lambda one: one.bits_per_second)]
 
 

@@ -5,16 +5,15 @@ import time
 from collections.abc import Iterator, Mapping, Sized
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 
-from structgstream.codec.encoder import Encoded
 from structgstream.codec.packets import PacketKind
+from structgstream.codec.scene_coder import Encoded
 from structgstream.memory import PeakKind, PeakMeter
 from structgstream.scene.render import Drawable
 from structgstream.scene.scene import Scene
-from structgstream.session.pipeline import FrameRemarks
 from structgstream.training.result import FitResult
 
 T = TypeVar("T")
@@ -84,7 +83,7 @@ class FrameMeter:
         encoded: Encoded[StateT],
         size: int,
         *,
-        remarks: FrameRemarks | None = None,
+        remarks: Mapping[str, Any] | None = None,
     ) -> FrameReport:
         """The report of a frame with a packet of ``size`` bytes, including the remarks of its task."""
         packet, state = encoded.packet, encoded.reconstruction
@@ -109,7 +108,7 @@ class FrameMeter:
             peak_device_bytes=self._peaks.device_bytes,
             peak_memory_kind=self._peaks.kind,
             cpu_seconds=time.process_time() - self._cpu_started,
-            **({} if remarks is None else vars(remarks)),
+            **(remarks or {}),
         )
 
 

@@ -13,12 +13,11 @@ from typing import Generic
 
 import torch
 
-from structgstream.cameras import CameraRig
+from structgstream.cameras import CameraRig, Similarity, normalizing_similarity
 from structgstream.codec.container.records import MAX_PERIODS, Period
 from structgstream.codec.contents import PacketInfo
-from structgstream.codec.encoder import Encoded
-from structgstream.codec.header import check_picture_sizes
-from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
+from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader, check_picture_sizes
+from structgstream.codec.scene_coder import Encoded
 from structgstream.data.denoising import denoised
 from structgstream.data.points import PointsConfig, initial_points
 from structgstream.data.source import FrameStream, frame_count, is_recording, retain_frames
@@ -40,7 +39,6 @@ from structgstream.session.pipeline import (
 )
 from structgstream.session.presets import completed
 from structgstream.session.rate_control import RateController
-from structgstream.similarity import Similarity, normalizing_similarity
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.result import StepListener
 
@@ -320,11 +318,8 @@ def shows_enough(frame: MultiViewFrame, rig: CameraRig) -> bool:
 
 
 def check_enough_pictures(frame: MultiViewFrame, rig: CameraRig, capture: str) -> None:
-    """Check that at least two training cameras have pictures, which in frame 0 must not be blank.
-
-    Raises:
-        CaptureError: they do not; the message names the cameras.
-    """
+    """Check that at least two training cameras have pictures, which in frame 0 must not be blank. Raises CaptureError
+    if they do not; the message names the cameras."""
     present = frame.present(rig.training) if frame.index else frame.showing(rig.training)
     if len(present) < MIN_CAMERAS:
         raise CaptureError(
@@ -351,11 +346,8 @@ def initial_points_of(
 
 
 def check_resumable(header: StreamHeader, facts: StreamFacts) -> None:
-    """Check that a stream was made with the same method, configuration and capture.
-
-    Raises:
-        ConfigError: it was not; the message names the differences.
-    """
+    """Check that a stream was made with the same method, configuration and capture. Raises ConfigError if it was not;
+    the message names the differences."""
     if header.codec != facts.codec:
         raise ConfigError(
             f"The stream was made by another method or codec, {header.codec!r} instead of {facts.codec!r}. "

@@ -29,12 +29,8 @@ _SAME = 0.5  # tolerance in frames, because times of frames jitter
 
 
 class KeyFrames:
-    """Follows a stream's packets and decides the kind of the next one.
-
-    Args:
-        interval: frames of a group without skipped frames.
-        fps: frames per second of the media.
-    """
+    """Follows a stream's packets and decides the kind of the next one; a group has ``interval`` frames without skipped
+    ones."""
 
     def __init__(self, interval: int, fps: float) -> None:
         self._interval, self._seconds = interval, (interval - _SAME) / fps
@@ -107,15 +103,8 @@ class PeriodConfig:
 
 
 class PeriodPlan:
-    """Finds the frames that begin another period, from times and residuals of the frames before them.
-
-    Args:
-        config: conditions of a new period.
-        most: largest number of periods of a stream; the last one does not end.
-
-    Raises:
-        ConfigError: a value is out of range.
-    """
+    """Finds the frames that begin another period, from times and residuals of the frames before them; the last of
+    ``most`` periods does not end. Raises ConfigError if a value is out of range."""
 
     def __init__(self, config: PeriodConfig, *, most: int) -> None:
         for name, value, least in (("seconds", config.seconds, 0.0), ("residual", config.residual, 1.0)):

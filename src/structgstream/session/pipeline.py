@@ -13,11 +13,11 @@ from typing import Any, Generic, Protocol, TypeVar
 import torch
 from torch import Tensor
 
-from structgstream.cameras import CameraRig
+from structgstream.cameras import CameraRig, Similarity
 from structgstream.codec.container.records import Period
 from structgstream.codec.contents import PacketInfo
-from structgstream.codec.encoder import Encoded
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
+from structgstream.codec.scene_coder import Encoded
 from structgstream.data.denoising import DenoisingConfig
 from structgstream.data.points import PointsConfig
 from structgstream.frames import MultiViewFrame
@@ -25,7 +25,6 @@ from structgstream.kernels.backend import Backend
 from structgstream.scene.render import Drawable
 from structgstream.session.periods import PeriodConfig
 from structgstream.session.rate_control import RateConfig
-from structgstream.similarity import Similarity
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.result import FitResult, StepListener
 
@@ -38,53 +37,25 @@ Memory = TypeVar("Memory")
 
 @dataclass(frozen=True)
 class FrameTask:
-    """Input of a method for one frame, in normalised units.
+    """Input of a method for one frame, in normalised units."""
 
-    Args:
-        frame: pictures and time of the frame.
-        pictures: pictures of the training cameras, preprocessed by :meth:`Method.observe`.
-        rig: all cameras; held-out ones are not used.
-        points: computes initial points ``[P, 3]`` of the frame, which may take long.
-        backend: the compute back-end.
-        seed: seed of all random numbers, so that a frame can be repeated separately.
-        steps: the codec's quantization steps by name; empty in frame 0.
-        pressure: factor of the rate control (``rate_control``, Note [Pressure]).
-        begins: why the frame begins another period, in a few words (``periods``); None if it does not.
-        on_step: called after every optimisation step.
-    """
-
-    frame: MultiViewFrame
-    pictures: FramePictures
-    rig: CameraRig
-    points: Callable[[], Tensor]
-    backend: Backend
-    seed: int
-    steps: Mapping[str, float] = field(default_factory=dict)
-    pressure: float = 1.0
-    begins: str | None = None
-    on_step: StepListener | None = None
+    frame: MultiViewFrame  # pictures and time of the frame
+    pictures: FramePictures  # pictures of the training cameras, preprocessed by Method.observe
+    rig: CameraRig  # all cameras; held-out ones are not used
+    points: Callable[[], Tensor]  # computes initial points [P, 3] of the frame, which may take long
+    backend: Backend  # the compute back-end
+    seed: int  # seed of all random numbers, so that a frame can be repeated separately
+    steps: Mapping[str, float] = field(default_factory=dict)  # the codec's quantization steps by name; empty in frame 0
+    pressure: float = 1.0  # factor of the rate control (rate_control, Note [Pressure])
+    begins: str | None = None  # why the frame begins another period, in a few words (periods); None if it does not
+    on_step: StepListener | None = None  # called after every optimisation step
 
     @property
-    def remarks(self) -> "FrameRemarks":
-        """Remarks for the frame's report, in addition to its fit."""
+    def remarks(self) -> dict[str, Any]:
+        """What ``FrameReport`` states of its pictures; a training camera with a blank one is absent, too."""
         there = {*self.frame.showing(self.rig.training), *self.frame.present(self.rig.testing)}
         absent = tuple(name for name in self.rig if name not in there)
-        return FrameRemarks(absent, self.begins, self.frame.mean_of)
-
-
-@dataclass(frozen=True)
-class FrameRemarks:
-    """Remarks of a frame's report on its pictures.
-
-    Args:
-        absent: the cameras without a picture that counts, and training cameras with a blank one, in the rig's order.
-        begins: see :class:`FrameTask`.
-        mean_of: see ``MultiViewFrame``.
-    """
-
-    absent: tuple[str, ...]
-    begins: str | None
-    mean_of: float
+        return {"absent": absent, "begins": self.begins, "mean_of": self.frame.mean_of}
 
 
 EQUAL_INTERVALS = 0.25
@@ -95,19 +66,14 @@ MAX_INTERVALS = 3.0
 
 @dataclass(frozen=True)
 class Past(Generic[State, Memory]):
-    """The state from which a frame is fitted.
+    """The state from which a frame is fitted."""
 
-    Args:
-        state: the previous decoded frame (``codec.encoder``, Note [Closed loop]).
-        memory: see :meth:`Method.prepare`.
-        older: the decoded frame before that, if the method needs it and it is of the same period. Frames that show
-            nothing, whose scene is that of the frame before them, do not count for either.
-        seconds: presentation times of ``older`` and ``state``; None where one of them is unknown.
-    """
-
-    state: State
-    memory: Memory
+    state: State  # the previous decoded frame (codec.scene_coder, Note [Closed loop])
+    memory: Memory  # see Method.prepare
+    # the decoded frame before that, if the method needs it and it is of the same period. Frames that show nothing,
+    # whose scene is that of the frame before them, do not count for either.
     older: State | None = None
+    # presentation times of older and state; None where one of them is unknown
     seconds: tuple[float, float] | None = None
 
     def intervals(self, pts_seconds: float) -> float:
@@ -156,23 +122,14 @@ class Method(Protocol[State, Memory]):
 
 @dataclass(frozen=True)
 class StreamFacts:
-    """Facts of a run for the header; a run that resumes the stream must have the same ones.
+    """Facts of a run for the header; a run that resumes the stream must have the same ones."""
 
-    Args:
-        codec: name of the codec.
-        rig: every camera, in the capture's own units.
-        similarity: from the capture's units to the scene's.
-        fps: frames per second of the media.
-        config: the resolved configuration, as plain JSON values.
-        metadata: capture name, start frame and the like, as plain JSON values.
-    """
-
-    codec: str
-    rig: CameraRig
-    similarity: Similarity
-    fps: float
-    config: Mapping[str, Any]
-    metadata: Mapping[str, Any]
+    codec: str  # name of the codec
+    rig: CameraRig  # every camera, in the capture's own units
+    similarity: Similarity  # from the capture's units to the scene's
+    fps: float  # frames per second of the media
+    config: Mapping[str, Any]  # the resolved configuration, as plain JSON values
+    metadata: Mapping[str, Any]  # capture name, start frame and the like, as plain JSON values
 
 
 class StoredStream(Protocol[State_co]):

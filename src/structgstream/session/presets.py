@@ -2,22 +2,12 @@
 """Configurations as values. Paper mode is a preset; the paper's ablations are edits of a preset."""
 
 import math
-import re
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, ClassVar, Literal
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from types import UnionType
+from typing import Any, ClassVar, Literal, Union, get_args, get_origin, get_type_hints
 
 from structgstream.cameras import CameraRig
-from structgstream.config_fields import (
-    check_numbers,
-    holds,
-    plain_value,
-    read_value,
-    unknown_fields,
-    with_present_names,
-    without_constants,
-    without_fields,
-)
 from structgstream.data.denoising import DenoisingConfig
 from structgstream.data.points import PointsConfig
 from structgstream.errors import ConfigError
@@ -39,6 +29,92 @@ from structgstream.training.online.config import (
     ThinSpawnConfig,
 )
 from structgstream.training.parameters import RoundingConfig
+
+SIGNED = frozenset({"quality", "tiles_around"})
+"""Fields that may be negative."""
+SHARES = frozenset({"mean_of_last", "motion_prior", "picture_scale", "dropped_share", "occluded_share"})
+"""Fields that are at most 1."""
+POSITIVE = frozenset({"picture_scale", "key_interval_seconds"})
+"""Fields that must not be 0."""
+_KINDS: Mapping[Any, tuple[type, ...]] = {int: (int,), float: (int, float), bool: (bool,)}
+
+
+def holds(found: Any, given: Any) -> bool:
+    """Whether ``found`` has all that is ``given``."""
+    if isinstance(given, list) and isinstance(found, list):
+        return len(found) == len(given) and all(map(holds, found, given))
+    if isinstance(given, dict) and isinstance(found, dict):
+        return all((key == "period" and key not in found) or holds(found.get(key), item) for key, item in given.items())
+    return (type(found) is type(given) and found == given) or (_is_number(found, given) and found == given)
+
+
+def _is_number(*values: Any) -> bool:
+    return all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
+
+
+def unknown_fields(kind: Any, values: Any, path: str = "") -> Iterator[str]:
+    """Paths in ``values`` of fields that the dataclass ``kind`` lacks."""
+    hints = get_type_hints(kind) if isinstance(kind, type) and is_dataclass(kind) else {}
+    for name, item in values.items() if hints and isinstance(values, Mapping) else ():
+        if name not in hints:
+            yield f"{path}{name}"
+        else:
+            yield from unknown_fields(hints[name], item, f"{path}{name}.")
+
+
+def plain_value(value: Any) -> Any:
+    """``value``, of a configuration, as plain JSON values."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return plain_value(asdict(value))
+    if isinstance(value, dict):
+        return {key: plain_value(item) for key, item in value.items()}
+    if isinstance(value, frozenset | set):
+        return sorted(value)
+    return [plain_value(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def check_numbers(config: Any, path: str = "") -> None:
+    """Check every number of a configuration and of those in it: finite, not negative, and within its bounds.
+
+    Raises:
+        ConfigError: naming the field by its path.
+    """
+    hints = get_type_hints(type(config))
+    for item in fields(config):
+        value, where = getattr(config, item.name), f"{path}{item.name}"
+        if is_dataclass(value):
+            check_numbers(value, f"{where}.")
+        elif isinstance(value, tuple):
+            for number in value:
+                _check_number(number, item.name, where)
+        elif hints[item.name] in _KINDS and type(value) not in _KINDS[hints[item.name]]:
+            expected = {int: "a whole number", float: "a number", bool: "true or false"}[hints[item.name]]
+            raise ConfigError(f"{where} is {value!r}; expected {expected}.")
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            _check_number(value, item.name, where)
+
+
+def _check_number(value: float, name: str, where: str) -> None:
+    shares, positive = name in SHARES, name in POSITIVE
+    least, most = (-math.inf if name in SIGNED else 0.0), (1.0 if shares else math.inf)
+    if not math.isfinite(value) or not least <= value <= most or (positive and value == 0):
+        start = "more than 0" if positive else "a finite number" if name in SIGNED else "0 or more"
+        raise ConfigError(f"{where} is {value!r}; expected {start}{', and at most 1' if shares else ''}.")
+
+
+def read_value(kind: Any, value: Any) -> Any:
+    """``value``, plain JSON, as a ``kind``: a dataclass, a container, or what JSON has itself."""
+    if isinstance(kind, type) and is_dataclass(kind):
+        hints = get_type_hints(kind)
+        return kind(**{name: read_value(hints[name], item) for name, item in value.items()})
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin in (Union, UnionType):
+        (kind,) = (of for of in arguments if of is not type(None))
+        return None if value is None else read_value(kind, value)
+    if origin is tuple:
+        return tuple(read_value(arguments[0], item) for item in value)
+    return origin(value) if origin in (frozenset, dict) else value
+
 
 MAX_QUALITY = 6.0  # steps 64 times as small, or as large
 
@@ -83,69 +159,14 @@ def to_json(config: StreamConfig) -> dict[str, Any]:
     return found
 
 
-WITHDRAWN = frozenset(
-    {
-        "initial.disturbance.view_noise",
-        "initial.disturbance.view_noise_left",
-        "initial.growth.contribution_at",
-        "initial.growth.least_contribution",
-        "initial.rates.positions",
-        "online.least_gain",
-        "online.losses.offset_distance",
-        "online.losses.offset_distance_reading",
-        "online.losses.offset_distance_reduction",
-        "online.motion.full_every_frames",
-        "online.motion.least_views_share",
-        "online.motion.tiles",
-        "online.motion.unseen_pixels",
-    }
-)
-"""Fields of earlier versions whose mechanisms are gone. A stream that has them goes on by this version's method."""
-
-
-RENAMED: Mapping[str, str] = {
-    "initial.disturbance": "perturbation",
-    "initial.free_space": "floaters",
-    "initial.solidity": "depth_distortion",
-    "online.births": "spawn",
-    "online.births.blame_share": "outlier_share",
-    "online.births.blame_views": "outlier_views",
-    "online.births.crowded": "overflow",
-    "online.births.thin.crowded": "overflow",
-    "online.coherence": "smoothness",
-    "online.light": "exposure",
-    "online.motion.carried_share": "occluded_share",
-    "online.motion.moved_ease": "hysteresis",
-    "online.start": "scene_flow",
-}
-"""The names that fields of earlier versions, by their whole path, have now; beside them ``least_`` is ``min_`` and
-``most_`` is ``max_``."""
-
-
-def present_name(path: str) -> str:
-    """The present name of the field or group that had ``path`` in an earlier version."""
-    name = path.rpartition(".")[2]
-    return RENAMED.get(path) or re.sub("^most_", "max_", re.sub("^least_", "min_", name))
-
-
-def renamed(path: str) -> str:
-    """The present path of a field or a group that had ``path`` in an earlier version."""
-    parts = path.split(".")
-    return ".".join(present_name(".".join(parts[: n + 1])) for n in range(len(parts)))
-
-
 def from_json(values: Mapping[str, Any]) -> StreamConfig:
     """The configuration that :func:`to_json` turned into ``values``, such as a stream's header has.
 
-    Fields that ``values`` lacks, as those of an older version do, have their defaults; renamed ones are read by their
-    earlier names (:func:`present_name`). :data:`WITHDRAWN` ones are ignored, and so
-    are those that are constants now and have the constant's value.
+    Fields that ``values`` lacks have their defaults.
 
     Raises:
-        ConfigError: there is a field that this version does not have, another value than that of a constant, or a value
-            that no field can have.
+        ConfigError: there is a field that this version does not have, or a value that no field can have.
     """
-    values = without_constants(StreamConfig, with_present_names(without_fields(values, WITHDRAWN), present_name))
     if unknown := [*unknown_fields(StreamConfig, values)]:
         raise ConfigError(
             f"The header's configuration has the field {unknown[0]}, which this version of structgstream does not "
@@ -169,28 +190,15 @@ def completed(values: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def preset_named(name: str) -> StreamConfig:
-    """The configuration of a preset.
-
-    Raises:
-        ConfigError: there is no such preset.
-    """
+    """The configuration of a preset. Raises ConfigError if there is no such preset."""
     if name not in PRESETS:
         raise ConfigError(f"there is no preset {name!r}; there are {', '.join(PRESETS)}.")
     return PRESETS[name]
 
 
 def with_budget(config: StreamConfig, *, name: str | None, quality: float | None, mbits: float | None) -> StreamConfig:
-    """``config`` with another quality and a target rate, if they are given.
-
-    Args:
-        config: of a compact stream.
-        name: of its preset, for messages.
-        quality: every quantization step is multiplied by 2^-quality; 0 is the preset's own.
-        mbits: target rate in Mbit/s.
-
-    Raises:
-        ConfigError: the codec is not ``compact``, or a value is out of range.
-    """
+    """``config`` with another quality, by 2^-quality of which every quantization step is multiplied, and a target rate
+    in Mbit/s, if they are given. Raises ConfigError if the codec is not ``compact``, or a value is out of range."""
     if quality is None and mbits is None:
         return config
     if config.codec != "compact":
@@ -228,25 +236,15 @@ Section Implementations gives one set of them for all data sets; what differs is
 
 @dataclass(frozen=True)
 class PaperData:
-    """The paper's properties of one data set (section Datasets), which are all that differs between its experiments.
+    """The paper's properties of one data set (section Datasets), which are all that differs between its experiments."""
 
-    Args:
-        width: of the pictures that are trained on and scored, pixels, after reduction.
-        height: the same.
-        cameras: number of cameras of the rig.
-        held_out: number of held-out cameras; None if the paper does not state it.
-        held_out_camera: the camera that published results hold out.
-        scale: of the pictures relative to the stored ones; ``--scale`` of ``reconstruct``.
-        undistorted: whether fisheye pictures were undistorted first.
-    """
-
-    width: int
-    height: int
-    cameras: int
-    held_out: int | None
-    held_out_camera: str
-    scale: float = 1.0
-    undistorted: bool = False
+    width: int  # of the pictures that are trained on and scored, pixels, after reduction
+    height: int  # the same
+    cameras: int  # number of cameras of the rig
+    held_out: int | None  # number of held-out cameras; None if the paper does not state it
+    held_out_camera: str  # the camera that published results hold out
+    scale: float = 1.0  # of the pictures relative to the stored ones; --scale of reconstruct
+    undistorted: bool = False  # whether fisheye pictures were undistorted first
 
 
 PAPER_DATA: Mapping[str, PaperData] = {

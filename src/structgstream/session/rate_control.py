@@ -72,17 +72,9 @@ class RateController:
     """Computes the pressure of the next frame from the sizes of all packets in order.
 
     The pressure is multiplied by the ratio of the last delta packet's size to the next one's budget. Bytes fall with
-    about the cube root of lambda, so each step corrects about a third of the excess.
-
-    Args:
-        config: the target.
-        fps: frames per second of the media.
-        keys: follows the same packets, and must receive each of them before this object does.
-
-    A warning is logged when the target starts to be missed.
-
-    Raises:
-        ConfigError: a target that is not positive.
+    about the cube root of lambda, so each step corrects about a third of the excess. ``keys`` must receive each packet
+    before this object does. A warning is logged when the target starts to be missed. Raises ConfigError if the target
+    is not positive.
     """
 
     def __init__(self, config: RateConfig, fps: float, *, keys: KeyFrames) -> None:

@@ -1,53 +1,159 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The method Struct-GStream: frame 0 from initial points, each later frame from the decoded previous one."""
+"""Struct-GStream: frame 0 from initial points, each later frame from the decoded previous one; and its two codecs of
+scenes, ``raw`` and ``compact``, with their headers."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
 
 from structgstream.cameras import CameraRig
-from structgstream.errors import ConfigError
+from structgstream.codec.fields.quantization import float32, round_to_bins
+from structgstream.codec.packets import StreamHeader
+from structgstream.codec.reader import StreamReader
+from structgstream.codec.scene_coder import SceneEncoder
+from structgstream.codec.sinks import FileSink
+from structgstream.errors import CalibrationError, ConfigError
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
+from structgstream.scene.appearance import with_appearance
+from structgstream.scene.order import in_morton_order
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import on_device
-from structgstream.session.pipeline import FrameTask, Past, Pipeline
+from structgstream.scene.state import (
+    FieldName,
+    fields_of,
+    on_device,
+    parameters_of,
+    scene_of,
+    state_of,
+    with_dynamic_fields,
+)
+from structgstream.session.pipeline import FrameTask, Past, Pipeline, StreamFacts
 from structgstream.session.presets import StreamConfig, to_json
 from structgstream.session.rate_control import with_rate_control
-from structgstream.session.scene_codecs import scene_codec
 from structgstream.training.frame0.fit import fit_first_frame, fit_first_frame_again
+from structgstream.training.frame0.quantization import estimate_sensitivity, quantize_first_frame, regauge
 from structgstream.training.frame0.seeding import fit_environment
 from structgstream.training.online.exposure import ExposureReference, exposure_reference
 from structgstream.training.online.fit import fit_next_frame, needs_older
 from structgstream.training.online.preprocess import FramePictures, preprocess
+from structgstream.training.parameters import pixel_size
 from structgstream.training.residuals import ResidualFloor, mean_residual, residual_floor
 from structgstream.training.result import FitResult
 
 
 @dataclass(frozen=True)
+class QuantizationSteps:
+    """Quantization steps of a stream, as stored in the header; empty with codec ``raw``."""
+
+    steps: Mapping[str, float] = field(default_factory=dict)  # steps of packets, by parameter
+    init_steps: Mapping[FieldName, float] = field(default_factory=dict)  # steps of the init record, by field
+
+
+@dataclass(frozen=True)
+class SceneCodec:
+    """Stores scenes: with codec ``raw`` every number as float32; with ``compact`` all values are quantized
+    (``codec/fields/quantization.py``, Note [Bins]), and anchors are in Z-order."""
+
+    config: StreamConfig
+
+    @property
+    def name(self) -> str:
+        """The value of the header's ``codec``."""
+        return self.config.codec
+
+    def key_interval(self, fps: float) -> int:
+        """Frames from one key packet to the next."""
+        return max(1, round(fps * self.config.key_interval_seconds))
+
+    def file(self, path: Path, *, frames: int | None, resume: bool) -> tuple[FileSink, StreamReader | None]:
+        """A sink to the file, which is replaced unless it is resumed; ``frames`` is not used.
+
+        Raises:
+            StorageError: another process writes to the file.
+            StreamError: the file to resume is not a stream, or is damaged so that it cannot be continued.
+        """
+        sink = FileSink(path, overwrite=True)
+        sink.check_unused()
+        return FileSink.resume(path) if resume else (sink, None)
+
+    def coder(self, header: StreamHeader, device: torch.device) -> SceneEncoder:
+        """The encoder of the stream, on the CPU."""
+        return SceneEncoder(header)
+
+    def prepare(self, fitted: Scene, task: FrameTask, facts: StreamFacts) -> tuple[Scene, StreamHeader]:
+        """The reconstruction of a period's first frame, which later frames and receivers use, and its header."""
+        scene, step_sizes = self._initialize_stream(fitted, task)
+        state, dynamic = state_of(scene), self.config.online.dynamic
+        reference = dynamic.difference(fields_of("free")) if step_sizes.steps else ()
+        header = StreamHeader(
+            rig=facts.rig,
+            similarity=facts.similarity,
+            fps=facts.fps,
+            codec=facts.codec,
+            dynamic=dynamic,
+            static={name: value.cpu() for name, value in state.items() if name not in dynamic},
+            distance_input=scene.distance_input,
+            config=facts.config,
+            metadata=facts.metadata,
+            steps=step_sizes.steps,
+            reference={name: state[name].cpu() for name in reference},
+            init_steps=step_sizes.init_steps,
+            periods=self.config.period.enabled,
+        )
+        return scene, header
+
+    def _initialize_stream(self, scene: Scene, task: FrameTask) -> tuple[Scene, QuantizationSteps]:
+        """The reconstruction of frame 0, as a receiver decodes it, and its steps."""
+        if self.config.codec == "raw":
+            return self._with_dynamic_fields(scene), QuantizationSteps()
+        dynamic, rounding = self.config.online.dynamic, self.config.online.rounding
+        scene, sensitivity = regauge(scene, estimate_sensitivity(scene, task.rig, backend=task.backend, seed=task.seed))
+        scene = self._with_dynamic_fields(scene)
+        pixel = pixel_size(scene.anchors.positions, [task.rig[name] for name in task.rig.training])
+        if pixel is None:
+            raise CalibrationError(
+                "No training camera sees an anchor of frame 0, so positions have no step; check the calibration with "
+                "structgstream prepare --check."
+            )
+        known = rounding.steps(pixel)
+        used = {parameter.name for parameter in parameters_of(dynamic)}
+        steps = {name: float32(step) for name, step in known.items() if name in used}
+        voxel_size = self.config.initial.voxel_size
+        scene, init_steps = quantize_first_frame(
+            scene, sensitivity, config=rounding, voxel_size=voxel_size, steps=steps
+        )
+        if scene.environment is not None:
+            init_steps["environment"] = float32(self.config.environment.STEP)
+        rounded = round_to_bins(state_of(in_morton_order(scene, step=init_steps["anchor_positions"])), init_steps)
+        scene = scene_of(rounded, distance_input=scene.distance_input, sampling=scene.sampling)
+        return scene, QuantizationSteps(steps, init_steps)
+
+    def _with_dynamic_fields(self, scene: Scene) -> Scene:
+        """``scene`` with all dynamic fields; dynamic appearance gets its basis."""
+        online = self.config.online
+        if "appearance" in online.dynamic:
+            scene = with_appearance(scene, online.appearance_rank)
+        return with_dynamic_fields(scene, online.dynamic)
+
+
+@dataclass(frozen=True)
 class FrameZeroContext:
-    """The data of a period's first frame that later frames need in addition to its scene; None if not used.
+    """The data of a period's first frame that later frames need in addition to its scene; None if not used."""
 
-    Args:
-        floor: baseline residuals.
-        light: exposure reference: its pictures and F_c.
-    """
-
-    floor: ResidualFloor | None = None
-    light: ExposureReference | None = None
+    floor: ResidualFloor | None = None  # baseline residuals
+    light: ExposureReference | None = None  # exposure reference: its pictures and F_c
 
 
 @dataclass(frozen=True)
 class StructGStream:
-    """The method. Its memory is :class:`FrameZeroContext`.
+    """The method. Its memory is :class:`FrameZeroContext`."""
 
-    Args:
-        config: configuration of the stream.
-        fitted: returns an earlier fit of frame 0 with the same capture, seed and ``config.initial``, for configurations
-            that differ only in later frames. None: frame 0 is fitted.
-    """
-
-    config: StreamConfig
+    config: StreamConfig  # configuration of the stream
+    # returns an earlier fit of frame 0 with the same capture, seed and config.initial, for configurations that differ
+    # only in later frames. None: frame 0 is fitted.
     fitted: Callable[[], FitResult[Scene]] | None = None
 
     @property
@@ -57,7 +163,6 @@ class StructGStream:
 
     @property
     def needs_older(self) -> bool:
-        """See ``training.online.needs_older``."""
         return needs_older(self.config.online)
 
     def observe(
@@ -171,7 +276,7 @@ def stream_pipeline(
     method = StructGStream(config, fitted)
     return Pipeline(
         method,
-        scene_codec(config),
+        SceneCodec(config),
         config=to_json(config),
         seed=config.seed,
         normalised_radius=config.NORMALISED_RADIUS,

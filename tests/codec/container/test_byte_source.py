@@ -46,15 +46,8 @@ def test_what_is_appended_is_not_seen_and_what_is_cut_is_reported(path: Path) ->
 
 def test_a_read_that_gives_less_at_a_time_is_repeated(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stored = FileBytes(path)
-    read = stored._file.read
-
-    class Slow:
-        seek = stored._file.seek
-
-        def read(self, count: int) -> bytes:
-            return read(min(count, 7))
-
-    monkeypatch.setattr(stored, "_file", Slow())
+    pread = os.pread
+    monkeypatch.setattr(os, "pread", lambda handle, count, start: pread(handle, min(count, 7), start))
     assert stored[10:150] == DATA[10:150]
     assert stored[10:900] == DATA[10:]
 

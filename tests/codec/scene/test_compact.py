@@ -15,12 +15,18 @@ from hypothesis import strategies as st
 
 from structgstream.codec.container.blocks import coded_payloads
 from structgstream.codec.container.records import FRAME, RECORD, RecordType, scan_records
-from structgstream.codec.decoder import CompactDecoder, SceneDecoder
-from structgstream.codec.encoder import CompactEncoder, SceneEncoder
 from structgstream.codec.fields.packet_fields import CODABLE
-from structgstream.codec.header import check_shapes, pack_header, unpack_header
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet
+from structgstream.codec.packets import (
+    Packet,
+    PacketKind,
+    StreamHeader,
+    check_shapes,
+    pack_header,
+    parse_packet,
+    unpack_header,
+)
 from structgstream.codec.reader import StreamReader
+from structgstream.codec.scene_coder import CompactCoder, SceneDecoder, SceneEncoder
 from structgstream.codec.sinks import MemorySink
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
@@ -163,7 +169,7 @@ def test_a_packet_out_of_order() -> None:
 
 def test_an_encoder_keeps_the_order_as_well() -> None:
     first = small_scene()
-    encoder = CompactEncoder(compact_header(first))
+    encoder = CompactCoder(compact_header(first))
     with pytest.raises(StreamError, match="Packet 0 needs packet -1"):
         encoder.encode(state_of(first), kind=PacketKind.DELTA, index=0)
     encoder.encode(state_of(first), kind=PacketKind.KEY, index=0)
@@ -172,7 +178,7 @@ def test_an_encoder_keeps_the_order_as_well() -> None:
 
 
 def test_a_scene_of_another_size_is_refused() -> None:
-    encoder = CompactEncoder(compact_header(small_scene(3)))
+    encoder = CompactCoder(compact_header(small_scene(3)))
     with pytest.raises(StreamError, match="Frame 0 has 4 anchors, the header 3"):
         encoder.encode(state_of(small_scene(4)), kind=PacketKind.KEY, index=0)
     state: dict[FieldName, torch.Tensor] = {**state_of(small_scene(3)), "covariance_mlp": torch.zeros(7)}
@@ -288,7 +294,7 @@ def flipped(data: bytes, places: Sequence[int]) -> Iterator[bytes]:
 def test_every_byte_of_a_packet_changed_gives_a_scene_or_one_kind_of_error(index: int) -> None:
     """With the checksum out of the way, the decoders see it all."""
     header, _, seen, packets = small()
-    decoder = CompactDecoder(header)
+    decoder = CompactCoder(header)
     for packet in packets[(index // 3) * 3 : index]:
         decoder.decode(coded_payloads(packet.payload, FRAME.size, where=""), kind=packet.kind, index=packet.index)
     state, failed, different = decoder.state, 0, 0
@@ -344,7 +350,7 @@ def test_a_mangled_file_gives_scenes_or_one_kind_of_error(data: st.DataObject) -
 def test_truncated_fields(field: FieldName) -> None:
     """Each field cut at each of its bytes, and with one more; now and then a cut one is a code of something else."""
     header, _, seen, packets = small()
-    coded = CompactEncoder(header).encode(state_of(seen[0]), kind=PacketKind.KEY, index=0)
+    coded = CompactCoder(header).encode(state_of(seen[0]), kind=PacketKind.KEY, index=0)
     decoder = SceneDecoder(header)._compact
     assert decoder is not None
     failed, cuts = 0, [coded[field][:end] for end in range(len(coded[field]))]

@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from structgstream.codec.header import check_shapes
+from structgstream.codec.packets import check_shapes
 from structgstream.errors import StreamError
 from structgstream.scene.appearance import with_appearance
 from structgstream.scene.state import STATE_TABLE, FieldName, state_of

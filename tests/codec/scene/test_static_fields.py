@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.codec.entropy.bits import varint
-from structgstream.codec.entropy.section_coder import SectionEncoder, Tables
+from structgstream.codec.entropy.rans import SectionEncoder
 from structgstream.codec.fields.quantization import round_to_bins
 from structgstream.codec.fields.static_fields import (
     FREE_NUMBERS,
@@ -205,7 +205,7 @@ def test_few_bytes_do_not_make_many_numbers() -> None:
     with pytest.raises(StreamError, match=message):
         decode_fields({"anchor_positions": varint(most + 2000) + positions(most)[3:]}, STEPS)
     anchors = FREE_NUMBERS // 256
-    encoder = SectionEncoder(Tables())
+    encoder = SectionEncoder()
     encoder.number("anchor_features.columns", 256)
     many: dict[FieldName, bytes] = {
         "anchor_positions": positions(anchors),
@@ -229,7 +229,7 @@ def test_offsets_and_directions_that_do_not_fit() -> None:
 
 
 def test_an_environment_of_no_whole_rows() -> None:
-    alone = SectionEncoder(Tables())
+    alone = SectionEncoder()
     alone.number("environment.count", 4)
     alone.naturals("environment.value", np.arange(4), np.zeros(4, np.uint16), count=1)
     with pytest.raises(StreamError, match=r"holds 4 numbers of environment, which do not fit \(1, 3\)"):
@@ -238,7 +238,7 @@ def test_an_environment_of_no_whole_rows() -> None:
 
 def _unchecked(fields: dict[FieldName, torch.Tensor]) -> dict[FieldName, bytes]:
     whole = encode_fields(fields_of(), STEPS)
-    alone = SectionEncoder(Tables())
+    alone = SectionEncoder()
     bins = np.rint(fields["appearance_basis"].numpy().ravel() / STEPS["appearance_basis"]).astype(np.int64)
     alone.number("appearance_basis.count", len(bins))
     values = np.where(bins < 0, -2 * bins - 1, 2 * bins)

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from structgstream.cameras import Similarity
 from structgstream.codec.container.records import scan_records
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.errors import StorageError, StreamError
 from structgstream.scene.state import STATE_TABLE
-from structgstream.similarity import Similarity
 from structgstream_studies.peers.container import (
     PeerReader,
     PeerSink,

@@ -63,11 +63,8 @@ def pack_coded_block(name: FieldName, data: bytes) -> bytes:
 
 
 def iterate_blocks(payload: ByteSource, start: int, *, where: str) -> Iterator[Block]:
-    """Every block from byte ``start`` to the end.
-
-    Raises:
-        StreamError: an unknown field or coding, a repeated field, or a size beyond the payload.
-    """
+    """Every block from byte ``start`` to the end. Raises StreamError for an unknown field or coding, a
+    repeated field, or a size beyond the payload."""
     seen: set[int] = set()
     while start < len(payload):
         if start + BLOCK.size > len(payload):
@@ -148,11 +145,8 @@ _ZSTD_LEVEL = 19
 
 
 def pack_init(description: Mapping[str, Any], blocks: Iterable[bytes]) -> bytes:
-    """The payload of a description, which is plain JSON values, and blocks.
-
-    Raises:
-        StreamError: the description is too long.
-    """
+    """The payload of a description, which is plain JSON values, and blocks. Raises StreamError if the description is
+    too long."""
     text = json.dumps(description, sort_keys=True, allow_nan=False, separators=(",", ":")).encode()
     if len(text) > MAX_JSON_BYTES:
         raise StreamError(
@@ -164,11 +158,8 @@ def pack_init(description: Mapping[str, Any], blocks: Iterable[bytes]) -> bytes:
 
 
 def first_block(payload: bytes) -> int:
-    """The byte where the description ends and field blocks begin.
-
-    Raises:
-        StreamError: the payload is too short for it.
-    """
+    """The byte where the description ends and field blocks begin. Raises StreamError if the payload is too short for
+    it."""
     if len(payload) < LENGTH.size:
         raise StreamError("The init record is too short.")
     (length,) = LENGTH.unpack_from(payload)
@@ -197,11 +188,7 @@ def read_description(payload: bytes) -> dict[str, Any]:
 
 
 def field_sizes(payload: bytes) -> dict[str, int]:
-    """Bytes of each field in the payload.
-
-    Raises:
-        StreamError: the payload violates the format.
-    """
+    """Bytes of each field in the payload. Raises StreamError if the payload violates the format."""
     blocks = iterate_blocks(payload, first_block(payload), where="The init record")
     return {block.name: block.end - block.start for block in blocks}
 

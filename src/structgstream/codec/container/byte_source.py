@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random-access bytes, in memory or in a file that is read on demand; and the room that a disk has left."""
 
+import os
 import shutil
-import threading
 import weakref
 from io import FileIO
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, Self
 
 from structgstream.errors import StorageError, StreamError
 
@@ -25,48 +25,45 @@ class FileBytes:
     The length is that at opening; bytes appended later by a running reconstruction are not visible. Thread-safe. The
     file is closed by :meth:`close` or when the object is collected.
 
+    Args:
+        file: its path, or an open descriptor, which is closed with this object.
+        name: of the file, for messages; None for the path.
+
     Raises:
         StreamError: it cannot be read; on slicing also if it is closed or has become shorter.
     """
 
-    def __init__(self, path: Path | str) -> None:
-        self._path = path
+    def __init__(self, file: Path | str | int, *, name: str | None = None) -> None:
+        self._name = str(file) if name is None else name
         try:
-            self._file = FileIO(path)
+            self._file = FileIO(file)
             # The finalizer refers to the file, not to this object, so that an unclosed reader leaks no open file.
             self._finalizer = weakref.finalize(self, self._file.close)
             self._size = self._file.seek(0, 2)
         except OSError as error:
-            raise StreamError(f"Cannot read {path} ({error.strerror}); expected a stream file.") from error
-        self._lock = threading.Lock()
+            raise StreamError(f"Cannot read {self._name} ({error.strerror}); expected a stream file.") from error
 
     def __len__(self) -> int:
         return self._size
 
     def __getitem__(self, key: slice, /) -> bytes:
         start, stop, _ = key.indices(self._size)
-        try:
-            with self._lock:
-                self._file.seek(start)
-                return self._read(max(stop - start, 0))
-        except OSError as error:
-            raise StreamError(f"Cannot read {self._path} ({error.strerror}); it could be read before.") from error
-        except ValueError as error:
-            raise StreamError(f"Cannot read {self._path}: it has been closed; open it again.") from error
-
-    def _read(self, count: int) -> bytes:
-        """``count`` bytes from the file's position; the operating system may return fewer per call."""
         pieces = []
-        while count:
-            if not (piece := self._file.read(count)):
-                raise StreamError(
-                    f"Cannot read {self._path}: it has become shorter since it was opened; open it again."
-                )
-            pieces.append(piece)
-            count -= len(piece)
+        try:
+            while start < stop:  # The operating system may return fewer bytes per call.
+                if not (piece := os.pread(self._file.fileno(), stop - start, start)):
+                    raise StreamError(
+                        f"Cannot read {self._name}: it has become shorter since it was opened; open it again."
+                    )
+                pieces.append(piece)
+                start += len(piece)
+        except OSError as error:
+            raise StreamError(f"Cannot read {self._name} ({error.strerror}); it could be read before.") from error
+        except ValueError as error:
+            raise StreamError(f"Cannot read {self._name}: it has been closed; open it again.") from error
         return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
-    def __enter__(self) -> "FileBytes":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *raised: object) -> None:
@@ -106,17 +103,10 @@ def free_bytes(path: Path) -> int | None:
 
 
 def check_room(free: int | None, *, largest: int, closing: int, where: str, frames: int) -> None:
-    """Check that the next packet and the end of the stream fit.
+    """Check that the next packet and the end of the stream fit. Raises StorageError if they may not.
 
-    Args:
-        free: bytes that are left; None if that is not known.
-        largest: bytes of the largest packet so far, the next one included.
-        closing: bytes that closing the stream takes.
-        where: the stream, for the message.
-        frames: number of frames that it has.
-
-    Raises:
-        StorageError: they may not fit.
+    All sizes are bytes: ``free`` ones are left (None if that is not known), the ``largest`` packet so far has, the next
+    one included, and ``closing`` the stream takes.
     """
     needed = MARGIN_PACKETS * largest + closing
     if free is not None and free < needed:

@@ -90,16 +90,9 @@ def may_be_prefix(data: bytes | memoryview) -> bool:
 
 
 def packed(kind: int, payload: bytes, *, period: int = 0) -> bytes:
-    """A record as bytes: header, payload, CRC-32 of both.
-
-    Args:
-        kind: its type.
-        payload: its content.
-        period: number of the period that an init record begins, or that a packet belongs to.
-
-    Raises:
-        StreamError: the payload is longer than a record can hold, or there are too many periods.
-    """
+    """A record as bytes: header, payload, CRC-32 of both; ``period`` is the one that an init record begins, or that a
+    packet belongs to. Raises StreamError if the payload is longer than a record can hold, or there are too many
+    periods."""
     if period >= MAX_PERIODS:
         raise StreamError(f"A stream has at most {MAX_PERIODS} periods; begin another one.")
     if len(payload) > MAX_RECORD_BYTES:
@@ -109,11 +102,7 @@ def packed(kind: int, payload: bytes, *, period: int = 0) -> bytes:
 
 
 def check_prefix(data: ByteSource, name: str) -> None:
-    """Check that ``data`` is a stream of this major version.
-
-    Raises:
-        StreamError: it is not.
-    """
+    """Check that ``data`` is a stream of this major version. Raises StreamError if it is not."""
     if not prefix().startswith(bytes(data[: len(MAGIC)])):
         raise StreamError(f"{name} is not a structgstream file: its first bytes are not the format's signature.")
     if len(data) < PREFIX.size:
@@ -190,19 +179,12 @@ FRAME = struct.Struct("<Id")  # index, presentation time in seconds
 
 @dataclass(frozen=True)
 class Period:
-    """Where a period begins.
+    """Where a period begins."""
 
-    Args:
-        number: as stated by its records; 0 for the first of a stream.
-        first_frame: its first whole packet's.
-        offset: of its init record.
-        bytes: of its init record.
-    """
-
-    number: int
-    first_frame: int
-    offset: int
-    bytes: int
+    number: int  # as stated by its records; 0 for the first of a stream
+    first_frame: int  # its first whole packet's
+    offset: int  # of its init record
+    bytes: int  # of its init record
 
 
 def period_at(periods: Sequence[Period], frame: int) -> int:
@@ -215,24 +197,15 @@ INDEX_ENTRY = struct.Struct("<IBQ")  # frame index, record type, offset
 
 @dataclass(frozen=True)
 class Index:
-    """What an index says.
+    """What an index says."""
 
-    Args:
-        offsets: of packets, by frame.
-        periods: those after the first.
-    """
-
-    offsets: "array[int]"
-    periods: tuple[Period, ...]
+    offsets: "array[int]"  # of packets, by frame
+    periods: tuple[Period, ...]  # those after the first
 
 
 def pack_index(entries: Iterable[tuple[int, int, int]], offset: int) -> bytes:
-    """Index record, to be written at byte ``offset``, and footer.
-
-    Args:
-        entries: frame index, record type and offset of each packet, and of each init record after the first.
-        offset: where the index record begins.
-    """
+    """Index record, to be written at byte ``offset``, and footer. Entries are frame index, record type and offset of
+    each packet, and of each init record after the first."""
     index = b"".join(INDEX_ENTRY.pack(*entry) for entry in entries)
     return packed(RecordType.INDEX, index) + FOOTER.pack(offset, FOOTER_MAGIC)
 
@@ -243,14 +216,9 @@ def indexed_frames(payload: bytes) -> int:
 
 
 def read_index(data: ByteSource, start: int, *, period: int = 0) -> Index | None:
-    """Offsets, from the index, of the packets from byte ``start`` on; None if the stream must be scanned.
+    """Offsets, from the index, of the packets after the first init record, of ``period``, which ends at ``start``.
 
-    The index is not used if footer or index is damaged, or disagrees with the heads of the records.
-
-    Args:
-        data: the stream.
-        start: the end of its first init record.
-        period: the number that this states.
+    None if the stream must be scanned: footer or index is damaged, or disagrees with the heads of the records.
     """
     end = footer_offset(data)
     if end is None or end < start:

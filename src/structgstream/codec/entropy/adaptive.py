@@ -115,11 +115,7 @@ class AdaptiveDecoder(AdaptiveCoder):
         self._codes = {name: ArithmeticState(data) for name, data in fields.items()}
 
     def end(self) -> None:
-        """Checks that all bytes have been read.
-
-        Raises:
-            StreamError: there are more, or fewer.
-        """
+        """Checks that all bytes have been read. Raises StreamError if there are more, or fewer."""
         for name, code in self._codes.items():
             if not code.is_exhausted():
                 raise StreamError(f"{self._where} has {code.size} bytes of {name}, which are not all; it is damaged.")

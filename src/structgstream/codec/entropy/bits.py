@@ -65,10 +65,7 @@ def bit_lengths(values: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def unpack_numbers(data: bytes | memoryview, widths: NDArray[np.int64], *, where: str) -> NDArray[np.int64]:
     """Numbers int64 ``[n]`` with widths ``[n]`` of 0 to 56 bits that fill ``data`` up to zero padding in the last byte.
-
-    Raises:
-        StreamError: there are fewer or more bytes, or the padding is not zero.
-    """
+    Raises StreamError if there are fewer or more bytes, or the padding is not zero."""
     ends = np.cumsum(widths)
     bits = int(ends[-1]) if len(ends) else 0
     if len(data) != -(-bits // 8) or (bits % 8 and data[-1] & 0xFF >> bits % 8):
@@ -82,12 +79,7 @@ def unpack_numbers(data: bytes | memoryview, widths: NDArray[np.int64], *, where
 
 
 class BitReader:
-    """Reads what :func:`pack_bits` wrote.
-
-    Args:
-        data: all bytes; the caller bounds their number.
-        where: subject of error messages.
-    """
+    """Reads what :func:`pack_bits` wrote; the caller bounds the number of bytes."""
 
     def __init__(self, data: bytes | memoryview, *, where: str) -> None:
         self._text = f"{int.from_bytes(data, 'big'):0{8 * len(data)}b}" if len(data) else ""
@@ -95,11 +87,7 @@ class BitReader:
         self._where = where
 
     def fixed(self, width: int) -> int:
-        """The next ``width`` bits as a number.
-
-        Raises:
-            StreamError: there are fewer.
-        """
+        """The next ``width`` bits as a number. Raises StreamError if there are fewer."""
         end = self._position + width
         if end > len(self._text):
             raise StreamError(f"{self._where} ends within a number; it is damaged.")
@@ -108,11 +96,8 @@ class BitReader:
         return value
 
     def golomb(self, *, order: int, max_zeros: int) -> int:
-        """An Exp-Golomb code with at most ``max_zeros`` leading zeros.
-
-        Raises:
-            StreamError: it has more, or is truncated.
-        """
+        """An Exp-Golomb code with at most ``max_zeros`` leading zeros. Raises StreamError if it has more, or is
+        truncated."""
         first = self._text.find("1", self._position, self._position + max_zeros + 1)
         if first < 0:
             raise StreamError(f"{self._where} holds a number that is cut or out of bounds; it is damaged.")
@@ -128,11 +113,7 @@ class BitReader:
         return unzigzag(self.golomb(order=order, max_zeros=max_zeros))
 
     def end(self) -> None:
-        """Checks that only zero padding of the last byte is left.
-
-        Raises:
-            StreamError: more is left.
-        """
+        """Checks that only zero padding of the last byte is left. Raises StreamError if more is left."""
         rest = self._text[self._position :]
         if len(rest) > 7 or "1" in rest:
             raise StreamError(f"{self._where} goes on after its last number; it is damaged.")
@@ -146,14 +127,8 @@ _MAX_ZEROS = 28
 
 
 def residuals_to_symbols(residuals: NDArray[np.integer]) -> tuple[NDArray[np.uint8], bytes]:
-    """Symbols u8 ``[n]`` (0, -1, 1, -2, 2 ... 7 are 0 to 14; 15 is any other) and the others' values.
-
-    Args:
-        residuals: integers ``[n]`` that int32 can hold.
-
-    Raises:
-        StreamError: one is out of int32's range.
-    """
+    """Symbols u8 ``[n]`` of residuals ``[n]`` (0, -1, 1, -2, 2 ... 7 are 0 to 14; 15 is any other) and the others'
+    values. Raises StreamError if a residual is out of int32's range."""
     values = residuals.astype(np.int64)
     if len(values) and (int(values.min()) < -(2**31) or int(values.max()) >= 2**31):
         raise StreamError("A residual is beyond 32 bits; take a larger quantization step.")
@@ -166,12 +141,8 @@ def residuals_to_symbols(residuals: NDArray[np.integer]) -> tuple[NDArray[np.uin
 def symbols_to_residuals(
     symbols: NDArray[np.uint8], escapes: bytes | memoryview, *, where: str = "A section of escapes"
 ) -> NDArray[np.int32]:
-    """Inverse of :func:`residuals_to_symbols`: residuals int32 ``[n]``.
-
-    Raises:
-        StreamError: a symbol is above 15, the number of values differs from that of escapes, or a value is beyond 32
-            bits.
-    """
+    """Inverse of :func:`residuals_to_symbols`: residuals int32 ``[n]``. Raises StreamError if a symbol is above 15, the
+    number of values differs from that of escapes, or a value is beyond 32 bits."""
     if (symbols > ESCAPE).any():
         raise StreamError(f"{where} belongs to symbols above {ESCAPE}; they are damaged.")
     values = unzigzag(symbols.astype(np.int64))

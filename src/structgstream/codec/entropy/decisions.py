@@ -70,19 +70,12 @@ class NativeArithmetic(ctypes.Structure):
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """An adaptive model of decisions; each decision updates it.
+    """An adaptive model of decisions; each decision updates it."""
 
-    Args:
-        chances: u16 ``[rows, nodes]``, probability of 1 in units of 1/65536.
-        seen: u8 ``[rows, nodes]``, number of decisions so far, up to 255.
-        weights: i32 ``[nodes, inputs]``, mixing weights in units of 1/65536.
-        starts: i32 ``[inputs]``, the row of each input's first context.
-    """
-
-    chances: NDArray[np.uint16]
-    seen: NDArray[np.uint8]
-    weights: NDArray[np.int32]
-    starts: NDArray[np.int32]
+    chances: NDArray[np.uint16]  # u16 [rows, nodes], probability of 1 in units of 1/65536
+    seen: NDArray[np.uint8]  # u8 [rows, nodes], number of decisions so far, up to 255
+    weights: NDArray[np.int32]  # i32 [nodes, inputs], mixing weights in units of 1/65536
+    starts: NDArray[np.int32]  # i32 [inputs], the row of each input's first context
 
     @classmethod
     def new(cls, counts: Sequence[int], *, nodes: int) -> "Model":
@@ -131,11 +124,7 @@ class Models:
 
 
 class ArithmeticState:
-    """The arithmetic code of one field, in either direction.
-
-    Args:
-        data: the bytes to decode; None to encode.
-    """
+    """The arithmetic code of one field, of bytes to decode, or of none to encode."""
 
     def __init__(self, data: bytes | memoryview | None) -> None:
         self.encodes = data is None
@@ -366,7 +355,6 @@ def code_activity(
     """Codes which rows are active (docs/bitstream.md, section Rows).
 
     Args:
-        arithmetic: of the field.
         models: of blocks and of rows.
         history: ``[n]``: bit 0 is the row's activity in the last frame, bits 1 and 2 in the two before.
         sizes: ``[n]``, sum of the magnitudes of each row's last residuals.
@@ -428,12 +416,10 @@ def code_residuals(
     """Codes residuals of active rows (docs/bitstream.md, section Rows); returns whether they are within bounds.
 
     Args:
-        arithmetic: of the field.
         model: of the group of columns.
         last: ``[n, c]``, the rows' last residuals.
         others: ``[n]``, sizes of the residuals in earlier groups.
         residuals: ``[n, c]``, read or filled.
-        native: as in :func:`code_activity`.
     """
     arithmetic.reserve(residuals.size)
     if uses_native(native):
@@ -496,12 +482,10 @@ def code_numbers(
     """Codes signed 32-bit numbers, or flags; returns whether they are within bounds.
 
     Args:
-        arithmetic: of the field.
         model: with one input per column of the contexts.
         contexts: ``[n, K]``, each below the model's number of contexts for its input.
         values: ``[n]``, read or filled.
         flags: whether the values are 0 and 1, with a model of one node.
-        native: as in :func:`code_activity`.
     """
     arithmetic.reserve(len(values))
     if uses_native(native):

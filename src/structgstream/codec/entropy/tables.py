@@ -26,16 +26,9 @@ COST_BITS = 16
 
 @dataclass(frozen=True, eq=False)
 class FrequencyTables:
-    """One row of frequencies per context.
+    """One row of frequencies per context. Raises StreamError if ``rows`` does not satisfy this."""
 
-    Args:
-        rows: u16 ``[C, A]``, each row summing to 4096; C at most 4096, A at most 32.
-
-    Raises:
-        StreamError: ``rows`` does not satisfy this.
-    """
-
-    rows: NDArray[np.uint16]
+    rows: NDArray[np.uint16]  # u16 [C, A], each row summing to 4096; C at most 4096, A at most 32
 
     def __post_init__(self) -> None:
         shape, dtype = self.rows.shape, self.rows.dtype
@@ -211,11 +204,8 @@ def top_level(precision: int) -> int:
 def decode_tables(
     data: bytes | memoryview, previous: FrequencyTables, *, where: str = "A table set"
 ) -> FrequencyTables:
-    """The tables coded in ``data`` relative to the previous ones, which have the same contexts and alphabet.
-
-    Raises:
-        StreamError: the set is damaged.
-    """
+    """The tables coded in ``data`` relative to the previous ones, which have the same contexts and alphabet. Raises
+    StreamError if the set is damaged."""
     if len(data) > _MAX_ROW_BYTES * previous.contexts:
         raise StreamError(f"{where} has {len(data)} bytes for {previous.contexts} contexts; it is damaged.")
     if not len(data):
@@ -277,19 +267,12 @@ _FORMS = [_Form(*form) for form in product((False, True), range(1 << PRECISION_B
 
 @dataclass(frozen=True)
 class _Explicit:
-    """Explicitly coded rows of one precision; axes are flags of presence, order, reference, context and symbol.
+    """Explicitly coded rows of one precision; axes are flags of presence, order, reference, context and symbol."""
 
-    Args:
-        rows: ``[2, 2, 2, C, A]`` frequencies.
-        cost: ``[2, 2, 2, C]`` of row and symbols, 2^-16 bit.
-        steps: ``[2, 2, C, A]``, levels relative to those of the reference.
-        present: ``[2, C, A]``.
-    """
-
-    rows: NDArray[np.int64]
-    cost: NDArray[np.int64]
-    steps: NDArray[np.int64]
-    present: NDArray[np.bool_]
+    rows: NDArray[np.int64]  # [2, 2, 2, C, A] frequencies
+    cost: NDArray[np.int64]  # [2, 2, 2, C] of row and symbols, 2^-16 bit
+    steps: NDArray[np.int64]  # [2, 2, C, A], levels relative to those of the reference
+    present: NDArray[np.bool_]  # [2, C, A]
 
     def bits(self, form: _Form, context: int, number: int) -> str:
         """The row of one context as bits; ``number`` of its geometric row."""

@@ -29,23 +29,14 @@ CODABLE: frozenset[FieldName] = frozenset(quantized_fields("anchor") + quantized
 
 @dataclass(frozen=True)
 class SceneBins:
-    """The quantized dynamic fields of a scene, and their change by the last frame.
+    """The quantized dynamic fields of a scene, and their change by the last frame."""
 
-    Args:
-        anchors: ``[M, columns of the dynamic anchor fields]``.
-        columns: ``(name, first column, end)`` of each of these fields.
-        change: of ``anchors``.
-        weights: of MLPs and other shared fields, by field, ``[P, 1]``.
-        weight_changes: of ``weights``, by field.
-        free: the free Gaussians.
-    """
-
-    anchors: Bins
-    columns: Sequence[tuple[FieldName, int, int]]
-    change: Change
-    weights: Mapping[FieldName, Bins]
-    weight_changes: Mapping[FieldName, Change]
-    free: FreeBins
+    anchors: Bins  # [M, columns of the dynamic anchor fields]
+    columns: Sequence[tuple[FieldName, int, int]]  # (name, first column, end) of each of these fields
+    change: Change  # of anchors
+    weights: Mapping[FieldName, Bins]  # of MLPs and other shared fields, by field, [P, 1]
+    weight_changes: Mapping[FieldName, Change]  # of weights, by field
+    free: FreeBins  # the free Gaussians
 
     def without_change(self) -> "SceneBins":
         """The same bins with zero change."""
@@ -60,11 +51,7 @@ class SceneBins:
 def quantize_state(
     state: Mapping[FieldName, Tensor], dynamic: frozenset[FieldName], steps: Mapping[str, float]
 ) -> SceneBins:
-    """Quantizes the dynamic fields of a state.
-
-    Raises:
-        StreamError: a bin is beyond 22 bits.
-    """
+    """Quantizes the dynamic fields of a state. Raises StreamError if a bin is beyond 22 bits."""
     names: list[FieldName] = [name for name in quantized_fields("anchor") if name in dynamic]
     rows = [quantize(state[name], steps[name]) for name in names]
     count = len(state["anchor_positions"])
@@ -101,11 +88,8 @@ def dequantize_state(
 def code_scene(
     coder: AdaptiveCoder, after: SceneBins | None, before: SceneBins, *, has_free: bool, where: str
 ) -> SceneBins:
-    """Codes the bins of a frame given those of the frame ``before``, in either direction.
-
-    Raises:
-        StreamError: decoded values are out of range or inconsistent.
-    """
+    """Codes the bins of a frame given those of the frame ``before``, in either direction. Raises StreamError if decoded
+    values are out of range or inconsistent."""
     given = None if after is None else Change.of(after.anchors - before.anchors)
     change = code_change(coder, given, before.change, groups=before.columns)
     anchors = before.anchors + change.residuals

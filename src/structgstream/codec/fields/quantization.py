@@ -37,11 +37,7 @@ def float32(value: float) -> float:
 
 
 def quantize(value: Tensor, step: float | NDArray[np.float32]) -> Bins:
-    """Quantizes a tensor: each value to the nearest bin.
-
-    Raises:
-        StreamError: a bin is beyond :data:`LARGEST`.
-    """
+    """Quantizes a tensor: each value to the nearest bin. Raises StreamError if a bin is beyond :data:`LARGEST`."""
     found = np.rint(value.detach().cpu().numpy().astype(np.float64) / np.asarray(step, np.float32))
     if found.size and not np.abs(found).max() <= LARGEST:
         raise StreamError(f"A value is {np.abs(found).max():g} steps from zero, at most {LARGEST} can be coded.")
@@ -54,21 +50,14 @@ def dequantize(bins: Bins, step: float | NDArray[np.float32]) -> Tensor:
 
 
 def check_range(bins: NDArray[np.integer], where: str) -> None:
-    """Check decoded bins of any shape.
-
-    Raises:
-        StreamError: one is beyond :data:`LARGEST`.
-    """
+    """Check decoded bins of any shape. Raises StreamError if one is beyond :data:`LARGEST`."""
     if bins.size and not -LARGEST <= int(bins.min()) <= int(bins.max()) <= LARGEST:
         raise StreamError(f"{where} has a bin beyond 22 bits, the largest allowed; it is damaged.")
 
 
 def round_to_bins(state: Mapping[FieldName, Tensor], steps: Mapping[FieldName, float]) -> dict[FieldName, Tensor]:
-    """Quantizes and dequantizes the fields that have a step; others are returned as they are.
-
-    Raises:
-        StreamError: a bin is beyond :data:`LARGEST`.
-    """
+    """Quantizes and dequantizes the fields that have a step; others are returned as they are. Raises StreamError if a
+    bin is beyond :data:`LARGEST`."""
     return {
         name: dequantize(quantize(value, steps[name]), steps[name]) if name in steps else value
         for name, value in state.items()
@@ -108,16 +97,11 @@ class RateTerm:
     """An estimate of the bits of changes, as a loss term.
 
     A bit has the same weight in every frame, however much moves: that gives the best pictures for the bytes of all.
-
-    Args:
-        weight: what a kilobyte adds to the loss.
-        before: the last frame's values by name.
-        steps: the quantization steps by name.
     """
 
-    weight: float
-    before: Mapping[ParameterName, Tensor]
-    steps: Mapping[ParameterName, float]
+    weight: float  # what a kilobyte adds to the loss
+    before: Mapping[ParameterName, Tensor]  # the last frame's values by name
+    steps: Mapping[ParameterName, float]  # the quantization steps by name
 
     @classmethod
     def of(
@@ -128,14 +112,9 @@ class RateTerm:
         weight: float,
         free: bool,
     ) -> "RateTerm | None":
-        """The rate term of changes of anchors' parameters from ``values``, their present ones; None without any.
-
-        Args:
-            values: tensors by name; those without a step do not count.
-            steps: quantization steps by name.
-            weight: what a kilobyte adds to the loss; None is returned unless it is positive.
-            free: whether changes of free Gaussians count, too.
-        """
+        """The rate term of changes of anchors' parameters, and of free Gaussians' if they count, from their present
+        ``values`` by name; those without a step do not count. None without any, and unless ``weight``, what a kilobyte
+        adds to the loss, is positive."""
         names = (*trainable("anchor"), *trainable("free")) if free else trainable("anchor")
         counted: dict[ParameterName, float] = {name: steps[name] for name in names if name in steps and name in values}
         if not counted or weight <= 0.0:

@@ -24,17 +24,11 @@ _MOST = 255  # a residual's magnitude is clamped to this in a size
 
 @dataclass(frozen=True)
 class Change:
-    """The change of rows of bins by a frame, and which rows the two frames before changed.
+    """The change of rows of bins by a frame, and which rows the two frames before changed."""
 
-    Args:
-        residuals: ``[n, C]``, zero in rows that did not change.
-        history: u8 ``[n]``: bit 0 is set if this frame changed the row, bits 1 and 2 if the two before did.
-        sizes: i32 ``[n]``: sum of the magnitudes of each row's residuals.
-    """
-
-    residuals: Bins
-    history: NDArray[np.uint8]
-    sizes: Bins
+    residuals: Bins  # [n, C], zero in rows that did not change
+    history: NDArray[np.uint8]  # u8 [n]: bit 0 is set if this frame changed the row, bits 1 and 2 if the two before did
+    sizes: Bins  # i32 [n]: sum of the magnitudes of each row's residuals
 
     @property
     def active(self) -> Flags:
@@ -76,15 +70,8 @@ _REMEMBERED = 7  # activity of three frames
 def code_change(
     coder: AdaptiveCoder, change: Change | None, before: Change, *, groups: Sequence[tuple[str, int, int]]
 ) -> Change:
-    """Codes a change, with the rows' previous change as context.
-
-    Args:
-        coder: an encoder or a decoder.
-        change: the change to encode; None when decoding.
-        before: the same rows' previous change.
-        groups: ``(name, first column, end)`` of the groups of columns with a model each; they cover all columns in
-            order.
-    """
+    """Codes a change (None when decoding), with the rows' previous change as context. Each group of columns ``(name,
+    first, end)`` has a model; they cover all columns in order."""
     if not groups:
         return before
     active = coder.activity(
@@ -119,17 +106,11 @@ _FRAME_BITS = 32  # an identity is frame * 2^32 + number
 
 @dataclass(frozen=True)
 class FreeBins:
-    """Free Gaussians as bins.
+    """Free Gaussians as bins."""
 
-    Args:
-        births: int64 ``[F]`` identities, from the frame in which each was spawned; ascending.
-        bins: ``[F, 14]``.
-        change: by the last frame; zero for Gaussians spawned in it.
-    """
-
-    births: NDArray[np.int64]
-    bins: Bins
-    change: Change
+    births: NDArray[np.int64]  # int64 [F] identities, from the frame in which each was spawned; ascending
+    bins: Bins  # [F, 14]
+    change: Change  # by the last frame; zero for Gaussians spawned in it
 
     @classmethod
     def none(cls) -> "FreeBins":
@@ -142,11 +123,8 @@ class FreeBins:
 
     @classmethod
     def quantized(cls, values: Tensor, births: Tensor, steps: Mapping[str, float]) -> "FreeBins":
-        """The bins of ``values`` ``[F, 14]`` with identities ``births`` ``[F]``, and zero change.
-
-        Raises:
-            StreamError: a bin is beyond 22 bits.
-        """
+        """The bins of ``values`` ``[F, 14]`` with identities ``births`` ``[F]``, and zero change. Raises StreamError if
+        a bin is beyond 22 bits."""
         return cls(
             births.cpu().numpy().astype(np.int64),
             quantize(values, _steps_of_columns(steps)),
@@ -165,10 +143,7 @@ def _steps_of_columns(steps: Mapping[str, float]) -> NDArray[np.float32]:
 
 def code_free(coder: AdaptiveCoder, after: FreeBins | None, before: FreeBins, *, where: str) -> FreeBins:
     """Codes pruned, changed and spawned Gaussians from ``before`` to ``after``, whose identities and bins are read.
-
-    Raises:
-        StreamError: identities do not ascend or are out of range, or there are too many.
-    """
+    Raises StreamError if identities do not ascend or are out of range, or there are too many."""
     alive = None if after is None else np.isin(before.births, after.births)
     alive = coder.flags("free_births.alive", alive, [before.change.history], counts=[8])
     old = FreeBins(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from structgstream.codec.entropy.bits import LARGEST_SYMBOL, Bins, Contexts, Naturals, bit_lengths, unzigzag, zigzag
-from structgstream.codec.entropy.section_coder import SectionCoder, SectionDecoder, SectionEncoder, Tables
+from structgstream.codec.entropy.rans import SectionCoder, SectionDecoder, SectionEncoder
 from structgstream.codec.fields.quantization import check_range, dequantize, quantize
 from structgstream.errors import StreamError
 from structgstream.scene.order import CELL_BITS, morton_cells, morton_keys
@@ -55,16 +55,8 @@ def _max_numbers(coded: Iterable[bytes | memoryview]) -> int:
 
 
 def encode_fields(fields: Mapping[FieldName, Tensor], steps: Mapping[FieldName, float]) -> dict[FieldName, bytes]:
-    """The bytes of every field that has a coding.
-
-    Args:
-        fields: of the init record, by name.
-        steps: quantization steps, by field.
-
-    Raises:
-        StreamError: a field has no step, a value is not a multiple of its step, or there are too many numbers, in
-            absolute terms or for their bytes.
-    """
+    """The bytes of every field that has a coding. Raises StreamError if a field has no step, a value is not a multiple
+    of its step, or there are too many numbers, in absolute terms or for their bytes."""
     bins: dict[FieldName, Bins] = {}
     for name in _coded_names(fields.keys()):
         if name not in steps:
@@ -73,7 +65,7 @@ def encode_fields(fields: Mapping[FieldName, Tensor], steps: Mapping[FieldName, 
         if dequantize(found, steps[name]).numpy().tobytes() != fields[name].cpu().contiguous().numpy().tobytes():
             raise StreamError(f"The header's {name} are no multiples of the step {steps[name]:g}; quantize them first.")
         bins[name] = found
-    encoder = SectionEncoder(Tables())
+    encoder = SectionEncoder()
     numbers = sum(found.size for found in bins.values())
     _code_fields(encoder, bins, bins.keys(), _Budget(numbers))
     if numbers > (most := _max_numbers(encoder.fields.values())):
@@ -86,17 +78,14 @@ def encode_fields(fields: Mapping[FieldName, Tensor], steps: Mapping[FieldName, 
 def decode_fields(
     coded: Mapping[FieldName, bytes | memoryview], steps: Mapping[FieldName, float]
 ) -> dict[FieldName, Tensor]:
-    """The fields that :func:`encode_fields` wrote.
-
-    Raises:
-        StreamError: the bytes are damaged, or there is no step or no coding for a field.
-    """
+    """The fields that :func:`encode_fields` wrote. Raises StreamError if the bytes are damaged, or there is no step or
+    no coding for a field."""
     names = _coded_names(coded.keys())
     if len(names) < len(coded):
         raise StreamError(f"{_WHERE} holds {', '.join(sorted(coded.keys() & UNCODED_FIELDS))} coded; expected raw.")
     if missing := [name for name in names if name not in steps]:
         raise StreamError(f"The header states no step for {', '.join(missing)} in the init record.")
-    decoder = SectionDecoder(Tables(), coded, where=_WHERE)
+    decoder = SectionDecoder(coded, where=_WHERE)
     bins = _code_fields(decoder, None, coded.keys(), _Budget(_max_numbers(coded.values())))
     decoder.end()
     return {name: dequantize(found, steps[name]) for name, found in bins.items()}

@@ -132,11 +132,7 @@ class Fields:
 
 
 def parse_object(data: bytes, where: str, *, max_bytes: int) -> Fields:
-    """The JSON object in ``data``.
-
-    Raises:
-        StreamError: it is longer than ``max_bytes``, or not a JSON object.
-    """
+    """The JSON object in ``data``. Raises StreamError if it is longer than ``max_bytes``, or not a JSON object."""
     if len(data) > max_bytes:
         raise StreamError(f"{where} has {len(data)} bytes; expected at most {max_bytes}.")
     try:
@@ -191,19 +187,12 @@ class StoredFile(Protocol):
 
 @dataclass(frozen=True)
 class Edge:
-    """The newest frame.
+    """The newest frame."""
 
-    Args:
-        frame: its number.
-        pts_seconds: its presentation time.
-        captured_unix_seconds: when it was filmed; None if that is not known.
-        published_unix_seconds: when it was written, by the writer's clock.
-    """
-
-    frame: int
-    pts_seconds: float
-    captured_unix_seconds: float | None
-    published_unix_seconds: float
+    frame: int  # its number
+    pts_seconds: float  # its presentation time
+    captured_unix_seconds: float | None  # when it was filmed; None if that is not known
+    published_unix_seconds: float  # when it was written, by the writer's clock
 
 
 @dataclass(frozen=True)
@@ -229,58 +218,33 @@ class PeriodEntry:
 
 @dataclass(frozen=True)
 class SegmentEntry:
-    """A whole group of frames.
+    """A whole group of frames."""
 
-    Args:
-        segment: its number.
-        file: its name.
-        period: number of the period whose init record it needs.
-        first_frame: number of its key frame.
-        frames: how many.
-        pts_seconds: presentation times of its first and last frame.
-        bytes: its length.
-        key_bytes: length of its prefix with which its first frame can be shown.
-        frame_bytes: length of each frame's records, in order.
-        sha256: of its content.
-    """
-
-    segment: int
-    file: str
-    period: int
-    first_frame: int
-    frames: int
-    pts_seconds: tuple[float, float]
-    bytes: int
-    key_bytes: int
-    frame_bytes: tuple[int, ...]
-    sha256: str
+    segment: int  # its number
+    file: str  # its name
+    period: int  # number of the period whose init record it needs
+    first_frame: int  # number of its key frame
+    frames: int  # how many
+    pts_seconds: tuple[float, float]  # presentation times of its first and last frame
+    bytes: int  # its length
+    key_bytes: int  # length of its prefix with which its first frame can be shown
+    frame_bytes: tuple[int, ...]  # length of each frame's records, in order
+    sha256: str  # of its content
 
 
 @dataclass(frozen=True)
 class HistoryEntry:
-    """A page of older segments.
+    """A page of older segments."""
 
-    Args:
-        file: its name.
-        level: 0 if the page lists segments, otherwise it lists pages of the level below.
-        first_segment: number of the first segment of the page.
-        segments: number of segments in all.
-        first_frame: number of the first frame.
-        frames: number of frames in all.
-        pts_seconds: presentation times of the first and the last frame.
-        bytes: length of the page.
-        sha256: of the page.
-    """
-
-    file: str
-    level: int
-    first_segment: int
-    segments: int
-    first_frame: int
-    frames: int
-    pts_seconds: tuple[float, float]
-    bytes: int
-    sha256: str
+    file: str  # its name
+    level: int  # 0 if the page lists segments, otherwise it lists pages of the level below
+    first_segment: int  # number of the first segment of the page
+    segments: int  # number of segments in all
+    first_frame: int  # number of the first frame
+    frames: int  # number of frames in all
+    pts_seconds: tuple[float, float]  # presentation times of the first and the last frame
+    bytes: int  # length of the page
+    sha256: str  # of the page
 
 
 @dataclass(frozen=True)
@@ -298,35 +262,20 @@ class PartEntry:
 
 @dataclass(frozen=True)
 class Manifest:
-    """A stream at one moment: pages, then segments, then parts follow each other without gaps.
+    """A stream at one moment: pages, then segments, then parts follow each other without gaps."""
 
-    Args:
-        sequence: rises by one with every rewriting.
-        live: False once the run has finished or was stopped.
-        fps: of the media.
-        name: of the capture.
-        target_latency_seconds: how far a player should keep behind the edge.
-        frame_seconds: mean wall-clock seconds from frame to frame of late; None before the second.
-        edge: the newest frame.
-        window: what is still there.
-        periods: of what is listed, the last one is the running one.
-        history: pages, oldest first.
-        segments: the newest ones.
-        parts: of the group being written, none when ``live`` is False.
-    """
-
-    sequence: int
-    live: bool
-    fps: float
-    name: str
-    target_latency_seconds: float
-    frame_seconds: float | None
-    edge: Edge
-    window: Window
-    periods: tuple[PeriodEntry, ...]
-    history: tuple[HistoryEntry, ...]
-    segments: tuple[SegmentEntry, ...]
-    parts: tuple[PartEntry, ...]
+    sequence: int  # rises by one with every rewriting
+    live: bool  # False once the run has finished or was stopped
+    fps: float  # of the media
+    name: str  # of the capture
+    target_latency_seconds: float  # how far a player should keep behind the edge
+    frame_seconds: float | None  # mean wall-clock seconds from frame to frame of late; None before the second
+    edge: Edge  # the newest frame
+    window: Window  # what is still there
+    periods: tuple[PeriodEntry, ...]  # of what is listed, the last one is the running one
+    history: tuple[HistoryEntry, ...]  # pages, oldest first
+    segments: tuple[SegmentEntry, ...]  # the newest ones
+    parts: tuple[PartEntry, ...]  # of the group being written, none when live is False
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -375,11 +324,8 @@ def manifest_to_json(manifest: Manifest) -> bytes:
 
 
 def manifest_from_json(data: bytes, *, name: str) -> Manifest:
-    """The manifest in ``data``; ``name`` is for messages.
-
-    Raises:
-        StreamError: it is no manifest, of a newer version, or contradicts itself or the format's bounds.
-    """
+    """The manifest in ``data``; ``name`` is for messages. Raises StreamError if it is no manifest, of a newer version,
+    or contradicts itself or the format's bounds."""
     top = parse_object(data, name, max_bytes=MAX_MANIFEST_BYTES)
     if (found := top.text("format")) != FORMAT:
         raise StreamError(f"{name} is no manifest of segments: its format is {found!r}; expected {FORMAT!r}.")
@@ -416,11 +362,8 @@ def page_to_json(entries: Sequence[SegmentEntry] | Sequence[HistoryEntry]) -> by
 
 
 def page_from_json(data: bytes, entry: HistoryEntry) -> tuple[SegmentEntry, ...] | tuple[HistoryEntry, ...]:
-    """The entries of the page that ``entry`` names: pages if its level is above 0, otherwise segments.
-
-    Raises:
-        StreamError: it is no page, or not what ``entry`` announces.
-    """
+    """The entries of the page that ``entry`` names: pages if its level is above 0, otherwise segments. Raises
+    StreamError if it is no page, or not what ``entry`` announces."""
     top = parse_object(data, entry.file, max_bytes=MAX_PAGE_BYTES)
     if top.text("format") != FORMAT or top.whole("version") != VERSION:
         top.refuse(f"is no history page of {FORMAT} {VERSION}")

@@ -43,27 +43,15 @@ class AnotherStreamError(StorageError):
 
 @dataclass(frozen=True)
 class MirrorOptions:
-    """How the copy is made.
+    """How the copy is made."""
 
-    Args:
-        grace_seconds: how long a file that has left the folder stays in the other store.
-        report: gets a sentence when trouble begins and when it ends.
-        elapsed: seconds that never jump.
-    """
-
-    grace_seconds: float = 120.0
-    report: Callable[[str], object] = lambda text: None
-    elapsed: Callable[[], float] = time.monotonic
+    grace_seconds: float = 120.0  # how long a file that has left the folder stays in the other store
+    report: Callable[[str], object] = lambda text: None  # gets a sentence when trouble begins and when it ends
+    elapsed: Callable[[], float] = time.monotonic  # seconds that never jump
 
 
 class MirroredStore:
-    """A folder whose files are copied to ``remote`` by a thread (Note [Order of copying]).
-
-    Args:
-        folder: what is read and written.
-        remote: what follows it.
-        options: how.
-    """
+    """A folder whose files are copied to ``remote`` by a thread (Note [Order of copying])."""
 
     def __init__(self, folder: FolderStore, remote: Store, *, options: MirrorOptions | None = None) -> None:
         self._folder = folder
@@ -145,7 +133,7 @@ class MirroredStore:
             mine = Owner.new(PURPOSE)
             self._folder.put(MARKER, mine.content)
         theirs = _owner(self._remote)
-        # Copies of before there were markers are known by the stream's first record, whose name is its hash.
+        # A copy by another program has no marker; it is known by the stream's first record, whose name is its hash.
         sent = any(name.startswith("init-") for name in there & self._folder.names())
         if (theirs is None and there and not sent) or (theirs is not None and theirs.identity != mine.identity):
             raise AnotherStreamError(

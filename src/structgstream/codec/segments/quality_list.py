@@ -25,17 +25,11 @@ _PATH = re.compile(r"([A-Za-z0-9_-][A-Za-z0-9._-]{0,127}/){0,4}[A-Za-z0-9_-][A-Z
 
 @dataclass(frozen=True)
 class ListedQuality:
-    """One of the runs of the same frames.
+    """One of the runs of the same frames."""
 
-    Args:
-        name: what players call it.
-        manifest: path of its manifest below the list.
-        bits_per_second: of media time, as measured, or expected while nothing has been measured.
-    """
-
-    name: str
-    manifest: str
-    bits_per_second: float
+    name: str  # what players call it
+    manifest: str  # path of its manifest below the list
+    bits_per_second: float  # of media time, as measured, or expected while nothing has been measured
 
     @property
     def folder(self) -> str | None:
@@ -56,11 +50,8 @@ def list_to_json(qualities: Sequence[ListedQuality]) -> bytes:
 
 
 def list_from_json(data: bytes, *, name: str) -> tuple[ListedQuality, ...]:
-    """The qualities in ``data``; ``name`` is for messages.
-
-    Raises:
-        StreamError: it is no list of qualities, of a newer version, or leaves the bounds of players.
-    """
+    """The qualities in ``data``; ``name`` is for messages. Raises StreamError if it is no list of qualities, of a newer
+    version, or leaves the bounds of players."""
     top = parse_object(data, name, max_bytes=MAX_LIST_BYTES)
     if (found := top.text("format")) != FORMAT:
         raise StreamError(f"{name} is no list of qualities: its format is {found!r}; expected {FORMAT!r}.")
@@ -73,11 +64,7 @@ def list_from_json(data: bytes, *, name: str) -> tuple[ListedQuality, ...]:
 
 
 def read_list(folder: Path) -> tuple[ListedQuality, ...] | None:
-    """The qualities of a folder; None if it has no list.
-
-    Raises:
-        StreamError: the list is none, or cannot be read.
-    """
+    """The qualities of a folder; None if it has no list. Raises StreamError if the list is none, or cannot be read."""
     path = folder / QUALITIES
     if not path.exists():
         return None
@@ -86,11 +73,8 @@ def read_list(folder: Path) -> tuple[ListedQuality, ...] | None:
 
 
 def write_list(folder: Path, qualities: Sequence[ListedQuality]) -> None:
-    """Writes the list of a folder, or replaces it in one step.
-
-    Raises:
-        StorageError: it cannot be written; what was there before stays.
-    """
+    """Writes the list of a folder, or replaces it in one step. Raises StorageError if it cannot be written; what was
+    there before stays."""
     atomic_write(folder / QUALITIES, list_to_json(qualities), called="The list of qualities")
 
 

@@ -21,8 +21,7 @@ from structgstream.codec.container.records import (
     prefix,
     read_record,
 )
-from structgstream.codec.header import pack_header, unpack_header
-from structgstream.codec.packets import StreamHeader
+from structgstream.codec.packets import StreamHeader, pack_header, unpack_header
 from structgstream.codec.segments.manifest import (
     MANIFEST,
     MAX_MANIFEST_BYTES,
@@ -44,11 +43,7 @@ from structgstream.errors import StreamError
 
 
 def part_of(record: bytes) -> PartEntry:
-    """The entry of a packet's record.
-
-    Raises:
-        StreamError: it is no whole record of a packet.
-    """
+    """The entry of a packet's record. Raises StreamError if it is no whole record of a packet."""
     found = read_record(record, 0)
     if found is None or found.type not in PACKET_KINDS or len(found.payload) < FRAME.size:
         raise StreamError(f"{len(record)} bytes are no whole record of a packet.")
@@ -86,16 +81,11 @@ def records_of(entry: SegmentEntry, data: bytes) -> list[bytes]:
 
 @dataclass(frozen=True)
 class Draft:
-    """A manifest to write.
+    """A manifest to write."""
 
-    Args:
-        manifest: with ``parts`` of the group that is being written.
-        records: of each of these parts.
-        files: names and contents of other files that must be there before the manifest.
-    """
-
-    manifest: Manifest
-    records: tuple[bytes, ...] = ()
+    manifest: Manifest  # with parts of the group that is being written
+    records: tuple[bytes, ...] = ()  # of each of these parts
+    # names and contents of other files that must be there before the manifest
     files: tuple[tuple[str, bytes], ...] = ()
 
 
@@ -149,11 +139,8 @@ def with_segment(draft: Draft) -> Draft:
 
 
 def reopened(draft: Draft, store: Store) -> Draft:
-    """With the last segment, which an orderly stop has closed early, as the group that is being written.
-
-    Raises:
-        StreamError: the segment is missing or damaged.
-    """
+    """With the last segment, which an orderly stop has closed early, as the group that is being written. Raises
+    StreamError if the segment is missing or damaged."""
     manifest = draft.manifest
     *before, last = manifest.segments
     records = records_of(last, verified(store, last))

@@ -50,40 +50,23 @@ from structgstream.errors import StorageError, StreamError
 
 @dataclass(frozen=True)
 class SegmentsOptions:
-    """How long files of a stream stay.
+    """How long files of a stream stay."""
 
-    Args:
-        window_seconds: media seconds before the edge that viewers can go back; None for everything.
-        grace_seconds: seconds that a file stays after the last manifest that named it.
-    """
-
-    window_seconds: float | None = None
-    grace_seconds: float = 120.0
+    window_seconds: float | None = None  # media seconds before the edge that viewers can go back; None for everything
+    grace_seconds: float = 120.0  # seconds that a file stays after the last manifest that named it
 
 
 @dataclass(frozen=True)
 class Turnover:
-    """What a manifest changes of a window; nothing without one.
+    """What a manifest changes of a window; nothing without one."""
 
-    Args:
-        stay: segments in the window.
-        leave: those that were in it before.
-        window: of the manifest.
-    """
-
-    stay: tuple[SegmentEntry, ...]
-    leave: tuple[SegmentEntry, ...]
-    window: Window
+    stay: tuple[SegmentEntry, ...]  # segments in the window
+    leave: tuple[SegmentEntry, ...]  # those that were in it before
+    window: Window  # of the manifest
 
 
 class Retention:
-    """Follows which files manifests name, and removes those that none has named for the time of grace.
-
-    Args:
-        store: where the files are.
-        options: how long files stay.
-        elapsed: seconds that never jump.
-    """
+    """Follows which files manifests name, and removes those that none has named for the time of grace."""
 
     def __init__(self, store: Store, options: SegmentsOptions, elapsed: Callable[[], float]) -> None:
         self._store, self._options, self._elapsed = store, options, elapsed
@@ -93,11 +76,8 @@ class Retention:
         self._leaving: dict[str, float] = {}  # files that no manifest names, and since when; oldest first
 
     def take_up(self, manifest: Manifest) -> None:
-        """Begins with a stream that is there, whose last manifest this is.
-
-        Raises:
-            StreamError: a page of its history is missing or damaged.
-        """
+        """Begins with a stream that is there, whose last manifest this is. Raises StreamError if a page of its history
+        is missing or damaged."""
         there = self._store.names()
         self._periods = manifest.periods
         if self._options.window_seconds is not None:
@@ -123,13 +103,8 @@ class Retention:
         return Turnover(present[gone:], present[:gone], window)
 
     def published(self, manifest: Manifest, turnover: Turnover, leaving: Iterable[str]) -> None:
-        """Takes in that a manifest is there, and removes what has not been named for long enough.
-
-        Args:
-            manifest: that was written.
-            turnover: what it has changed of the window.
-            leaving: other files that it is the first not to name.
-        """
+        """Takes in that a manifest is there, the first not to name the files ``leaving``, and removes what has not been
+        named for long enough."""
         needed = running_period(manifest).first_segment  # Its first frame is needed to resume.
         left = (*self._needed, *turnover.leave)
         ended = {period.file for period in self._periods} - {period.file for period in manifest.periods}
@@ -162,29 +137,17 @@ def _unknown(frame: int) -> float | None:
 
 @dataclass(frozen=True)
 class Clocks:
-    """Where times come from.
+    """Where times come from."""
 
-    Args:
-        wall: seconds since 1970.
-        elapsed: seconds that never jump.
-        captured: when a frame was filmed, by its number, in seconds since 1970; None where that is not known.
-    """
-
-    wall: Callable[[], float] = time.time
-    elapsed: Callable[[], float] = time.monotonic
+    wall: Callable[[], float] = time.time  # seconds since 1970
+    elapsed: Callable[[], float] = time.monotonic  # seconds that never jump
+    # when a frame was filmed, by its number, in seconds since 1970; None where that is not known
     captured: Callable[[int], float | None] = _unknown
 
 
 class SegmentsSink:
-    """A sink of immutable segments and a manifest. Every packet is durable in the store when ``write`` returns.
-
-    Args:
-        store: where the files go.
-        overwrite: whether a stream that is there may be replaced.
-        options: how long files stay.
-        clocks: where times come from.
-        found: what is there already, to go on after it (``recovery.find``).
-    """
+    """A sink of immutable segments and a manifest, which goes on after what was ``found`` (``recovery.find``), or
+    replaces it. Every packet is durable in the store when ``write`` returns."""
 
     def __init__(
         self,
@@ -205,11 +168,8 @@ class SegmentsSink:
         self._header_bytes = self._largest = 0
 
     def open(self, header: StreamHeader) -> int:
-        """Write the init record, or continue a stream, which already has one; returns the bytes written.
-
-        Raises:
-            StorageError: there is a stream already and it may not be overwritten, or nothing can be written.
-        """
+        """Write the init record, or continue a stream, which already has one; returns the bytes written. Raises
+        StorageError if there is a stream already and it may not be overwritten, or nothing can be written."""
         if self._found is not None:
             self._continue(self._found)
             return 0
@@ -228,11 +188,8 @@ class SegmentsSink:
         return len(data)
 
     def begin(self, header: StreamHeader) -> int:
-        """Begin another period with the next packet; its init record is written and named at once.
-
-        Raises:
-            StorageError: it cannot be written; earlier packets stay.
-        """
+        """Begin another period with the next packet; its init record is written and named at once. Raises StorageError
+        if it cannot be written; earlier packets stay."""
         draft = with_period(self._opened(), header)
         size = draft.manifest.periods[-1].bytes
         self._header_bytes = max(self._header_bytes, size)
@@ -241,11 +198,8 @@ class SegmentsSink:
         return size
 
     def write(self, packet: Packet) -> int:
-        """Write one packet; returns the bytes of its record.
-
-        Raises:
-            StorageError: it cannot be written; earlier packets stay.
-        """
+        """Write one packet; returns the bytes of its record. Raises StorageError if it cannot be written; earlier
+        packets stay."""
         draft = self._opened()
         assert packet.index == draft.manifest.edge.frame + 1, "frames have no gaps"
         period = draft.manifest.periods[-1]
@@ -309,12 +263,8 @@ class SegmentsSink:
         return sequence
 
     def _publish(self, draft: Draft, leaving: Iterable[str]) -> None:
-        """Write the files of a draft, then its manifest; then remove what has not been named for long enough.
-
-        Args:
-            draft: what to write.
-            leaving: files that this manifest is the first not to name.
-        """
+        """Write the files of a draft, then its manifest, the first not to name the files ``leaving``; then remove what
+        has not been named for long enough."""
         self._put(draft.files)
         turnover = self._retention.turnover(draft.manifest)
         manifest = self._stamped(draft.manifest, turnover.window)

@@ -29,11 +29,8 @@ def is_ours(name: str) -> bool:
 
 
 def read_bounded(path: Path, *, max_bytes: int) -> bytes:
-    """The bytes of a regular file; pipes, devices and files that are too large are refused before they are read.
-
-    Raises:
-        StreamError: it cannot be read, is no regular file, or has more bytes.
-    """
+    """The bytes of a regular file; pipes, devices and files that are too large are refused before they are read. Raises
+    StreamError if it cannot be read, is no regular file, or has more bytes."""
     try:
         with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
             status = os.fstat(file.fileno())
@@ -56,35 +53,21 @@ class Store(Protocol):
         ...
 
     def put(self, name: str, data: bytes) -> None:
-        """Write a file, or replace it in one step: readers see the old bytes or the new ones.
-
-        Raises:
-            StorageError: it cannot be written; what was there before stays.
-        """
+        """Write a file, or replace it in one step: readers see the old bytes or the new ones. Raises StorageError if it
+        cannot be written; what was there before stays."""
         ...
 
     def get(self, name: str, *, max_bytes: int | None = None) -> bytes:
-        """The bytes of a file.
-
-        Raises:
-            StreamError: there is none, or it cannot be read, or has more bytes than ``max_bytes``.
-        """
+        """The bytes of a file. Raises StreamError if there is none, or it cannot be read, or has more bytes than
+        ``max_bytes``."""
         ...
 
     def delete(self, name: str) -> None:
-        """Remove a file if it is there.
-
-        Raises:
-            StorageError: it cannot be removed.
-        """
+        """Remove a file if it is there. Raises StorageError if it cannot be removed."""
         ...
 
     def names(self) -> frozenset[str]:
-        """The names of all files that a sink has made.
-
-        Raises:
-            StreamError: they cannot be listed.
-        """
+        """The names of all files that a sink has made. Raises StreamError if they cannot be listed."""
         ...
 
     def free_bytes(self) -> int | None:
@@ -104,22 +87,15 @@ class FolderStore:
         return str(self.folder)
 
     def make(self) -> None:
-        """Make the folder, if it is not there.
-
-        Raises:
-            StorageError: it cannot be made, or it is a file.
-        """
+        """Make the folder, if it is not there. Raises StorageError if it cannot be made, or it is a file."""
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise StorageError(f"The folder {self.folder} cannot be made ({error.strerror}).") from error
 
     def prepare(self) -> None:
-        """Make the folder, and remove the temporary files of a writer that was killed.
-
-        Raises:
-            StorageError: the folder cannot be made or changed, or it is a file.
-        """
+        """Make the folder, and remove the temporary files of a writer that was killed. Raises StorageError if the
+        folder cannot be made or changed, or it is a file."""
         self.make()
         try:
             for path in self.folder.glob(f"{_TEMPORARY}*"):
@@ -128,11 +104,8 @@ class FolderStore:
             raise StorageError(f"{self.folder} cannot be changed ({error.strerror}).") from error
 
     def lock(self) -> None:
-        """Keep other processes from writing here, until this one ends or forgets the store.
-
-        Raises:
-            StorageError: another process writes here, or the lock's file cannot be opened, or is a link.
-        """
+        """Keep other processes from writing here, until this one ends or forgets the store. Raises StorageError if
+        another process writes here, or the lock's file cannot be opened, or is a link."""
         path = self.folder / _LOCK
         try:
             file = open_lockable(path)
@@ -144,7 +117,6 @@ class FolderStore:
         weakref.finalize(self, file.close)
 
     def put(self, name: str, data: bytes) -> None:
-        """See :meth:`Store.put`."""
         try:
             with replacing(self.folder / name, partial=self.folder / f"{_TEMPORARY}{name}") as file:
                 file.write(data)
@@ -154,18 +126,15 @@ class FolderStore:
             ) from error
 
     def get(self, name: str, *, max_bytes: int | None = None) -> bytes:
-        """See :meth:`Store.get`."""
         return read_bounded(self.folder / name, max_bytes=MAX_FILE_BYTES if max_bytes is None else max_bytes)
 
     def delete(self, name: str) -> None:
-        """See :meth:`Store.delete`."""
         try:
             (self.folder / name).unlink(missing_ok=True)
         except OSError as error:
             raise StorageError(f"Cannot remove {self.folder / name} ({error.strerror}).") from error
 
     def names(self) -> frozenset[str]:
-        """See :meth:`Store.names`."""
         try:
             return frozenset(filter(is_ours, os.listdir(self.folder)))
         except FileNotFoundError:
@@ -186,18 +155,10 @@ _ATOMIC = ("s3", "s3a", "gcs", "gs", "abfs", "az", "adl", "memory")
 
 
 class CloudStore:
-    """A folder of a URL such as ``s3://bucket/streams/studio``.
+    """A folder of a URL such as ``s3://bucket/streams/studio``, with options of the file system (``open_url``).
 
     Object stores write an object in one step and durably. Elsewhere (sftp and the like) a file is written under a
     temporary name and moved. S3 gets content types and cache headers, so that the bucket can be read by browsers.
-
-    Args:
-        url: the folder.
-        options: of the file system, as fsspec takes them, such as ``endpoint_url`` of an S3 that is not Amazon's.
-
-    Raises:
-        MissingExtraError: fsspec, or the package for this scheme, is not installed.
-        StorageError: the URL is not understood.
     """
 
     def __init__(self, url: str, **options: Any) -> None:
@@ -208,7 +169,6 @@ class CloudStore:
         self._scheme = protocols if isinstance(protocols, str) else protocols[0]
 
     def put(self, name: str, data: bytes) -> None:
-        """See ``Store.put``."""
         path = f"{self._root}/{name}"
         with self._writing(f"write {len(data)} bytes to {name}"):
             if self._scheme in _ATOMIC:
@@ -220,7 +180,6 @@ class CloudStore:
                 self._files.mv(temporary, path)
 
     def get(self, name: str, *, max_bytes: int | None = None) -> bytes:
-        """See ``Store.get``."""
         end = None if max_bytes is None else max_bytes + 1
         try:
             data = self._files.cat_file(f"{self._root}/{name}", end=end)
@@ -231,7 +190,6 @@ class CloudStore:
         return data
 
     def delete(self, name: str) -> None:
-        """See ``Store.delete``."""
         with self._writing(f"remove {name}"):
             try:
                 self._files.rm_file(f"{self._root}/{name}")
@@ -239,7 +197,6 @@ class CloudStore:
                 return
 
     def names(self) -> frozenset[str]:
-        """See ``Store.names``."""
         try:
             self._files.invalidate_cache()
             found = self._files.ls(self._root, detail=False)

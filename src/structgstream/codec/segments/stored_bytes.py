@@ -87,18 +87,8 @@ def segments_from(
     first: int = 0,
     held: Mapping[str, bytes] | None = None,
 ) -> Iterator[SegmentEntry]:
-    """Every segment from number ``first`` on, those on pages included.
-
-    Args:
-        store: has the pages.
-        history: pages of older segments.
-        segments: the segments after them.
-        first: number of the first segment to give.
-        held: contents of pages that are not in the store yet.
-
-    Raises:
-        StreamError: a page is missing, damaged, or not what is announced.
-    """
+    """Every segment from number ``first`` on, those on pages included; ``held`` are contents of pages that are not in
+    the store yet. Raises StreamError if a page is missing, damaged, or not what is announced."""
     for entry in history:
         if entry.first_segment + entry.segments > first:
             data = held[entry.file] if held and entry.file in held else verified(store, entry)
@@ -110,11 +100,8 @@ def segments_from(
 
 
 def verified(store: Store, entry: StoredFile) -> bytes:
-    """The content of the file that an entry names.
-
-    Raises:
-        StreamError: it is missing, or is not what the entry states.
-    """
+    """The content of the file that an entry names. Raises StreamError if it is missing, or is not what the entry
+    states."""
     data = store.get(entry.file)
     if len(data) != entry.bytes or sha256_of(data) != entry.sha256:
         raise StreamError(
@@ -143,8 +130,6 @@ class StoredBytes:
     are no longer there, are left out: :attr:`gone` has their frames.
 
     Args:
-        store: where the files are.
-        manifest: what the stream consists of.
         held: contents of files that are not in the store yet.
         check: verify the SHA-256 of every file; otherwise only lengths, and readers verify records.
 
@@ -293,14 +278,8 @@ class StoredBytes:
 
 
 def open_segments(path: Path | str) -> StoredBytes:
-    """The bytes of a stream in a folder.
-
-    Args:
-        path: the folder, or its manifest.
-
-    Raises:
-        StreamError: there is no manifest, or it is not valid, or a file is missing.
-    """
+    """The bytes of a stream in a folder. Raises StreamError if there is no manifest, or it is not valid, or a file is
+    missing."""
     path = Path(path)
     store = FolderStore(path.parent if path.name == MANIFEST else path)
     return StoredBytes(store, read_manifest(store))
@@ -313,11 +292,7 @@ def is_segments(path: Path | str) -> bool:
 
 
 def read_manifest(store: Store) -> Manifest:
-    """The manifest of a stream of segments.
-
-    Raises:
-        StreamError: there is none, or it is not valid.
-    """
+    """The manifest of a stream of segments. Raises StreamError if there is none, or it is not valid."""
     if MANIFEST not in store.names():
         raise StreamError(f"{store.name} has no {MANIFEST}; expected a folder written with --sink segments.")
     return manifest_from_json(store.get(MANIFEST, max_bytes=MAX_MANIFEST_BYTES), name=f"{MANIFEST} in {store.name}")

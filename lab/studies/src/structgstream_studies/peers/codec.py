@@ -10,8 +10,8 @@ import torch
 
 from structgstream.codec.container.byte_source import FileBytes
 from structgstream.codec.container.records import PREFIX, read_record
-from structgstream.codec.encoder import Encoded
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.codec.scene_coder import Encoded
 from structgstream.scene.state import STATE_TABLE
 from structgstream.session.pipeline import FrameTask, Memory, Pipeline, State, StreamFacts
 from structgstream.session.presets import RIG, to_json

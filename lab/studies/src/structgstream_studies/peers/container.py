@@ -33,9 +33,8 @@ from structgstream.codec.container.records import (
     scan_records,
 )
 from structgstream.codec.contents import PacketInfo
-from structgstream.codec.decoder import FRAME
-from structgstream.codec.header import pack_header, unpack_header
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader, pack_header, unpack_header
+from structgstream.codec.scene_coder import FRAME
 from structgstream.errors import StorageError, StreamError
 from structgstream.session.pipeline import State
 from structgstream_studies.peers.method import Arrays, PeerMethod

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from structgstream.codec.header import check_shapes
+from structgstream.codec.packets import check_shapes
 from structgstream.errors import StreamError
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import STATE_TABLE, FieldName, on_device, scene_of, state_of

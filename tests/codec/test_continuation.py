@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.codec.container.damage import readable_part
 from structgstream.codec.container.records import PREFIX, RECORD, prefix, read_record
+from structgstream.codec.contents import readable_part
 from structgstream.codec.reader import StreamReader
 from structgstream.errors import StreamError
 from tests.support.properties import examples

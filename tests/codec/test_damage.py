@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.codec.container import damage as damage_module
-from structgstream.codec.container.damage import MIN_PACKET_BYTES, Damage, PacketSearch, Standing
+from structgstream.codec import contents
 from structgstream.codec.container.records import RECORD, RecordType, scan_records
+from structgstream.codec.contents import MIN_PACKET_BYTES, Damage, PacketSearch, Standing
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.errors import StreamError
@@ -154,8 +154,8 @@ def test_a_file_full_of_heads_does_not_keep_a_reader_busy(monkeypatch: pytest.Mo
     rows = 20_000
     head = struct.pack("<BBHIId", RecordType.KEY, 0, 0, 10_000, 1, 9.0)
     hostile = data[: offsets[2]] + head * rows + bytes(10_000)
-    read, read_record = [], damage_module.read_record
-    monkeypatch.setattr(damage_module, "read_record", lambda *given: read.append(1) or read_record(*given))
+    read, read_record = [], contents.read_record
+    monkeypatch.setattr(contents, "read_record", lambda *given: read.append(1) or read_record(*given))
     assert len(StreamReader(hostile)) == 1
     assert 0 < 10_000 * len(read) <= 4 * len(hostile)
 
@@ -163,7 +163,7 @@ def test_a_file_full_of_heads_does_not_keep_a_reader_busy(monkeypatch: pytest.Mo
 def test_heads_across_pieces_of_a_search(monkeypatch: pytest.MonkeyPatch) -> None:
     data, _, offsets = whole()
     for size in (8, 9, 64, 1000):
-        monkeypatch.setattr(damage_module, "_CHUNK_BYTES", size)
+        monkeypatch.setattr(contents, "_CHUNK_BYTES", size)
         found = PacketSearch(data).next(offsets[1], Standing(offsets[1], 0, 0.0))
         assert found is not None
         assert found.offset == offsets[2]

@@ -1,19 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decodes packets to scenes (docs/bitstream.md, sections Packets and Compact).
+"""Codes frames: packets to scenes, and scenes to packets (docs/bitstream.md, sections Packets and Compact).
 
 With the codec ``compact`` bins are predicted from the previous frame's. A key packet is predicted from the header's
 reference state and starts with fresh models, so each group of packets (a key packet and the delta packets up to the
 next one) can be decoded by itself.
+
+Note [Closed loop]
+~~~~~~~~~~~~~~~~~~
+Prediction is closed-loop: :meth:`SceneEncoder.encode` decodes the bytes it has just made and returns the
+reconstruction, from which the trainer starts the next frame. It equals the decoder's scene bit for bit; otherwise
+trainer and viewers would diverge.
 """
 
+import math
 from collections.abc import Mapping, Set
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from torch import Tensor
 
-from structgstream.codec.container.blocks import coded_payloads, unpack_raw_blocks
+from structgstream.codec.container.blocks import (
+    coded_payloads,
+    pack_coded_block,
+    pack_raw_block,
+    unpack_raw_blocks,
+)
 from structgstream.codec.container.records import FRAME
-from structgstream.codec.entropy.adaptive import AdaptiveCoder, AdaptiveDecoder
+from structgstream.codec.entropy.adaptive import AdaptiveCoder, AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.entropy.decisions import Models
 from structgstream.codec.fields.packet_fields import (
     CODABLE,
@@ -23,12 +36,13 @@ from structgstream.codec.fields.packet_fields import (
     dequantize_state,
     quantize_state,
 )
-from structgstream.codec.header import check_shapes
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader, check_shapes, packet_from_blocks
 from structgstream.errors import StreamError
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
-from structgstream.scene.state import FieldName, parameters_of, scene_of
+from structgstream.scene.state import STATE_TABLE, FieldName, parameters_of, scene_of, state_of
+
+SceneT = TypeVar("SceneT", covariant=True)
 
 
 @dataclass(frozen=True)
@@ -41,7 +55,7 @@ class CompactState:
 
 
 class CompactCoder:
-    """State that encoder and decoder share: the prediction of each packet.
+    """Encodes or decodes the frames of one stream in order; decoding may start at any key packet.
 
     Raises:
         StreamError: the header has another codec, dynamic fields that cannot be coded, or no step or reference for one.
@@ -69,6 +83,33 @@ class CompactCoder:
         self._reference = quantize_state(known, rows, header.steps)
         self.state: CompactState | None = None
 
+    def encode(self, state: Mapping[FieldName, Tensor], *, kind: PacketKind, index: int) -> dict[FieldName, bytes]:
+        """The bytes of each dynamic field. Raises StreamError if a value is out of range, or a delta packet does not
+        follow the packet before it."""
+        before, models = self._start(kind, index)
+        after = quantize_state(state, self._header.dynamic, self._header.steps)
+        if after.anchors.shape != before.anchors.shape:
+            raise StreamError(f"Frame {index} has {len(after.anchors)} anchors, the header {len(before.anchors)}.")
+        for name, bins in after.weights.items():
+            if bins.shape != before.weights[name].shape:
+                raise StreamError(f"Frame {index} has {name} of another size than the header.")
+        encoder = AdaptiveEncoder(models, where=f"Frame {index}")
+        self._keep(kind, index, self._code(encoder, after, before, index), models)
+        fields = encoder.fields()
+        return {name: fields.get(name, b"") for name in self._header.dynamic}
+
+    def decode(
+        self, fields: Mapping[FieldName, bytes | memoryview], *, kind: PacketKind, index: int
+    ) -> dict[FieldName, Tensor]:
+        """The dynamic fields of a frame. Raises StreamError if the packet is damaged, or does not follow the one before
+        it."""
+        before, models = self._start(kind, index)
+        decoder = AdaptiveDecoder(models, fields, where=f"Packet {index}")
+        bins = self._code(decoder, None, before, index)
+        decoder.end()
+        self._keep(kind, index, bins, models)
+        return dequantize_state(bins, self._header.dynamic, self._header.steps)
+
     def _start(self, kind: PacketKind, index: int) -> tuple[SceneBins, Models]:
         if kind is PacketKind.KEY:
             return self._reference, Models()
@@ -85,25 +126,6 @@ class CompactCoder:
         self.state = CompactState(index, bins.without_change() if kind is PacketKind.KEY else bins, models)
 
 
-class CompactDecoder(CompactCoder):
-    """Decodes the frames of one stream in order, starting at any key packet."""
-
-    def decode(
-        self, fields: Mapping[FieldName, bytes | memoryview], *, kind: PacketKind, index: int
-    ) -> dict[FieldName, Tensor]:
-        """The dynamic fields of a frame.
-
-        Raises:
-            StreamError: the packet is damaged, or does not follow the one before it.
-        """
-        before, models = self._start(kind, index)
-        decoder = AdaptiveDecoder(models, fields, where=f"Packet {index}")
-        bins = self._code(decoder, None, before, index)
-        decoder.end()
-        self._keep(kind, index, bins, models)
-        return dequantize_state(bins, self._header.dynamic, self._header.steps)
-
-
 class SceneDecoder:
     """Decodes the packets of one stream, in order: a delta packet follows the packet before it.
 
@@ -116,7 +138,7 @@ class SceneDecoder:
     def __init__(self, header: StreamHeader) -> None:
         self._header = header
         self._sampling = RigSampling.of(header.similarity.rig(header.rig))
-        self._compact = None if header.codec == "raw" else CompactDecoder(header)
+        self._compact = None if header.codec == "raw" else CompactCoder(header)
 
     @property
     def state(self) -> CompactState | None:
@@ -124,12 +146,8 @@ class SceneDecoder:
         return None if self._compact is None else self._compact.state
 
     def decode(self, packet: Packet) -> Scene:
-        """The scene of one frame, on the CPU, in normalised units.
-
-        Raises:
-            StreamError: the packet's fields are not the header's dynamic ones, their shapes are inconsistent, or the
-                packet before it has not been decoded.
-        """
+        """The scene of one frame, on the CPU, in normalised units. Raises StreamError if the packet's fields are not
+        the header's dynamic ones, their shapes are inconsistent, or the packet before it has not been decoded."""
         header, where = self._header, f"Packet {packet.index}"
         if self._compact is None:
             dynamic = unpack_raw_blocks(packet.payload, FRAME.size, where=where)
@@ -151,3 +169,52 @@ def _check_fields(names: Set[FieldName], header: StreamHeader, where: str) -> No
             f"{where} holds {', '.join(sorted(names)) or 'no field'}; "
             f"the header announces {', '.join(sorted(header.dynamic)) or 'none'}."
         )
+
+
+@dataclass(frozen=True)
+class Encoded(Generic[SceneT]):
+    """A packet and its reconstruction: the scene that a decoder gets."""
+
+    packet: Packet
+    reconstruction: SceneT
+
+
+class SceneEncoder:
+    """Encodes scenes of one stream, in order."""
+
+    def __init__(self, header: StreamHeader) -> None:
+        self._header = header
+        self._decoder = SceneDecoder(header)
+        self._compact = None if header.codec == "raw" else CompactCoder(header)
+        self._last_pts_seconds = -math.inf
+
+    def replay(self, packet: Packet) -> Scene:
+        """Continue after ``packet`` of another encoder, and return its scene; call it for every packet of the group.
+        Raises StreamError if it does not follow the packet before it, or is damaged."""
+        scene = self._decoder.decode(packet)
+        if self._compact is not None:
+            self._compact.state = self._decoder.state
+        self._last_pts_seconds = packet.pts_seconds
+        return scene
+
+    def encode(self, scene: Scene, *, index: int, pts_seconds: float, kind: PacketKind) -> Encoded[Scene]:
+        """The packet of one frame. Raises StreamError if the scene's shapes differ from the header's, or the
+        presentation time is not after the previous frame's."""
+        if not self._last_pts_seconds < pts_seconds < math.inf:
+            raise StreamError(
+                f"Frame {index} is to be presented at {pts_seconds} s, which is not after the frame before it "
+                f"({self._last_pts_seconds} s); the capture's time stamps must rise."
+            )
+        state = state_of(scene)
+        coded = None if self._compact is None else self._compact.encode(state, kind=kind, index=index)
+        blocks: dict[FieldName, bytes] = {
+            row.name: pack_raw_block(row.name, state[row.name])
+            if coded is None
+            else pack_coded_block(row.name, coded[row.name])
+            for row in STATE_TABLE
+            if row.name in self._header.dynamic
+        }
+        packet = packet_from_blocks(blocks, index=index, pts_seconds=pts_seconds, kind=kind)
+        encoded = Encoded(packet, self._decoder.decode(packet))
+        self._last_pts_seconds = pts_seconds
+        return encoded
