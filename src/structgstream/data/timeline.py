@@ -8,6 +8,7 @@ are matched by the numbers in their names.
 """
 
 import logging
+import math
 import re
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -18,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.errors import CaptureError
+from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MIN_CAMERAS
 from structgstream.geometry import Floats
 
@@ -31,6 +32,16 @@ MAX_SINGLE = 2
 def period_seconds(stamps: NDArray[np.float64]) -> float:
     """The usual time in seconds between two frames at ``stamps`` ``[T]``; 1/30 s for a single one."""
     return float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1 / 30
+
+
+def check_rate(fps: float) -> None:
+    """Check a number of frames a second.
+
+    Raises:
+        ConfigError: it is not positive, or not finite.
+    """
+    if not 0 < fps < math.inf:
+        raise ConfigError(f"Frames a second must be positive, got {fps:g}.")
 
 
 @dataclass(frozen=True)

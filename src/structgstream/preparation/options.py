@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from structgstream.data.timeline import check_rate
 from structgstream.data.undistortion import check_field_of_view
 from structgstream.errors import ConfigError
 from structgstream.preparation.calibration.board import Board
@@ -72,8 +73,8 @@ class PrepareOptions:
     def __post_init__(self) -> None:
         if self.near is not None and not 0 < self.near < math.inf:
             raise ConfigError(f"The near plane must be positive, got {self.near:g}.")
-        if self.fps is not None and not 0 < self.fps < math.inf:
-            raise ConfigError(f"Frames a second must be positive, got {self.fps:g}.")
+        if self.fps is not None:
+            check_rate(self.fps)
         if self.field_of_view is not None:
             check_field_of_view(self.field_of_view)
         if self.instants < 1:
