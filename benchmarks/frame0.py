@@ -11,7 +11,7 @@ from benchmarks.contenders import torch_but_raster
 from benchmarks.contest import Contestant, Quantity, Results
 from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.data.points import initial_points
-from structgstream.data.wrappers import resized
+from structgstream.data.source import resized
 from structgstream.kernels.backend import Backend, cpu_backend
 from structgstream.session.presets import FAST, TINY
 from structgstream.similarity import normalizing_similarity

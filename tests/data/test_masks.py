@@ -14,9 +14,9 @@ from structgstream.data.lenses import LensCamera, RadialTangential
 from structgstream.data.masks import with_masks
 from structgstream.data.open import open_capture
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
+from structgstream.data.source import every_nth_frame
 from structgstream.data.timeline import Clock
 from structgstream.data.undistortion import Undistortion, rectilinear, undistort
-from structgstream.data.wrappers import every_nth_frame
 from structgstream.errors import CaptureError
 from tests.support.captures import HEIGHT, WIDTH, picture, small_rig, write_clip, write_panoptic, write_picture
 

@@ -20,9 +20,9 @@ from structgstream.data.prepared import (
     read_prepared,
     write_prepared,
 )
+from structgstream.data.source import apart_seconds
 from structgstream.data.timeline import Clock
 from structgstream.data.undistortion import rectilinear
-from structgstream.data.wrappers import apart_seconds
 from structgstream.errors import CalibrationError, CaptureError, StorageError
 from tests.support.captures import (
     HEIGHT,

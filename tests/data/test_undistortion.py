@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole
+from structgstream.data.source import resized, section, select_cameras
 from structgstream.data.undistortion import UndistortedSource, Undistortion, rectilinear, undistort
-from structgstream.data.wrappers import resized, section, select_cameras
 from structgstream.errors import CalibrationError
 from structgstream.frames import MultiViewFrame
 from tests.support.captures import small_rig

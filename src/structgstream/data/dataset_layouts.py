@@ -63,7 +63,7 @@ from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, common_pict
 from structgstream.data.lenses import LensCamera, fisheye_lens, from_integer_centers
 from structgstream.data.matching import PairMatcher, confirmed_share
 from structgstream.data.posed_capture import of_pictures, of_videos, open_posed
-from structgstream.data.source import FrameSource
+from structgstream.data.source import FrameSource, resized
 from structgstream.data.text_files import (
     NamedFiles,
     mapping,
@@ -79,7 +79,6 @@ from structgstream.data.text_files import (
 from structgstream.data.timeline import natural
 from structgstream.data.video import VideoSource, synchronised
 from structgstream.data.video_index import scan_videos
-from structgstream.data.wrappers import resized
 from structgstream.errors import CalibrationError, CaptureError
 
 PANOPTIC_FPS = 30000 / 1001

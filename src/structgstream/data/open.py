@@ -48,8 +48,7 @@ from structgstream.data.found_calibrations import (
 from structgstream.data.masks import FOLDER, with_masks
 from structgstream.data.posed_capture import NoFrames, open_posed
 from structgstream.data.prepared import open_prepared, recognizes_prepared
-from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import WithoutPoints, WithRig, resized, section
+from structgstream.data.source import FrameSource, WithoutPoints, WithRig, resized, section
 from structgstream.errors import CaptureError, ConfigError, StructGStreamError
 from structgstream.geometry import Floats
 

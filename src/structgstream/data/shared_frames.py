@@ -12,8 +12,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 
-from structgstream.data.source import FrameStream, frame_count, retain_frames
-from structgstream.data.wrappers import SourceFacts
+from structgstream.data.source import FrameStream, SourceFacts, frame_count, retain_frames
 from structgstream.frames import MultiViewFrame
 
 
@@ -45,8 +44,7 @@ class SharedFrames:
     def take(self, reader: int, index: int) -> MultiViewFrame | None:
         """Frame ``index`` for a reader, which does not need those before; None after the last one.
 
-        Raises:
-            CaptureError: the source's; every reader gets it.
+        An error of the source is raised for every reader.
         """
         with self._changed:
             self._positions[reader] = max(self._positions[reader], index)

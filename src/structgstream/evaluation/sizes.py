@@ -8,8 +8,7 @@ import numpy as np
 import torch
 
 from structgstream.cameras import Camera
-from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import select_cameras
+from structgstream.data.source import FrameSource, select_cameras
 from structgstream.errors import CaptureError
 from structgstream.evaluation.metrics import (
     Mask,

@@ -14,8 +14,7 @@ from structgstream.codec.container.records import PREFIX, RecordType, check_pref
 from structgstream.codec.decoder import SceneDecoder
 from structgstream.codec.header import unpack_header
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet
-from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import WithRig, section
+from structgstream.data.source import FrameSource, WithRig, section
 from structgstream.errors import CaptureError, ConfigError, StreamError
 from structgstream.evaluation.recording import capture_of
 from structgstream.scene.scene import Scene

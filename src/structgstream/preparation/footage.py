@@ -34,9 +34,8 @@ from structgstream.data.images import PICTURE_SUFFIXES, check_one_series, pictur
 from structgstream.data.posed_capture import filmed_roots
 from structgstream.data.prepared import pictures_of
 from structgstream.data.timeline import natural, picture_slots
-from structgstream.data.video import measured_fps
+from structgstream.data.video import measured_fps, pictures_at
 from structgstream.data.video_index import VIDEO_SUFFIXES, VideoTrack, load_av, open_video, scan_videos, video_stream
-from structgstream.data.video_pictures import pictures_at
 from structgstream.errors import CaptureError
 
 _log = logging.getLogger(__name__)

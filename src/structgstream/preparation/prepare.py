@@ -28,11 +28,10 @@ from structgstream.data.prepared import (
     recognizes_prepared,
     write_prepared,
 )
-from structgstream.data.source import FrameSource
+from structgstream.data.source import FrameSource, WithRig
 from structgstream.data.timeline import Clock
 from structgstream.data.undistortion import rectilinear
 from structgstream.data.video import measured_fps
-from structgstream.data.wrappers import WithRig
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.frames import MIN_CAMERAS
 from structgstream.pose_check.findings import Finding

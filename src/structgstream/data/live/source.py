@@ -33,10 +33,9 @@ from structgstream.data.prepared import (
     undistorted,
 )
 from structgstream.data.source import FrameSource
-from structgstream.data.undistortion import UndistortedSource
+from structgstream.data.undistortion import lenses_of
+from structgstream.data.video import srgb
 from structgstream.data.video_index import load_av
-from structgstream.data.video_pictures import srgb
-from structgstream.data.wrappers import SourceWrapper
 from structgstream.errors import CaptureError, StorageError
 from structgstream.frames import MIN_CAMERAS, MultiViewFrame
 
@@ -68,7 +67,7 @@ def read_calibration(folder: Path) -> PreparedCapture:
     if recognizes_prepared(folder):
         return read_prepared(folder)
     source = open_capture(folder)
-    lenses = _lenses(source)
+    lenses = lenses_of(source) or {}
     rig = source.rig
     cameras = {
         name: PreparedCamera(name, lenses.get(name, LensCamera(rig[name], Pinhole())), rig[name]) for name in rig
@@ -103,14 +102,6 @@ def with_calibration(
     """
     source = with_masks(undistorted(pictures, folder, capture), folder / FOLDER)
     return selected(source, held_out=held_out, scale=scale, near=near)
-
-
-def _lenses(source: FrameSource) -> Mapping[str, LensCamera]:
-    while isinstance(source, SourceWrapper):
-        if isinstance(source, UndistortedSource):
-            return source.filmed
-        source = source.source
-    return {}
 
 
 log = logging.getLogger(__name__)

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from structgstream.cameras import Camera
-from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import select_cameras
+from structgstream.data.source import FrameSource, select_cameras
 from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.check import examine_poses
 from structgstream.pose_check.findings import Finding, explain, worst_first

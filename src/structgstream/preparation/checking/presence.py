@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.images import ImageSource
-from structgstream.data.source import FrameSource
+from structgstream.data.source import FrameSource, unwrapped
 from structgstream.data.video import VideoSource
-from structgstream.data.wrappers import unwrapped
 from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.findings import Finding
 

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.lenses import LensCamera, Pinhole
-from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import apart_seconds
+from structgstream.data.source import FrameSource, apart_seconds
 from structgstream.pose_check.findings import Finding
 from structgstream.preparation.synchronization.correlation import require_scipy
 from structgstream.preparation.synchronization.motion import (
