@@ -26,10 +26,7 @@ from structgstream.kernels.backend import processor_backend
 def plane_homographies(reference: Camera, cameras: Sequence[Camera], planes: Floats) -> Floats:
     """From pixel indices of ``reference`` to those of each of ``N`` cameras, through each plane: ``[P, N, 3, 3]``.
 
-    Args:
-        reference: the camera whose pixels are mapped.
-        cameras: the others.
-        planes: ``[P, 3]``; a plane is ``plane . x = 1`` in the axes of ``reference``.
+    A plane of ``planes`` ``[P, 3]`` is ``plane . x = 1`` in the axes of ``reference``.
     """
     # The first pixel has the index 0, its centre is at 0.5.
     centred = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
@@ -169,16 +166,15 @@ def consistent_pixels(
 def sweep_points(
     cameras: Mapping[str, Camera],
     images: Mapping[str, NDArray[np.uint8]],
+    masks: Mapping[str, NDArray[np.bool_]],
     *,
     neighbours: Mapping[str, tuple[str, ...]],
     bounds: Mapping[str, SweepBounds],
     workers: int,
-    levels: Sequence[SweepConfig] = DEFAULT_LEVELS,
-    masks: Mapping[str, NDArray[np.bool_]] | None = None,
+    levels: Sequence[SweepConfig],
 ) -> tuple[Floats, NDArray[np.uint8]]:
-    """Consistent points and their colours from depth maps of all ``cameras``; ``images`` ``[H, W, 3]`` uint8.
-
-    ``masks`` ``[H, W]`` leave pixels of a camera out.
+    """Consistent points and their colours from depth maps of all ``cameras``; ``images`` ``[H, W, 3]`` uint8, of whose
+    pixels ``masks`` ``[H, W]`` leave some out.
 
     A later level adds points only where earlier ones have none nearby, because large windows extend surfaces over
     outlines.
@@ -191,7 +187,7 @@ def sweep_points(
     with ThreadPoolExecutor(workers) as pool:
         for config in levels:
             views = {
-                name: sweep_view(camera, images[name], width=config.width, mask=(masks or {}).get(name))
+                name: sweep_view(camera, images[name], width=config.width, mask=masks.get(name))
                 for name, camera in cameras.items()
             }
             pending = {

@@ -111,13 +111,11 @@ def _running_numbers(stems: Sequence[str]) -> dict[str, str]:
 
 
 def picture_slots(pictures: Mapping[str, Sequence[Path]]) -> dict[str, NDArray[np.intp]]:
-    """Which instant each picture of each camera is of, ``[N]`` from 0 on, ascending.
+    """Which instant each picture of each camera is of, ``[N]`` from 0 on, ascending; pictures are in :func:`natural`
+    order.
 
     Cameras that share instants (:func:`instants_of`) number their pictures alike, so one that lacks a name lacks that
     instant. Where a camera shares none with any other, each numbers as it likes, and pictures are counted.
-
-    Args:
-        pictures: camera name to its pictures, in :func:`natural` order of their stems, which differ.
     """
     keys = instants_of({name: [file.stem for file in files] for name, files in pictures.items()})
     stems = {name: [keys[name][file.stem] for file in files] for name, files in pictures.items()}
@@ -144,7 +142,7 @@ def common_slots(
     Args:
         slots: camera name to the slots it has, ascending; a slot is one instant of the common timeline.
         label: names the instant of a slot, for messages ("at 0.133 s", "000017").
-        training: names of the cameras that are not held out; None for all.
+        training: names of the cameras that are not held out.
 
     Raises:
         CaptureError: no camera pictures, no frames in common, or two frames of a camera for one slot.

@@ -11,7 +11,7 @@ from structgstream.data.timeline import check_rate
 from structgstream.data.undistortion import check_field_of_view
 from structgstream.errors import ConfigError
 from structgstream.preparation.calibration.board import Board
-from structgstream.preparation.calibration.colmap import LensModel
+from structgstream.preparation.calibration.lens_terms import LensModel
 from structgstream.preparation.synchronization import Method
 
 Link = Literal["hard", "symlink", "copy"]

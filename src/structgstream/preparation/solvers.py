@@ -17,9 +17,8 @@ from structgstream.data.prepared import FILE as PREPARED
 from structgstream.data.prepared import LENSES, camera_of, filmed_entry, read_prepared
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.calibration.board_solving import solve_board
-from structgstream.preparation.calibration.refinement import refine
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
-from structgstream.preparation.calibration.structure import solve_structure
+from structgstream.preparation.calibration.structure import refine, solve_structure
 from structgstream.preparation.clocks import (
     Clocks,
     Picture,

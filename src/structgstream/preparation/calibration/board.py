@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,11 +68,7 @@ class Board:
         )
 
     def opencv_board(self) -> Any:
-        """The board as OpenCV's.
-
-        Raises:
-            ConfigError: a dictionary that OpenCV lacks, or with too few markers.
-        """
+        """The board as OpenCV's."""
         aruco = opencv().aruco
         number = getattr(aruco, self.dictionary, None)
         if not self.dictionary.startswith("DICT_") or not isinstance(number, int):
@@ -256,9 +252,8 @@ BAR_MM = 100.0
 OVERLAP = 1e-4  # of a square, between rows of a marker, so that no hairline shows there
 
 
-@dataclass(frozen=True)
-class Rectangle:
-    """A black rectangle of the page: left, bottom, width and height in mm from the page's lower left corner."""
+class Rectangle(NamedTuple):
+    """A black rectangle of the page, in mm from the page's lower left corner."""
 
     left: float
     bottom: float
@@ -291,11 +286,7 @@ def write_board_pdf(path: Path, board: Board, paper: Paper = "A4") -> None:
 
 
 def board_page(board: Board, paper: Paper) -> tuple[float, float]:
-    """Width and height of the page in mm, lying.
-
-    Raises:
-        ConfigError: an unknown paper, or one that is too small.
-    """
+    """Width and height of the page in mm, lying."""
     if paper not in PAPERS_MM:
         raise ConfigError(f"{paper!r} is no paper size; expected one of {', '.join(PAPERS_MM)}.")
     width, height = PAPERS_MM[paper]

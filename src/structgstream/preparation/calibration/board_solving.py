@@ -25,26 +25,14 @@ from structgstream.preparation.calibration.bundle import (
     posed_problem,
     solved,
 )
-from structgstream.preparation.calibration.colmap import (
-    LensModel,
-    colmap_camera,
-    filmed_camera,
-    guessed_camera,
-    pycolmap_module,
-)
-from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL
+from structgstream.preparation.calibration.colmap import colmap_camera, filmed_camera, guessed_camera, pycolmap_module
+from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL, LensModel
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
 
 Sightings = Mapping[str, Sequence[Sighting]]
 
 
-FIELDS_OF_VIEW: Mapping[LensModel, tuple[float, ...]] = {
-    "pinhole": (30.0, 50.0, 70.0, 90.0),
-    "radial": (30.0, 50.0, 70.0, 90.0),
-    "opencv": (30.0, 50.0, 70.0, 90.0),
-    "brown": (30.0, 50.0, 70.0, 90.0),
-    "fisheye": (60.0, 90.0, 120.0, 150.0, 175.0),
-}
+FIELDS_OF_VIEW, FISHEYE_FIELDS_OF_VIEW = (30.0, 50.0, 70.0, 90.0), (60.0, 90.0, 120.0, 150.0, 175.0)
 MAX_SIGHTINGS_ALONE = 24
 POSE_PIXELS = 0.02  # of the longer side: coarse, since the lens is not known yet
 OUTLIER_PIXELS = 2.0
@@ -57,18 +45,16 @@ def solve_board(
     *,
     lens: LensModel = "opencv",
 ) -> SolvedCalibration:
-    """Poses, intrinsics and lenses from pictures of ``board`` at many instants.
+    """Poses, intrinsics and lenses from pictures of ``board`` at many instants, in metres and the axes of the first
+    camera.
 
     The lens of each camera is estimated from its own sightings, poses between cameras from the instants that they
     share, and all of them, with the board's pose at each instant, are then adjusted together, at last with what alike
-    lenses share (lens_terms.py, Note [Alike lenses]).
+    lenses share (lens_terms.py, Note [Alike lenses]). The points are the board's corners at each instant.
 
     Args:
         pictures: camera name to pictures ``[H, W, 3]`` of the same instants for all cameras.
         lens: which distortion is estimated.
-
-    Returns:
-        the calibration in metres, in the axes of the first camera; the points are the board's corners at each instant.
 
     Raises:
         CalibrationError: a camera that does not show the board well enough, or at no instant at which it connects to
@@ -108,7 +94,7 @@ def _own_view(
     picks = np.linspace(0, len(chosen) - 1, min(len(chosen), MAX_SIGHTINGS_ALONE)).round().astype(int)
     sample = [chosen[index] for index in picks]
     best: tuple[float, LensCamera] | None = None
-    for degrees in FIELDS_OF_VIEW[lens]:
+    for degrees in FISHEYE_FIELDS_OF_VIEW if lens == "fisheye" else FIELDS_OF_VIEW:
         camera = filmed_camera(guessed_camera(lens, 1, size, degrees), pycolmap_module().Rigid3d())
         poses = _poses(camera, sample, board)
         if len(poses) < max(3, len(sample) // 2):
@@ -255,9 +241,7 @@ def adjust_board(
 ) -> tuple[dict[str, LensCamera], dict[int, Floats]]:
     """Cameras and board-to-world poses ``[4, 4]`` by instant, adjusted together; the first camera is the world.
 
-    Args:
-        lens: which distortion is estimated.
-        rough: a few steps only, with the usual noise and differences of lenses; else these are estimated, too.
+    ``rough`` takes a few steps only, with the usual noise and differences of lenses; else these are estimated, too.
     """
     number = {instant: index for index, instant in enumerate(poses)}
     seen = [(index, sighting) for index, name in enumerate(cameras) for sighting in sightings[name]]

@@ -11,7 +11,7 @@ from structgstream.data.calibration import Alignment, alignment
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import level_normal
 from structgstream.errors import CalibrationError
-from structgstream.geometry import Floats
+from structgstream.geometry import Floats, cross_matrices
 
 Indices = NDArray[np.intp]
 
@@ -118,11 +118,10 @@ def upright(solved: SolvedCalibration) -> SolvedCalibration:
     return solved.aligned(Alignment(1.0, _turn(up, np.array([0.0, -1.0, 0.0])), np.zeros(3)))
 
 
-def _turn(start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64]:
+def _turn(start: Floats, end: Floats) -> Floats:
     """The smallest rotation that turns one unit vector to another."""
     axis, cosine = np.cross(start, end), float(start @ end)
     if cosine < -1 + 1e-9:
         return np.diag([1.0, -1.0, -1.0])
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    cross = cross_matrices(axis)
     return np.eye(3) + cross + cross @ cross / (1 + cosine)
