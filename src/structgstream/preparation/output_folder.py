@@ -9,7 +9,7 @@ import json
 import os
 import shutil
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from structgstream.atomic_files import give_name, lock_file, open_lockable, partial_path, replacing
@@ -24,12 +24,7 @@ _MARKS = (Path(FOLDER), partial_path(Path(FOLDER, SOURCE)))
 
 
 def mark_output(capture: Path, videos: Path) -> None:
-    """Marks ``capture`` as the one of these videos.
-
-    Raises:
-        CaptureError: it is something else's folder.
-        StorageError: it cannot be written.
-    """
+    """Marks ``capture`` as the one of these videos; a ``CaptureError`` where it is something else's folder."""
     marker = capture / FOLDER / SOURCE
     origin = str(videos.resolve())
     if capture.resolve() == videos.resolve():
@@ -37,13 +32,15 @@ def mark_output(capture: Path, videos: Path) -> None:
     if capture.exists() and not capture.is_dir():
         raise CaptureError(f"{capture} is a file; choose a folder with -o.")
     if marker.is_file():
-        before = _origin(marker)
+        before = None
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            before = str(json.loads(marker.read_text())["videos"])
         if before != origin:
             raise CaptureError(
                 f"{capture} was prepared from {before}, not from {origin}; choose another folder with -o, or remove it."
             )
         return
-    if any(entry not in _MARKS for entry in _below(capture)):
+    if any(entry.relative_to(capture) not in _MARKS for entry in capture.rglob("*")):
         raise CaptureError(f"The folder {capture} is not empty and was not made by prepare; choose another with -o.")
     try:
         marker.parent.mkdir(parents=True, exist_ok=True)
@@ -55,14 +52,7 @@ def mark_output(capture: Path, videos: Path) -> None:
 
 @contextmanager
 def lock_output(capture: Path) -> Iterator[None]:
-    """No other process prepares the same capture within the block.
-
-    Args:
-        capture: its folder, which was marked.
-
-    Raises:
-        StorageError: another one does, or the folder cannot be written.
-    """
+    """No other process prepares the same marked capture within the block, or a ``StorageError`` says that one does."""
     try:
         file = open_lockable(capture / FOLDER / LOCK)
     except OSError as error:
@@ -75,28 +65,10 @@ def lock_output(capture: Path) -> Iterator[None]:
         yield
 
 
-def _below(folder: Path) -> Iterator[Path]:
-    """Everything in a folder and its folders, relative to it; nothing if there is none."""
-    return (path.relative_to(folder) for path in folder.rglob("*"))
-
-
-def _origin(marker: Path) -> str | None:
-    try:
-        return str(json.loads(marker.read_text())["videos"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-
-
 def link(source: Path, target: Path, *, how: Link) -> None:
     """Makes ``target`` the file or the folder of files ``source``; what is there already stays.
 
-    Args:
-        source: a file, or a folder of files.
-        target: its place in the capture.
-        how: ``hard`` links, and copies where file systems differ; ``symlink`` points to the source; ``copy`` copies.
-
-    Raises:
-        StorageError: it cannot be written.
+    ``how`` is ``hard`` links, and copies where file systems differ; ``symlink`` to the source; or ``copy``.
     """
     try:
         if source.is_dir():
@@ -113,21 +85,13 @@ def link(source: Path, target: Path, *, how: Link) -> None:
 
 
 def remove_others(folder: Path, names: Collection[str]) -> None:
-    """Removes files that an earlier run linked into ``folder`` and whose names are not among ``names``.
-
-    Raises:
-        StorageError: it cannot be removed.
-    """
+    """Removes files that an earlier run linked into ``folder`` and whose names are not among ``names``."""
     for file in sorted(entry for entry in folder.iterdir() if entry.name not in names and not entry.is_dir()):
         _remove(file)
 
 
 def unlink(source: Path, target: Path) -> None:
-    """Removes what :func:`link` made of ``source``, a file or a folder of files; other files stay.
-
-    Raises:
-        StorageError: it cannot be removed.
-    """
+    """Removes what :func:`link` made of ``source``, a file or a folder of files; other files stay."""
     if source.is_dir():
         for file in sorted(entry for entry in source.iterdir() if entry.is_file()):
             unlink(file, target / file.name)

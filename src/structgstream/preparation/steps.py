@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from structgstream.atomic_files import replacing
 from structgstream.errors import StorageError
-from structgstream.preparation.options import PrepareOptions
 
 FOLDER = "work"
 VERSION = 4  # of the steps' results; a new one does all steps again
@@ -52,11 +51,8 @@ class Silent(Listener):
 
 
 class Steps(Listener):
-    """Runs the steps of one capture, reports them, and records their summaries.
-
-    Args:
-        capture: the capture's folder; results go to ``work`` in it.
-        listener: receives them.
+    """Runs the steps of one capture, reports them to ``listener``, and records their summaries; results go to ``work``
+    in it.
 
     Attributes:
         skipped: steps whose results were there already.
@@ -71,15 +67,12 @@ class Steps(Listener):
         self.summaries: dict[str, str] = {}
 
     def begin(self, step: str, *, skipped: bool = False) -> None:
-        """Reports that a step begins."""
         self._listener.begin(step, skipped=skipped)
 
     def progress(self, done: int, total: int, what: str) -> None:
-        """Reports that a part of the running step is done."""
         self._listener.progress(done, total, what)
 
     def end(self, step: str, summary: str) -> None:
-        """Records and reports the summary of a step."""
         self.summaries[step] = summary
         self._listener.end(step, summary)
 
@@ -98,8 +91,7 @@ class Steps(Listener):
 
         Args:
             inputs: what it depends on apart from other steps, as JSON can hold it.
-            compute: makes the result.
-            pack: the result as numbers and arrays.
+            pack: the result as numbers and arrays, of which ``unpack`` makes it.
             summary: the result in one line.
             after: steps whose results it uses.
 
@@ -158,13 +150,3 @@ def fingerprint(files: Mapping[str, Path]) -> list[tuple[str, str, int, int]]:
             inner = file.relative_to(path).as_posix() if path.is_dir() else file.name
             found.append((name, inner, status.st_size, status.st_mtime_ns))
     return found
-
-
-@dataclass(frozen=True)
-class Job:
-    """One preparation."""
-
-    videos: Path  # the folder of what was filmed
-    capture: Path  # the folder to make
-    options: PrepareOptions  # of the preparation
-    steps: Steps  # runs them, or takes their results from the disk, and reports them
