@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from structgstream.frames import MultiViewFrame
     from structgstream.kernels.backend import Backend, select_backend
     from structgstream.memory import PeakKind
-    from structgstream.pose_check.findings import Finding
+    from structgstream.pose_check.check import Finding
     from structgstream.preparation.checking.check import CheckReport
     from structgstream.preparation.options import PrepareOptions
     from structgstream.preparation.prepare import Preparation
@@ -48,7 +48,7 @@ _HOMES = {
     "CameraRig": "cameras",
     "CheckReport": "preparation.checking.check",
     "FileSink": "codec.sinks",
-    "Finding": "pose_check.findings",
+    "Finding": "pose_check.check",
     "FrameOptions": "exporters.formats",
     "FrameReport": "session.frame_report",
     "FrameScores": "evaluation.report",

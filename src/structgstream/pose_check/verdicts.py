@@ -104,8 +104,7 @@ class _View:
 def resect(tracks: Tracks, camera: Camera, name: str) -> Resection | None:
     """What corrects a camera to the points that others agree on; None if too few of them are in its picture.
 
-    Args:
-        tracks: with the camera among those that are off, so that no point is made of its keypoints.
+    ``tracks`` have the camera among those that are off, so that no point is made of its keypoints.
     """
     own = tracks.of(name) if name in tracks.names else np.zeros(len(tracks.point), bool)
     if own.sum() < MIN_SEEN:
@@ -282,15 +281,10 @@ def find_suspects(errors: Mapping[Pair, PairError], cameras: Mapping[str, Camera
 
 def track_outlier(tracks: Tracks, suspects: Suspects, *, cleared: Collection[str] = ()) -> str | None:
     """The camera, if any, whose observations lie farther from the points of the others than theirs, although its pairs
-    look well.
+    look well; none that is ``cleared``.
 
     Along an epipolar line a match may lie anywhere: in a row of cameras, no pair reveals one that was turned along it.
-    Points of several cameras do.
-
-    Args:
-        tracks: points of the cameras that are not off.
-        suspects: the verdict so far.
-        cleared: cameras that are not to be named.
+    Points of several cameras, which are not off, do.
     """
     medians = {}
     for name in tracks.names:
@@ -299,10 +293,9 @@ def track_outlier(tracks: Tracks, suspects: Suspects, *, cleared: Collection[str
             medians[name] = float(np.median(seen))
     if len(medians) < MIN_CAMERAS:
         return None
-    named = [name for name in medians if name not in cleared]
-    if not named:
+    worst = max((name for name in medians if name not in cleared), key=lambda name: medians[name], default=None)
+    if worst is None:
         return None
-    worst = max(named, key=lambda name: medians[name])
     others = float(np.median([median for name, median in medians.items() if name != worst]))
     return worst if medians[worst] > OUTLIER_RATIO * others else None
 

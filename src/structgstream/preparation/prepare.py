@@ -34,7 +34,7 @@ from structgstream.data.undistortion import rectilinear
 from structgstream.data.video import measured_fps
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.frames import MIN_CAMERAS
-from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.check import Finding
 from structgstream.preparation.calibration.solved import SolvedCalibration, with_distance
 from structgstream.preparation.checking.check import Checked, Examination, check_capture, examine_capture
 from structgstream.preparation.checking.overlap import nearest_depth, observed_depths

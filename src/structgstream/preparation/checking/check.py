@@ -10,8 +10,7 @@ import numpy as np
 from structgstream.cameras import Camera
 from structgstream.data.source import FrameSource, select_cameras
 from structgstream.frames import MultiViewFrame
-from structgstream.pose_check.check import examine_poses
-from structgstream.pose_check.findings import Finding, explain, worst_first
+from structgstream.pose_check.check import Finding, examine_poses, explain, worst_first
 from structgstream.pose_check.tracks import MIN_VIEWS, Evidence, Tracks, pair_errors
 from structgstream.pose_check.verdicts import Suspects, Verdict
 from structgstream.preparation.checking.bumps import bump_findings
@@ -73,18 +72,15 @@ class CameraCheck:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """The numbers of a check; ``as_json`` is what ``report.json`` holds.
+    """The numbers of a check; ``as_json`` is what ``report.json`` holds. Lengths are in the capture's units.
 
     Args:
         capture: its name.
         frame: the frame that was looked at.
         cameras: by name, in the order of the rig.
         pairs: all pairs that were matched.
-        coverage: of the points.
         findings: the worst first.
-        rig_radius: in the capture's units.
-        near: near plane, in the capture's units.
-        nearest: depth that 0.5 % of the points fall below, in the capture's units; None without points.
+        nearest: depth that 0.5 % of the points fall below; None without points.
         unit: of length, where the capture states it.
         steps: summaries of the preparation's steps, where there was one.
     """
@@ -159,11 +155,7 @@ def examine(frame: MultiViewFrame, cameras: Mapping[str, Camera]) -> Examination
 
 
 def examine_capture(source: FrameSource) -> Examination:
-    """The examination of the first frame of a capture that all cameras have.
-
-    Raises:
-        CaptureError: a frame cannot be read.
-    """
+    """The examination of the first frame of a capture that all cameras have."""
     presence = stated_presence(source)
     return replace(examine(whole_frame(source, presence), source.rig.cameras), presence=presence)
 
@@ -175,14 +167,8 @@ def check_capture(
     listener: Listener | None = None,
     examination: Examination | None = None,
 ) -> Checked:
-    """Checks the first frame that all cameras have and the last; held-out cameras are checked, too.
-
-    Args:
-        unit: of length, where it is known.
-
-    Raises:
-        CaptureError: a frame cannot be read.
-    """
+    """Checks the first frame that all cameras have and the last; held-out cameras are checked, too. ``unit`` is that of
+    length, where it is known."""
     cameras = source.rig.cameras
     listener = listener or Silent()
     listener.progress(0, 3, "first frame")
