@@ -113,7 +113,14 @@ def _read_meta(meta: Path) -> tuple[dict[str, Camera], dict[str, dict[str, Path]
         width, height = pixels((content["w"], content["h"]))
         pictures = NamedFiles(meta.parent / "ims", PICTURE_SUFFIXES)
         rows = [
-            (str(name), K, viewmat, _picture(pictures, str(file)), file)
+            # The path below ``ims`` may name that and what is above it.
+            (
+                str(name),
+                K,
+                viewmat,
+                pictures.find(str(file)) or pictures.find("/".join(path_parts(str(file))[-2:])),
+                file,
+            )
             for frame in zip(content["cam_id"], content["k"], content["w2c"], content["fn"], strict=True)
             for name, K, viewmat, file in zip(*frame, strict=True)
         ]
@@ -132,11 +139,6 @@ def _read_meta(meta: Path) -> tuple[dict[str, Camera], dict[str, dict[str, Path]
         for name, (K, viewmat) in first.items()
     }
     return cameras, files
-
-
-def _picture(pictures: NamedFiles, text: str) -> Path | None:
-    """The picture of a path below ``ims``, which may name that and what is above it."""
-    return pictures.find(text) or pictures.find("/".join(path_parts(text)[-2:]))
 
 
 def _same(a: tuple[Any, Any], b: tuple[Any, Any]) -> bool:
@@ -223,7 +225,9 @@ def open_n3dv(path: Path) -> FrameSource:
             "%s: its rows are in the order of the names as text (cam1, cam10, cam2), as the pictures say", path / POSES
         )
         source = opened(sorted(names))
-    return replace(source, points=_points(path, source.rig))  # type: ignore[type-var]
+    model = next((model for name in COLMAP_FOLDERS if (model := find_model(path / name)) is not None), None)
+    points = None if model is None else aligned_points(read_model(model), source.rig)
+    return replace(source, points=points)  # type: ignore[type-var]
 
 
 def _as_text(by_number: FrameSource, as_text: CameraRig) -> bool:
@@ -246,12 +250,6 @@ def _as_text(by_number: FrameSource, as_text: CameraRig) -> bool:
         )  # fmt: skip
         return False
     return shares[1] > shares[0]
-
-
-def _points(path: Path, rig: CameraRig) -> NDArray[np.float64] | None:
-    """The points of the COLMAP model next to the poses, if there is one that agrees with them."""
-    found = next((model for name in COLMAP_FOLDERS if (model := find_model(path / name)) is not None), None)
-    return None if found is None else aligned_points(read_model(found), rig)
 
 
 def _read_llff_poses(file: Path) -> NDArray[np.float64]:

@@ -67,7 +67,12 @@ class Denoised(SourceWrapper):
             own = self.source.frames(following) if following < len(self.source) else iter(())
             after = self.source.frames_after() if isinstance(self.source, SourceWrapper) else iter(())
             later = chain(_closed(stack, own), _closed(stack, after))
-            return mean_of_still(frame, _readable(later), names=self.rig.training, config=self.config)
+
+            def readable() -> Iterator[MultiViewFrame]:  # what cannot be read raises when it is reached itself
+                with suppress(CaptureError):
+                    yield from later
+
+            return mean_of_still(frame, readable(), names=self.rig.training, config=self.config)
 
 
 def denoised(source: FrameStream, config: DenoisingConfig, *, at: tuple[int, ...] = (0,)) -> FrameStream:
@@ -139,12 +144,6 @@ def _box_sums(values: Any) -> Any:
     """Sums over the squares of SMOOTHING_PIXELS around each pixel, float32."""
     cv2 = opencv()
     return cv2.boxFilter(values, cv2.CV_32F, (SMOOTHING_PIXELS, SMOOTHING_PIXELS), normalize=False)
-
-
-def _readable(frames: Iterator[MultiViewFrame]) -> Iterator[MultiViewFrame]:
-    """``frames`` up to one that cannot be read, which raises its error when it is reached itself."""
-    with suppress(CaptureError):
-        yield from frames
 
 
 def _closed(stack: ExitStack, frames: Iterator[MultiViewFrame]) -> Iterator[MultiViewFrame]:

@@ -440,18 +440,14 @@ def read_exif(path: Path) -> StatedOptics:
 
 
 def _focal_pixels(tags: Mapping[int, Any], size: tuple[int, int]) -> float | None:
-    film, plane = _by_film(tags, size), _by_plane(tags, size)
+    equivalent, plane = _number(tags.get(FOCAL_35MM)), _by_plane(tags, size)
+    film = None if equivalent is None else equivalent * math.hypot(*size) / DIAGONAL_35MM
     likely = [
         focal for focal in (plane, film) if focal is not None and MIN_FOCAL_SHARE < focal / max(size) < MAX_FOCAL_SHARE
     ]
     if len(likely) == 2 and abs(likely[0] / likely[1] - 1) > AGREE:
         return film
     return likely[0] if likely else None
-
-
-def _by_film(tags: Mapping[int, Any], size: tuple[int, int]) -> float | None:
-    equivalent = _number(tags.get(FOCAL_35MM))
-    return None if equivalent is None else equivalent * math.hypot(*size) / DIAGONAL_35MM
 
 
 def _by_plane(tags: Mapping[int, Any], size: tuple[int, int]) -> float | None:

@@ -138,14 +138,6 @@ def _masks(folder: Path) -> list[Path]:
     return [file for file in sorted(folder.iterdir()) if file.is_file() and not is_hidden(file) and _is_mask(file)]
 
 
-def _instants(name: str, source: FrameSource) -> tuple[str, ...]:
-    """What the frames of a camera are called in its files; nothing for videos."""
-    source = innermost(source)
-    if not isinstance(source, ImageSource):
-        return ()
-    return source.instants or tuple("" if file is None else file.stem for file in source.files[name])
-
-
 def _is_mask(file: Path) -> bool:
     suffix = file.suffix.lower()
     if suffix in PICTURE_SUFFIXES - {".png"}:
@@ -157,7 +149,9 @@ def _files(folder: Path, name: str, source: FrameSource) -> CameraMasks:
     """The mask files of a camera, the first of which is checked."""
     always, own = by_stem(_masks(folder)).get(name), folder / name
     files = by_stem(_masks(own)) if own.is_dir() else {}
-    instants = _instants(name, source)
+    inner, instants = innermost(source), ()
+    if isinstance(inner, ImageSource):  # frames of videos have no names
+        instants = inner.instants or tuple("" if file is None else file.stem for file in inner.files[name])
     numbers = {instant: index for index, instant in enumerate(instants or map(str, range(len(source))))}
     if not instants:
         files = {str(int(stem)) if stem.isdecimal() else stem: file for stem, file in files.items()}

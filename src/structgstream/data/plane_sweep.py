@@ -248,7 +248,10 @@ def _families(camera: Camera, others: Sequence[Camera], bounds: SweepBounds, con
     Floors and tables are seen at a slant: on planes parallel to the picture wide windows do not match there.
     """
     near, far = bounds.depth_range
-    pixels_per_inverse = float(camera.K[0, 0]) * _base_across(camera, others)
+    axis = camera.viewmat.numpy()[2, :3]
+    bases = [other.center.numpy() - camera.center.numpy() for other in others]
+    across = float(np.median([np.linalg.norm(base - (base @ axis) * axis) for base in bases]))
+    pixels_per_inverse = float(camera.K[0, 0]) * across
     count = int(np.clip(math.ceil(pixels_per_inverse * (1 / near - 1 / far)), *config.planes))
     families = [_Family(np.array([0.0, 0.0, 1.0]), np.linspace(1 / far, 1 / near, count))]
     if bounds.up is None or not config.level_planes:
@@ -264,13 +267,6 @@ def _families(camera: Camera, others: Sequence[Camera], bounds: SweepBounds, con
             count = int(np.clip(math.ceil(span), 8, config.planes[1]))
             families.append(_Family(normal, np.linspace(1 / offset, 1 / close, count)))
     return families
-
-
-def _base_across(camera: Camera, others: Sequence[Camera]) -> float:
-    """Median distance of the other cameras from the optical axis."""
-    axis = camera.viewmat.numpy()[2, :3]
-    bases = [other.center.numpy() - camera.center.numpy() for other in others]
-    return float(np.median([np.linalg.norm(base - (base @ axis) * axis) for base in bases]))
 
 
 def _search(

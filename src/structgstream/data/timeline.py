@@ -68,7 +68,10 @@ def instants_of(stems: Mapping[str, Sequence[str]]) -> dict[str, dict[str, str]]
     Numbers are compared whatever their padding. Where a camera then shares no name with another and its names differ in
     one number alone, that number counts, whatever stands around it (``00_00_00000012``, ``000012_left``).
     """
-    keys = {name: _distinct({stem: re.sub(r"\d+", _unpadded, stem) for stem in own}) for name, own in stems.items()}
+    keys = {}
+    for name, own in stems.items():
+        unpadded = {stem: re.sub(r"\d+", lambda digits: str(int(digits[0])), stem) for stem in own}
+        keys[name] = unpadded if len({*unpadded.values()}) == len(own) else {stem: stem for stem in own}
     taken = Counter(key for own in keys.values() for key in own.values())
     if len(keys) < 2 or all(any(taken[key] > 1 for key in own.values()) for own in keys.values()):
         return keys
@@ -85,15 +88,6 @@ def instants_of(stems: Mapping[str, Sequence[str]]) -> dict[str, dict[str, str]]
             first, stems[first][0], other, stems[other][0],
         )  # fmt: skip
     return numbered
-
-
-def _unpadded(digits: re.Match[str]) -> str:
-    return str(int(digits.group()))
-
-
-def _distinct(keys: dict[str, str]) -> dict[str, str]:
-    """The keys; the names themselves where two have one key."""
-    return keys if len(set(keys.values())) == len(keys) else {stem: stem for stem in keys}
 
 
 def _running_numbers(stems: Sequence[str]) -> dict[str, str]:

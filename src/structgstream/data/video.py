@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
 from structgstream.data.images import OPAQUE, reduced_mask
-from structgstream.data.timeline import Clock, Placed, common_slots, log_time_error, measured_rate, origin_of, place
+from structgstream.data.timeline import Clock, common_slots, log_time_error, measured_rate, origin_of, place
 from structgstream.data.video_index import (
     BT2020,
     HIGH_RANGE,
@@ -172,8 +172,13 @@ def synchronised(
         training=rig.training,
     )
     log_time_error(placed, common, fps=rate, where=str(where))
-    stamps = {name: _stamps(tracks[name], own, common) for name, own in placed.items()}
-    errors = {name: _errors(own, common) / rate for name, own in placed.items()}
+    stamps, errors = {}, {}
+    for name, own in placed.items():
+        frame_of = dict(zip(own.slots.tolist(), own.frames.tolist(), strict=True))
+        stamps[name] = tuple(tracks[name].stamps[frame_of[slot]] if slot in frame_of else None for slot in common)
+        inside = (own.slots >= common.start) & (own.slots < common.stop)
+        errors[name] = np.full(len(common), np.nan)
+        errors[name][own.slots[inside] - common.start] = own.errors[inside] / rate
     return VideoSource(where.name, rig, rate, tracks, stamps, points, errors)
 
 
@@ -207,20 +212,6 @@ def _common_times(
         name: track.start if is_mixed and track.container in STREAM_FORMATS else 0 for name, track in tracks.items()
     }
     return {name: track.seconds - starts[name] * track.tick_seconds for name, track in tracks.items()}
-
-
-def _stamps(track: VideoTrack, placed: Placed, common: range) -> tuple[int | None, ...]:
-    """The time stamp of each slot of the range; None for those without a frame."""
-    frame_of = dict(zip(placed.slots.tolist(), placed.frames.tolist(), strict=True))
-    return tuple(track.stamps[frame_of[slot]] if slot in frame_of else None for slot in common)
-
-
-def _errors(placed: Placed, common: range) -> NDArray[np.float64]:
-    """Time of the frame of each slot of the range minus the slot's instant, in periods; NaN for those without one."""
-    errors = np.full(len(common), np.nan)
-    inside = (placed.slots >= common.start) & (placed.slots < common.stop)
-    errors[placed.slots[inside] - common.start] = placed.errors[inside]
-    return errors
 
 
 Damage = Callable[[int, int | None, str], None]

@@ -111,7 +111,9 @@ def resect(tracks: Tracks, camera: Camera, name: str) -> Resection | None:
         return None
     points, pixels = tracks.points[tracks.point[own]], tracks.pixels[own]
     limit = AGREE_PIXELS * pixel_scale(camera.width)
-    view = _view(camera)
+    K = camera.K.numpy()
+    focal, principal, skew = K.diagonal()[:2].copy(), K[:2, 2].copy(), float(K[0, 1])
+    view = _View(camera.viewmat.numpy()[:3, :3], camera.center.numpy(), focal, principal, skew)
     starts = [start for start in (np.zeros(7), _by_points(camera, points, pixels, limit)) if start is not None]
     best = max((_adjusted(view, start, points, pixels, limit) for start in starts), key=lambda found: found[1].sum())
     change, fits = best
@@ -146,12 +148,6 @@ def explained(tracks: Tracks, camera: Camera, name: str) -> int:
     seen, depths = project(camera, tracks.points[tracks.point[own]])
     distances = np.linalg.norm(seen - tracks.pixels[own], axis=1)
     return int(((depths > 0) & (distances < 2 * AGREE_PIXELS * pixel_scale(camera.width))).sum())
-
-
-def _view(camera: Camera) -> _View:
-    K = camera.K.numpy()
-    rotation = camera.viewmat.numpy()[:3, :3]
-    return _View(rotation, camera.center.numpy(), np.array([K[0, 0], K[1, 1]]), K[:2, 2].copy(), float(K[0, 1]))
 
 
 def _by_points(camera: Camera, points: Floats, pixels: Floats, limit: float) -> Floats | None:

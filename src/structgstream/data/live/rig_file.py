@@ -115,22 +115,13 @@ def check_cameras(rig: LiveRig, calibrated: Collection[str], path: Path) -> None
 
 
 def _resolved(rig: LiveRig, path: Path) -> LiveRig:
-    """Files and folders are relative to the rig file; names of devices stay."""
-    folder = path.parent
-    cameras = {
-        name: _in_folder(camera, folder) if camera.is_session or _is_path(camera, folder) else camera
-        for name, camera in rig.cameras.items()
-    }
-    return replace(rig, calibration=folder / rig.calibration, cameras=cameras)
-
-
-def _is_path(camera: LiveCamera, folder: Path) -> bool:
-    """Whether the URL is a path; with a format it may be the name of a device."""
-    return not SCHEME.match(camera.url) and (camera.format is None or (folder / camera.url).is_file())
-
-
-def _in_folder(camera: LiveCamera, folder: Path) -> LiveCamera:
-    return replace(camera, url=str(folder / camera.url))
+    """Files and folders are relative to the rig file; names of devices, which may come with a format, stay."""
+    cameras = dict(rig.cameras)
+    for name, camera in cameras.items():
+        file = path.parent / camera.url
+        if not SCHEME.match(camera.url) and (camera.is_session or camera.format is None or file.is_file()):
+            cameras[name] = replace(camera, url=str(file))
+    return replace(rig, calibration=path.parent / rig.calibration, cameras=cameras)
 
 
 def _parse(kind: type[Parsed], entry: Any, *, where: str) -> Parsed:

@@ -66,7 +66,10 @@ def solve_board(
     views = {name: _own_view(name, sightings[name], board, size, lens) for name, size in sizes.items()}
     sensors = _connected_sensors(views)
     poses = _rig_poses(views, sensors, sightings)
-    filmed = {name: _placed(view.filmed, sensors[name]) for name, view in views.items()}
+    filmed = {
+        name: replace(view.filmed, camera=replace(view.filmed.camera, viewmat=torch.from_numpy(sensors[name].copy())))
+        for name, view in views.items()
+    }
     inliers: Sightings = {name: [s for s in sightings[name] if s.instant in view.poses] for name, view in views.items()}
     for _ in range(2):
         filmed, poses = adjust_board(board, inliers, filmed, poses, lens=lens, rough=True)
@@ -190,10 +193,6 @@ def _rig_poses(views: Mapping[str, _View], sensors: Mapping[str, Floats], sighti
     return {instant: best[instant][1] for instant in sorted(best)}
 
 
-def _placed(filmed: LensCamera, viewmat: Floats) -> LensCamera:
-    return replace(filmed, camera=replace(filmed.camera, viewmat=torch.from_numpy(viewmat.copy())))
-
-
 def _solved(
     board: Board, sightings: Sightings, filmed: Mapping[str, LensCamera], poses: Mapping[int, Floats]
 ) -> SolvedCalibration:
@@ -263,9 +262,9 @@ def adjust_board(
     )
     parameters = solved(bundle, parameters, max_steps=ROUGH_STEPS) if rough else estimated(bundle, parameters)[1]
     parameters = _from_first(parameters)
-    return cameras_in(parameters, cameras, bundle.lens), dict(
-        zip(poses, _matrices(parameters.body_rotations, parameters.body_positions), strict=True)
-    )
+    matrices = np.tile(np.eye(4), (len(poses), 1, 1))
+    matrices[:, :3, :3], matrices[:, :3, 3] = parameters.body_rotations, parameters.body_positions
+    return cameras_in(parameters, cameras, bundle.lens), dict(zip(poses, matrices, strict=True))
 
 
 def _from_first(parameters: Parameters) -> Parameters:
@@ -281,9 +280,3 @@ def _from_first(parameters: Parameters) -> Parameters:
         body_rotations=turn @ parameters.body_rotations,
         body_positions=parameters.body_positions @ turn.T + move,
     )
-
-
-def _matrices(body_rotations: Floats, body_positions: Floats) -> Floats:
-    found = np.tile(np.eye(4), (len(body_rotations), 1, 1))
-    found[:, :3, :3], found[:, :3, 3] = body_rotations, body_positions
-    return found

@@ -113,10 +113,12 @@ def missing_cameras(missing: Sequence[str], matches: Matches, pairs: Mapping[Pai
     reasons = []
     for name in missing:
         others = {
-            (two if name == one else one): _agreeing((one, two), matches, pairs)
-            for one, two in matches
-            if name in (one, two)
-        }
+            (pair[1] if name == pair[0] else pair[0]): (
+                len(pairs[pair].inlier_matches) if pair in pairs else 0, len(found),
+            )
+            for pair, found in matches.items()
+            if name in pair
+        }  # fmt: skip
         best = sorted(others, key=lambda other: -others[other][0])[:2]
         best_pairs = " and ".join(f"{others[other][0]} of {others[other][1]} matches with {other!r}" for other in best)
         reasons.append(f"{name!r} ({best_pairs} agree)")
@@ -220,10 +222,6 @@ def _finished(
     return normalized(
         rematched(normalized(adjusted(rough)), keypoints, limits=limits, adjust=adjusted, workers=workers)
     )
-
-
-def _agreeing(pair: Pair, matches: Matches, pairs: Mapping[Pair, Any]) -> tuple[int, int]:
-    return (len(pairs[pair].inlier_matches) if pair in pairs else 0), len(matches[pair])
 
 
 def _nothing(pictures: Pictures, matches: Matches, pairs: Mapping[Pair, Any]) -> str:

@@ -94,7 +94,10 @@ def frame_residuals(common: Mapping[str, Floats]) -> dict[str, float]:
     period = 1 / (counted_rate(list(common.values())) or 30.0)  # one frame a camera: any rate is right
     start = max(times[0] for times in common.values())
     end = min(times[-1] for times in common.values())
-    turns = [np.exp(2j * np.pi * _inside(times, start, end) / period).mean() for times in common.values()]
+    inside = {name: own[(own >= start - 1e-9) & (own <= end + 1e-9)] for name, own in common.items()}
+    turns = [
+        np.exp(2j * np.pi * (inside[name] if len(inside[name]) else common[name]) / period).mean() for name in common
+    ]
     phase = float(np.angle(np.sum(turns))) / (2 * np.pi) * period
     first = np.ceil((start - phase) / period - 0.5)
     instants = phase + period * np.arange(first, first + max(int((end - start) / period), 1))
@@ -108,11 +111,6 @@ def frame_residuals(common: Mapping[str, Floats]) -> dict[str, float]:
         late = late[np.abs(late) <= period / 2 + 1e-9]
         residuals[name] = float(late[np.abs(late).argmax()]) if len(late) else 0.0
     return residuals
-
-
-def _inside(times: Floats, start: float, end: float) -> Floats:
-    inside = times[(times >= start - 1e-9) & (times <= end + 1e-9)]
-    return inside if len(inside) else times
 
 
 def _require_overlap(common: Mapping[str, Floats]) -> None:
