@@ -13,10 +13,9 @@ from structgstream.data.timeline import Clock
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.options import Distance, PrepareOptions
-from structgstream.preparation.output_folder import SOURCE
+from structgstream.preparation.output_folder import FOLDER, SOURCE, Silent, Steps
 from structgstream.preparation.prepare import Job, chosen_method
 from structgstream.preparation.solvers import TIMESTAMPS, Clocks
-from structgstream.preparation.steps import FOLDER, Silent, Steps
 from tests.support.footage_made import still_room
 from tests.support.rooms import write_room
 

@@ -16,9 +16,9 @@ from structgstream.errors import ConfigError, StorageError
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import PrepareOptions
+from structgstream.preparation.output_folder import FOLDER, Silent, Steps
 from structgstream.preparation.prepare import POINTS, Job, assembled, chosen_method, held_out_of
 from structgstream.preparation.solvers import given_cameras
-from structgstream.preparation.steps import FOLDER, Silent, Steps
 from tests.support.rooms import write_room
 
 NONE = PrepareOptions(synchronize="none", near=0.25)

@@ -342,20 +342,19 @@ def _check(
 
 def _filmed(poses: Mapping[str, PosedCamera], sizes: Sizes, calibration: Calibration) -> dict[str, LensCamera]:
     """Every camera at the size of its pictures, in the order of ``sizes``."""
-    return {
-        name: LensCamera(_sized(name, poses[name], sizes[name], calibration.where), poses[name].lens) for name in sizes
-    }
-
-
-def _sized(name: str, posed: PosedCamera, size: tuple[int, int], where: Path) -> Camera:
-    width, height = posed.size or size
-    camera = calibrated_camera(name, viewmat=posed.viewmat, K=posed.K, width=width, height=height, where=where)
-    if abs(size[1] - height * size[0] / width) > 1:
-        raise CalibrationError(
-            f"The pictures of camera {name!r} have {size[0]}x{size[1]} pixels, {where} is for {width}x{height}: other "
-            "proportions, so they are not a reduction; use pictures of the mode that was calibrated, or calibrate it."
-        )
-    return camera.resized(*size)
+    filmed, where = {}, calibration.where
+    for name, size in sizes.items():
+        posed = poses[name]
+        width, height = posed.size or size
+        camera = calibrated_camera(name, viewmat=posed.viewmat, K=posed.K, width=width, height=height, where=where)
+        if abs(size[1] - height * size[0] / width) > 1:
+            raise CalibrationError(
+                f"The pictures of camera {name!r} have {size[0]}x{size[1]} pixels, {where} is for {width}x{height}: "
+                "other proportions, so they are not a reduction; use pictures of the mode that was calibrated, or "
+                "calibrate it."
+            )
+        filmed[name] = LensCamera(camera.resized(*size), posed.lens)
+    return filmed
 
 
 def _rig(

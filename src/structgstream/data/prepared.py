@@ -80,6 +80,12 @@ def write_prepared(path: Path, capture: PreparedCapture) -> None:
 
 def prepared_entries(capture: PreparedCapture) -> dict[str, Any]:
     """What ``capture.json`` holds."""
+    cameras = {}
+    for name, camera in capture.cameras.items():
+        pinhole = {"size": [camera.pinhole.width, camera.pinhole.height], "K": camera.pinhole.K.tolist()}
+        cameras[name] = {
+            "files": camera.files, **filmed_entry(camera.filmed), "clock": asdict(camera.clock), "pinhole": pinhole,
+        }  # fmt: skip
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -88,7 +94,7 @@ def prepared_entries(capture: PreparedCapture) -> dict[str, Any]:
         "near": capture.near,
         "held_out": sorted(capture.held_out, key=natural),
         "points": capture.points,
-        "cameras": {name: _camera_entry(camera) for name, camera in capture.cameras.items()},
+        "cameras": cameras,
     }
 
 
@@ -204,16 +210,6 @@ def _read_points(path: Path, capture: PreparedCapture) -> NDArray[np.float64] | 
         if points.ndim != 2 or points.shape[1] != 3:
             raise Unreadable(f"an array of shape {points.shape}")
     return points
-
-
-def _camera_entry(camera: PreparedCamera) -> dict[str, Any]:
-    pinhole = camera.pinhole
-    return {
-        "files": camera.files,
-        **filmed_entry(camera.filmed),
-        "clock": asdict(camera.clock),
-        "pinhole": {"size": [pinhole.width, pinhole.height], "K": pinhole.K.tolist()},
-    }
 
 
 def filmed_entry(filmed: LensCamera) -> dict[str, Any]:

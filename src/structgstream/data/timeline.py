@@ -161,23 +161,7 @@ def common_slots(
                 f"Camera {camera!r} of {where} has two frames for {label(repeated)}; expected one frame per "
                 "camera and instant at one common rate. Re-encode it at the rate of the others."
             )
-    _log_cuts(slots, first, last, where=where, label=label)
-    _log_absences(inside, first, last, where=where, label=label, training=training)
-    return range(first, last + 1)
-
-
-def _end(slots: Mapping[str, Sequence[int]], training: Collection[str] | None) -> int:
-    """The last slot that half of the cameras, and two training cameras, reach."""
-    ends = sorted((own[-1] for own in slots.values()), reverse=True)
-    trained = sorted((own[-1] for name, own in slots.items() if training is None or name in training), reverse=True)
-    return min(ends[(len(ends) - 1) // 2], trained[min(MIN_CAMERAS, len(trained)) - 1])
-
-
-def _log_cuts(
-    slots: Mapping[str, Sequence[int]], first: int, last: int, *, where: str, label: Callable[[int], str]
-) -> None:
-    starts = min(own[0] for own in slots.values())
-    ends = max(own[-1] for own in slots.values())
+    starts, ends = min(own[0] for own in slots.values()), max(own[-1] for own in slots.values())
     if first > starts:
         late = next(camera for camera, own in slots.items() if own[0] == first)
         log.warning(
@@ -190,6 +174,15 @@ def _log_cuts(
             "%s: camera %r ends with %s; %d later frames of other cameras are left out",
             where, early, label(last), ends - last,
         )  # fmt: skip
+    _log_absences(inside, first, last, where=where, label=label, training=training)
+    return range(first, last + 1)
+
+
+def _end(slots: Mapping[str, Sequence[int]], training: Collection[str] | None) -> int:
+    """The last slot that half of the cameras, and two training cameras, reach."""
+    ends = sorted((own[-1] for own in slots.values()), reverse=True)
+    trained = sorted((own[-1] for name, own in slots.items() if training is None or name in training), reverse=True)
+    return min(ends[(len(ends) - 1) // 2], trained[min(MIN_CAMERAS, len(trained)) - 1])
 
 
 def _log_absences(

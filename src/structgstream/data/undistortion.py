@@ -266,11 +266,6 @@ class UndistortedSource(WithRig):
                 masks = {name: mask for name in names if (mask := self._mask(name, frame.masks.get(name))) is not None}
                 yield replace(frame, images=images, masks=masks)
 
-    def shown(self, name: str) -> NDArray[np.bool_] | None:
-        """Mask ``[H, W]`` of a camera's pixels that its lens shows; None if all."""
-        plan = self._plan(name)
-        return None if plan is None else plan.shown
-
     def resized(self, rig: CameraRig) -> "UndistortedSource":
         """The same frames at the sizes of ``rig``, resampled once."""
         return replace(self, other=rig)

@@ -40,7 +40,19 @@ from structgstream.preparation.checking.check import Checked, Examination, check
 from structgstream.preparation.checking.overlap import nearest_depth, observed_depths
 from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import METHODS, PrepareOptions
-from structgstream.preparation.output_folder import link, lock_output, mark_output, remove_others, unlink
+from structgstream.preparation.output_folder import (
+    FOLDER,
+    Listener,
+    Silent,
+    Steps,
+    Stored,
+    fingerprint,
+    link,
+    lock_output,
+    mark_output,
+    remove_others,
+    unlink,
+)
 from structgstream.preparation.report import write_report
 from structgstream.preparation.solvers import (
     TIMESTAMPS,
@@ -63,7 +75,6 @@ from structgstream.preparation.solvers import (
     unpacked,
     unpacked_clocks,
 )
-from structgstream.preparation.steps import FOLDER, Listener, Silent, Steps, Stored, fingerprint
 from structgstream.similarity import rig_radius
 
 MIN_SOLVED = 3  # cameras, for poses that can be checked

@@ -23,7 +23,7 @@ from structgstream.pose_check.tracks import pair_errors
 from structgstream.preparation.checking.check import Checked, CheckReport, Examination
 from structgstream.preparation.checking.overlap import cameras_per_point
 from structgstream.preparation.checking.times import SIGMAS
-from structgstream.preparation.steps import Listener, Silent
+from structgstream.preparation.output_folder import Listener, Silent
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -35,7 +35,7 @@ from structgstream.preparation.footage import (
     still_pictures,
 )
 from structgstream.preparation.options import PrepareOptions
-from structgstream.preparation.steps import Stored
+from structgstream.preparation.output_folder import Stored
 from structgstream.preparation.synchronization.synchronize import Method, synchronize
 
 TIMESTAMPS = "timestamps.csv"
