@@ -12,7 +12,7 @@ from benchmarks.contest import Contestant, Quantity, Results
 from structgstream.cameras import normalizing_similarity
 from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.data.points import initial_points
-from structgstream.data.wrappers import resized
+from structgstream.data.source import resized
 from structgstream.kernels.backend import Backend, cpu_backend
 from structgstream.session.presets import FAST, TINY
 from structgstream.training.frame0.fit import fit_first_frame

@@ -18,7 +18,7 @@ from structgstream import memory
 from structgstream.cameras import CameraRig
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
-from structgstream.data.wrappers import Prefetch
+from structgstream.data.source import Prefetch
 from structgstream.frames import MultiViewFrame
 from structgstream.memory import PeakKind, PeakMeter, resident_bytes
 from structgstream.session.loop import Session

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.open import open_capture
-from structgstream.data.source import FrameSource
+from structgstream.data.source import FrameSource, SourceWrapper
 from structgstream.data.video_writer import bt709_frame, state_bt709
-from structgstream.data.wrappers import SourceWrapper
 from structgstream.frames import MultiViewFrame
 
 Picture = NDArray[np.uint8]

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from structgstream.data import bundled_clip, open_capture
 from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import LensCamera, Pinhole
-from structgstream.preparation.calibration.refinement import refine
-from structgstream.preparation.calibration.structure import solve_structure
+from structgstream.preparation.calibration.structure import refine, solve_structure
 from tests.support.calibration_errors import CameraError, calibration_errors
 
 Rig = Mapping[str, LensCamera]

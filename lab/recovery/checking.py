@@ -20,10 +20,9 @@ import torch
 
 from structgstream.cameras import Camera
 from structgstream.data.open import open_capture
-from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import SourceWrapper, WithRig, every_nth_frame, section
+from structgstream.data.source import FrameSource, SourceWrapper, WithRig, every_nth_frame, section
 from structgstream.frames import MultiViewFrame
-from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.check import Finding
 from structgstream.pose_check.verdicts import judge
 from structgstream.preparation.checking.check import Examination, check_capture, examine_capture
 

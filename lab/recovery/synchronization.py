@@ -25,7 +25,7 @@ from structgstream.data.source import FrameSource
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
 from structgstream.preparation.checking.times import check_synchronization, time_findings
-from structgstream.preparation.synchronization import Synchronization, synchronize
+from structgstream.preparation.synchronization.synchronize import Synchronization, synchronize
 
 LATE_FRAMES = (1, 3)  # of two cameras, for the check
 MAX_FRAMES = 300

@@ -24,8 +24,7 @@ from benchmarks.machine import load_average, machine
 from structgstream.cameras import Camera, normalizing_similarity
 from structgstream.codec.reader import open_stream
 from structgstream.data.dataset_layouts import bundled_clip
-from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import SourceWrapper, resized
+from structgstream.data.source import FrameSource, SourceWrapper, resized
 from structgstream.evaluation.evaluate import evaluate
 from structgstream.evaluation.run_log import read_log
 from structgstream.frames import MultiViewFrame

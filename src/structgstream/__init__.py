@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from structgstream.frames import MultiViewFrame
     from structgstream.kernels.backend import Backend, select_backend
     from structgstream.memory import PeakKind
-    from structgstream.pose_check.findings import Finding
+    from structgstream.pose_check.check import Finding
     from structgstream.preparation.checking.check import CheckReport
     from structgstream.preparation.options import PrepareOptions
     from structgstream.preparation.prepare import Preparation
@@ -56,7 +56,7 @@ _NAMES = {
     "frames": "MultiViewFrame",
     "kernels.backend": "Backend select_backend",
     "memory": "PeakKind",
-    "pose_check.findings": "Finding",
+    "pose_check.check": "Finding",
     "preparation.checking.check": "CheckReport",
     "preparation.options": "PrepareOptions",
     "preparation.prepare": "Preparation",

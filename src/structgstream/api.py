@@ -27,8 +27,8 @@ from structgstream.exporters.write import write_frames
 from structgstream.kernels.backend import Backend, BackendName, select_backend
 from structgstream.preparation.checking.check import CheckReport
 from structgstream.preparation.options import PrepareOptions
+from structgstream.preparation.output_folder import Listener
 from structgstream.preparation.prepare import Preparation, check_folder, prepare_capture
-from structgstream.preparation.steps import Listener
 from structgstream.recorder import check_output, record, segments_at, segments_folder
 from structgstream.serve.pages import StreamFile, write_page, write_site
 from structgstream.session.frame_report import FrameReport

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rotations, covariances, and the type of float64 arrays."""
+"""Cross products, rotations, and the type of float64 arrays."""
 
 import numpy as np
 import torch
@@ -7,6 +7,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Floats = NDArray[np.float64]
+
+
+def cross_matrices(vectors: Floats) -> Floats:
+    """Matrices ``[..., 3, 3]`` of the cross product with ``vectors`` ``[..., 3]`` from the left."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*vectors.shape, 3)
 
 
 def quaternion_matrices(quats: Tensor) -> Tensor:

@@ -39,9 +39,7 @@ from structgstream.codec.segments.quality_list import (
     write_list,
 )
 from structgstream.data.denoising import DenoisingConfig, denoised
-from structgstream.data.shared_frames import SharedFrames
-from structgstream.data.source import FrameStream
-from structgstream.data.wrappers import read_ahead
+from structgstream.data.source import FrameStream, SharedFrames, read_ahead
 from structgstream.errors import ConfigError, StorageError, StreamError
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry, read_log
 from structgstream.frames import MultiViewFrame

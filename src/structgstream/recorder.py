@@ -31,8 +31,7 @@ from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.codec.segments.stored_bytes import read_manifest
 from structgstream.codec.sinks import StoredSegments, resume_segments
 from structgstream.data.live.status import LiveStatus
-from structgstream.data.source import FrameStream, frame_count
-from structgstream.data.wrappers import read_ahead
+from structgstream.data.source import FrameStream, frame_count, read_ahead
 from structgstream.errors import StorageError, StreamError
 from structgstream.evaluation.pictures import png_bytes
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry

@@ -21,8 +21,8 @@ from structgstream.data.posed_capture import filmed_by
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
 from structgstream.data.timeline import Clock
 from structgstream.data.undistortion import rectilinear
+from structgstream.data.video import pictures_at
 from structgstream.data.video_index import scan_videos
-from structgstream.data.video_pictures import pictures_at
 from structgstream.errors import StructGStreamError
 from tests.support.calibrations import OF_PINHOLES, WRITERS, truths
 from tests.support.captures import (

@@ -9,8 +9,7 @@ import pytest
 
 from structgstream import cameras
 from structgstream.data.denoising import MAX_FRAMES, Denoised, DenoisingConfig, denoised, mean_of_still
-from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import Prefetch, section
+from structgstream.data.source import FrameSource, Prefetch, section
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MultiViewFrame
 from tests.support.memory_captures import MemoryCapture

@@ -14,9 +14,9 @@ from structgstream.data.lenses import LensCamera, RadialTangential
 from structgstream.data.masks import with_masks
 from structgstream.data.open import open_capture
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
+from structgstream.data.source import every_nth_frame
 from structgstream.data.timeline import Clock
 from structgstream.data.undistortion import Undistortion, rectilinear, undistort
-from structgstream.data.wrappers import every_nth_frame
 from structgstream.errors import CaptureError
 from tests.support.captures import HEIGHT, WIDTH, picture, small_rig, write_clip, write_panoptic, write_picture
 
@@ -127,7 +127,7 @@ def test_a_mask_and_what_the_lens_shows_join(tmp_path: Path) -> None:
     wide = {name: LensCamera(source.rig[name], lens) for name in rig}
     made = undistort(open_capture(tmp_path), wide, target=lambda each: rectilinear(each, degrees=100))
     frame = next(made.frames())
-    shown = made.shown("cam02")  # type: ignore[attr-defined]
+    shown = made._plan("cam02").shown  # type: ignore[attr-defined]
     assert set(frame.masks) == set(rig)
     assert 0.2 < shown.mean() < 0.9
     np.testing.assert_array_equal(frame.masks["cam01"], shown)

@@ -94,6 +94,7 @@ def test_points_lie_on_the_planes_whatever_the_number_of_threads() -> None:
         return sweep_points(
             cameras,
             frame.images,
+            {},
             neighbours=neighbor_views(cameras, count=4, distance=2.6),
             bounds=dict.fromkeys(cameras, BOUNDS),
             workers=workers,

@@ -13,7 +13,7 @@ from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.data.matching import inside, project
 from structgstream.data.plane_sweep import DEFAULT_LEVELS, SweepConfig
 from structgstream.data.points import InitialPoints, PointsConfig, _has_neighbors, initial_points
-from structgstream.data.wrappers import resized
+from structgstream.data.source import resized
 from structgstream.frames import MultiViewFrame
 from tests.support.planes import distance_to_surface, room_frame, room_rig
 from tests.support.varied import varied

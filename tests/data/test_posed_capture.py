@@ -11,9 +11,9 @@ import pytest
 
 from structgstream.data.calibration import Calibration, PosedCamera
 from structgstream.data.lenses import RadialTangential
-from structgstream.data.posed_capture import filmed_by
-from structgstream.errors import CalibrationError
-from tests.support.captures import HEIGHT, WIDTH, small_rig
+from structgstream.data.posed_capture import filmed_by, open_posed
+from structgstream.errors import CalibrationError, ConfigError
+from tests.support.captures import HEIGHT, WIDTH, picture, small_rig, write_picture
 
 LENS = RadialTangential(k1=-0.1)
 ROOT = Path("take")
@@ -131,3 +131,27 @@ def test_rounded_rotations_stand_still() -> None:
             replace(given, cameras=tuple(cameras)), dict.fromkeys(("left", "middle"), (WIDTH, HEIGHT)), root=ROOT
         )
         assert list(found) == ["left", "middle"]
+
+
+def written(folder: Path) -> Path:
+    for number, name in enumerate(("left", "middle", "right")):
+        write_picture(folder / "images" / name / "0000.png", picture(number, 0))
+    return folder
+
+
+@pytest.mark.parametrize("fps", [0.0, -30.0, float("nan"), float("inf")])
+def test_a_rate_that_is_none(tmp_path: Path, fps: float) -> None:
+    with pytest.raises(ConfigError, match=f"Frames a second must be positive, got {fps:g}"):
+        open_posed(written(tmp_path), calibration(("left", "middle", "right")), fps=fps)
+
+
+def test_cameras_are_held_out_by_their_name_in_the_calibration(tmp_path: Path) -> None:
+    names = tuple(f"images/{name}/0000.png" for name in ("left", "middle", "right"))
+    given = replace(calibration(names), held_out=names[1:2])
+    assert open_posed(written(tmp_path), given, fps=25.0).rig.testing == ("middle",)
+
+
+def test_a_camera_to_hold_out_that_there_is_none_of(tmp_path: Path) -> None:
+    sentence = "rig.json holds out camera 'nobody', which it does not have; its cameras are left, middle, right"
+    with pytest.raises(CalibrationError, match=sentence):
+        open_posed(written(tmp_path), replace(calibration(("left", "middle", "right")), held_out=["nobody"]))

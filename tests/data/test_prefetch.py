@@ -9,8 +9,8 @@ import pytest
 
 from structgstream.cameras import CameraRig
 from structgstream.data.dataset_layouts import open_json_videos
-from structgstream.data.wrappers import Prefetch
-from structgstream.errors import CaptureError, ConfigError
+from structgstream.data.source import Prefetch
+from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
 from tests.support.captures import picture, small_rig, write_clip
 
@@ -47,11 +47,10 @@ def no_thread_is_left() -> bool:
     return not any(thread.name.startswith("lookahead") for thread in threading.enumerate())
 
 
-@pytest.mark.parametrize("depth", [1, 2, 7])
-def test_frames_are_the_same_with_and_without(tmp_path: Path, depth: int) -> None:
+def test_frames_are_the_same_with_and_without(tmp_path: Path) -> None:
     write_clip(tmp_path)
     source = open_json_videos(tmp_path)
-    plain, ahead = list(source.frames(1)), list(Prefetch(source, depth).frames(1))
+    plain, ahead = list(source.frames(1)), list(Prefetch(source).frames(1))
     assert [(a.index, a.pts_seconds) for a in plain] == [(b.index, b.pts_seconds) for b in ahead]
     for a, b in zip(plain, ahead, strict=True):
         assert list(a.images) == list(b.images)
@@ -67,7 +66,7 @@ def test_it_stands_for_its_source() -> None:
 
 def test_it_decodes_ahead_but_not_further_than_its_depth() -> None:
     source = Scripted()
-    frames = Prefetch(source, 2).frames()
+    frames = Prefetch(source).frames()
     assert next(frames).index == 0
     for _ in range(3):  # the one taken and two ahead
         assert source.reached.acquire(timeout=10)
@@ -77,7 +76,7 @@ def test_it_decodes_ahead_but_not_further_than_its_depth() -> None:
 
 
 def test_an_error_comes_at_its_frame() -> None:
-    frames = Prefetch(Scripted(fails_at=3), 5).frames()
+    frames = Prefetch(Scripted(fails_at=3)).frames()
     assert [next(frames).index for _ in range(3)] == [0, 1, 2]
     with pytest.raises(CaptureError, match="frame 3 is broken"):
         next(frames)
@@ -86,12 +85,12 @@ def test_an_error_comes_at_its_frame() -> None:
 
 def test_closing_stops_the_thread_and_closes_the_source() -> None:
     source = Scripted()
-    frames = Prefetch(source, 1).frames()
+    frames = Prefetch(source).frames()
     next(frames)
     frames.close()  # type: ignore[attr-defined]
     assert no_thread_is_left()
     assert source.closed.is_set()
-    assert len(source.decoded) < 4
+    assert len(source.decoded) < 5
 
 
 def test_an_interrupt_in_the_consumer_stops_the_thread() -> None:
@@ -105,8 +104,3 @@ def test_an_interrupt_in_the_consumer_stops_the_thread() -> None:
         consume()
     del caught
     assert source.closed.wait(timeout=10)
-
-
-def test_depth_must_be_positive() -> None:
-    with pytest.raises(ConfigError, match="depth of at least 1"):
-        Prefetch(Scripted(), 0)

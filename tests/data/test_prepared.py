@@ -20,9 +20,9 @@ from structgstream.data.prepared import (
     read_prepared,
     write_prepared,
 )
+from structgstream.data.source import apart_seconds
 from structgstream.data.timeline import Clock
 from structgstream.data.undistortion import rectilinear
-from structgstream.data.wrappers import apart_seconds
 from structgstream.errors import CalibrationError, CaptureError, StorageError
 from tests.support.captures import (
     HEIGHT,
@@ -73,6 +73,13 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
             assert torch.equal(one.K, other.K)
             assert torch.equal(one.viewmat, other.viewmat)
             assert (one.width, one.height) == (other.width, other.height)
+
+
+def test_a_camera_to_hold_out_that_there_is_none_of(tmp_path: Path) -> None:
+    """Also where a live rig takes some of the cameras only."""
+    write_prepared(tmp_path, replace(content(), held_out=frozenset({"nobody"})))
+    with pytest.raises(CalibrationError, match=r"capture\.json holds out camera 'nobody', .*its cameras are cam00, "):
+        read_prepared(tmp_path)
 
 
 def test_tone_curves_of_earlier_versions_are_ignored(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -18,9 +18,8 @@ from structgstream.data.camera_files import files_of
 from structgstream.data.images import ImageSource, common_pictures, read_picture, turned
 from structgstream.data.posed_capture import _orientation
 from structgstream.data.timeline import picture_slots
-from structgstream.data.transfer import HLG, PQ, high_range_to_srgb
-from structgstream.data.video import synchronised
-from structgstream.data.video_index import scan_videos
+from structgstream.data.video import high_range_to_srgb, synchronised
+from structgstream.data.video_index import HLG, PQ, scan_videos
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.footage import find_footage
 from tests.support.captures import small_rig

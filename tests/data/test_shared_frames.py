@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from structgstream.cameras import CameraRig
-from structgstream.data.shared_frames import SharedFrames
-from structgstream.data.source import frame_count, is_recording, retain_frames
+from structgstream.data.source import SharedFrames, frame_count, is_recording, retain_frames
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
 from tests.support.rigs import arc_rig

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole
+from structgstream.data.source import resized, section, select_cameras
 from structgstream.data.undistortion import UndistortedSource, Undistortion, rectilinear, undistort
-from structgstream.data.wrappers import resized, section, select_cameras
 from structgstream.errors import CalibrationError
 from structgstream.frames import MultiViewFrame
 from tests.support.captures import small_rig
@@ -157,7 +157,7 @@ def test_a_capture_of_lenses_becomes_one_of_pinholes(source: Filmed) -> None:
             error = np.abs(frame.images[name].astype(float) - wanted[name] // (frame.index + 1))
             assert error.mean() < 1
             assert torch.equal(made.rig[name].viewmat, source.rig[name].viewmat)
-    assert made.shown("cam00") is None
+    assert made._plan("cam00") is None
     assert [frame.index for frame in made.frames(1)] == [1]
 
 

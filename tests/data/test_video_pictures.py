@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from structgstream.data.video import pictures_at
 from structgstream.data.video_index import VideoTrack, scan_videos
-from structgstream.data.video_pictures import pictures_at
 from structgstream.errors import CaptureError
 from tests.support.captures import HEIGHT, WIDTH, numbers, picture, write_video
 

@@ -8,8 +8,8 @@ import torch
 
 from structgstream.data.dataset_layouts import open_json_videos, open_panoptic
 from structgstream.data.images import ImageSource
-from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import (
+from structgstream.data.source import (
+    FrameSource,
     SourceWrapper,
     WithoutPoints,
     WithRig,

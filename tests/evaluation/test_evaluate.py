@@ -14,7 +14,7 @@ import torch
 from structgstream.cameras import Similarity
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.data.images import ImageSource
-from structgstream.data.wrappers import section
+from structgstream.data.source import section
 from structgstream.errors import BackendError, CaptureError, ConfigError
 from structgstream.evaluation.evaluate import compared_frames, evaluate
 from structgstream.evaluation.lpips import ENVIRONMENT

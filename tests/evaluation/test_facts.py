@@ -11,7 +11,7 @@ import pytest
 from structgstream.cameras import CameraRig
 from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import PacketKind, StreamHeader
-from structgstream.data.wrappers import section
+from structgstream.data.source import section
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.evaluation.recording import (
     Recording,

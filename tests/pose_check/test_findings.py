@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from structgstream.cameras import Camera
-from structgstream.pose_check.findings import Finding, explain
+from structgstream.pose_check.check import Finding, explain
 from structgstream.pose_check.verdicts import judge
 from tests.support.evidence_made import Cameras, evidence_of, scattered, turned, wide_ring
 

@@ -10,7 +10,7 @@ import torch
 from structgstream.cameras import CameraRig
 from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.data.open import open_capture
-from structgstream.data.wrappers import resized
+from structgstream.data.source import resized
 from structgstream.errors import CalibrationError
 from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.check import check_poses

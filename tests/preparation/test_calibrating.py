@@ -15,9 +15,9 @@ from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
 from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import PrepareOptions
+from structgstream.preparation.output_folder import Stored
 from structgstream.preparation.prepare import check_enough, check_used, chosen_method
 from structgstream.preparation.solvers import check_complete, given_cameras, packed, summary, unpacked
-from structgstream.preparation.steps import Stored
 from tests.support.captures import write_video
 from tests.support.filmed import ring
 from tests.support.rooms import write_room

@@ -12,11 +12,10 @@ from structgstream.data.calibration import Calibration
 from structgstream.data.timeline import Clock
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.solved import SolvedCalibration
-from structgstream.preparation.clocks import TIMESTAMPS, Clocks
 from structgstream.preparation.options import Distance, PrepareOptions
-from structgstream.preparation.output_folder import SOURCE
-from structgstream.preparation.prepare import CameraSteps, chosen_method
-from structgstream.preparation.steps import FOLDER, Job, Silent, Steps
+from structgstream.preparation.output_folder import FOLDER, SOURCE, Silent, Steps
+from structgstream.preparation.prepare import Job, chosen_method
+from structgstream.preparation.solvers import TIMESTAMPS, Clocks
 from tests.support.footage_made import still_room
 from tests.support.rooms import write_room
 
@@ -36,7 +35,7 @@ def job(room: Path, capture: Path, options: PrepareOptions = NONE) -> Job:
 
 def run(job: Job) -> tuple[Clocks, SolvedCalibration]:
     """All steps with the calibration that lies beside the videos."""
-    steps = CameraSteps(job)
+    steps = job
     footage = steps.find()
     method = chosen_method(footage, job.options)
     clocks = steps.synchronize(footage, method)
@@ -47,11 +46,11 @@ def run(job: Job) -> tuple[Clocks, SolvedCalibration]:
 
 def test_what_was_found_is_described_and_claimed(room: Path, tmp_path: Path) -> None:
     one = job(room, tmp_path / "out")
-    footage = CameraSteps(one).find()
+    footage = one.find()
     assert footage.cameras == ("cam00", "cam01", "cam02", "cam03")
     assert one.steps.summaries["find"] == "4 videos, 160x120, 2 frames, 30 a second"
     assert (tmp_path / "out" / FOLDER / SOURCE).is_file()
-    assert CameraSteps(job(room, tmp_path / "o", replace(NONE, without=("cam01",)))).find().cameras == (
+    assert job(room, tmp_path / "o", replace(NONE, without=("cam01",))).find().cameras == (
         "cam00", "cam02", "cam03",
     )  # fmt: skip
 
@@ -69,21 +68,21 @@ def test_cameras_that_are_not_there_cost_no_time(
     room: Path, tmp_path: Path, options: PrepareOptions, purpose: str
 ) -> None:
     with pytest.raises(ConfigError, match=f"has no camera .* to {purpose}; its cameras are cam0"):
-        CameraSteps(job(room, tmp_path / "out", options)).find()
+        job(room, tmp_path / "out", options).find()
     assert not (tmp_path / "out").exists()
 
 
 def test_too_many_held_out_cost_no_time(room: Path, tmp_path: Path) -> None:
     options = replace(NONE, held_out=("cam00", "cam01", "cam02"))
     with pytest.raises(ConfigError, match="4 cameras, 3 of them held out; a reconstruction needs 2 or more"):
-        CameraSteps(job(room, tmp_path / "out", options)).find()
+        job(room, tmp_path / "out", options).find()
     assert not (tmp_path / "out").exists()
-    CameraSteps(job(room, tmp_path / "out", replace(NONE, held_out=("cam00", "cam01")))).find()
+    job(room, tmp_path / "out", replace(NONE, held_out=("cam00", "cam01"))).find()
 
 
 def test_too_few_cameras_claim_nothing(room: Path, tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match="needs 3 or more"):
-        CameraSteps(job(room, tmp_path / "out", replace(NONE, without=("cam00", "cam01")))).find()
+        job(room, tmp_path / "out", replace(NONE, without=("cam00", "cam01"))).find()
     assert not (tmp_path / "out").exists()
 
 
@@ -129,8 +128,8 @@ def test_a_table_of_times_that_comes_later_is_looked_at(tmp_path: Path) -> None:
 
 def test_clocks_come_back_as_they_were(room: Path, tmp_path: Path) -> None:
     found = Clocks({"a": Clock(0.25, 1.00001), "b": Clock()}, "motion", "summary", sure=False)
-    assert CameraSteps(job(room, tmp_path))._clocks("clocks", {}, lambda: found) == found
-    other = CameraSteps(job(room, tmp_path))._clocks("clocks", {}, lambda: pytest.fail("it is there"))
+    assert job(room, tmp_path)._clocks("clocks", {}, lambda: found) == found
+    other = job(room, tmp_path)._clocks("clocks", {}, lambda: pytest.fail("it is there"))
     assert other == found
 
 
@@ -141,7 +140,7 @@ def test_another_calibration_is_another_result(room: Path, tmp_path: Path) -> No
     changed = job(room, tmp_path / "out", options)
     run(changed)
     assert changed.steps.skipped == []
-    assert isinstance(chosen_method(CameraSteps(changed).find(), options), Calibration)
+    assert isinstance(chosen_method(changed.find(), options), Calibration)
 
 
 def test_focal_lengths_that_pictures_state_are_reported(tmp_path: Path) -> None:

@@ -16,9 +16,9 @@ from structgstream.errors import ConfigError, StorageError
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import PrepareOptions
-from structgstream.preparation.prepare import POINTS, CaptureSteps, assembled, chosen_method, held_out_of
+from structgstream.preparation.output_folder import FOLDER, Silent, Steps
+from structgstream.preparation.prepare import POINTS, Job, assembled, chosen_method, held_out_of
 from structgstream.preparation.solvers import given_cameras
-from structgstream.preparation.steps import FOLDER, Job, Silent, Steps
 from tests.support.rooms import write_room
 
 NONE = PrepareOptions(synchronize="none", near=0.25)
@@ -71,7 +71,7 @@ def test_files_are_brought_with_their_masks(tmp_path: Path) -> None:
     (tmp_path / "videos" / "masks" / "cam00" / "0.png").write_bytes(b"mask")
     one = job(tmp_path / "videos", tmp_path / "out")
     (tmp_path / "out").mkdir()
-    CaptureSteps(one).link(footage, content)
+    one.link(footage, content)
     for name in content.cameras:
         assert (tmp_path / "out" / "videos" / f"{name}.mp4").samefile(tmp_path / "videos" / f"{name}.mp4")
     assert (tmp_path / "out" / "masks" / "cam00" / "0.png").read_bytes() == b"mask"
@@ -87,13 +87,13 @@ def test_masks_of_cameras_that_are_left_out_stay_behind(tmp_path: Path) -> None:
     for name in ("cam00.png", "cam01.png", "cam01/0.png", "cam02.png"):
         (masks / name).write_bytes(name.encode())
     (tmp_path / "out").mkdir()
-    CaptureSteps(job(tmp_path / "videos", tmp_path / "out")).link(footage, content)
+    job(tmp_path / "videos", tmp_path / "out").link(footage, content)
     assert (brought / "cam01" / "0.png").is_file()
     (brought / "cam02.png").unlink()
     (brought / "cam02.png").write_bytes(b"drawn by hand")
     less = replace(NONE, without=("cam01", "cam02"))
     for _ in range(2):
-        CaptureSteps(job(tmp_path / "videos", tmp_path / "out", less)).link(footage, content)
+        job(tmp_path / "videos", tmp_path / "out", less).link(footage, content)
         assert sorted(entry.name for entry in brought.iterdir()) == ["cam00.png", "cam02.png"]
     assert sorted(entry.name for entry in masks.iterdir()) == ["cam00.png", "cam01", "cam01.png", "cam02.png"]
 
@@ -116,15 +116,15 @@ def test_another_mask_does_again_what_depends_on_it(tmp_path: Path) -> None:
 def test_a_near_plane_that_is_given_is_not_looked_for(tmp_path: Path) -> None:
     _, _, content = made(tmp_path / "videos")
     one = job(tmp_path / "videos", tmp_path / "out")
-    assert CaptureSteps(one).near(content) is content
+    assert one.near(content) is content
     assert "near" not in one.steps.summaries
 
 
-def brought(tmp_path: Path, options: PrepareOptions = NONE) -> tuple[Job, CaptureSteps, PreparedCapture]:
+def brought(tmp_path: Path, options: PrepareOptions = NONE) -> tuple[Job, Job, PreparedCapture]:
     footage, _, content = made(tmp_path / "videos", options)
     content = replace(content, cameras={n: replace(c, clock=Clock()) for n, c in content.cameras.items()})
     one = job(tmp_path / "videos", tmp_path / "out", options)
-    steps = CaptureSteps(one)
+    steps = one
     (tmp_path / "out").mkdir(exist_ok=True)
     steps.link(footage, content)
     return one, steps, content

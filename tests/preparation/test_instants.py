@@ -5,8 +5,7 @@ import pytest
 
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
-from structgstream.preparation.clocks import shared_seconds, shots_of, spread_moments
-from structgstream.preparation.footage import find_footage
+from structgstream.preparation.footage import find_footage, shared_seconds, shots_of, spread_moments
 from tests.support.captures import numbers, write_videos
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from structgstream.errors import CaptureError, StorageError
 from structgstream.preparation.output_folder import (
+    FOLDER,
     LOCK,
     SOURCE,
     Link,
@@ -20,7 +21,6 @@ from structgstream.preparation.output_folder import (
     remove_others,
     unlink,
 )
-from structgstream.preparation.steps import FOLDER
 from tests.support.killed import folders_of_the_killed
 
 

@@ -12,7 +12,7 @@ from structgstream.data.open import open_capture
 from structgstream.data.prepared import read_prepared
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.options import Distance, PrepareOptions
-from structgstream.preparation.prepare import CaptureSteps, prepare_capture
+from structgstream.preparation.prepare import Job, prepare_capture
 from tests.support.captures import write_picture, write_videos
 from tests.support.planes import room_frame
 from tests.support.rooms import write_room
@@ -64,8 +64,8 @@ def carried(capture: Path) -> list[dict[str, int]]:
 
 def test_a_picture_that_lacks_is_no_other_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From the first time, or deleted between two runs: its camera is absent there, and in step after it."""
-    monkeypatch.setattr(CaptureSteps, "points", lambda self, content: content)
-    monkeypatch.setattr(CaptureSteps, "check", lambda self, content: ())
+    monkeypatch.setattr(Job, "points", lambda self, content: content)
+    monkeypatch.setattr(Job, "check", lambda self, content: ())
     options = replace(OPTIONS, near=0.3)
     write_pictures(tmp_path / "videos", 5)
     names = ("cam00", "cam01", "cam02", "cam03")
@@ -85,7 +85,7 @@ def test_an_interrupted_preparation_goes_on(tmp_path: Path, monkeypatch: pytest.
         raise KeyboardInterrupt
 
     write_room(tmp_path / "videos", cameras=4)
-    monkeypatch.setattr(CaptureSteps, "check", lambda self, content: ())
+    monkeypatch.setattr(Job, "check", lambda self, content: ())
     with monkeypatch.context() as patched:
         patched.setattr("structgstream.preparation.prepare.initial_points", interrupt)
         with pytest.raises(KeyboardInterrupt):

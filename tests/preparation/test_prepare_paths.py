@@ -12,11 +12,10 @@ import pytest
 from structgstream.data.prepared import PreparedCapture, read_prepared
 from structgstream.data.timeline import Clock
 from structgstream.errors import CalibrationError, CaptureError
-from structgstream.preparation.clocks import first_clocks
 from structgstream.preparation.footage import find_footage
 from structgstream.preparation.options import Distance, PrepareOptions
-from structgstream.preparation.prepare import CaptureSteps, Preparation, prepare_capture
-from structgstream.preparation.solvers import matched_pictures
+from structgstream.preparation.prepare import Job, Preparation, prepare_capture
+from structgstream.preparation.solvers import first_clocks, matched_pictures
 from tests.support.calibration_errors import calibration_errors
 from tests.support.captures import write_video, write_videos
 from tests.support.filmed import Film, noise_texture, ring, room
@@ -30,13 +29,13 @@ NONE = PrepareOptions(synchronize="none")
 @pytest.fixture
 def without_points(monkeypatch: pytest.MonkeyPatch) -> None:
     """The test is about what comes before initial points."""
-    monkeypatch.setattr(CaptureSteps, "points", lambda self, content: content)
+    monkeypatch.setattr(Job, "points", lambda self, content: content)
 
 
 @pytest.fixture
 def without_check(monkeypatch: pytest.MonkeyPatch) -> None:
     """The test is about what comes before the check."""
-    monkeypatch.setattr(CaptureSteps, "check", lambda self, content: ())
+    monkeypatch.setattr(Job, "check", lambda self, content: ())
 
 
 def errors(made: Preparation) -> list[str]:
@@ -51,7 +50,7 @@ def starts_in_frames(capture: PreparedCapture, fps: float) -> np.ndarray:
 
 def test_motion_and_structure_without_any_calibration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As where motion alone tells no clocks: the calibration comes from what stands still."""
-    monkeypatch.setattr("structgstream.preparation.clocks.SURE_PERIODS", 0.0)
+    monkeypatch.setattr("structgstream.preparation.solvers.SURE_PERIODS", 0.0)
     starts = [0, 7, 3, 12]
     truth = write_take(tmp_path / "videos", starts=starts, frames=36)
     made = prepare_capture(tmp_path / "videos", tmp_path / "out", options=PrepareOptions(lens="pinhole", instants=1))

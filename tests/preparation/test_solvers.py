@@ -11,15 +11,18 @@ from PIL import Image
 
 from structgstream.data.timeline import Clock
 from structgstream.errors import CalibrationError, CaptureError
-from structgstream.preparation.clocks import TIMESTAMPS, Clocks, first_clocks, synchronized
 from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.solvers import (
+    TIMESTAMPS,
+    Clocks,
     board_footage,
     describe_focals,
     describe_turns,
+    first_clocks,
     matched_pictures,
     stated_focals,
+    synchronized,
 )
 from tests.support.captures import write_video
 

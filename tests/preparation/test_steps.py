@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from structgstream.errors import StorageError
-from structgstream.preparation.steps import FOLDER, Silent, Steps, Stored, fingerprint
+from structgstream.preparation.output_folder import FOLDER, Silent, Steps, Stored, fingerprint
 from tests.support.killed import folders_of_the_killed
 
 

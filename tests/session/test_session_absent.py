@@ -16,8 +16,7 @@ from structgstream.cli.evaluate import report_tables
 from structgstream.cli.progress import summary
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.sinks import FileSink
-from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import section
+from structgstream.data.source import FrameSource, section
 from structgstream.errors import CaptureError
 from structgstream.evaluation.evaluate import evaluate
 from structgstream.evaluation.optional_metrics import OF_WHOLE_PICTURES

@@ -401,9 +401,9 @@ def capture_tables(name: str, content: dict[str, Any]) -> tuple[Table, ...]:
 
 def _camera(source: "FrameSource", name: str) -> dict[str, Any]:
     from structgstream.data.images import ImageSource
+    from structgstream.data.source import SourceWrapper
     from structgstream.data.undistortion import UndistortedSource
     from structgstream.data.video import VideoSource
-    from structgstream.data.wrappers import SourceWrapper
 
     lens, stored = "pinhole", source
     while isinstance(stored, SourceWrapper):

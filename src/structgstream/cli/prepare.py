@@ -14,7 +14,7 @@ from structgstream.cli.options import Flag, Folder, check_ending, parse_options
 from structgstream.cli.progress import StepDisplay, print_lines
 
 if TYPE_CHECKING:
-    from structgstream.pose_check.findings import Finding
+    from structgstream.pose_check.check import Finding
     from structgstream.preparation.options import PrepareOptions
 
 HIDDEN = tyro.conf.arg(help_behavior_hint="")

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibrated cameras: what calibration files contain (:class:`Calibration`), rigs made of them, and the similarity
-transform between two estimates of one rig.
+"""Calibrated cameras: what calibration files contain (:class:`Calibration`), the formats of such files
+(:class:`CalibrationFormat`), rigs made of them, and the similarity transform between two estimates of one rig.
 
 Errors name the camera and the file.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+import logging
+import operator
+import os
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,9 +19,12 @@ from torch import from_numpy
 
 from structgstream.cameras import Camera, CameraRig, rig_radius
 from structgstream.data.lenses import Lens, LensCamera, Pinhole
-from structgstream.data.text_files import BROKEN, Unreadable, number, reason
+from structgstream.data.text_files import BROKEN, Unreadable, number, readable, reason
 from structgstream.errors import CalibrationError, CaptureError
-from structgstream.geometry import Floats
+from structgstream.geometry import Floats, cross_matrices
+
+Entry = TypeVar("Entry")
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -53,11 +59,7 @@ class Calibration:
 
 
 def rigid(rotation: ArrayLike, translation: ArrayLike) -> NDArray[np.float64]:
-    """The matrix ``[4, 4]`` of a rotation ``[3, 3]``, or a vector ``[3]`` in radians, and a translation ``[3]``.
-
-    Raises:
-        Unreadable: other shapes.
-    """
+    """The matrix ``[4, 4]`` of a rotation ``[3, 3]``, or a vector ``[3]`` in radians, and a translation ``[3]``."""
     turned, moved = np.array(rotation, dtype=np.float64), np.array(translation, dtype=np.float64).reshape(-1)
     if turned.size == 3:
         turned = rotation_matrix(turned.reshape(3))
@@ -75,17 +77,12 @@ def rotation_matrix(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     angle = float(np.linalg.norm(vector))
     if angle < 1e-12:
         return np.eye(3)
-    x, y, z = vector / angle
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    cross = cross_matrices(vector / angle)
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
 def intrinsics(fx: Any, fy: Any, cx: Any, cy: Any) -> NDArray[np.float64]:
-    """The matrix ``[3, 3]`` of focal lengths and principal point, pixels.
-
-    Raises:
-        Unreadable: one is no finite number.
-    """
+    """The matrix ``[3, 3]`` of focal lengths and principal point, pixels."""
     fx, fy, cx, cy = map(number, (fx, fy, cx, cy))
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
 
@@ -94,13 +91,11 @@ NEAR_IN_RIG_RADII = 0.12  # cameras of a dome stand in the wall that the others 
 
 
 def calibrated_camera(name: str, *, viewmat: ArrayLike, K: ArrayLike, width: int, height: int, where: Path) -> Camera:
-    """One camera of the calibration file ``where``.
+    """One camera of the calibration file ``where``, for pictures of ``width`` x ``height`` pixels.
 
     Args:
         viewmat: ``[4, 4]`` or ``[3, 4]``, world to camera, OpenCV axes.
         K: ``[3, 3]`` intrinsics, pixels.
-        width: picture width that ``K`` belongs to, pixels.
-        height: picture height that ``K`` belongs to, pixels.
 
     Raises:
         CalibrationError: invalid values (see :class:`Camera`), or a principal point for a picture of another size.
@@ -147,6 +142,79 @@ def calibrated_rig(
 def with_near(rig: CameraRig, near: float) -> CameraRig:
     """The same rig with the near plane of every camera at ``near``, capture units."""
     return rig.mapped({name: replace(rig[name], near=near) for name in rig})
+
+
+class NoPose(Exception):
+    """A file has no pose of a camera, since it was not calibrated with the others."""
+
+
+@dataclass(frozen=True)
+class CalibrationFormat:
+    """The calibration files of a tool."""
+
+    find: Callable[[Path], Iterator[tuple[Path, ...]]]
+    """Gives the sets of files in a folder that are a calibration of the tool each."""
+    entries: Callable[[tuple[Path, ...]], Iterable[tuple[str, Any]]]
+    """Gives the cameras of such a set by name, with what the files state of them."""
+    camera: Callable[[str, Any], PosedCamera]  # makes the camera of an entry
+    expected: str  # what the files contain, for messages
+    turned_by_exif: bool | None = None  # see :class:`Calibration`
+    where: Callable[[tuple[Path, ...]], Path] = operator.itemgetter(0)  # gives the file or folder that messages name
+
+    def read(self, files: tuple[Path, ...]) -> Calibration:
+        """The cameras of a set of files.
+
+        Raises:
+            CalibrationError: a file is missing or broken, or a camera has a model that is not known here.
+        """
+        where = self.where(files)
+        with readable(where, self.expected):
+            entries = list(self.entries(files))
+        calibration = calibration_of(entries, self.camera, file=where, expected=self.expected)
+        return replace(calibration, turned_by_exif=self.turned_by_exif)
+
+
+def common_folder(files: tuple[Path, ...]) -> Path:
+    """The one file, or the folder of several."""
+    return files[0] if len(files) == 1 else Path(os.path.commonpath(files))
+
+
+def calibration_of(
+    entries: Iterable[tuple[str, Entry]], read: Callable[[str, Entry], PosedCamera], *, file: Path, expected: str
+) -> Calibration:
+    """The cameras of a file, in its order; those without a pose are left out with a warning.
+
+    Raises:
+        CalibrationError: an entry is broken, naming its camera; or there is none, or none with a pose.
+    """
+    cameras, unposed = [], []
+    for name, entry in entries:
+        try:
+            with readable(f"Camera {name!r} of {file}", expected):
+                camera = read(name, entry)
+                if not (np.isfinite(camera.viewmat).all() and np.isfinite(camera.K).all()):
+                    raise Unreadable("a number that is not finite (NaN or infinity)")
+            cameras.append(camera)
+        except NoPose:
+            unposed.append(name)
+    if not cameras:
+        found = f"no pose of {listed(unposed)}" if unposed else "no cameras"
+        raise CalibrationError(f"{file} holds {found}; expected {expected}.")
+    if unposed:
+        log.warning("%s has no pose of %s; left out", file, listed(unposed))
+    return Calibration(file, tuple(cameras), unposed=tuple(unposed))
+
+
+def check_held_out(held_out: Collection[str], cameras: Collection[str], *, where: Path) -> None:
+    """Check that the cameras to hold out are among those of the file ``where``.
+
+    Raises:
+        CalibrationError: one is not.
+    """
+    if unknown := [name for name in held_out if name not in cameras]:
+        raise CalibrationError(
+            f"{where} holds out {listed(unknown)}, which it does not have; its cameras are {', '.join(cameras)}."
+        )
 
 
 def check_names(calibrated: Collection[str], pictured: Collection[str], *, calibration: Path, pictures: Path) -> None:
@@ -210,12 +278,8 @@ def alignment(theirs: Mapping[str, Floats], ours: Mapping[str, Floats]) -> Align
     turns = sum(ours[name][:3, :3].T @ theirs[name][:3, :3] for name in theirs)
     u, _, vh = np.linalg.svd(turns)
     rotation = u @ np.diag([1, 1, np.linalg.det(u @ vh)]) @ vh
-    from_, to = (np.array([_center(poses[name]) for name in theirs]) for poses in (theirs, ours))
+    from_, to = (np.array([-poses[name][:3, :3].T @ poses[name][:3, 3] for name in theirs]) for poses in (theirs, ours))
     turned = (from_ - from_.mean(0)) @ rotation.T
     spread = float((turned**2).sum())
     scale = float((turned * (to - to.mean(0))).sum() / spread) if spread > 0 else 1.0
     return Alignment(scale, rotation, to.mean(0) - scale * rotation @ from_.mean(0))
-
-
-def _center(viewmat: Floats) -> Floats:
-    return -viewmat[:3, :3].T @ viewmat[:3, 3]

@@ -9,7 +9,8 @@
     FRAME/CAMERA.jpg         a folder of pictures per frame (frame000000/images/CAMERA.png of 3DGStream)
     CAMERA.jpg               one picture per camera
 
-in the folder itself or in one below it: of a name of :data:`ROOTS`, or the only one that holds videos.
+in the folder itself or in one below it: of a name of :data:`ROOTS`, or the only one that holds videos. Two files of one
+name, a link to a file that is not there, or several takes are a ``CaptureError``.
 """
 
 import logging
@@ -44,11 +45,7 @@ def name_of(path: Path) -> str:
 
 
 def files_of(folder: Path, suffixes: Collection[str]) -> list[Path]:
-    """The files of these kinds (lower-case suffixes, with the dot) in a folder, sorted by name, without hidden ones.
-
-    Raises:
-        CaptureError: one is a link to a file that is not there.
-    """
+    """The files of these kinds (lower-case suffixes, with the dot) in a folder, sorted by name, without hidden ones."""
     named = (file for file in folder.iterdir() if file.suffix.lower() in suffixes and not is_hidden(file))
     found = sorted(file for file in named if not file.is_dir())
     for file in found:
@@ -57,11 +54,7 @@ def files_of(folder: Path, suffixes: Collection[str]) -> list[Path]:
 
 
 def check_link(file: Path) -> None:
-    """A link leads somewhere.
-
-    Raises:
-        CaptureError: it does not.
-    """
+    """Refuses a link to a file that is not there."""
     if file.is_symlink() and not file.exists():
         raise CaptureError(
             f"{file} is a link to {file.readlink()}, which does not exist; restore that file, or move the link out of "
@@ -70,11 +63,7 @@ def check_link(file: Path) -> None:
 
 
 def by_stem(files: Iterable[Path]) -> dict[str, Path]:
-    """Files by their names without suffix.
-
-    Raises:
-        CaptureError: two have one name.
-    """
+    """Files by their names without suffix."""
     found: dict[str, Path] = {}
     for file in files:
         if (name := name_of(file)) in found:
@@ -131,11 +120,7 @@ def filmed_folder(folder: Path, suffixes: Collection[str]) -> Path | None:
 
 
 def videos_in(root: Path) -> dict[str, Path]:
-    """The video of each camera by its name: ``CAMERA.mp4``, else ``CAMERA/anything.mp4``; nothing where there is none.
-
-    Raises:
-        CaptureError: several of one camera.
-    """
+    """The video of each camera by its name: ``CAMERA.mp4``, else ``CAMERA/anything.mp4``; empty without any."""
     if not root.is_dir():
         return {}
     if found := by_stem(files_of(root, VIDEO_SUFFIXES)):
@@ -153,24 +138,28 @@ def pictures_in(root: Path) -> dict[str, dict[str, Path]]:
     return {name: by_stem(files_of(own, PICTURE_SUFFIXES)) for name, own in filmed.items() if own is not None}
 
 
-def other_roots(where: Path, *, pictures: bool = False) -> Iterator[Path]:
-    """Folders of videos, or of folders of pictures, up to two below ``where`` and of other names: takes.
+def has_files(folder: Path) -> bool:
+    """Whether a folder has videos of cameras, or folders of pictures."""
+    return bool(videos_in(folder) or pictures_in(folder))
 
-    Raises:
-        CaptureError: there are several.
-    """
+
+def has_frames(path: Path) -> bool:
+    """Whether the folder itself or one of :data:`ROOTS` in it has."""
+    return any(map(has_files, roots_of(path)))
+
+
+def other_roots(where: Path, *, pictures: bool = False) -> Iterator[Path]:
+    """Folders of videos, or of folders of pictures, up to two below ``where`` and of other names: takes."""
     below = folders_of(where) + folders_of(where / RECORDINGS)
     below += [inner for folder in folders_of(where, without=NO_TAKES) for inner in folders_of(folder, without=NO_TAKES)]
     found = {folder: pictures_in(folder) if pictures else files_of(folder, VIDEO_SUFFIXES) for folder in below}
     takes = [folder for folder, own in found.items() if len(own) > 1]
     if len(takes) > 1:
         names = ", ".join(str(take.relative_to(where)) for take in takes[:4])
-        what = "pictures in several folders ({}); expected those of one take, a folder per camera."
-        if not pictures:
-            what = "videos in several folders ({}); expected those of one take, a video per camera."
+        what, each = ("pictures", "folder") if pictures else ("videos", "video")
         raise CaptureError(
-            f"{where} has {what.format(names)} Give the folder of one take; if these are cameras, join the chapters of "
-            "each to one file."
+            f"{where} has {what} in several folders ({names}); expected those of one take, a {each} per camera. Give "
+            "the folder of one take; if these are cameras, join the chapters of each to one file."
         )
     yield from takes
 

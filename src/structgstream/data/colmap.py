@@ -2,7 +2,8 @@
 """Reads a COLMAP model, text or binary: ``cameras``, ``images`` and ``points3D``.
 
 The format is that of COLMAP's documentation, "Output Format". Poses are world to camera with OpenCV axes,
-and the top-left pixel's centre is (0.5, 0.5): both as in this package.
+and the top-left pixel's centre is (0.5, 0.5): both as in this package. Files that are cut or no model, and lens models
+that are not known here, are a ``CalibrationError``.
 """
 
 import logging
@@ -16,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.calibration import Calibration, PosedCamera, intrinsics
-from structgstream.data.calibration_files.reading import readable
 from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential
-from structgstream.data.text_files import Unreadable, number, pixels, read_text, whole
+from structgstream.data.text_files import Unreadable, number, pixels, read_text, readable, whole
 from structgstream.data.timeline import natural
 from structgstream.errors import CalibrationError
 
@@ -87,11 +87,7 @@ def warn_of_other_models(folder: Path) -> None:
 
 
 def read_model(folder: Path) -> Calibration:
-    """The model in ``folder``; binary files are preferred. Its cameras have the names of its pictures.
-
-    Raises:
-        CalibrationError: the files are cut or not a model, or a camera has a lens model that is not known here.
-    """
+    """The model in ``folder``; binary files are preferred. Its cameras have the names of its pictures."""
     warn_of_other_models(folder)
     binary = (folder / "cameras.bin").is_file() and (folder / "images.bin").is_file()
     with readable(f"The COLMAP model in {folder}", "cameras, images and points3D as COLMAP writes them"):

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Layouts of published data sets that have a calibration file of their own.
+"""Layouts of published data sets that have a calibration file of their own, by which they are recognised.
+
+What a layout asks for and a capture lacks is a ``CaptureError``, broken numbers are a ``CalibrationError``.
 
 PanopticSports of Dynamic 3D Gaussians (Luiten et al., 3DV 2024): ``train_meta.json`` and ``test_meta.json`` have ``w``,
 ``h`` and, per frame and camera, ``k``, ``w2c`` (OpenCV world to camera), ``fn`` (file below ``ims/``) and ``cam_id``.
@@ -48,42 +50,43 @@ from structgstream.data.calibration import (
     alignment,
     calibrated_camera,
     calibrated_rig,
+    calibration_of,
+    check_held_out,
     check_names,
     intrinsics,
     rigid,
     rotation_matrix,
 )
-from structgstream.data.calibration_files.reading import calibration_of, positive, read_array, readable
 from structgstream.data.camera_files import pictures_in, roots_of, videos_in
 from structgstream.data.colmap import find_model, read_model
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, common_pictures
 from structgstream.data.lenses import LensCamera, fisheye_lens, from_integer_centers
 from structgstream.data.matching import PairMatcher, confirmed_share
 from structgstream.data.posed_capture import of_pictures, of_videos, open_posed
-from structgstream.data.source import FrameSource
-from structgstream.data.text_files import NamedFiles, mapping, number, path_parts, pixels, read_json, whole
+from structgstream.data.source import FrameSource, resized
+from structgstream.data.text_files import (
+    NamedFiles,
+    mapping,
+    number,
+    path_parts,
+    pixels,
+    positive,
+    read_array,
+    read_json,
+    readable,
+    whole,
+)
 from structgstream.data.timeline import natural
 from structgstream.data.video import VideoSource, synchronised
 from structgstream.data.video_index import scan_videos
-from structgstream.data.wrappers import resized
 from structgstream.errors import CalibrationError, CaptureError
 
 PANOPTIC_FPS = 30000 / 1001
 TRAIN, TEST = "train_meta.json", "test_meta.json"
 
 
-def recognizes_panoptic(path: Path) -> bool:
-    """Whether the folder has this layout."""
-    return (path / TRAIN).is_file()
-
-
 def open_panoptic(path: Path) -> ImageSource:
-    """The capture at ``path``.
-
-    Raises:
-        CaptureError: a file is not what the layout asks for, or a camera has no pictures.
-        CalibrationError: broken numbers, or a camera that moves.
-    """
+    """The capture at ``path``."""
     cameras: dict[str, Camera] = {}
     files: dict[str, dict[str, Path]] = {}
     held_out: list[str] = []
@@ -110,7 +113,14 @@ def _read_meta(meta: Path) -> tuple[dict[str, Camera], dict[str, dict[str, Path]
         width, height = pixels((content["w"], content["h"]))
         pictures = NamedFiles(meta.parent / "ims", PICTURE_SUFFIXES)
         rows = [
-            (str(name), K, viewmat, _picture(pictures, str(file)), file)
+            # The path below ``ims`` may name that and what is above it.
+            (
+                str(name),
+                K,
+                viewmat,
+                pictures.find(str(file)) or pictures.find("/".join(path_parts(str(file))[-2:])),
+                file,
+            )
             for frame in zip(content["cam_id"], content["k"], content["w2c"], content["fn"], strict=True)
             for name, K, viewmat, file in zip(*frame, strict=True)
         ]
@@ -129,11 +139,6 @@ def _read_meta(meta: Path) -> tuple[dict[str, Camera], dict[str, dict[str, Path]
         for name, (K, viewmat) in first.items()
     }
     return cameras, files
-
-
-def _picture(pictures: NamedFiles, text: str) -> Path | None:
-    """The picture of a path below ``ims``, which may name that and what is above it."""
-    return pictures.find(text) or pictures.find("/".join(path_parts(text)[-2:]))
 
 
 def _same(a: tuple[Any, Any], b: tuple[Any, Any]) -> bool:
@@ -156,18 +161,8 @@ IMMERSIVE_EXPECTED = (
 )
 
 
-def recognizes_immersive(path: Path) -> bool:
-    """Whether the folder has this layout."""
-    return (path / MODELS_FILE).is_file()
-
-
 def open_immersive(path: Path) -> FrameSource:
-    """The capture at ``path``, undistorted; a video without calibration, which some takes have, is left out.
-
-    Raises:
-        CaptureError: a video cannot be read.
-        CalibrationError: a broken file, or videos of other proportions than it states.
-    """
+    """The capture at ``path``, undistorted; a video without calibration, which some takes have, is left out."""
     return open_posed(path, read_models(path / MODELS_FILE), target=_as_published, complete=False)
 
 
@@ -177,30 +172,20 @@ def _as_published(filmed: LensCamera) -> Camera:
 
 
 def read_models(file: Path) -> Calibration:
-    """The cameras of ``models.json``.
-
-    Raises:
-        CalibrationError: the file cannot be read.
-    """
+    """The cameras of ``models.json``."""
     with readable(file, IMMERSIVE_EXPECTED):
         entries = [(str(entry["name"]), entry) for entry in read_json(file)]
-    return replace(
-        calibration_of(entries, _immersive_camera, file=file, expected=IMMERSIVE_EXPECTED),
-        held_out=(IMMERSIVE_HELD_OUT,),
-    )
+    found = calibration_of(entries, _immersive_camera, file=file, expected=IMMERSIVE_EXPECTED)
+    return replace(found, held_out=[camera.name for camera in found.cameras if camera.name == IMMERSIVE_HELD_OUT])
 
 
 def _immersive_camera(name: str, entry: dict[str, Any]) -> PosedCamera:
     focal, (cx, cy) = number(entry["focal_length"]), entry["principal_point"]
     rotation = rotation_matrix(np.array(entry["orientation"], dtype=np.float64).reshape(3))
     viewmat = rigid(rotation, -rotation @ np.array(entry["position"], dtype=np.float64))
-    return PosedCamera(
-        name=name,
-        viewmat=viewmat,
-        K=from_integer_centers(intrinsics(focal, focal * number(entry.get("pixel_aspect_ratio", 1)), cx, cy)),
-        size=pixels((entry["width"], entry["height"])),
-        lens=fisheye_lens(entry["radial_distortion"][:2]),
-    )
+    K = from_integer_centers(intrinsics(focal, focal * number(entry.get("pixel_aspect_ratio", 1)), cx, cy))
+    size = pixels((entry["width"], entry["height"]))
+    return PosedCamera(name, viewmat, K, size, fisheye_lens(entry["radial_distortion"][:2]))
 
 
 log = logging.getLogger(__name__)
@@ -213,18 +198,8 @@ LARGEST = 1e100  # of a number of a pose
 MIN_CONFIRMED = 0.5  # of the pairs of neighbours
 
 
-def recognizes_n3dv(path: Path) -> bool:
-    """Whether the folder has this layout."""
-    return (path / POSES).is_file()
-
-
 def open_n3dv(path: Path) -> FrameSource:
-    """The capture at ``path``. Videos smaller than the size of the poses are taken as uniformly reduced.
-
-    Raises:
-        CaptureError: a video or picture cannot be read.
-        CalibrationError: broken poses, not one pose per video, or a video of other proportions than its pose.
-    """
+    """The capture at ``path``. Videos smaller than the size of the poses are taken as uniformly reduced."""
     poses = _read_llff_poses(path / POSES)
     videos = next(filter(None, map(videos_in, roots_of(path))), {})
     pictures = {} if videos else next(filter(None, map(pictures_in, roots_of(path))), {})
@@ -250,7 +225,9 @@ def open_n3dv(path: Path) -> FrameSource:
             "%s: its rows are in the order of the names as text (cam1, cam10, cam2), as the pictures say", path / POSES
         )
         source = opened(sorted(names))
-    return replace(source, points=_points(path, source.rig))  # type: ignore[type-var]
+    model = next((model for name in COLMAP_FOLDERS if (model := find_model(path / name)) is not None), None)
+    points = None if model is None else aligned_points(read_model(model), source.rig)
+    return replace(source, points=points)  # type: ignore[type-var]
 
 
 def _as_text(by_number: FrameSource, as_text: CameraRig) -> bool:
@@ -275,12 +252,6 @@ def _as_text(by_number: FrameSource, as_text: CameraRig) -> bool:
     return shares[1] > shares[0]
 
 
-def _points(path: Path, rig: CameraRig) -> NDArray[np.float64] | None:
-    """The points of the COLMAP model next to the poses, if there is one that agrees with them."""
-    found = next((model for name in COLMAP_FOLDERS if (model := find_model(path / name)) is not None), None)
-    return None if found is None else aligned_points(read_model(found), rig)
-
-
 def _read_llff_poses(file: Path) -> NDArray[np.float64]:
     """``[V, 3, 5]`` matrices of the file."""
     with readable(file, "3x5 poses and two bounds of each camera"):
@@ -303,18 +274,8 @@ def _n3dv_camera(name: str, pose: NDArray[np.float64], where: Path) -> PosedCame
 CAMERAS_FILE = "cameras.json"
 
 
-def recognizes_json_videos(path: Path) -> bool:
-    """Whether the folder has this layout."""
-    return (path / CAMERAS_FILE).is_file()
-
-
 def open_json_videos(path: Path) -> VideoSource:
-    """The capture at ``path``.
-
-    Raises:
-        CaptureError: ``cameras.json`` or a video cannot be read, or they do not belong together.
-        CalibrationError: broken numbers.
-    """
+    """The capture at ``path``."""
     file = path / CAMERAS_FILE
     rig, fps, stated_frames = read_cameras(file)
     videos = next(filter(None, map(videos_in, roots_of(path))), {})
@@ -329,11 +290,7 @@ def open_json_videos(path: Path) -> VideoSource:
 
 
 def read_cameras(file: Path) -> tuple[CameraRig, float | None, int]:
-    """The rig of a ``cameras.json``, its frames a second (None if not stated) and the number of frames.
-
-    Raises:
-        CalibrationError: the file cannot be read, or has broken numbers.
-    """
+    """The rig of a ``cameras.json``, its frames a second (None if not stated) and the number of frames."""
     with readable(file, "width, height and cameras with K and viewmat, or w, h, fl_x, fl_y, cx, cy and cams"):
         content = mapping(read_json(file))
         rig = _own_rig(content, file) if "cameras" in content else _shared_intrinsics_rig(content, file)
@@ -347,7 +304,8 @@ def _own_rig(content: dict[str, Any], file: Path) -> CameraRig:
         for name, entry in mapping(content["cameras"]).items()
     }
     near = positive(content, "near") if "near" in content else None
-    return calibrated_rig(cameras, content.get("held_out", ()), where=file, near=near)
+    check_held_out(held_out := content.get("held_out", ()), cameras, where=file)
+    return calibrated_rig(cameras, held_out, where=file, near=near)
 
 
 def _shared_intrinsics_rig(content: dict[str, Any], file: Path) -> CameraRig:
@@ -369,7 +327,7 @@ def bundled_clip_path() -> Path:
         CaptureError: the installation lacks the clip.
     """
     folder = Path(str(files("structgstream.data") / "clip"))
-    if not recognizes_json_videos(folder):
+    if not (folder / CAMERAS_FILE).is_file():
         raise CaptureError("The bundled clip is missing from the installation; reinstall structgstream.")
     return folder
 

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import enlargement
 from structgstream.data.images import opencv
-from structgstream.data.source import FrameStream, is_recording
-from structgstream.data.wrappers import SourceWrapper
+from structgstream.data.source import FrameStream, SourceWrapper, is_recording
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MultiViewFrame
 
@@ -51,11 +50,7 @@ class DenoisingConfig:
 
 @dataclass(frozen=True)
 class Denoised(SourceWrapper):
-    """The same frames; the training pictures of some of them are means over the frames after them.
-
-    Args:
-        at: numbers of the frames that are.
-    """
+    """The same frames; the training pictures of those of the numbers ``at`` are means over the frames after them."""
 
     config: DenoisingConfig
     at: tuple[int, ...]
@@ -72,7 +67,12 @@ class Denoised(SourceWrapper):
             own = self.source.frames(following) if following < len(self.source) else iter(())
             after = self.source.frames_after() if isinstance(self.source, SourceWrapper) else iter(())
             later = chain(_closed(stack, own), _closed(stack, after))
-            return mean_of_still(frame, _readable(later), names=self.rig.training, config=self.config)
+
+            def readable() -> Iterator[MultiViewFrame]:  # what cannot be read raises when it is reached itself
+                with suppress(CaptureError):
+                    yield from later
+
+            return mean_of_still(frame, readable(), names=self.rig.training, config=self.config)
 
 
 def denoised(source: FrameStream, config: DenoisingConfig, *, at: tuple[int, ...] = (0,)) -> FrameStream:
@@ -85,12 +85,8 @@ def mean_of_still(
 ) -> MultiViewFrame:
     """``frame`` with the means of its pixels over the frames ``later``, as long as they stand still, rounded to 8 bits.
 
-    Args:
-        later: the frames after it, of which as many are read as ``config`` says.
-        names: cameras whose pictures are averaged; the others' stay.
-
-    Returns:
-        the frame; ``mean_of`` is the mean number of pictures over which a pixel was averaged.
+    As many of ``later`` are read as ``config`` says; pictures of other cameras than ``names`` stay. ``mean_of`` of the
+    result is the mean number of pictures over which a pixel was averaged.
     """
     sums = {name: _Sum(frame.images[name], frame.masks.get(name), config) for name in names if name in frame.images}
     for other in islice(later, config.frames - 1):
@@ -148,12 +144,6 @@ def _box_sums(values: Any) -> Any:
     """Sums over the squares of SMOOTHING_PIXELS around each pixel, float32."""
     cv2 = opencv()
     return cv2.boxFilter(values, cv2.CV_32F, (SMOOTHING_PIXELS, SMOOTHING_PIXELS), normalize=False)
-
-
-def _readable(frames: Iterator[MultiViewFrame]) -> Iterator[MultiViewFrame]:
-    """``frames`` up to one that cannot be read, which raises its error when it is reached itself."""
-    with suppress(CaptureError):
-        yield from frames
 
 
 def _closed(stack: ExitStack, frames: Iterator[MultiViewFrame]) -> Iterator[MultiViewFrame]:

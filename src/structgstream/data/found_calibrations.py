@@ -2,7 +2,8 @@
 """The calibration of a project folder, as COLMAP, transforms.json or a file of another tool, in it or one folder below.
 
 Tools separate calibration and videos: Pose2Sim has ``calibration/Calib.toml`` next to ``videos/``, caliscope
-``camera_array.toml`` above ``recordings/TAKE/``, 3DGStream the model of COLMAP in the folder of the first frame.
+``camera_array.toml`` above ``recordings/TAKE/``, 3DGStream the model of COLMAP in the folder of the first frame. One
+that is broken or refused, or several that differ, are a ``CalibrationError``.
 """
 
 import logging
@@ -15,7 +16,16 @@ from structgstream.data import transforms
 from structgstream.data.calibration import Calibration, PosedCamera
 from structgstream.data.calibration_files import tools
 from structgstream.data.calibration_files.opencv_cameras import OPENCV_CAMERAS
-from structgstream.data.camera_files import NO_CAMERAS, files_of, folders_of, pictures_in, roots_of, videos_in
+from structgstream.data.camera_files import (
+    NO_CAMERAS,
+    files_of,
+    folders_of,
+    has_files,
+    has_frames,
+    pictures_in,
+    roots_of,
+    videos_in,
+)
 from structgstream.data.colmap import find_model, read_model
 from structgstream.data.images import PICTURE_SUFFIXES
 from structgstream.errors import CalibrationError
@@ -49,11 +59,7 @@ def recognizes_calibrated(path: Path) -> bool:
 
 
 def read_calibrated(path: Path, file: Path | None = None) -> Calibration | None:
-    """The cameras of the other tools' calibration file in the folder ``path``; None when there is none.
-
-    Raises:
-        CalibrationError: a broken file, one that only running it could read, or several that differ.
-    """
+    """The cameras of the other tools' calibration file in the folder ``path``; None when there is none."""
     found = [(own, files) for own in CALIBRATION_FORMATS for files in own.find(path)]
     read = [own.read(files) for own, files in found if file is None or file in files]
     if different := [other for other in read[1:] if not _agree(read[0], other)]:
@@ -73,11 +79,7 @@ def read_calibrated(path: Path, file: Path | None = None) -> Calibration | None:
 
 
 def read_calibration(folder: Path, file: Path | None = None) -> Calibration | None:
-    """The calibration in a folder, of COLMAP, transforms.json or another tool, in this order; None when there is none.
-
-    Raises:
-        CalibrationError: it is broken, refused, or there are several that differ.
-    """
+    """The calibration in a folder, of COLMAP, transforms.json or another tool, in this order; None without any."""
     model, files = find_model(folder), transforms.find(folder)
     if model is not None and (file is None or file.parent == model):
         return read_model(model)
@@ -95,16 +97,11 @@ def calibration_below(path: Path) -> Path | None:
     """The one folder in ``path`` that holds the calibration of what was filmed elsewhere in ``path``; None for none.
 
     It may lie one deeper, as EasyVolcap's ``optimized/cameras``.
-
-    Raises:
-        CalibrationError: there are several.
     """
     inner = inner_folders(path)
     found = [folder for folder in inner if has_calibration(folder) and not _is_capture(folder)]
-    if not found and any(videos_in(root) or pictures_in(root) for root in roots_of(path)):
-        deeper = (
-            own for folder in inner if not (videos_in(folder) or pictures_in(folder)) for own in folders_of(folder)
-        )
+    if not found and has_frames(path):
+        deeper = [own for folder in inner if not has_files(folder) for own in folders_of(folder)]
         found = [folder for folder in deeper if has_calibration(folder) and not _is_capture(folder)]
     frames = pictures_in(path)
     if found and all(folder.name in frames for folder in found):

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Captures whose frames are picture files, one list of files per camera; what the header of a picture states (Exif)."""
+"""Captures whose frames are picture files, one list of files per camera; what the header of a picture states (Exif).
+
+A file that cannot be read or decoded, or is no picture, is a ``CaptureError``.
+"""
 
 import io
 import logging
@@ -13,6 +16,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import repeat
 from pathlib import Path
 from types import ModuleType
@@ -58,21 +62,18 @@ class ImageSource:
     known."""
     turns: Mapping[str, int] = field(default_factory=dict)
     """Camera name to the EXIF orientation, 1 to 8, by which its pictures are turned; 1 where it is missing."""
-    _bits: dict[int, int] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __len__(self) -> int:
         return min(len(files) for files in self.files.values())
 
-    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
-        """The frames from stream index ``start``; the pictures of one instant are read in parallel.
+    @cached_property
+    def _bits(self) -> int:
+        return significant_bits(self.files)
 
-        Raises:
-            CaptureError: a picture has gone, cannot be decoded, or has another size than its intrinsics.
-        """
+    def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
+        """The frames from stream index ``start``; the pictures of one instant are read in parallel."""
         opencv()  # missing, it is reported once
-        if 0 not in self._bits:
-            self._bits[0] = significant_bits(self.files)
-        bits = self._bits[0]
+        bits = self._bits
         with ThreadPoolExecutor(min(len(self.rig), os.cpu_count() or 1), "pictures") as pool:
             for index in range(start, len(self)):
                 paths = {name: path for name in self.rig if (path := self.files[name][index]) is not None}
@@ -99,12 +100,7 @@ def opencv() -> ModuleType:
 
 
 class CommonPictures(NamedTuple):
-    """The pictures of a capture's frames.
-
-    Args:
-        files: camera name to its picture in each frame; None where it has none.
-        instants: name of each frame.
-    """
+    """The pictures of a capture's frames by camera, None where it has none in one, and the name of each frame."""
 
     files: dict[str, tuple[Path | None, ...]]
     instants: tuple[str, ...]
@@ -117,7 +113,7 @@ def common_pictures(
 
     Args:
         files: camera name to its pictures, by the name of the instant.
-        training: names of the cameras that are not held out; None for all.
+        training: names of the cameras that are not held out.
 
     Raises:
         CaptureError: see :func:`~structgstream.data.timeline.common_slots`; or a camera shares no instant with another.
@@ -148,22 +144,16 @@ def common_pictures(
 
 
 def read_picture(path: Path, *, bits: int = 16) -> NDArray[np.uint8]:
-    """One picture as ``[H, W, 3]`` sRGB, as its pixels are stored.
-
-    Args:
-        bits: of which the values of pictures of 16 bits are (:func:`significant_bits`).
-
-    Raises:
-        CaptureError: it cannot be read or decoded.
-    """
+    """The picture of :func:`read_picture_and_mask`."""
     return read_picture_and_mask(path, bits=bits)[0]
 
 
 def read_picture_and_mask(path: Path, *, bits: int = 16) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-    """As :func:`read_picture`, and where it is opaque, ``[H, W]``; None where it is everywhere.
+    """One picture as ``[H, W, 3]`` sRGB, as its pixels are stored, and where it is opaque, ``[H, W]``; None where it is
+    everywhere.
 
-    Raises:
-        CaptureError: it cannot be read or decoded.
+    Args:
+        bits: of which the values of pictures of 16 bits are (:func:`significant_bits`).
     """
     cv2 = opencv()
     stored = stored_picture(path)
@@ -190,9 +180,6 @@ def significant_bits(files: Mapping[str, Sequence[Path | None]]) -> int:
 
     Machine vision cameras store 10 to 14 bits in 16. The first, middle and last picture of each camera decide, so that
     it does not depend on where reading starts.
-
-    Raises:
-        CaptureError: a picture cannot be read or decoded.
     """
     most = 0
     for own in files.values():
@@ -226,11 +213,7 @@ def _may_be_deep(path: Path) -> bool:
 
 
 def stored_picture(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """The values of a file, ``[H, W]``, or ``[H, W, 3 or 4]`` in OpenCV's order of colours.
-
-    Raises:
-        CaptureError: it cannot be read or decoded, or is none of whole numbers.
-    """
+    """The values of a file, ``[H, W]``, or ``[H, W, 3 or 4]`` in OpenCV's order of colours."""
     cv2 = opencv()
     try:
         data = path.read_bytes()
@@ -367,11 +350,7 @@ MAX_SERIES = 8  # of names that differ by more than numbers, of which one pictur
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Width and height of the stored pixels; other files than PNG and JPEG are decoded.
-
-    Raises:
-        CaptureError: the file cannot be read or is not a picture.
-    """
+    """Width and height of the stored pixels; other files than PNG and JPEG are decoded."""
     with _opened(path) as picture:
         if picture is not None and picture.format in ("PNG", "JPEG", "MPO"):
             return picture.size
@@ -379,11 +358,8 @@ def picture_size(path: Path) -> tuple[int, int]:
 
 
 def check_one_series(camera: str, files: Iterable[Path]) -> None:
-    """Check that a camera's pictures whose names differ by more than numbers have one size, unlike thumbnails.
-
-    Raises:
-        CaptureError: they have not, or one of them cannot be read.
-    """
+    """Refuses pictures of one camera whose names differ by more than numbers and that have several sizes
+    (thumbnails)."""
     firsts: dict[str, Path] = {}
     for file in files:
         firsts.setdefault(re.sub(r"\d+", "0", file.stem), file)
@@ -449,9 +425,6 @@ def read_exif(path: Path) -> StatedOptics:
 
     Files without such a header, or with a damaged one, state nothing; whether the picture can be decoded is not looked
     at.
-
-    Raises:
-        CaptureError: the file cannot be read.
     """
     with _opened(path) as picture:
         if picture is None:
@@ -467,18 +440,14 @@ def read_exif(path: Path) -> StatedOptics:
 
 
 def _focal_pixels(tags: Mapping[int, Any], size: tuple[int, int]) -> float | None:
-    film, plane = _by_film(tags, size), _by_plane(tags, size)
+    equivalent, plane = _number(tags.get(FOCAL_35MM)), _by_plane(tags, size)
+    film = None if equivalent is None else equivalent * math.hypot(*size) / DIAGONAL_35MM
     likely = [
         focal for focal in (plane, film) if focal is not None and MIN_FOCAL_SHARE < focal / max(size) < MAX_FOCAL_SHARE
     ]
     if len(likely) == 2 and abs(likely[0] / likely[1] - 1) > AGREE:
         return film
     return likely[0] if likely else None
-
-
-def _by_film(tags: Mapping[int, Any], size: tuple[int, int]) -> float | None:
-    equivalent = _number(tags.get(FOCAL_35MM))
-    return None if equivalent is None else equivalent * math.hypot(*size) / DIAGONAL_35MM
 
 
 def _by_plane(tags: Mapping[int, Any], size: tuple[int, int]) -> float | None:

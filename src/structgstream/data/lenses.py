@@ -187,12 +187,7 @@ def from_integer_centers(K: ArrayLike) -> Floats:
 
 
 def opencv_lens(coefficients: Sequence[float]) -> Lens:
-    """From OpenCV's vector ``k1, k2, p1, p2[, k3[, k4, k5, k6]]``, which may be empty.
-
-    Raises:
-        Unreadable: a vector of another length that is not padded with zeros: a model with more terms; or a number that
-            is not finite.
-    """
+    """From OpenCV's vector ``k1, k2, p1, p2[, k3[, k4, k5, k6]]``, which may be empty, or longer by zeros."""
     values = [number(value) for value in coefficients]
     if any(values[8:]) or len(values) in (1, 2, 3):
         raise Unreadable(
@@ -203,11 +198,7 @@ def opencv_lens(coefficients: Sequence[float]) -> Lens:
 
 
 def fisheye_lens(coefficients: Sequence[float]) -> Fisheye:
-    """From the vector ``k1, k2, k3, k4`` of OpenCV's fisheye module; missing ones are 0.
-
-    Raises:
-        Unreadable: more than four numbers that are not 0, or one that is not finite.
-    """
+    """From the vector ``k1, k2, k3, k4`` of OpenCV's fisheye module; missing ones are 0."""
     values = [number(value) for value in coefficients]
     if any(values[4:]):
         raise Unreadable(f"{len(values)} fisheye coefficients; expected at most 4 (k1, k2, k3, k4)")

@@ -6,7 +6,8 @@
     masks/CAMERA.png          for all frames
     masks/CAMERA/FRAME.png    for one; FRAME is the name of the frame's pictures, of videos its number from 0
 
-They have the size of the pictures or videos as stored (before undistortion). Where a camera has both, both hold.
+They have the size of the pictures or videos as stored (before undistortion). Where a camera has both, both hold. One
+that cannot be read, of another size or format, or of no camera or frame is a ``CaptureError``.
 """
 
 import logging
@@ -23,10 +24,9 @@ from structgstream.cameras import CameraRig
 from structgstream.data.calibration import listed
 from structgstream.data.camera_files import by_stem, is_hidden
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, opencv, reduced_mask
-from structgstream.data.source import FrameSource
+from structgstream.data.source import FrameSource, SourceWrapper, innermost, resized_to
 from structgstream.data.timeline import natural
-from structgstream.data.undistortion import UndistortedSource
-from structgstream.data.wrappers import SourceWrapper, innermost, resized_to
+from structgstream.data.undistortion import UndistortedSource, lenses_of
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
 
@@ -53,11 +53,7 @@ class MaskedSource(SourceWrapper):
     _always: dict[str, Mask | None] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
-        """The frames from stream index ``start``.
-
-        Raises:
-            CaptureError: a mask cannot be read, or has another size than its camera's pictures.
-        """
+        """The frames from stream index ``start``."""
         with ThreadPoolExecutor(min(len(self.files), os.cpu_count() or 1) or 1, "masks") as pool:
             for frame in self.source.frames(start):
                 names = [name for name in frame.images if name in self.files]
@@ -91,11 +87,7 @@ class MaskedSource(SourceWrapper):
 
 
 def read_mask(file: Path, *, size: tuple[int, int], camera: str) -> Mask:
-    """The mask ``[H, W]`` of a file: True where it is not black.
-
-    Raises:
-        CaptureError: it cannot be read, or has another size than ``size`` (width, height).
-    """
+    """The mask ``[H, W]`` of a file, of ``size`` (width, height): True where it is not black."""
     cv2 = opencv()
     try:
         data = np.frombuffer(file.read_bytes(), np.uint8)
@@ -113,14 +105,7 @@ def read_mask(file: Path, *, size: tuple[int, int], camera: str) -> Mask:
 
 
 def with_masks(source: FrameSource, folder: Path) -> FrameSource:
-    """The capture with the masks of ``folder``; the source itself when there are none.
-
-    Args:
-        source: the whole capture, as its layout is read.
-
-    Raises:
-        CaptureError: a mask of an unknown camera, of no frame, of another size, or in a lossy format.
-    """
+    """The whole capture ``source``, as its layout is read, with the masks of ``folder``; itself when there are none."""
     found = sorted(folder.iterdir(), key=lambda entry: natural(entry.name)) if folder.is_dir() else []
     entries = [entry for entry in found if not is_hidden(entry) and (entry.is_dir() or _is_mask(entry))]
     if not entries:
@@ -144,25 +129,13 @@ def _below_lenses(source: FrameSource, wrap: Callable[[FrameSource], FrameSource
     """``source`` with the stored pictures, which are undistorted where they have a lens, wrapped."""
     if isinstance(source, UndistortedSource):
         return replace(source, source=wrap(source.source))
-    if isinstance(source, SourceWrapper) and _has_lenses(source.source):
+    if isinstance(source, SourceWrapper) and lenses_of(source) is not None:
         return replace(source, source=_below_lenses(source.source, wrap))
     return wrap(source)
 
 
-def _has_lenses(source: FrameSource) -> bool:
-    return isinstance(source, UndistortedSource) or (isinstance(source, SourceWrapper) and _has_lenses(source.source))
-
-
 def _masks(folder: Path) -> list[Path]:
     return [file for file in sorted(folder.iterdir()) if file.is_file() and not is_hidden(file) and _is_mask(file)]
-
-
-def _instants(name: str, source: FrameSource) -> tuple[str, ...]:
-    """What the frames of a camera are called in its files; nothing for videos."""
-    source = innermost(source)
-    if not isinstance(source, ImageSource):
-        return ()
-    return source.instants or tuple("" if file is None else file.stem for file in source.files[name])
 
 
 def _is_mask(file: Path) -> bool:
@@ -176,7 +149,9 @@ def _files(folder: Path, name: str, source: FrameSource) -> CameraMasks:
     """The mask files of a camera, the first of which is checked."""
     always, own = by_stem(_masks(folder)).get(name), folder / name
     files = by_stem(_masks(own)) if own.is_dir() else {}
-    instants = _instants(name, source)
+    inner, instants = innermost(source), ()
+    if isinstance(inner, ImageSource):  # frames of videos have no names
+        instants = inner.instants or tuple("" if file is None else file.stem for file in inner.files[name])
     numbers = {instant: index for index, instant in enumerate(instants or map(str, range(len(source))))}
     if not instants:
         files = {str(int(stem)) if stem.isdecimal() else stem: file for stem, file in files.items()}

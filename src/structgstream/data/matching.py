@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, enlargement
 from structgstream.data.images import opencv, reduced_mask, reduced_picture
-from structgstream.geometry import Floats
+from structgstream.geometry import Floats, cross_matrices
 
 Pair = tuple[str, str]
 """Names of two cameras."""
@@ -179,8 +179,7 @@ def connected_groups(names: Iterable[str], pairs: Iterable[Pair]) -> list[tuple[
 def fundamental_matrix(first: Camera, second: Camera) -> Floats:
     """``F [3, 3]`` with ``x2^T F x1 = 0`` for homogeneous pixels of one point in both pictures."""
     relative = second.viewmat.numpy() @ np.linalg.inv(first.viewmat.numpy())
-    x, y, z = relative[:3, 3]
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    cross = cross_matrices(relative[:3, 3])
     F = np.linalg.inv(second.K.numpy()).T @ cross @ relative[:3, :3] @ np.linalg.inv(first.K.numpy())
     return F / max(float(np.linalg.norm(F)), 1e-300)
 
@@ -217,13 +216,12 @@ def guided_matches(
     line_pixels: float,
     depth_range: tuple[float, float],
     ratio: float,
-    distinct_pixels: float = 4.0,
 ) -> NDArray[np.intp]:
     """Mutually best matches ``[S, 2]`` (indices into the two sets) among keypoints near the epipolar line.
 
-    A match survives if no other candidate, further than ``distinct_pixels`` from it, comes within ``ratio``
-    of its descriptor distance: along a line repeating texture is the main danger. Candidates outside
-    ``depth_range`` of either camera are not considered.
+    A match survives if no other candidate, further than :data:`DISTINCT_PIXELS` from it, comes within ``ratio`` of its
+    descriptor distance: along a line repeating texture is the main danger. Candidates outside ``depth_range`` of either
+    camera are not considered.
     """
     F = fundamental_matrix(*cameras)
     lines = _homogeneous(first.pixels) @ F.T
@@ -233,7 +231,7 @@ def guided_matches(
     _, depths = triangulate(*cameras, first.pixels[row], second.pixels[column])
     in_range = ((depths > depth_range[0]) & (depths < depth_range[1])).all(1)
     row, column = row[in_range], column[in_range]
-    return mutually_best(first, second, row, column, ratio=ratio, distinct_pixels=distinct_pixels)
+    return mutually_best(first, second, row, column, ratio=ratio)
 
 
 def mutually_best(
@@ -243,45 +241,36 @@ def mutually_best(
     column: NDArray[np.intp],
     *,
     ratio: float,
-    distinct_pixels: float,
     distance: float = np.inf,
 ) -> NDArray[np.intp]:
     """Matches ``[S, 2]`` among candidates that are each other's best and pass the ratio test both ways.
 
     Args:
-        row: ``[C]``, of each candidate the index into ``first``.
-        column: ``[C]``, the index into ``second``.
-        ratio: see :func:`distinct_best`.
-        distinct_pixels: see :func:`distinct_best`.
+        row: ``[C]``, of each candidate the index into ``first``; ``column`` that into ``second``.
+        ratio: largest ratio of the best descriptor distance to that of a rival, see :func:`distinct_best`.
         distance: descriptor distance below which a match must be.
     """
     similarity = np.einsum("sd,sd->s", first.descriptors[row], second.descriptors[column])
     cost = np.sqrt(np.maximum(2 - 2 * similarity, 1e-12))
-    forward = distinct_best(row, column, cost, second.pixels, ratio=ratio, distinct_pixels=distinct_pixels)
-    backward = distinct_best(column, row, cost, first.pixels, ratio=ratio, distinct_pixels=distinct_pixels)
+    forward = distinct_best(row, column, cost, second.pixels, ratio=ratio)
+    backward = distinct_best(column, row, cost, first.pixels, ratio=ratio)
     mutual = np.intersect1d(forward, backward)
     mutual = mutual[cost[mutual] < distance]
     return np.stack([row[mutual], column[mutual]], 1)
 
 
+DISTINCT_PIXELS = 4.0  # what lies nearer to the best candidate is no rival of it
+
+
 def distinct_best(
-    query: NDArray[np.intp],
-    candidate: NDArray[np.intp],
-    cost: NDArray[np.float32],
-    pixels: Floats,
-    *,
-    ratio: float,
-    distinct_pixels: float,
+    query: NDArray[np.intp], candidate: NDArray[np.intp], cost: NDArray[np.float32], pixels: Floats, *, ratio: float
 ) -> NDArray[np.intp]:
     """Positions, in a list of candidates, of each query's best one if it passes the ratio test.
 
     Args:
         query: ``[C]``, whose candidate each is.
-        candidate: ``[C]``, index into ``pixels``.
+        candidate: ``[C]``, index into ``pixels`` ``[S, 2]`` of the candidates' keypoints.
         cost: ``[C]``, descriptor distance.
-        pixels: ``[S, 2]`` of the candidates' keypoints.
-        ratio: largest ratio of the best cost to that of a rival.
-        distinct_pixels: what lies nearer to the best candidate is no rival of it.
     """
     order = np.lexsort((cost, query))
     query_sorted = query[order]
@@ -289,7 +278,7 @@ def distinct_best(
     best = order[starts]
     group = np.cumsum(np.diff(query_sorted, prepend=-1) != 0) - 1
     distances = np.linalg.norm(pixels[candidate[order]] - pixels[candidate[best]][group], axis=1)
-    rival = distances > distinct_pixels
+    rival = distances > DISTINCT_PIXELS
     rival_cost = np.full(len(starts), np.inf)
     np.minimum.at(rival_cost, group[rival], cost[order][rival])
     return best[cost[best] < ratio * rival_cost]
@@ -388,19 +377,12 @@ MIN_INLIERS, MIN_INLIER_SHARE = 20, 0.5  # of the matches of a pair that is used
 
 
 class PairMatcher:
-    """Matches of pairs of pictures that are inliers of some epipolar geometry (Hartley and Zisserman, Multiple View
-    Geometry, chapter 11); results per picture and pair are cached.
-
-    Args:
-        images: name of a camera to its picture ``[H, W, 3]``.
-        masks: name of a camera to ``[H, W]``, False where its picture does not count.
-    """
+    """Matches of pairs of pictures ``[H, W, 3]`` by camera that are inliers of some epipolar geometry (Hartley and
+    Zisserman, Multiple View Geometry, chapter 11); pixels where ``masks`` ``[H, W]`` are False have no keypoints.
+    Results per picture and pair are cached."""
 
     def __init__(
-        self,
-        images: Mapping[str, NDArray[np.uint8]],
-        *,
-        masks: Mapping[str, NDArray[np.bool_]] | None = None,
+        self, images: Mapping[str, NDArray[np.uint8]], *, masks: Mapping[str, NDArray[np.bool_]] | None = None
     ) -> None:
         self._images = images
         self._masks = masks or {}
@@ -409,13 +391,9 @@ class PairMatcher:
 
     def matches(self, pairs: Sequence[Pair]) -> dict[Pair, tuple[Floats, Floats]]:
         """Pixels ``[S, 2]`` in the first and in the second picture of each pair; none where too few agree."""
-        found = self.indices(pairs)
         return {
-            (first, second): (
-                self._features[first].pixels[rows[:, 0]],
-                self._features[second].pixels[rows[:, 1]],
-            )
-            for (first, second), rows in found.items()
+            (first, second): (self.keypoints(first)[rows[:, 0]], self.keypoints(second)[rows[:, 1]])
+            for (first, second), rows in self.indices(pairs).items()
         }
 
     def indices(self, pairs: Sequence[Pair]) -> dict[Pair, NDArray[np.intp]]:

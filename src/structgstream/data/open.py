@@ -24,18 +24,19 @@ from typing import Literal
 import numpy as np
 
 from structgstream.cameras import CameraRig
+from structgstream.data import transforms
 from structgstream.data.calibration import with_near
-from structgstream.data.camera_files import ROOTS, pictures_in, roots_of, unread_files, videos_in
+from structgstream.data.camera_files import ROOTS, has_frames, unread_files
 from structgstream.data.colmap import find_model
 from structgstream.data.dataset_layouts import (
+    CAMERAS_FILE,
+    MODELS_FILE,
+    POSES,
+    TRAIN,
     open_immersive,
     open_json_videos,
     open_n3dv,
     open_panoptic,
-    recognizes_immersive,
-    recognizes_json_videos,
-    recognizes_n3dv,
-    recognizes_panoptic,
 )
 from structgstream.data.found_calibrations import (
     calibration_below,
@@ -47,9 +48,7 @@ from structgstream.data.found_calibrations import (
 from structgstream.data.masks import FOLDER, with_masks
 from structgstream.data.posed_capture import NoFrames, open_posed
 from structgstream.data.prepared import open_prepared, recognizes_prepared
-from structgstream.data.source import FrameSource
-from structgstream.data.transforms import open_transforms, recognizes_transforms
-from structgstream.data.wrappers import WithoutPoints, WithRig, resized, section
+from structgstream.data.source import FrameSource, WithoutPoints, WithRig, resized, section
 from structgstream.errors import CaptureError, ConfigError, StructGStreamError
 from structgstream.geometry import Floats
 
@@ -84,12 +83,12 @@ def open_calibrated(path: Path) -> FrameSource:
 
 CAPTURE_LAYOUTS: tuple[tuple[Callable[[Path], bool], Callable[[Path], FrameSource]], ...] = (
     (recognizes_prepared, open_prepared),
-    (recognizes_panoptic, open_panoptic),
-    (recognizes_json_videos, open_json_videos),
-    (recognizes_n3dv, open_n3dv),
-    (recognizes_immersive, open_immersive),
+    (lambda path: (path / TRAIN).is_file(), open_panoptic),
+    (lambda path: (path / CAMERAS_FILE).is_file(), open_json_videos),
+    (lambda path: (path / POSES).is_file(), open_n3dv),
+    (lambda path: (path / MODELS_FILE).is_file(), open_immersive),
     (lambda path: find_model(path) is not None, open_calibrated),
-    (recognizes_transforms, open_transforms),
+    (lambda path: bool(transforms.find(path)), transforms.open_transforms),
     (recognizes_calibrated, open_calibrated),
     (lambda path: calibration_below(path) is not None, open_calibrated),
 )
@@ -145,11 +144,7 @@ def selected(
     scale: float = 1.0,
     near: float | None = None,
 ) -> FrameSource:
-    """The capture with other cameras held out, reduced pictures, another near plane; see :func:`open_capture`.
-
-    Raises:
-        ConfigError: an argument is invalid.
-    """
+    """The capture with other cameras held out, reduced pictures, another near plane; see :func:`open_capture`."""
     rig = source.rig
     if held_out is not None:
         rig = rig.with_held_out(_chosen(held_out, rig))
@@ -195,11 +190,7 @@ def _opened(folder: Path, opens: Callable[[Path], FrameSource]) -> FrameSource:
 
 
 def layout_of(path: Path) -> str:
-    """The layout of the capture that :func:`open_capture` opens, in words.
-
-    Raises:
-        CaptureError: the folder is missing, empty or of an unknown layout.
-    """
+    """The layout of the capture that :func:`open_capture` opens, in words."""
     return _located(path)[1].__name__.removeprefix("open_").replace("_", " ")
 
 
@@ -227,28 +218,22 @@ def _located(path: Path) -> tuple[Path, Callable[[Path], FrameSource]]:
         raise CaptureError(f"{path} has no calibration; the capture is the folder above it: give {above}.")
     shown = ", ".join(content[:6]) + (", ..." if len(content) > 6 else "")
     if any(Path(name).suffix.lower() in CALIBRATION_SUFFIXES for name in content):
-        why = f"no calibration that is known here; it holds {shown}{unread_files(path)}"
-    elif any(videos_in(root) or pictures_in(root) for root in roots_of(path)):
-        raise Uncalibrated(
-            f"The folder {path} has no calibration; it holds {shown}. structgstream prepare calibrates videos and "
-            f"pictures.\n{LAYOUTS_HELP}"
+        kind, why = CaptureError, f"no calibration that is known here; it holds {shown}{unread_files(path)}"
+    elif has_frames(path):
+        kind, why = (
+            Uncalibrated,
+            f"no calibration; it holds {shown}. structgstream prepare calibrates videos and pictures",
         )
     else:
-        raise Uncalibrated(
-            f"The folder {path} has no supported layout; it holds {shown}{unread_files(path)}.\n{LAYOUTS_HELP}"
-        )
-    raise CaptureError(f"The folder {path} has {why}.\n{LAYOUTS_HELP}")
+        kind, why = Uncalibrated, f"no supported layout; it holds {shown}{unread_files(path)}"
+    raise kind(f"The folder {path} has {why}.\n{LAYOUTS_HELP}")
 
 
 def _above(path: Path) -> Path | None:
     """The capture of which ``path`` is a folder, up to three above; None where there is none."""
     for inside, folder in zip((path, *path.parents), path.parents[:3]):
         with suppress(OSError, StructGStreamError):
-            if (
-                inside.name.lower() in PARTS
-                and _opener(folder) is not None
-                and any(videos_in(root) or pictures_in(root) for root in roots_of(folder))
-            ):
+            if inside.name.lower() in PARTS and _opener(folder) is not None and has_frames(folder):
                 return folder
     return None
 

@@ -26,10 +26,7 @@ from structgstream.kernels.backend import processor_backend
 def plane_homographies(reference: Camera, cameras: Sequence[Camera], planes: Floats) -> Floats:
     """From pixel indices of ``reference`` to those of each of ``N`` cameras, through each plane: ``[P, N, 3, 3]``.
 
-    Args:
-        reference: the camera whose pixels are mapped.
-        cameras: the others.
-        planes: ``[P, 3]``; a plane is ``plane . x = 1`` in the axes of ``reference``.
+    A plane of ``planes`` ``[P, 3]`` is ``plane . x = 1`` in the axes of ``reference``.
     """
     # The first pixel has the index 0, its centre is at 0.5.
     centred = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
@@ -169,16 +166,15 @@ def consistent_pixels(
 def sweep_points(
     cameras: Mapping[str, Camera],
     images: Mapping[str, NDArray[np.uint8]],
+    masks: Mapping[str, NDArray[np.bool_]],
     *,
     neighbours: Mapping[str, tuple[str, ...]],
     bounds: Mapping[str, SweepBounds],
     workers: int,
-    levels: Sequence[SweepConfig] = DEFAULT_LEVELS,
-    masks: Mapping[str, NDArray[np.bool_]] | None = None,
+    levels: Sequence[SweepConfig],
 ) -> tuple[Floats, NDArray[np.uint8]]:
-    """Consistent points and their colours from depth maps of all ``cameras``; ``images`` ``[H, W, 3]`` uint8.
-
-    ``masks`` ``[H, W]`` leave pixels of a camera out.
+    """Consistent points and their colours from depth maps of all ``cameras``; ``images`` ``[H, W, 3]`` uint8, of whose
+    pixels ``masks`` ``[H, W]`` leave some out.
 
     A later level adds points only where earlier ones have none nearby, because large windows extend surfaces over
     outlines.
@@ -191,7 +187,7 @@ def sweep_points(
     with ThreadPoolExecutor(workers) as pool:
         for config in levels:
             views = {
-                name: sweep_view(camera, images[name], width=config.width, mask=(masks or {}).get(name))
+                name: sweep_view(camera, images[name], width=config.width, mask=masks.get(name))
                 for name, camera in cameras.items()
             }
             pending = {
@@ -252,7 +248,10 @@ def _families(camera: Camera, others: Sequence[Camera], bounds: SweepBounds, con
     Floors and tables are seen at a slant: on planes parallel to the picture wide windows do not match there.
     """
     near, far = bounds.depth_range
-    pixels_per_inverse = float(camera.K[0, 0]) * _base_across(camera, others)
+    axis = camera.viewmat.numpy()[2, :3]
+    bases = [other.center.numpy() - camera.center.numpy() for other in others]
+    across = float(np.median([np.linalg.norm(base - (base @ axis) * axis) for base in bases]))
+    pixels_per_inverse = float(camera.K[0, 0]) * across
     count = int(np.clip(math.ceil(pixels_per_inverse * (1 / near - 1 / far)), *config.planes))
     families = [_Family(np.array([0.0, 0.0, 1.0]), np.linspace(1 / far, 1 / near, count))]
     if bounds.up is None or not config.level_planes:
@@ -268,13 +267,6 @@ def _families(camera: Camera, others: Sequence[Camera], bounds: SweepBounds, con
             count = int(np.clip(math.ceil(span), 8, config.planes[1]))
             families.append(_Family(normal, np.linspace(1 / offset, 1 / close, count)))
     return families
-
-
-def _base_across(camera: Camera, others: Sequence[Camera]) -> float:
-    """Median distance of the other cameras from the optical axis."""
-    axis = camera.viewmat.numpy()[2, :3]
-    bases = [other.center.numpy() - camera.center.numpy() for other in others]
-    return float(np.median([np.linalg.norm(base - (base @ axis) * axis) for base in bases]))
 
 
 def _search(

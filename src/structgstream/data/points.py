@@ -109,13 +109,7 @@ def initial_points(
     if config.SWEEP_LEVELS:
         bounds = _sweep_bounds(cameras, positions, distance=distance, config=config)
         swept, swept_colors = sweep_points(
-            cameras,
-            images,
-            neighbours=neighbours,
-            bounds=bounds,
-            workers=workers,
-            levels=config.SWEEP_LEVELS,
-            masks=masks,
+            cameras, images, masks, neighbours=neighbours, bounds=bounds, workers=workers, levels=config.SWEEP_LEVELS
         )
         positions, colors = np.concatenate([positions, swept]), np.concatenate([colors, swept_colors])
         sources = np.concatenate([sources, np.ones(len(swept), np.uint8)])
@@ -125,10 +119,8 @@ def initial_points(
         _log.warning(
             "Only %d initial points could be triangulated from frame %d (too little texture or overlap); "
             "starting from %d random points in the volume that the cameras see: expect a worse result.",
-            len(selected),
-            frame.index,
-            config.RANDOM_POINTS,
-        )
+            len(selected), frame.index, config.RANDOM_POINTS,
+        )  # fmt: skip
         positions, colors = _random_points(
             cameras, images, masks=masks, distance=distance, rng=np.random.default_rng(seed), config=config
         )
@@ -261,8 +253,8 @@ def _depth_range(camera: Camera, points: Floats, distance: float, config: Points
     return max(near, 0.6 * float(low)), max(1.3 * float(high), 2 * near)
 
 
-def _has_neighbors(points: Floats, *, cell: float, least: int = 3) -> NDArray[np.bool_]:
-    """Mask ``[P]`` of the points with at least ``least`` others in the 27 cells around them."""
+def _has_neighbors(points: Floats, *, cell: float) -> NDArray[np.bool_]:
+    """Mask ``[P]`` of the points with at least three others in the 27 cells around them."""
     if len(points) == 0:
         return np.zeros(0, bool)
     keys, strides = _cells(points, cell)
@@ -271,7 +263,7 @@ def _has_neighbors(points: Floats, *, cell: float, least: int = 3) -> NDArray[np
     for offset in np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), -1).reshape(-1, 3) @ strides:
         at = np.minimum(np.searchsorted(occupied, keys + offset), len(occupied) - 1)
         total += np.where(occupied[at] == keys + offset, counts[at], 0)
-    return total > least
+    return total > 3
 
 
 def _thin_out(points: Floats, *, cell: float, count: int) -> NDArray[np.intp]:

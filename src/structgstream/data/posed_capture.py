@@ -28,6 +28,7 @@ from structgstream.data.calibration import (
     PosedCamera,
     calibrated_camera,
     calibrated_rig,
+    check_held_out,
     check_names,
     listed,
 )
@@ -52,7 +53,7 @@ from structgstream.data.images import (
 from structgstream.data.lenses import LensCamera
 from structgstream.data.source import FrameSource
 from structgstream.data.text_files import path_parts
-from structgstream.data.timeline import natural
+from structgstream.data.timeline import check_rate, natural
 from structgstream.data.undistortion import rectilinear, undistort
 from structgstream.data.video import VideoSource, synchronised
 from structgstream.data.video_index import VIDEO_SUFFIXES, scan_videos
@@ -84,8 +85,9 @@ def open_posed(
         fps: frames a second of pictures; None for :data:`PICTURE_FPS`. Videos state theirs.
 
     Raises:
-        CaptureError: no pictures or videos, or not of the calibrated cameras.
+        CaptureError: no pictures or videos, or not of the calibrated cameras; or they cannot be read.
         CalibrationError: a camera without calibration, one that moves, or pictures of other proportions.
+        ConfigError: a rate that is not positive.
     """
 
     def pictured(root: Path, files: Pictures, *, partial: bool) -> FrameSource:
@@ -93,6 +95,8 @@ def open_posed(
         filmed = of_pictures(path, files, _poses(calibration, files), root=root, calibration=calibration, fps=fps)
         return undistort(*filmed, target=target)
 
+    if fps is not None:
+        check_rate(fps)
     known = [root for root in roots_of(path) if root == path or root.name.lower() in ("images", "image", *REDUCED)]
     stills = [(root, found) for root in known if (found := by_stem(files_of(root, PICTURE_SUFFIXES)))]
     for root in chain(filmed_roots(path), other_roots(path)):
@@ -102,9 +106,8 @@ def open_posed(
             return undistort(*of_videos(path, videos, root=root, calibration=calibration), target=target)
         if folders := pictures_in(root):
             files = _layout(folders, calibration)
-            if (
-                root != path or not stills or _poses(calibration, files)
-            ):  # else depth maps, for example, next to images/CAMERA
+            # Else depth maps, for example, next to images/CAMERA.
+            if root != path or not stills or _poses(calibration, files):
                 return pictured(root, files, partial=bool(calibration.unposed))
     if stills:
         # Structure from motion often leaves out some photos.
@@ -151,17 +154,12 @@ def _posed(files: Mapping[str, Of], calibration: Calibration, root: Path) -> Map
 def of_videos(
     path: Path, videos: Mapping[str, Path], *, root: Path, calibration: Calibration
 ) -> tuple[VideoSource, Mapping[str, LensCamera]]:
-    """The videos as they are, and their cameras with lenses.
-
-    Raises:
-        CaptureError: a video cannot be read.
-        CalibrationError: ``videos`` are of other cameras, or have other proportions.
-    """
+    """The videos as they are, and their cameras with lenses."""
     poses = _poses(calibration, videos)
     _check(poses, videos, calibration=calibration, root=root)
     tracks = scan_videos({name: videos[name] for name in sorted(poses, key=natural)})
     filmed = _filmed(poses, {name: (track.width, track.height) for name, track in tracks.items()}, calibration)
-    rig = _rig(filmed, calibration, path)
+    rig = _rig(filmed, poses, calibration, path)
     return synchronised(tracks, rig, where=path, points=calibration.points), filmed
 
 
@@ -174,12 +172,7 @@ def of_pictures(
     calibration: Calibration,
     fps: float | None = None,
 ) -> tuple[ImageSource, Mapping[str, LensCamera]]:
-    """The pictures of the cameras of ``poses`` as they are, and these cameras with lenses.
-
-    Raises:
-        CaptureError: a picture is missing or cannot be read.
-        CalibrationError: ``files`` are of other cameras, or have other proportions.
-    """
+    """The pictures of the cameras of ``poses`` as they are, and these cameras with lenses."""
     _check(poses, files, calibration=calibration, root=root)
     held_out = set(calibration.held_out)
     names = sorted(poses, key=natural)
@@ -192,9 +185,15 @@ def of_pictures(
     turns = {name: _orientation(file, poses[name], calibration) for name, file in firsts.items()}
     sizes = {name: _shown_size(file, turns[name]) for name, file in firsts.items()}
     filmed = _filmed(poses, sizes, calibration)
-    rig = _rig(filmed, calibration, path)
+    rig = _rig(filmed, poses, calibration, path)
     source = ImageSource(
-        path.name, rig, fps or PICTURE_FPS, common.files, calibration.points, common.instants, turns=turns
+        path.name,
+        rig,
+        PICTURE_FPS if fps is None else fps,
+        common.files,
+        calibration.points,
+        common.instants,
+        turns=turns,
     )
     return source, filmed
 
@@ -205,11 +204,7 @@ def _shown_size(file: Path, orientation: int) -> tuple[int, int]:
 
 
 def orientations(calibration: Calibration, firsts: Mapping[str, Path]) -> dict[str, int]:
-    """The EXIF orientation by which each calibrated camera's pictures are turned, by its first picture.
-
-    Raises:
-        CalibrationError: neither the calibration nor the size of the pictures decides.
-    """
+    """The EXIF orientation by which each calibrated camera's pictures are turned, by its first picture."""
     return {name: _orientation(firsts[name], posed, calibration) for name, posed in _poses(calibration, firsts).items()}
 
 
@@ -347,34 +342,33 @@ def _check(
 
 def _filmed(poses: Mapping[str, PosedCamera], sizes: Sizes, calibration: Calibration) -> dict[str, LensCamera]:
     """Every camera at the size of its pictures, in the order of ``sizes``."""
-    return {
-        name: LensCamera(_sized(name, poses[name], sizes[name], calibration.where), poses[name].lens) for name in sizes
-    }
+    filmed, where = {}, calibration.where
+    for name, size in sizes.items():
+        posed = poses[name]
+        width, height = posed.size or size
+        camera = calibrated_camera(name, viewmat=posed.viewmat, K=posed.K, width=width, height=height, where=where)
+        if abs(size[1] - height * size[0] / width) > 1:
+            raise CalibrationError(
+                f"The pictures of camera {name!r} have {size[0]}x{size[1]} pixels, {where} is for {width}x{height}: "
+                "other proportions, so they are not a reduction; use pictures of the mode that was calibrated, or "
+                "calibrate it."
+            )
+        filmed[name] = LensCamera(camera.resized(*size), posed.lens)
+    return filmed
 
 
-def _sized(name: str, posed: PosedCamera, size: tuple[int, int], where: Path) -> Camera:
-    width, height = posed.size or size
-    camera = calibrated_camera(name, viewmat=posed.viewmat, K=posed.K, width=width, height=height, where=where)
-    if abs(size[1] - height * size[0] / width) > 1:
-        raise CalibrationError(
-            f"The pictures of camera {name!r} have {size[0]}x{size[1]} pixels, {where} is for {width}x{height}: other "
-            "proportions, so they are not a reduction; use pictures of the mode that was calibrated, or calibrate it."
-        )
-    return camera.resized(*size)
-
-
-def _rig(filmed: Mapping[str, LensCamera], calibration: Calibration, path: Path) -> CameraRig:
-    held_out = [name for name in calibration.held_out if name in filmed]
+def _rig(
+    filmed: Mapping[str, LensCamera], poses: Mapping[str, PosedCamera], calibration: Calibration, path: Path
+) -> CameraRig:
+    """The rig of the pictures, in which cameras are held out that the calibration does, by its names or by these."""
+    calibrated = [*(posed.name for posed in calibration.cameras), *calibration.unposed]
+    check_held_out(calibration.held_out, [*calibrated, *filmed], where=calibration.where)
+    held_out = [name for name in filmed if not {name, poses[name].name}.isdisjoint(calibration.held_out)]
     return calibrated_rig({name: own.camera for name, own in filmed.items()}, held_out, where=path)
 
 
 def filmed_by(calibration: Calibration, sizes: Sizes, *, root: Path) -> dict[str, LensCamera]:
-    """The cameras of a calibration with their lenses, at the size of their pictures.
-
-    Args:
-        calibration: of at least these cameras.
-        sizes: name of a camera to the width and height of its pictures, pixels.
-        root: where the pictures lie, for messages.
+    """The cameras of a calibration with their lenses, for pictures in ``root`` of ``sizes``, width and height.
 
     Raises:
         CalibrationError: it is of other cameras, of one that moves, or for pictures of other proportions.

@@ -2,7 +2,8 @@
 """Prepared captures: ``capture.json`` next to the original videos or pictures (docs/captures.md).
 
 Nothing is stored undistorted or in step: lenses and clocks are applied as frames are read, so that a capture can be
-calibrated again without touching what was filmed.
+calibrated again without touching what was filmed. A broken file is a ``CalibrationError``, one that is missing a
+``CaptureError``.
 """
 
 import json
@@ -18,13 +19,12 @@ from numpy.typing import NDArray
 
 from structgstream.atomic_files import atomic_write
 from structgstream.cameras import Camera, CameraRig
-from structgstream.data.calibration import calibrated_camera, calibrated_rig
-from structgstream.data.calibration_files.reading import positive, read_array, readable
+from structgstream.data.calibration import calibrated_camera, calibrated_rig, check_held_out
 from structgstream.data.camera_files import by_stem, files_of
 from structgstream.data.images import PICTURE_SUFFIXES, ImageSource, picture_size
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
 from structgstream.data.source import FrameSource
-from structgstream.data.text_files import Unreadable, mapping, number, pixels, read_json
+from structgstream.data.text_files import Unreadable, mapping, number, pixels, positive, read_array, read_json, readable
 from structgstream.data.timeline import Clock, common_slots, natural, picture_slots
 from structgstream.data.undistortion import undistorted_to
 from structgstream.data.video import synchronised
@@ -73,17 +73,19 @@ def recognizes_prepared(path: Path) -> bool:
 
 
 def write_prepared(path: Path, capture: PreparedCapture) -> None:
-    """Writes ``capture.json`` into the folder ``path``, whole or not at all.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
+    """Writes ``capture.json`` into the folder ``path``, whole or not at all."""
     content = json.dumps(prepared_entries(capture), indent=1) + "\n"
     atomic_write(path / FILE, content.encode())
 
 
 def prepared_entries(capture: PreparedCapture) -> dict[str, Any]:
     """What ``capture.json`` holds."""
+    cameras = {}
+    for name, camera in capture.cameras.items():
+        pinhole = {"size": [camera.pinhole.width, camera.pinhole.height], "K": camera.pinhole.K.tolist()}
+        cameras[name] = {
+            "files": camera.files, **filmed_entry(camera.filmed), "clock": asdict(camera.clock), "pinhole": pinhole,
+        }  # fmt: skip
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -92,16 +94,12 @@ def prepared_entries(capture: PreparedCapture) -> dict[str, Any]:
         "near": capture.near,
         "held_out": sorted(capture.held_out, key=natural),
         "points": capture.points,
-        "cameras": {name: _camera_entry(camera) for name, camera in capture.cameras.items()},
+        "cameras": cameras,
     }
 
 
 def read_prepared(path: Path) -> PreparedCapture:
-    """The content of ``capture.json`` in the folder ``path``.
-
-    Raises:
-        CalibrationError: the file is broken, or of a later version, naming the camera where it is one's.
-    """
+    """The content of ``capture.json`` in the folder ``path``."""
     file = path / FILE
     with readable(file, EXPECTED):
         content: dict[str, Any] = read_json(file)
@@ -116,6 +114,7 @@ def read_prepared(path: Path) -> PreparedCapture:
         cameras = {name: _read_camera(name, entry, file) for name, entry in entries.items()}
         if any(entry.get("tone") for entry in entries.values()):
             _log.warning("%s has tone curves, which are not applied any more; pictures are read as filmed.", file)
+        check_held_out(content["held_out"], cameras, where=file)
         return PreparedCapture(
             cameras=cameras,
             fps=positive(content, "fps"),
@@ -127,21 +126,15 @@ def read_prepared(path: Path) -> PreparedCapture:
 
 
 def open_prepared(path: Path) -> FrameSource:
-    """The capture at ``path``: in step by its clocks, undistorted to its pinholes.
-
-    Raises:
-        CaptureError: a file is missing, cannot be read or has changed.
-        CalibrationError: ``capture.json`` is broken, or of pictures of another size.
-    """
+    """The capture at ``path``: in step by its clocks, undistorted to its pinholes."""
     capture = read_prepared(path)
     rig = filmed_rig(path, capture)
     files = {name: path / camera.files for name, camera in capture.cameras.items()}
     if missing := [f"{file} of camera {name!r}" for name, file in files.items() if not file.exists()]:
         raise CaptureError(f"{missing[0]} is missing; restore it, or prepare the capture again.")
     points = _read_points(path, capture)
-    source: FrameSource
     if all(file.is_dir() for file in files.values()):
-        source = _of_folders(path, files, rig, capture, points)
+        source: FrameSource = _of_folders(path, files, rig, capture, points)
     else:
         clocks = {name: camera.clock for name, camera in capture.cameras.items()}
         source = synchronised(scan_videos(files), rig, where=path, fps=capture.fps, points=points, clocks=clocks)
@@ -155,41 +148,24 @@ def undistorted(source: FrameSource, path: Path, capture: PreparedCapture) -> Fr
 
 
 def filmed_rig(path: Path, capture: PreparedCapture) -> CameraRig:
-    """The rig of the pictures before undistortion.
-
-    Raises:
-        CalibrationError: a camera to hold out is not there.
-    """
+    """The rig of the pictures before undistortion."""
     return _rig({name: camera.filmed.camera for name, camera in capture.cameras.items()}, capture, path)
 
 
 def prepared_rig(path: Path, capture: PreparedCapture) -> CameraRig:
-    """The rig of the prepared capture at ``path``: what its pictures are undistorted to.
-
-    Raises:
-        CalibrationError: a camera to hold out is not there.
-    """
+    """The rig of the prepared capture at ``path``: what its pictures are undistorted to."""
     return _rig({name: camera.pinhole for name, camera in capture.cameras.items()}, capture, path)
 
 
 def camera_of(viewmat: Any, K: Any, size: Sequence[int]) -> Camera:
-    """A camera from plain numbers.
-
-    Raises:
-        CalibrationError: invalid values.
-        ValueError: values of other shapes.
-    """
+    """A camera from plain numbers; a ``ValueError`` for those of other shapes."""
     width, height = pixels(size)
     pose = torch.from_numpy(np.array(viewmat, np.float64).reshape(4, 4))
     return Camera(pose, torch.from_numpy(np.array(K, np.float64).reshape(3, 3)), width, height)
 
 
 def pictures_of(folder: Path) -> tuple[Path, ...]:
-    """The pictures of a camera's folder, in the order of their names.
-
-    Raises:
-        CaptureError: two have one name.
-    """
+    """The pictures of a camera's folder, in the order of their names."""
     return tuple(sorted(by_stem(files_of(folder, PICTURE_SUFFIXES)).values(), key=lambda file: natural(file.stem)))
 
 
@@ -234,16 +210,6 @@ def _read_points(path: Path, capture: PreparedCapture) -> NDArray[np.float64] | 
         if points.ndim != 2 or points.shape[1] != 3:
             raise Unreadable(f"an array of shape {points.shape}")
     return points
-
-
-def _camera_entry(camera: PreparedCamera) -> dict[str, Any]:
-    pinhole = camera.pinhole
-    return {
-        "files": camera.files,
-        **filmed_entry(camera.filmed),
-        "clock": asdict(camera.clock),
-        "pinhole": {"size": [pinhole.width, pinhole.height], "K": pinhole.K.tolist()},
-    }
 
 
 def filmed_entry(filmed: LensCamera) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 """Text that people and other programs wrote: its encoding, its numbers, the paths in it, and what is wrong with it.
 
 Editors of Windows put a byte order mark before UTF-8, its shells write UTF-16, locales write decimal commas, and paths
-are those of the machine that wrote the file. Every reader of calibrations and lists takes these functions.
+are those of the machine that wrote the file. Every reader of calibrations and lists takes these functions. They raise
+:class:`Unreadable`, or an ``OSError`` of the file itself; :func:`readable` makes one sentence of either.
 """
 
 import json
@@ -14,9 +15,15 @@ import tomllib
 import unicodedata
 import zipfile
 from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE, BOM_UTF32_BE, BOM_UTF32_LE
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.errors import CalibrationError
 
 # Longer marks first: UTF-32's begins as UTF-16's.
 ENCODINGS = (
@@ -45,10 +52,6 @@ def read_text(file: Path) -> str:
     """The text of a file in UTF-8, UTF-16 or UTF-32, with or without a byte order mark; lines end with ``\\n``.
 
     Letters with marks are composed, as :func:`~structgstream.data.camera_files.name_of` has them.
-
-    Raises:
-        Unreadable: it is in another encoding.
-        OSError: it cannot be read.
     """
     data = file.read_bytes()
     mark, encoding = next(((mark, name) for mark, name in ENCODINGS if data.startswith(mark)), (b"", "utf-8"))
@@ -63,12 +66,7 @@ def read_text(file: Path) -> str:
 
 
 def read_json(file: Path) -> Any:
-    """The content of a JSON file.
-
-    Raises:
-        Unreadable: it is not JSON.
-        OSError: it cannot be read.
-    """
+    """The content of a JSON file."""
     try:
         return json.loads(read_text(file))
     except json.JSONDecodeError as error:
@@ -78,12 +76,7 @@ def read_json(file: Path) -> Any:
 
 
 def read_toml(file: Path) -> dict[str, Any]:
-    """The content of a TOML file.
-
-    Raises:
-        Unreadable: it is not TOML.
-        OSError: it cannot be read.
-    """
+    """The content of a TOML file."""
     try:
         return tomllib.loads(read_text(file))
     except tomllib.TOMLDecodeError as error:
@@ -94,11 +87,7 @@ def read_toml(file: Path) -> dict[str, Any]:
 
 
 def number(value: Any) -> float:
-    """A finite number, also one that was written as text, with a decimal point or comma.
-
-    Raises:
-        Unreadable: it is something else.
-    """
+    """A finite number, also one that was written as text, with a decimal point or comma."""
     try:
         found = float(value.strip().replace(",", ".") if isinstance(value, str) else value)
     except (TypeError, ValueError, OverflowError):
@@ -109,22 +98,25 @@ def number(value: Any) -> float:
 
 
 def whole(value: Any) -> int:
-    """A whole number, as :func:`number`; ``320.0`` is one, too.
-
-    Raises:
-        Unreadable: it is something else.
-    """
+    """A whole number, as :func:`number`; ``320.0`` is one, too."""
     if not (found := number(value)).is_integer():
         raise Unreadable(f"{_shown(value)} in place of a whole number")
     return int(found)
 
 
-def pixels(size: Any) -> tuple[int, int]:
-    """Width and height of a picture.
+def positive(content: Mapping[str, Any], key: str) -> float:
+    """The number of a key, which is more than 0."""
+    try:
+        found = number(content[key])
+    except Unreadable as error:
+        raise Unreadable(f"{key}: {error}") from None
+    if found <= 0:
+        raise Unreadable(f"{key} {found:g}")
+    return found
 
-    Raises:
-        Unreadable: other than two numbers of at least one pixel.
-    """
+
+def pixels(size: Any) -> tuple[int, int]:
+    """Width and height of a picture."""
     if isinstance(size, str) or not hasattr(size, "__len__") or len(size) != 2:
         raise Unreadable(f"{_shown(size)} in place of width and height")
     width, height = (round(number(side)) for side in size)
@@ -134,11 +126,7 @@ def pixels(size: Any) -> tuple[int, int]:
 
 
 def mapping(value: Any) -> dict[str, Any]:
-    """Named values.
-
-    Raises:
-        Unreadable: it is something else.
-    """
+    """Named values."""
     if not isinstance(value, dict):
         raise Unreadable(f"{_shown(value)} in place of names with values")
     return value
@@ -160,6 +148,30 @@ def reason(error: Exception) -> str:
     if isinstance(error, struct.error | EOFError):
         return "it is cut"
     return "values are missing, or of another form"
+
+
+def read_array(file: Path) -> NDArray[np.float64]:
+    """The numbers of an ``.npy`` file."""
+    try:
+        return np.asarray(np.load(file, allow_pickle=False), dtype=np.float64)
+    except OSError:
+        raise
+    except Exception:  # a damaged header can raise anything
+        raise Unreadable("it is no array of numbers, or is cut") from None
+
+
+@contextmanager
+def readable(what: Path | str, expected: str) -> Iterator[None]:
+    """Converts what the body raises for a broken file to a sentence on ``what``, the file or its part.
+
+    Raises:
+        CalibrationError: it is broken, with the reason and what was ``expected``.
+    """
+    try:
+        with np.errstate(all="ignore"):  # what overflows is not finite, which is refused
+            yield
+    except BROKEN as error:
+        raise CalibrationError(f"{what} cannot be read ({reason(error)}); expected {expected}.") from None
 
 
 def path_parts(text: str) -> tuple[str, ...]:
@@ -187,11 +199,7 @@ class NamedFiles:
         self._texts: dict[Path, str] = {}
 
     def find(self, text: str) -> Path | None:
-        """The file that a path means; None where there is none.
-
-        Raises:
-            Unreadable: it is the file of another path, too.
-        """
+        """The file that a path means; None where there is none, and ``Unreadable`` where another path means it, too."""
         parts = path_parts(text)
         absolute = re.match(r"\s*(/|\\|file:|[A-Za-z]:[\\/])", text) is not None
         tails = [parts[first:] for first in range(len(parts) if absolute else 1)]

@@ -8,6 +8,7 @@ are matched by the numbers in their names.
 """
 
 import logging
+import math
 import re
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -18,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.errors import CaptureError
+from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MIN_CAMERAS
 from structgstream.geometry import Floats
 
@@ -31,6 +32,16 @@ MAX_SINGLE = 2
 def period_seconds(stamps: NDArray[np.float64]) -> float:
     """The usual time in seconds between two frames at ``stamps`` ``[T]``; 1/30 s for a single one."""
     return float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1 / 30
+
+
+def check_rate(fps: float) -> None:
+    """Check a number of frames a second.
+
+    Raises:
+        ConfigError: it is not positive, or not finite.
+    """
+    if not 0 < fps < math.inf:
+        raise ConfigError(f"Frames a second must be positive, got {fps:g}.")
 
 
 @dataclass(frozen=True)
@@ -57,7 +68,10 @@ def instants_of(stems: Mapping[str, Sequence[str]]) -> dict[str, dict[str, str]]
     Numbers are compared whatever their padding. Where a camera then shares no name with another and its names differ in
     one number alone, that number counts, whatever stands around it (``00_00_00000012``, ``000012_left``).
     """
-    keys = {name: _distinct({stem: re.sub(r"\d+", _unpadded, stem) for stem in own}) for name, own in stems.items()}
+    keys = {}
+    for name, own in stems.items():
+        unpadded = {stem: re.sub(r"\d+", lambda digits: str(int(digits[0])), stem) for stem in own}
+        keys[name] = unpadded if len({*unpadded.values()}) == len(own) else {stem: stem for stem in own}
     taken = Counter(key for own in keys.values() for key in own.values())
     if len(keys) < 2 or all(any(taken[key] > 1 for key in own.values()) for own in keys.values()):
         return keys
@@ -76,15 +90,6 @@ def instants_of(stems: Mapping[str, Sequence[str]]) -> dict[str, dict[str, str]]
     return numbered
 
 
-def _unpadded(digits: re.Match[str]) -> str:
-    return str(int(digits.group()))
-
-
-def _distinct(keys: dict[str, str]) -> dict[str, str]:
-    """The keys; the names themselves where two have one key."""
-    return keys if len(set(keys.values())) == len(keys) else {stem: stem for stem in keys}
-
-
 def _running_numbers(stems: Sequence[str]) -> dict[str, str]:
     """The number in each name that counts, where the names differ in nothing else; else nothing."""
     parts = [re.split(r"(\d+)", stem) for stem in stems]
@@ -100,13 +105,11 @@ def _running_numbers(stems: Sequence[str]) -> dict[str, str]:
 
 
 def picture_slots(pictures: Mapping[str, Sequence[Path]]) -> dict[str, NDArray[np.intp]]:
-    """Which instant each picture of each camera is of, ``[N]`` from 0 on, ascending.
+    """Which instant each picture of each camera is of, ``[N]`` from 0 on, ascending; pictures are in :func:`natural`
+    order.
 
     Cameras that share instants (:func:`instants_of`) number their pictures alike, so one that lacks a name lacks that
     instant. Where a camera shares none with any other, each numbers as it likes, and pictures are counted.
-
-    Args:
-        pictures: camera name to its pictures, in :func:`natural` order of their stems, which differ.
     """
     keys = instants_of({name: [file.stem for file in files] for name, files in pictures.items()})
     stems = {name: [keys[name][file.stem] for file in files] for name, files in pictures.items()}
@@ -133,7 +136,7 @@ def common_slots(
     Args:
         slots: camera name to the slots it has, ascending; a slot is one instant of the common timeline.
         label: names the instant of a slot, for messages ("at 0.133 s", "000017").
-        training: names of the cameras that are not held out; None for all.
+        training: names of the cameras that are not held out.
 
     Raises:
         CaptureError: no camera pictures, no frames in common, or two frames of a camera for one slot.
@@ -158,23 +161,7 @@ def common_slots(
                 f"Camera {camera!r} of {where} has two frames for {label(repeated)}; expected one frame per "
                 "camera and instant at one common rate. Re-encode it at the rate of the others."
             )
-    _log_cuts(slots, first, last, where=where, label=label)
-    _log_absences(inside, first, last, where=where, label=label, training=training)
-    return range(first, last + 1)
-
-
-def _end(slots: Mapping[str, Sequence[int]], training: Collection[str] | None) -> int:
-    """The last slot that half of the cameras, and two training cameras, reach."""
-    ends = sorted((own[-1] for own in slots.values()), reverse=True)
-    trained = sorted((own[-1] for name, own in slots.items() if training is None or name in training), reverse=True)
-    return min(ends[(len(ends) - 1) // 2], trained[min(MIN_CAMERAS, len(trained)) - 1])
-
-
-def _log_cuts(
-    slots: Mapping[str, Sequence[int]], first: int, last: int, *, where: str, label: Callable[[int], str]
-) -> None:
-    starts = min(own[0] for own in slots.values())
-    ends = max(own[-1] for own in slots.values())
+    starts, ends = min(own[0] for own in slots.values()), max(own[-1] for own in slots.values())
     if first > starts:
         late = next(camera for camera, own in slots.items() if own[0] == first)
         log.warning(
@@ -187,6 +174,15 @@ def _log_cuts(
             "%s: camera %r ends with %s; %d later frames of other cameras are left out",
             where, early, label(last), ends - last,
         )  # fmt: skip
+    _log_absences(inside, first, last, where=where, label=label, training=training)
+    return range(first, last + 1)
+
+
+def _end(slots: Mapping[str, Sequence[int]], training: Collection[str] | None) -> int:
+    """The last slot that half of the cameras, and two training cameras, reach."""
+    ends = sorted((own[-1] for own in slots.values()), reverse=True)
+    trained = sorted((own[-1] for name, own in slots.items() if training is None or name in training), reverse=True)
+    return min(ends[(len(ends) - 1) // 2], trained[min(MIN_CAMERAS, len(trained)) - 1])
 
 
 def _log_absences(

@@ -6,7 +6,8 @@ Poses are camera to world in OpenGL axes. Intrinsics are at the top or in each f
 is (0.5, 0.5), as here. ``transforms_test.json`` is held out.
 
 Pictures of one pose are of one camera. If each has a ``time``, the instants are the times; otherwise pictures and
-videos are found by the cameras' names, as with other calibrations, so that a file of one instant serves for all.
+videos are found by the cameras' names, as with other calibrations, so that a file of one instant serves for all. A
+broken file, an unknown lens and a camera that moves are a ``CalibrationError``.
 """
 
 import logging
@@ -18,13 +19,22 @@ from typing import Any
 
 import numpy as np
 
-from structgstream.data.calibration import Calibration, PosedCamera, intrinsics
-from structgstream.data.calibration_files.reading import calibration_of, positive, readable
+from structgstream.data.calibration import Calibration, PosedCamera, calibration_of, intrinsics
 from structgstream.data.images import PICTURE_SUFFIXES, picture_size
 from structgstream.data.lenses import Fisheye, Lens, Pinhole, RadialTangential
 from structgstream.data.posed_capture import of_pictures, open_posed
 from structgstream.data.source import FrameSource
-from structgstream.data.text_files import NamedFiles, Unreadable, mapping, number, path_parts, pixels, read_json
+from structgstream.data.text_files import (
+    NamedFiles,
+    Unreadable,
+    mapping,
+    number,
+    path_parts,
+    pixels,
+    positive,
+    read_json,
+    readable,
+)
 from structgstream.data.undistortion import undistort
 from structgstream.errors import CalibrationError
 
@@ -56,57 +66,38 @@ def find(folder: Path) -> tuple[Path, ...]:
 
 
 def read(files: tuple[Path, ...]) -> Calibration:
-    """A camera for each picture of the files.
-
-    Raises:
-        CalibrationError: they are broken.
-    """
+    """A camera for each picture of the files."""
     shots = read_shots(files)
     held_out = [shot.camera.name for shot in shots if shot.held_out]
     return Calibration(files[0], tuple(shot.camera for shot in shots), held_out=held_out)
 
 
 def read_shots(files: tuple[Path, ...]) -> list[Shot]:
-    """Every picture of the files, in their order.
-
-    Raises:
-        CalibrationError: they are broken, or a lens model is unknown.
-    """
-    shots = []
+    """Every picture of the files, in their order."""
     if (files[0].parent / VALIDATION).is_file():
         log.warning("%s: the pictures of %s are left out", files[0].parent, VALIDATION)
-    for file in files:
-        with readable(file, EXPECTED):
-            content = mapping(read_json(file))
-            frames = [{**content, **mapping(frame)} for frame in content["frames"]]
-            entries = [(str(frame["file_path"]), frame) for frame in frames]
-        pictures = NamedFiles(file.parent, PICTURE_SUFFIXES)
-        found: list[tuple[Path, float | None]] = []
+    return [shot for file in files for shot in _shots_of(file)]
 
-        def camera(
-            name: str,
-            frame: dict[str, Any],
-            pictures: NamedFiles = pictures,
-            found: list[tuple[Path, float | None]] = found,
-            file: Path = file,
-        ) -> PosedCamera:
-            picture = pictures.find(name) or file.parent.joinpath(*path_parts(name))
-            found.append((picture, None if frame.get("time") is None else number(frame["time"])))
-            return _camera(name, frame, picture, file)
 
-        cameras = calibration_of(entries, camera, file=file, expected=EXPECTED).cameras
-        shots += [
-            Shot(posed, picture, time, file.name == TEST) for posed, (picture, time) in zip(cameras, found, strict=True)
-        ]
-    return shots
+def _shots_of(file: Path) -> list[Shot]:
+    with readable(file, EXPECTED):
+        content = mapping(read_json(file))
+        frames = [{**content, **mapping(frame)} for frame in content["frames"]]
+        entries = [(str(frame["file_path"]), frame) for frame in frames]
+    pictures = NamedFiles(file.parent, PICTURE_SUFFIXES)
+    taken: list[tuple[Path, float | None]] = []
+
+    def camera(name: str, frame: dict[str, Any]) -> PosedCamera:
+        picture = pictures.find(name) or file.parent.joinpath(*path_parts(name))
+        taken.append((picture, None if frame.get("time") is None else number(frame["time"])))
+        return _camera(name, frame, picture, file)
+
+    cameras = calibration_of(entries, camera, file=file, expected=EXPECTED).cameras
+    return [Shot(posed, *own, file.name == TEST) for posed, own in zip(cameras, taken, strict=True)]
 
 
 def stated_fps(file: Path) -> float | None:
-    """The frames a second that a file states, or None.
-
-    Raises:
-        CalibrationError: a rate that is not positive.
-    """
+    """The frames a second that a file states, or None."""
     with readable(file, "fps as a number of frames a second"):
         content = mapping(read_json(file))
         return None if content.get("fps") is None else positive(content, "fps")
@@ -153,21 +144,9 @@ def _lens(name: str, frame: dict[str, Any], where: Path) -> Lens:
 
 SAME = 6  # digits in which poses of one camera agree
 
-Cameras = Mapping[str, Sequence[Shot]]
-
-
-def recognizes_transforms(path: Path) -> bool:
-    """Whether the folder has this layout."""
-    return bool(find(path))
-
 
 def open_transforms(path: Path) -> FrameSource:
-    """The capture at ``path``; what ``transforms_test.json`` lists is held out.
-
-    Raises:
-        CaptureError: a picture is missing or cannot be read.
-        CalibrationError: a broken file, or a camera that moves.
-    """
+    """The capture at ``path``; what ``transforms_test.json`` lists is held out."""
     files = find(path)
     shots = read_shots(files)
     if files[0].name == WHOLE and any(shot.time is None for shot in shots):
@@ -181,7 +160,7 @@ def open_transforms(path: Path) -> FrameSource:
     return undistort(source, filmed)
 
 
-def _by_pose(shots: Sequence[Shot], where: Path) -> Cameras:
+def _by_pose(shots: Sequence[Shot], where: Path) -> Mapping[str, Sequence[Shot]]:
     """The pictures of each camera, by a name that its files share."""
     groups: dict[tuple[float, ...], list[Shot]] = {}
     for shot in shots:
@@ -197,16 +176,12 @@ def _by_pose(shots: Sequence[Shot], where: Path) -> Cameras:
     for part in ("parent", "stem"):
         names = [{_part(shot.file, part) for shot in own} for own in listed]
         if all(len(name) == 1 for name in names) and len(set.union(*names)) == len(listed):
-            return dict(zip(sorted(set.union(*names)), _sorted(listed, part), strict=True))
+            return dict(sorted((_part(own[0].file, part), own) for own in listed))
     return {f"cam{number:02d}": own for number, own in enumerate(listed)}
 
 
 def _part(file: Path, part: str) -> str:
     return file.parent.name if part == "parent" else file.stem
-
-
-def _sorted(groups: Sequence[list[Shot]], part: str) -> list[list[Shot]]:
-    return sorted(groups, key=lambda own: _part(own[0].file, part))
 
 
 def _instants(shots: Sequence[Shot]) -> dict[str, Path]:

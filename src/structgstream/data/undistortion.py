@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.images import opencv, reduced_mask
 from structgstream.data.lenses import LensCamera, Pinhole
-from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import WithRig
+from structgstream.data.source import FrameSource, SourceWrapper, WithRig
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.frames import MultiViewFrame
 from structgstream.geometry import Floats
@@ -34,9 +33,9 @@ SLACK_PIXELS = 0.01  # by which a sampled border may leave the picture
 def rectilinear(filmed: LensCamera, *, degrees: float | None = None, size: tuple[int, int] | None = None) -> Camera:
     """The pinhole that pictures of a lens can be resampled for, with square pixels.
 
+    Without distortion the camera itself, unless ``degrees`` or ``size`` is given.
+
     Args:
-        filmed: the camera with its lens; without distortion it is returned unchanged, unless ``degrees`` or ``size``
-            is given.
         degrees: field of view across the picture's width, around the optical axis; None for the largest that the lens
             fills, up to :data:`WIDEST_DEGREES` across the longer side.
         size: width and height of the pictures, pixels; None for those of the lens.
@@ -66,23 +65,13 @@ def rectilinear(filmed: LensCamera, *, degrees: float | None = None, size: tuple
 
 
 def check_field_of_view(degrees: float) -> None:
-    """
-    Raises:
-        ConfigError: no angle across a plane.
-    """
+    """Refuses what is no angle across a plane."""
     if not 0 < degrees < 175:
         raise ConfigError(f"A plane cannot show {degrees:g} degrees; give a field of view of less than 175.")
 
 
 def shows(filmed: LensCamera, normalised: Floats) -> NDArray[np.bool_]:
-    """Which directions a lens has in its picture, within the outermost pixel centres.
-
-    Args:
-        normalised: ``[..., 2]``, x and y at depth 1.
-
-    Returns:
-        ``[...]``; False where the lens sees no such direction.
-    """
+    """Which directions ``[..., 2]``, x and y at depth 1, a lens has within its picture's outermost pixel centres."""
     pixels = filmed.to_pixels(normalised)  # NaN there, which lies on no side
     most = np.array([filmed.camera.width, filmed.camera.height]) - 0.5 + SLACK_PIXELS
     return np.all((pixels >= 0.5 - SLACK_PIXELS) & (pixels <= most), axis=-1)
@@ -266,21 +255,16 @@ class UndistortedSource(WithRig):
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
         plans = {name: self._plan(name) for name in self.rig}
 
-        def pinhole(plan: Undistortion | None, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-            return picture if plan is None else plan(picture)
+        def pinhole(name: str, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+            return picture if (plan := plans[name]) is None else plan(picture)
 
         with ThreadPoolExecutor(min(len(self.rig), os.cpu_count() or 1), "lenses") as pool:
             for frame in self.source.frames(start):
                 names = [name for name in self.rig if name in frame.images]
-                pictures = pool.map(pinhole, [plans[name] for name in names], [frame.images[name] for name in names])
+                pictures = pool.map(pinhole, names, [frame.images[name] for name in names])
                 images = dict(zip(names, pictures, strict=True))
                 masks = {name: mask for name in names if (mask := self._mask(name, frame.masks.get(name))) is not None}
                 yield replace(frame, images=images, masks=masks)
-
-    def shown(self, name: str) -> NDArray[np.bool_] | None:
-        """Mask ``[H, W]`` of a camera's pixels that its lens shows; None if all."""
-        plan = self._plan(name)
-        return None if plan is None else plan.shown
 
     def resized(self, rig: CameraRig) -> "UndistortedSource":
         """The same frames at the sizes of ``rig``, resampled once."""
@@ -306,6 +290,15 @@ class UndistortedSource(WithRig):
         if name not in self._plans:
             self._plans[name] = None if self.is_unchanged(name) else Undistortion(self.filmed[name], self.rig[name])
         return self._plans[name]
+
+
+def lenses_of(source: FrameSource) -> Mapping[str, LensCamera] | None:
+    """The cameras with lenses of a capture that is undistorted below some wrappers; None of another."""
+    while isinstance(source, SourceWrapper):
+        if isinstance(source, UndistortedSource):
+            return source.filmed
+        source = source.source
+    return None
 
 
 def undistort(

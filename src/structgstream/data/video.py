@@ -1,25 +1,60 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Captures with one video per camera, synchronised by time stamp."""
+"""Captures with one video per camera, synchronised by time stamp, and the pictures of a video at given time stamps.
+
+Note [Damaged videos]
+~~~~~~~~~~~~~~~~~~~~~
+A frame counts as decodable if all frames from the key frame before it on are. So what is lost does not depend on where
+reading starts, and a resumed stream sees what the first run saw. After damage, reading continues at the next key frame.
+
+Note [High dynamic range]
+~~~~~~~~~~~~~~~~~~~~~~~~~
+HLG and PQ (ITU-R BT.2100) are converted to light on a display: of HLG for a display of 1000 cd/m2, as BT.2100 has it.
+Reference white, 203 cd/m2 (ITU-R BT.2408), becomes 1; what is brighter than three quarters of it is compressed
+smoothly, by the brightest channel, so that hues remain. Every frame of a file is converted alike, so still things keep
+their colours.
+"""
 
 import logging
 import os
-from collections.abc import Generator, Iterator, Mapping
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
-from structgstream.data.timeline import Clock, Placed, common_slots, log_time_error, measured_rate, origin_of, place
-from structgstream.data.video_index import STREAM_FORMATS, VideoTrack
-from structgstream.data.video_pictures import Mask, Picture, pictures_at
+from structgstream.data.images import OPAQUE, reduced_mask
+from structgstream.data.timeline import Clock, common_slots, log_time_error, measured_rate, origin_of, place
+from structgstream.data.video_index import (
+    BT2020,
+    HIGH_RANGE,
+    HLG,
+    STREAM_FORMATS,
+    VideoTrack,
+    load_av,
+    open_video,
+    transfer_of,
+    video_stream,
+)
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.frames import MultiViewFrame
 
+if TYPE_CHECKING:
+    from av.container import InputContainer
+    from av.video.frame import VideoFrame
+    from av.video.reformatter import VideoReformatter
+    from av.video.stream import VideoStream
+
+
 log = logging.getLogger(__name__)
+Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -47,18 +82,14 @@ class VideoSource:
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
         """The frames from stream index ``start``: an exact seek, then the cameras in lockstep.
 
-        Where a video cannot be decoded its camera is absent, with one warning (``video_pictures``, Note [Damaged
-        videos]).
-
-        Raises:
-            CaptureError: a video was moved or replaced.
+        Where a video cannot be decoded its camera is absent, with one warning (Note [Damaged videos]).
         """
         with ExitStack() as stack:
             decoders = [stack.enter_context(closing(self._pictures(name, start))) for name in self.rig]
             # Entered last, so that no thread is inside a decoder when the decoders close.
             pool = stack.enter_context(ThreadPoolExecutor(min(len(self.rig), os.cpu_count() or 1), "videos"))
             for index in range(start, len(self)):
-                pictures = zip(self.rig, pool.map(_next, decoders), strict=True)
+                pictures = zip(self.rig, pool.map(next, decoders), strict=True)
                 present = {name: shown for name, shown in pictures if shown is not None}
                 images = {name: picture for name, (picture, _) in present.items()}
                 masks = {name: mask for name, (_, mask) in present.items() if mask is not None}
@@ -83,10 +114,6 @@ class VideoSource:
             )  # fmt: skip
 
         return pictures_at(track, self.stamps[name][start:], size=(camera.width, camera.height), on_damage=report)
-
-
-def _next(pictures: Iterator[tuple[Picture, Mask | None] | None]) -> tuple[Picture, Mask | None] | None:
-    return next(pictures)
 
 
 def synchronised(
@@ -135,14 +162,23 @@ def synchronised(
     origin = origin_of(list(positions.values()))
     placed = {name: place(own - origin) for name, own in positions.items()}
     common = common_slots(
-        {name: _slots(own, keep_repeated=clocks is None) for name, own in placed.items()},
+        # Without clocks, slots that two frames compete for are refused.
+        {
+            name: sorted([*own.slots.tolist(), *(own.repeated if clocks is None else ())])
+            for name, own in placed.items()
+        },
         where=str(where),
         label=lambda slot: f"the instant {(origin + slot) / rate:.3f} s",
         training=rig.training,
     )
     log_time_error(placed, common, fps=rate, where=str(where))
-    stamps = {name: _stamps(tracks[name], own, common) for name, own in placed.items()}
-    errors = {name: _errors(own, common) / rate for name, own in placed.items()}
+    stamps, errors = {}, {}
+    for name, own in placed.items():
+        frame_of = dict(zip(own.slots.tolist(), own.frames.tolist(), strict=True))
+        stamps[name] = tuple(tracks[name].stamps[frame_of[slot]] if slot in frame_of else None for slot in common)
+        inside = (own.slots >= common.start) & (own.slots < common.stop)
+        errors[name] = np.full(len(common), np.nan)
+        errors[name][own.slots[inside] - common.start] = own.errors[inside] / rate
     return VideoSource(where.name, rig, rate, tracks, stamps, points, errors)
 
 
@@ -178,20 +214,231 @@ def _common_times(
     return {name: track.seconds - starts[name] * track.tick_seconds for name, track in tracks.items()}
 
 
-def _slots(placed: Placed, *, keep_repeated: bool) -> list[int]:
-    """The slots that have a frame, ascending; those that two frames compete for are repeated if wanted."""
-    return sorted([*placed.slots.tolist(), *(placed.repeated if keep_repeated else ())])
+Damage = Callable[[int, int | None, str], None]
+"""Called with the time stamps, in ticks, of the first frame that is lost and of the next key frame, and the reason."""
+
+# Values of libswscale and of ISO/IEC 23091-2 that the bindings name differently from version to version.
+AREA, BICUBIC, FULL_CHROMA, ACCURATE_ROUNDING = 0x20, 0x4, 0x2000, 0x40000
+BT709, BT601, FULL_RANGE, LIMITED_RANGE = 1, 5, 2, 1
+VPX = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
+MATRICES = {1: BT709, 4: 4, 5: BT601, 6: BT601, 7: 7, 9: 9, 10: 9}
 
 
-def _stamps(track: VideoTrack, placed: Placed, common: range) -> tuple[int | None, ...]:
-    """The time stamp of each slot of the range; None for those without a frame."""
-    frame_of = dict(zip(placed.slots.tolist(), placed.frames.tolist(), strict=True))
-    return tuple(track.stamps[frame_of[slot]] if slot in frame_of else None for slot in common)
+def pictures_at(
+    track: VideoTrack, stamps: Sequence[int | None], *, size: tuple[int, int], on_damage: Damage
+) -> Generator[tuple[Picture, Mask | None] | None]:
+    """For each of ``stamps`` the picture ``[H, W, 3]`` sRGB and where it is opaque, ``[H, W]``, or None.
+
+    The second is None where all is opaque.
+
+    Args:
+        stamps: time stamps of its frames, ascending, in ticks; None where no picture is wanted.
+        size: width and height of the pictures.
+        on_damage: called for frames that cannot be decoded, whose pictures are None.
+    """
+    reformatter = load_av().video.reformatter.VideoReformatter()
+    with closing(_decoded(track, [stamp for stamp in stamps if stamp is not None], on_damage)) as decoded:
+        ready = next(decoded, None)
+        for stamp in stamps:
+            if ready is None or ready.pts != stamp:
+                yield None
+                continue
+            yield _shown(ready, reformatter, track, size), _opaque(ready, track, size)
+            ready = next(decoded, None)
 
 
-def _errors(placed: Placed, common: range) -> NDArray[np.float64]:
-    """Time of the frame of each slot of the range minus the slot's instant, in periods; NaN for those without one."""
-    errors = np.full(len(common), np.nan)
-    inside = (placed.slots >= common.start) & (placed.slots < common.stop)
-    errors[placed.slots[inside] - common.start] = placed.errors[inside]
-    return errors
+def _decoded(track: VideoTrack, wanted: Sequence[int], on_damage: Damage) -> Generator["VideoFrame"]:
+    """The frames at the time stamps ``wanted``, without those that are lost (Note [Damaged videos])."""
+    if not wanted:
+        return
+    at, begin, seeks = 0, _key_before(track, wanted[0]), True
+    while at < len(wanted):
+        run = _Run(track, begin)
+        with closing(run.frames()) as frames:
+            for frame in frames:
+                if frame.pts == wanted[at]:
+                    at += 1
+                    yield frame
+                    if at == len(wanted):
+                        return
+        if run.landed_late:  # Such a file is read from its beginning, and given up at its first damage.
+            begin, seeks = None, False
+            continue
+        following = bisect_right(track.keyframes, run.lost if begin is None else max(run.lost, begin))
+        begin = track.keyframes[following] if seeks and following < len(track.keyframes) else None
+        on_damage(run.lost, begin, run.reason)
+        if begin is None:
+            return
+        at = max(at, bisect_left(wanted, begin))
+        if at < len(wanted):
+            begin = max(begin, _key_before(track, wanted[at]) or begin)
+
+
+@dataclass
+class _Run:
+    """Decodes a file from a key frame on, or from its beginning, up to the first damage."""
+
+    track: VideoTrack  # the video
+    begin: int | None  # time stamp of a key frame; None for the beginning
+    expected: int = 0  # number of the next frame in the video's order
+    met: bool = False  # whether the first frame came
+    landed_late: bool = False  # whether the seek landed after the key frame, as it may without an index (MPEG-TS)
+    reason: str = "a frame is missing or broken"  # why it ended
+
+    @property
+    def lost(self) -> int:
+        """Time stamp of the first frame that did not come."""
+        if not self.met and self.begin is not None:
+            return self.begin
+        return self.track.stamps[min(self.expected, len(self.track.stamps) - 1)]
+
+    def frames(self) -> Generator["VideoFrame"]:
+        """The frames in the order in which they are shown, each with the time stamp of the index."""
+        av, stamps, begin = load_av(), self.track.stamps, self.begin
+        with open_video(self.track.path) as container:
+            stream = video_stream(container)
+            stream.codec_context.thread_count = 1  # the cameras are the parallelism
+            # AVI states the order in which frames are decoded, and they come in that in which they are shown.
+            reordered = container.format.name == "avi" and stream.codec_context.has_b_frames
+            try:
+                if begin is not None:
+                    container.seek(begin, stream=stream, backward=True)
+                for frame in _frames_from_key(container, stream, any_frame=not self.track.keyframes):
+                    if frame.pts is None or frame.pts < (stamps[0] if begin is None else begin):
+                        continue  # cut by the container's edit list, or before the key frame
+                    if not self.met and begin is not None and frame.pts > begin:
+                        self.landed_late = container.format.name == "mpegts"
+                        return
+                    if not self.met:
+                        self.expected, self.met = 0 if begin is None else bisect_left(stamps, begin), True
+                    if reordered and self.expected < len(stamps):
+                        frame.pts = stamps[self.expected]
+                    if self.expected == len(stamps) or frame.pts != stamps[self.expected] or frame.is_corrupt:
+                        return
+                    self.expected += 1
+                    yield frame
+            except av.error.FFmpegError as error:
+                self.reason = str(error.strerror)
+
+
+def _frames_from_key(container: "InputContainer", stream: "VideoStream", *, any_frame: bool) -> Generator["VideoFrame"]:
+    """The frames from the first key frame on: some decoders end at packets before it.
+
+    Those of VP8 and VP9 with alpha are decoded by libvpx, where it is built in, as others leave it out.
+    """
+    decoder, vpx = stream.codec_context, VPX.get(stream.codec_context.name)
+    has_alpha = "1" in (value for key, value in stream.metadata.items() if key.lower() == "alpha_mode")
+    if has_alpha and vpx in load_av().codecs_available:
+        decoder = load_av().CodecContext.create(vpx, "r")
+    for packet in container.demux(stream):
+        any_frame = any_frame or packet.is_keyframe
+        if any_frame:
+            yield from decoder.decode(packet)
+
+
+def _key_before(track: VideoTrack, stamp: int) -> int | None:
+    """The last key frame up to ``stamp``; None for the beginning of the file."""
+    found = bisect_right(track.keyframes, stamp)
+    return track.keyframes[found - 1] if found > 1 else None
+
+
+def _shown(frame: "VideoFrame", reformatter: "VideoReformatter", track: VideoTrack, size: tuple[int, int]) -> Picture:
+    """The picture as it is shown, at ``size``."""
+    turned = track.quarter_turns % 2
+    width, height = (frame.height, frame.width) if turned else (frame.width, frame.height)
+    if (width, height) != (track.width, track.height):
+        seconds = ((frame.pts or 0) - track.origin) * track.tick_seconds
+        raise CaptureError(
+            f"The video {track.path} changes its size from {track.width}x{track.height} to {width}x{height} at "
+            f"{seconds:.3f} s, and a camera has one; end the take before it (--frames), or film again."
+        )
+    if not track.quarter_turns:
+        return srgb(frame, reformatter, width=size[0], height=size[1])
+    width, height = size[::-1] if turned else size
+    return np.ascontiguousarray(np.rot90(srgb(frame, reformatter, width=width, height=height), track.quarter_turns))
+
+
+def _opaque(frame: "VideoFrame", track: VideoTrack, size: tuple[int, int]) -> Mask | None:
+    """Where the picture is opaque, as it is shown, at ``size``; None where it is everywhere."""
+    if not any(component.is_alpha for component in frame.format.components):
+        return None
+    opaque = frame.to_ndarray(format="rgba")[..., 3] >= OPAQUE * 255
+    return None if opaque.all() else reduced_mask(np.rot90(opaque, track.quarter_turns), size)
+
+
+def srgb(frame: "VideoFrame", reformatter: "VideoReformatter", *, width: int, height: int) -> NDArray[np.uint8]:
+    """Colours by the frame's own matrix and range, stated because the defaults differ between tools.
+
+    A file that states no matrix gets BT.709 from 720 lines on and BT.601 below, as broadcasting has it; one
+    that states no range is taken as limited unless its pixel format states otherwise. HLG and PQ are
+    converted (:func:`high_range_to_srgb`).
+    """
+    matrix = MATRICES.get(int(frame.colorspace), BT709 if frame.height >= 720 else BT601)
+    source_range = int(frame.color_range)
+    if source_range not in (FULL_RANGE, LIMITED_RANGE):
+        full = frame.format.name.startswith(("yuvj", "rgb", "bgr", "gbr"))
+        source_range = FULL_RANGE if full else LIMITED_RANGE
+    transfer = transfer_of(frame)
+    high = transfer in HIGH_RANGE
+    shrinks = width < frame.width or height < frame.height
+    converted = reformatter.reformat(
+        frame,
+        width=width,
+        height=height,
+        format="rgb48le" if high else "rgb24",
+        src_colorspace=matrix,
+        dst_colorspace=matrix,
+        src_color_range=source_range,
+        dst_color_range=FULL_RANGE,
+        interpolation=(AREA if shrinks else BICUBIC) | FULL_CHROMA | ACCURATE_ROUNDING,
+        threads=1,
+    )
+    if high:
+        wide = int(getattr(frame, "color_primaries", BT2020)) == BT2020
+        return high_range_to_srgb(cast(NDArray[np.uint16], converted.to_ndarray()), transfer, wide=wide)
+    return cast(NDArray[np.uint8], converted.to_ndarray())
+
+
+WHITE, PEAK, KNEE = 203.0, 1000.0, 0.75
+"""Reference white and the display's peak, cd/m2; where compression begins, relative to reference white."""
+BT2020_TO_709 = np.array(
+    [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]], np.float32
+)  # ITU-R BT.2087
+LUMA_2020 = np.array([0.2627, 0.6780, 0.0593], np.float32)
+
+
+def high_range_to_srgb(picture: NDArray[np.uint16], transfer: int, *, wide: bool) -> NDArray[np.uint8]:
+    """sRGB of a picture ``[H, W, 3]`` of high dynamic range (:data:`HLG` or PQ), full range (Note [High dynamic
+    range]); ``wide`` if its primaries are those of BT.2020, else those of BT.709."""
+    light = _decoding(transfer)[picture]
+    if transfer == HLG:  # Scene light to a display's, by luminance: the system gamma of 1.2.
+        light *= np.maximum(light @ LUMA_2020, 1e-9)[..., None] ** np.float32(0.2) * np.float32(PEAK / WHITE)
+    if wide:
+        light = light @ BT2020_TO_709.T
+    np.maximum(light, 0, out=light)
+    brightest = np.maximum(light.max(axis=2, keepdims=True), 1e-9)
+    shoulder = KNEE + (1 - KNEE) * -np.expm1((KNEE - brightest) / (1 - KNEE))
+    light *= np.where(brightest > KNEE, shoulder / brightest, 1)
+    return _encoding()[(np.minimum(light, 1) * 4095 + 0.5).astype(np.uint16)]
+
+
+@cache
+def _decoding(transfer: int) -> NDArray[np.float32]:
+    """Light of each of 65536 values: of HLG the scene's, up to 1; of PQ the display's, reference white 1."""
+    signal = np.linspace(0, 1, 65536)
+    if transfer == HLG:
+        a, b, c = 0.17883277, 0.28466892, 0.55991073
+        light = np.where(signal <= 0.5, signal**2 / 3, (np.exp((signal - c) / a) + b) / 12)
+    else:
+        m1, m2, c1, c2, c3 = 2610 / 16384, 2523 / 32, 3424 / 4096, 2413 / 128, 2392 / 128
+        root = signal ** (1 / m2)
+        light = (np.maximum(root - c1, 0) / (c2 - c3 * root)) ** (1 / m1) * 10000 / WHITE
+    return light.astype(np.float32)
+
+
+@cache
+def _encoding() -> NDArray[np.uint8]:
+    """sRGB of each of 4096 values of light."""
+    light = np.linspace(0, 1, 4096)
+    coded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return (coded * 255 + 0.5).astype(np.uint8)

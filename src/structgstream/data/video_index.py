@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The index of a video file: when each frame is shown, and how the picture lies.
+"""The index of a video file: when each frame is shown, how the picture lies, and what is stated of its colours.
 
-Videos are opened by :func:`open_video` alone.
+Videos are opened by :func:`open_video` alone. One that is missing, cut, no video, or of a kind that is not read is a
+``CaptureError``.
 """
 
 import logging
 import os
 from bisect import bisect_left
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.transfer import stated_colors
 from structgstream.errors import CaptureError, MissingExtraError
 
 if TYPE_CHECKING:
@@ -37,6 +37,19 @@ STREAM_FORMATS = frozenset({"mpegts", "mpeg"})
 PROGRESSIVE = 1  # the largest AVFieldOrder of pictures that are not fields; 0 is unknown
 # The upper left of a display matrix (ISO/IEC 14496-12) and the quarter turns counterclockwise that it stands for.
 TURNS = {(1, 0, 0, 1): 0, (0, -1, 1, 0): 1, (-1, 0, 0, -1): 2, (0, 1, -1, 0): 3}
+
+
+# Numbers of ISO/IEC 23091-2.
+UNSPECIFIED, PQ, HLG, BT2020 = 2, 16, 18, 9
+HIGH_RANGE = frozenset({PQ, HLG})
+DISPLAY_REFERRED = frozenset({0, 1, UNSPECIFIED, 4, 5, 6, 7, 11, 12, 13, 14, 15})
+TRANSFERS = {1: "BT.709", 4: "gamma 2.2", 5: "gamma 2.8", 6: "BT.601", 7: "SMPTE 240M", 8: "linear", 9: "logarithmic",
+             10: "logarithmic", 11: "xvYCC", 12: "BT.1361", 13: "sRGB", 14: "BT.2020", 15: "BT.2020", PQ: "PQ",
+             17: "SMPTE 428", HLG: "HLG"}  # fmt: skip
+PRIMARIES = {1: "BT.709", 4: "BT.470M", 5: "BT.470BG", 6: "SMPTE 170M", 7: "SMPTE 240M", BT2020: "BT.2020",
+             11: "DCI-P3", 12: "Display P3"}  # fmt: skip
+MATRICES = {0: "RGB", 1: "BT.709", 4: "FCC", 5: "BT.601", 6: "BT.601", 7: "SMPTE 240M", 8: "YCgCo", 9: "BT.2020",
+            10: "BT.2020 constant luminance"}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -62,12 +75,7 @@ class VideoTrack:
 
 
 def scan_videos(paths: Mapping[str, Path]) -> dict[str, VideoTrack]:
-    """The index of every video; only the first frame of each is decoded.
-
-    Raises:
-        CaptureError: a file is missing, truncated, or not a video; its codec or its transfer function is unknown; it is
-            interlaced, or turned by an angle that is not a quarter turn.
-    """
+    """The index of every video; only the first frame of each is decoded."""
     with ThreadPoolExecutor(min(len(paths), os.cpu_count() or 1) or 1) as pool:
         return dict(zip(paths, pool.map(_scan, paths.values()), strict=True))
 
@@ -82,11 +90,7 @@ def load_av() -> ModuleType:
 
 
 def open_video(path: Path) -> "InputContainer":
-    """The opened file, which has a video stream.
-
-    Raises:
-        CaptureError: it is missing, not a video, or coded in an unknown way.
-    """
+    """The opened file, which has a video stream."""
     av = load_av()
     try:
         container = av.open(str(path), metadata_errors="replace")
@@ -99,19 +103,16 @@ def open_video(path: Path) -> "InputContainer":
             f"The video {path} cannot be opened ({error.strerror}): it is truncated, damaged or not a video; "
             "copy or record it again."
         ) from None
-    reason = None
     found = _pictures_streams(container)
+    if found and found[0].codec_context is not None:
+        return container
+    container.close()
     if not found:
-        reason = f"The file {path} has no video stream; expected one video per camera."
-    elif found[0].codec_context is None:
-        reason = (
-            f"The video {path} is coded in a way that the installed PyAV cannot decode; convert it to H.264 or HEVC "
-            "in mp4, keeping the time of each frame."
-        )
-    if reason is not None:
-        container.close()
-        raise CaptureError(reason)
-    return container
+        raise CaptureError(f"The file {path} has no video stream; expected one video per camera.")
+    raise CaptureError(
+        f"The video {path} is coded in a way that the installed PyAV cannot decode; convert it to H.264 or HEVC "
+        "in mp4, keeping the time of each frame."
+    )
 
 
 def video_stream(container: "InputContainer") -> "VideoStream":
@@ -143,7 +144,7 @@ def _scan(path: Path) -> VideoTrack:
         try:
             for packet in container.demux(stream):
                 started = started or packet.is_keyframe
-                first = _first_frame(packet) if first is None and started else first
+                first = _first(packet.decode) if first is None and started else first
                 if packet.size:
                     packets.append(packet)
         except av.error.FFmpegError as error:
@@ -215,18 +216,15 @@ def _report_other_streams(path: Path, container: "InputContainer", taken: "Video
 
 
 def _first_of(path: Path) -> "VideoFrame | None":
-    """The first frame that the decoder gives out; None without one."""
+    """The first frame that a file gives."""
     with open_video(path) as container:
-        try:
-            return next(container.decode(video_stream(container)), None)
-        except load_av().error.FFmpegError:
-            return None
+        return _first(lambda: container.decode(video_stream(container)))
 
 
-def _first_frame(packet: "Packet") -> "VideoFrame | None":
-    """The first frame that the decoder gives out for a packet; None without one, or if it is damaged."""
+def _first(decode: Callable[[], Iterable[Any]]) -> Any:
+    """The first frame that a decoder gives out; None without one, or if it is damaged."""
     try:
-        return next(iter(packet.decode()), None)  # pyright: ignore[reportReturnType]
+        return next(iter(decode()), None)
     except load_av().error.FFmpegError:
         return None
 
@@ -249,3 +247,38 @@ def _quarter_turns(path: Path, stream: "VideoStream", frame: "VideoFrame | None"
             f"The metadata of the video {path} say that it is {what}; convert it to one that is stored as it is shown."
         )
     return turns
+
+
+def transfer_of(frame: "VideoFrame") -> int:
+    """The transfer function that a frame states, as the number of ISO/IEC 23091-2."""
+    return int(getattr(frame, "color_trc", UNSPECIFIED))
+
+
+def stated_colors(path: Path, frame: "VideoFrame | None") -> str:
+    """What a video states of its colours by one of its frames, in words; None where none decodes.
+
+    Raises:
+        CaptureError: a transfer function that is not converted, or wide primaries without any, as log videos have.
+    """
+    if frame is None:
+        return "no frame decodes"
+    transfer, primaries = transfer_of(frame), int(getattr(frame, "color_primaries", UNSPECIFIED))
+    if transfer == UNSPECIFIED and primaries == BT2020:
+        raise CaptureError(
+            f"The video {path} has the primaries of BT.2020 and does not state its transfer function, as log videos "
+            "have it, so its colours are unknown; convert it to BT.709 with the camera maker's conversion, keeping the "
+            "time of each frame, or film in standard range."
+        )
+    if transfer not in DISPLAY_REFERRED | HIGH_RANGE:
+        what = TRANSFERS.get(transfer, f"number {transfer}")
+        raise CaptureError(
+            f"The video {path} states a transfer function ({what}) that is not read; expected BT.709, sRGB, BT.2020, "
+            "HLG or PQ: convert it to BT.709, keeping the time of each frame."
+        )
+    matrix = MATRICES.get(int(frame.colorspace), "no matrix stated")
+    bounds = {1: "limited range", 2: "full range"}.get(int(frame.color_range), "no range stated")
+    words = [frame.format.name, matrix, bounds]
+    words += [f"primaries {PRIMARIES[primaries]}"] if primaries in PRIMARIES else []
+    words += [TRANSFERS[transfer]] if transfer in TRANSFERS else []
+    words += ["converted to sRGB"] if transfer in HIGH_RANGE else []
+    return ", ".join(words)

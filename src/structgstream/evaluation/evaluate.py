@@ -14,8 +14,7 @@ import torch
 from structgstream.cameras import Camera
 from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import PacketKind
-from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import select_cameras
+from structgstream.data.source import FrameSource, select_cameras
 from structgstream.errors import CaptureError
 from structgstream.evaluation.environment import environment
 from structgstream.evaluation.ghosts import Ghosts, GhostSearch

@@ -16,8 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import every_nth_frame, section
+from structgstream.data.source import FrameSource, every_nth_frame, section
 from structgstream.evaluation.metrics import (
     Mask,
     Picture,

@@ -12,9 +12,8 @@ from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.data.images import ImageSource
 from structgstream.data.open import open_capture
-from structgstream.data.source import FrameSource
+from structgstream.data.source import EveryNthFrame, FrameSource, Section, SourceWrapper, resized, section
 from structgstream.data.video import VideoSource
-from structgstream.data.wrappers import EveryNthFrame, Section, SourceWrapper, resized, section
 from structgstream.errors import BackendError, CaptureError, ConfigError
 from structgstream.evaluation.report import FrameScores
 from structgstream.scene.render import Drawable

@@ -13,8 +13,7 @@ from structgstream.codec.container.byte_source import FileBytes
 from structgstream.codec.container.records import PREFIX, RecordType, check_prefix, read_record
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet, unpack_header
 from structgstream.codec.scene_coder import SceneDecoder
-from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import WithRig, section
+from structgstream.data.source import FrameSource, WithRig, section
 from structgstream.errors import CaptureError, ConfigError, StreamError
 from structgstream.evaluation.recording import capture_of
 from structgstream.scene.scene import Scene

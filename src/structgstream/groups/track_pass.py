@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from structgstream.atomic_files import name_finished, partial_path
-from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import read_ahead
+from structgstream.data.source import FrameSource, read_ahead
 from structgstream.errors import ConfigError, StreamError
 from structgstream.groups.base import GroupBase, fingerprint
 from structgstream.groups.segment_file import GroupSoFar, Segment

@@ -53,13 +53,9 @@ def gather(
     matcher: PairMatcher | None = None,
     readings: Collection[Mapping[str, Camera]] = (),
 ) -> Evidence:
-    """Matches of all pairs of a frame's pictures; of large rigs those of neighbours, by the cameras and by ``readings``
-    of their poses.
-
-    Args:
-        matcher: of the same pictures, where some pairs were matched before.
-        readings: other poses of the same cameras.
-    """
+    """Matches of all pairs of a frame's pictures; of large rigs those of neighbours, by the cameras and by
+    ``readings``, other poses of the same cameras. ``matcher`` is of the same pictures, where some pairs were matched
+    before."""
     names = [name for name in cameras if name in frame.images]
     if len(names) <= ALL_PAIRS:
         pairs = list(combinations(names, 2))
@@ -214,7 +210,8 @@ def _agreeing(table: _Table, cameras: list[Camera], limit: float) -> _Table:
     doubted = np.unique(table.point[wrong])
     used = table.used.copy()
     rows = np.flatnonzero(table.used & np.isin(table.point, doubted))
-    for own in np.split(rows[order := np.argsort(table.point[rows], kind="stable")], _starts(table.point[rows][order])):
+    rows = rows[np.argsort(table.point[rows], kind="stable")]
+    for own in np.split(rows, np.flatnonzero(np.diff(table.point[rows])) + 1):
         if len(own) <= MIN_VIEWS:  # two of three always agree
             continue
         pairs = np.stack(np.triu_indices(len(own), 1), axis=1)
@@ -232,11 +229,6 @@ def _agreeing(table: _Table, cameras: list[Camera], limit: float) -> _Table:
         if within[best].sum() > max(rivals, MIN_VIEWS - 1, len(own) / 2):
             used[own] = within[best]
     return replace(table, used=used)
-
-
-def _starts(ascending: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Where another number begins."""
-    return np.flatnonzero(np.diff(ascending)) + 1
 
 
 def _closest(table: _Table, cameras: list[Camera]) -> Floats:

@@ -104,15 +104,16 @@ class _View:
 def resect(tracks: Tracks, camera: Camera, name: str) -> Resection | None:
     """What corrects a camera to the points that others agree on; None if too few of them are in its picture.
 
-    Args:
-        tracks: with the camera among those that are off, so that no point is made of its keypoints.
+    ``tracks`` have the camera among those that are off, so that no point is made of its keypoints.
     """
     own = tracks.of(name) if name in tracks.names else np.zeros(len(tracks.point), bool)
     if own.sum() < MIN_SEEN:
         return None
     points, pixels = tracks.points[tracks.point[own]], tracks.pixels[own]
     limit = AGREE_PIXELS * pixel_scale(camera.width)
-    view = _view(camera)
+    K = camera.K.numpy()
+    focal, principal, skew = K.diagonal()[:2].copy(), K[:2, 2].copy(), float(K[0, 1])
+    view = _View(camera.viewmat.numpy()[:3, :3], camera.center.numpy(), focal, principal, skew)
     starts = [start for start in (np.zeros(7), _by_points(camera, points, pixels, limit)) if start is not None]
     best = max((_adjusted(view, start, points, pixels, limit) for start in starts), key=lambda found: found[1].sum())
     change, fits = best
@@ -147,12 +148,6 @@ def explained(tracks: Tracks, camera: Camera, name: str) -> int:
     seen, depths = project(camera, tracks.points[tracks.point[own]])
     distances = np.linalg.norm(seen - tracks.pixels[own], axis=1)
     return int(((depths > 0) & (distances < 2 * AGREE_PIXELS * pixel_scale(camera.width))).sum())
-
-
-def _view(camera: Camera) -> _View:
-    K = camera.K.numpy()
-    rotation = camera.viewmat.numpy()[:3, :3]
-    return _View(rotation, camera.center.numpy(), np.array([K[0, 0], K[1, 1]]), K[:2, 2].copy(), float(K[0, 1]))
 
 
 def _by_points(camera: Camera, points: Floats, pixels: Floats, limit: float) -> Floats | None:
@@ -282,15 +277,10 @@ def find_suspects(errors: Mapping[Pair, PairError], cameras: Mapping[str, Camera
 
 def track_outlier(tracks: Tracks, suspects: Suspects, *, cleared: Collection[str] = ()) -> str | None:
     """The camera, if any, whose observations lie farther from the points of the others than theirs, although its pairs
-    look well.
+    look well; none that is ``cleared``.
 
     Along an epipolar line a match may lie anywhere: in a row of cameras, no pair reveals one that was turned along it.
-    Points of several cameras do.
-
-    Args:
-        tracks: points of the cameras that are not off.
-        suspects: the verdict so far.
-        cleared: cameras that are not to be named.
+    Points of several cameras, which are not off, do.
     """
     medians = {}
     for name in tracks.names:
@@ -299,10 +289,9 @@ def track_outlier(tracks: Tracks, suspects: Suspects, *, cleared: Collection[str
             medians[name] = float(np.median(seen))
     if len(medians) < MIN_CAMERAS:
         return None
-    named = [name for name in medians if name not in cleared]
-    if not named:
+    worst = max((name for name in medians if name not in cleared), key=lambda name: medians[name], default=None)
+    if worst is None:
         return None
-    worst = max(named, key=lambda name: medians[name])
     others = float(np.median([median for name, median in medians.items() if name != worst]))
     return worst if medians[worst] > OUTLIER_RATIO * others else None
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The files of each camera as they were found: one video a camera, or one folder of pictures.
+"""The files of each camera as they were found: one video a camera, or one folder of pictures; and pictures of them.
 
 ::
 
@@ -7,6 +7,8 @@
     VIDEOS/CAMERA/anything.mp4    a folder per camera with its one video, as cards are copied
     VIDEOS/CAMERA/FRAME.jpg       a folder of pictures per camera, in the folder or in images/ below it
     VIDEOS/CAMERA.jpg             one picture per camera
+
+What is missing, of two cameras of one name, or cannot be read is a ``CaptureError``.
 """
 
 import logging
@@ -16,6 +18,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,10 +36,9 @@ from structgstream.data.camera_files import (
 from structgstream.data.images import PICTURE_SUFFIXES, check_one_series, picture_size, read_picture, significant_bits
 from structgstream.data.posed_capture import filmed_roots
 from structgstream.data.prepared import pictures_of
-from structgstream.data.timeline import natural, picture_slots
-from structgstream.data.video import measured_fps
+from structgstream.data.timeline import Clock, natural, picture_slots
+from structgstream.data.video import measured_fps, pictures_at
 from structgstream.data.video_index import VIDEO_SUFFIXES, VideoTrack, load_av, open_video, scan_videos, video_stream
-from structgstream.data.video_pictures import pictures_at
 from structgstream.errors import CaptureError
 
 _log = logging.getLogger(__name__)
@@ -79,11 +81,7 @@ class Footage:
         return self.files[name]
 
     def size(self, name: str) -> tuple[int, int]:
-        """Width and height of a camera's pictures, pixels.
-
-        Raises:
-            CaptureError: its first picture cannot be read.
-        """
+        """Width and height of a camera's pictures, pixels."""
         if (track := self.tracks.get(name)) is not None:
             return track.width, track.height
         return picture_size(self.stills[name][0])
@@ -104,20 +102,20 @@ class Footage:
         return picture_slots(self.stills)
 
     def pictures(self, name: str, indices: Sequence[int] | NDArray[np.intp]) -> Iterator[NDArray[np.uint8]]:
-        """Pictures ``[H, W, 3]`` sRGB of frames of one camera, whose numbers ascend, at their stored size.
-
-        Raises:
-            CaptureError: a picture cannot be read.
-        """
+        """Pictures ``[H, W, 3]`` sRGB of frames of one camera, whose numbers ascend, at their stored size."""
         if (track := self.tracks.get(name)) is not None:
             for run in _runs([int(index) for index in indices]):
                 yield from self._decoded(name, track, run)
         else:
-            size = self.size(name)
-            for index in indices:
-                yield _of_size(
-                    read_picture(self.stills[name][index], bits=self._bits), size, name, self.stills[name][index]
-                )
+            for file in (self.stills[name][index] for index in indices):
+                picture, size = read_picture(file, bits=self._bits), self.size(name)
+                if picture.shape[1::-1] != size:
+                    raise CaptureError(
+                        f"The picture {file} has {picture.shape[1]}x{picture.shape[0]} pixels, the first one of camera "
+                        f"{name!r} {size[0]}x{size[1]}; expected one size: export them again in one mode, or move the "
+                        "others out of the folder."
+                    )
+                yield picture
 
     def _decoded(self, name: str, track: VideoTrack, indices: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
         def refuse(lost: int, following: int | None, reason: str) -> None:
@@ -133,22 +131,14 @@ class Footage:
                 yield shown[0]
 
     def audio(self, name: str) -> tuple[NDArray[np.float32], float] | None:
-        """Mono samples ``[N]`` and their rate in hertz; sample 0 is at time 0 of the stamps. None without sound.
-
-        Raises:
-            CaptureError: the sound cannot be decoded.
-        """
+        """Mono samples ``[N]`` and their rate in hertz; sample 0 is at time 0 of the stamps. None without sound."""
         if name not in self.tracks:
             return None
         samples = read_audio(self.files[name], rate=(rate := 48_000))
         return None if samples is None else (samples, float(rate))
 
     def metadata(self, name: str) -> dict[str, str]:
-        """What a camera's file states as text, by lower-case key; nothing for pictures.
-
-        Raises:
-            CaptureError: the file cannot be opened.
-        """
+        """What a camera's file states as text, by lower-case key; nothing for pictures."""
         if name not in self.tracks:
             return {}
         with open_video(self.files[name]) as container:
@@ -167,16 +157,7 @@ class Footage:
 
 
 def find_footage(where: Path, *, picture_fps: float | None = None) -> Footage:
-    """The cameras of a folder.
-
-    Args:
-        where: the folder, in one of the layouts of this module.
-        picture_fps: frames a second of folders of pictures.
-
-    Raises:
-        CaptureError: the folder is missing or holds no videos or pictures, two files have the name of one camera, or
-            a file cannot be read.
-    """
+    """The cameras of a folder in one of the layouts of this module; pictures are ``picture_fps`` a second."""
     if not where.is_dir():
         kind = "a file" if where.exists() else "missing"
         raise CaptureError(f"{where} is {kind}; give the folder that holds the cameras' videos ({LAYOUTS}).")
@@ -193,21 +174,10 @@ def find_footage(where: Path, *, picture_fps: float | None = None) -> Footage:
             _log.warning("%s is left out: the cameras are those of %s", found[where][stray], root)
         _check_left(root, files)
         ordered = {name: files[name] for name in sorted(files, key=natural)}
-        return _footage(where, ordered, picture_fps or PICTURE_FPS)
+        return _footage(where, ordered, PICTURE_FPS if picture_fps is None else picture_fps)
     contents = ", ".join(sorted(entry.name for entry in where.iterdir())[:6])
     found = f"holds no videos and no pictures, but {contents}" if contents else "is empty"
     raise NoFootage(f"{where} {found}; expected {LAYOUTS}.")
-
-
-def _of_size(picture: NDArray[np.uint8], size: tuple[int, int], name: str, file: Path) -> NDArray[np.uint8]:
-    """The picture itself."""
-    height, width = picture.shape[:2]
-    if (width, height) != size:
-        raise CaptureError(
-            f"The picture {file} has {width}x{height} pixels, the first one of camera {name!r} {size[0]}x{size[1]}; "
-            "expected one size: export them again in one mode, or move the others out of the folder."
-        )
-    return picture
 
 
 def _runs(indices: Sequence[int]) -> list[list[int]]:
@@ -309,9 +279,6 @@ def read_audio(path: Path, *, rate: int = 48_000) -> NDArray[np.float32] | None:
     """Mono samples ``[N]`` in [-1, 1]; sample ``k`` sounds at ``k / rate`` seconds of the video's time stamps.
 
     Where the sound starts later than time 0, silence precedes it. None when the file has no sound.
-
-    Raises:
-        CaptureError: the file cannot be read, or is longer than two hours.
     """
     av = load_av()
     with open_video(path) as container:
@@ -339,3 +306,79 @@ def read_audio(path: Path, *, rate: int = 48_000) -> NDArray[np.float32] | None:
     if len(samples) + first > LONGEST_SECONDS * rate:
         raise CaptureError(f"{path} is longer than two hours; cut it to the take.")
     return np.concatenate([np.zeros(first, np.float32), samples]) if first > 0 else samples[-first:]
+
+
+Picture = NDArray[np.uint8]
+STILL_PICTURES = 9
+
+
+@dataclass(frozen=True)
+class Shots(Sequence[Picture]):
+    """Pictures of one camera, decoded on access, so that a long take does not fill the memory."""
+
+    footage: Footage
+    camera: str
+    indices: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    @overload
+    def __getitem__(self, number: int) -> Picture: ...
+    @overload
+    def __getitem__(self, number: slice) -> "Shots": ...
+    def __getitem__(self, number: int | slice) -> "Picture | Shots":
+        if isinstance(number, slice):
+            return Shots(self.footage, self.camera, self.indices[number])
+        return next(self.footage.pictures(self.camera, [self.indices[number]]))
+
+
+def shared_seconds(footage: Footage, clocks: Mapping[str, Clock]) -> tuple[float, float]:
+    """First and last moment that all cameras filmed, in the time that they share; without one a
+    ``CaptureError``."""
+    spans = {}
+    for name in footage.cameras:
+        first, last = clocks.get(name, Clock()).common_seconds(footage.stamps(name)[[0, -1]])
+        spans[name] = first, last
+    late = max(spans, key=lambda name: spans[name][0])
+    early = min(spans, key=lambda name: spans[name][1])
+    first, last = spans[late][0], spans[early][1]
+    if first > last + 1e-6:
+        lengths = [f"{spans[name][1] - spans[name][0]:.3f} s" for name in (early, late)]
+        raise CaptureError(
+            f"The cameras of {footage.where} have no moment in common: {footage.path(early).name} of camera {early!r} "
+            f"ends {first - last:.3f} s before {footage.path(late).name} of camera {late!r} begins (lengths "
+            f"{lengths[0]} and {lengths[1]}); give longer videos, or leave one camera out with --without."
+        )
+    return first, last
+
+
+def shots_of(footage: Footage, clocks: Mapping[str, Clock], seconds: Sequence[float]) -> dict[str, Shots]:
+    """Each camera's pictures nearest to these moments of the shared time."""
+    found = {}
+    for name in footage.cameras:
+        times = clocks.get(name, Clock()).common_seconds(footage.stamps(name))
+        indices = [int(np.abs(times - moment).argmin()) for moment in seconds]
+        found[name] = Shots(footage, name, tuple(indices))
+    return found
+
+
+def still_pictures(footage: Footage) -> dict[str, list[Picture]]:
+    """One picture of each camera without what moves: each value is the median over pictures spread over its take.
+
+    It is of no moment, so it needs no clocks; what stands longer than half of the take remains.
+    """
+    found = {}
+    for name in footage.cameras:
+        taken = len(footage.stamps(name))
+        count = min(STILL_PICTURES, taken - 1 + taken % 2)  # an odd one, whose median is a value that was filmed
+        indices = np.unique(np.linspace(0, taken - 1, count).round().astype(int))
+        stacked = np.stack(list(footage.pictures(name, indices.tolist())))
+        stacked.partition(count // 2, axis=0)
+        found[name] = [stacked[count // 2].copy()]
+    return found
+
+
+def spread_moments(first: float, last: float, count: int) -> list[float]:
+    """Moments from the first to the last, both included; fewer when the take has no length."""
+    return np.linspace(first, last, count).tolist() if last > first and count > 1 else [first]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The options of a preparation, and how they are written on the command line."""
+"""The options of a preparation, and how they are written on the command line; what is none is a ``ConfigError``."""
 
 import math
 import re
@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from structgstream.data.timeline import check_rate
 from structgstream.data.undistortion import check_field_of_view
 from structgstream.errors import ConfigError
 from structgstream.preparation.calibration.board import Board
-from structgstream.preparation.calibration.colmap import LensModel
-from structgstream.preparation.synchronization import Method
+from structgstream.preparation.calibration.lens_terms import LensModel
+from structgstream.preparation.synchronization.synchronize import Method
 
 Link = Literal["hard", "symlink", "copy"]
 METHODS = ("auto", "sfm", "board")
@@ -72,8 +73,8 @@ class PrepareOptions:
     def __post_init__(self) -> None:
         if self.near is not None and not 0 < self.near < math.inf:
             raise ConfigError(f"The near plane must be positive, got {self.near:g}.")
-        if self.fps is not None and not 0 < self.fps < math.inf:
-            raise ConfigError(f"Frames a second must be positive, got {self.fps:g}.")
+        if self.fps is not None:
+            check_rate(self.fps)
         if self.field_of_view is not None:
             check_field_of_view(self.field_of_view)
         if self.instants < 1:
@@ -81,11 +82,7 @@ class PrepareOptions:
 
 
 def parse_length(text: str) -> float:
-    """A length as it is written on the command line, in metres: ``3.2m``, ``320cm``, ``50mm``, ``10.5ft``.
-
-    Raises:
-        ConfigError: no positive length.
-    """
+    """A length as it is written on the command line, in metres: ``3.2m``, ``320cm``, ``50mm``, ``10.5ft``."""
     found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([a-z]*)\s*", text)
     if found is None or found[2] not in UNITS_IN_METRES or not float(found[1]) > 0:
         raise ConfigError(f"A length is a positive number with its unit, such as 3.2m, 50mm or 10.5ft; got {text!r}.")
@@ -93,22 +90,14 @@ def parse_length(text: str) -> float:
 
 
 def parse_distance(first: str, second: str, length: str) -> Distance:
-    """A distance as it is written on the command line: two cameras and a length.
-
-    Raises:
-        ConfigError: no positive length, or one camera twice.
-    """
+    """A distance as it is written on the command line: two cameras and a length."""
     if first == second:
         raise ConfigError(f"A distance is between two cameras, got {first!r} twice.")
     return Distance(first, second, parse_length(length))
 
 
 def parse_board(text: str) -> Board:
-    """A board as it is written on the command line: ``7x5:50mm``, or ``7x5:50mm:DICT_4X4_50``.
-
-    Raises:
-        ConfigError: anything else, or sizes that make no board.
-    """
+    """A board as it is written on the command line: ``7x5:50mm``, or ``7x5:50mm:DICT_4X4_50``."""
     squares, *rest = text.split(":")
     numbers = _two_numbers(squares)
     if numbers is None or not 1 <= len(rest) <= 2:
@@ -124,11 +113,7 @@ def board_text(board: Board) -> str:
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """A size as it is written on the command line: ``1280x720``.
-
-    Raises:
-        ConfigError: anything else.
-    """
+    """A size as it is written on the command line: ``1280x720``."""
     numbers = _two_numbers(text)
     if numbers is None:
         raise ConfigError(f"A size is WIDTHxHEIGHT in pixels, such as 1280x720; got {text!r}.")

@@ -28,87 +28,96 @@ from structgstream.data.prepared import (
     recognizes_prepared,
     write_prepared,
 )
-from structgstream.data.source import FrameSource
+from structgstream.data.source import FrameSource, WithRig
 from structgstream.data.timeline import Clock
 from structgstream.data.undistortion import rectilinear
 from structgstream.data.video import measured_fps
-from structgstream.data.wrappers import WithRig
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.frames import MIN_CAMERAS
-from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.check import Finding
 from structgstream.preparation.calibration.solved import SolvedCalibration, with_distance
 from structgstream.preparation.checking.check import Checked, Examination, check_capture, examine_capture
 from structgstream.preparation.checking.overlap import nearest_depth, observed_depths
-from structgstream.preparation.clocks import (
-    TIMESTAMPS,
-    Clocks,
-    first_clocks,
-    packed_clocks,
-    synchronized,
-    unpacked_clocks,
-)
 from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import METHODS, PrepareOptions
-from structgstream.preparation.output_folder import link, lock_output, mark_output, remove_others, unlink
+from structgstream.preparation.output_folder import (
+    FOLDER,
+    Listener,
+    Silent,
+    Steps,
+    Stored,
+    fingerprint,
+    link,
+    lock_output,
+    mark_output,
+    remove_others,
+    unlink,
+)
 from structgstream.preparation.report import write_report
 from structgstream.preparation.solvers import (
+    TIMESTAMPS,
+    Clocks,
     calibration_key,
     check_complete,
     describe_focals,
     describe_turns,
     find_calibration,
+    first_clocks,
     given_cameras,
     packed,
+    packed_clocks,
     refined,
     require_calibration,
     solve_cameras,
     stated_focals,
     summary,
+    synchronized,
     unpacked,
+    unpacked_clocks,
 )
-from structgstream.preparation.steps import FOLDER, Job, Listener, Silent, Steps, Stored, fingerprint
 
 MIN_SOLVED = 3  # cameras, for poses that can be checked
 
 
-class CameraSteps:
-    """The steps of one preparation up to a calibration in a unit."""
+POINTS = "points.npy"
+NEAR_SHARE = 0.5  # of the depth of the nearest points: what comes closer later is still drawn
 
-    def __init__(self, job: Job) -> None:
-        self.videos, self.capture, self.options = job.videos, job.capture, job.options
-        self.steps = job.steps
+
+class Job:
+    """One preparation of ``capture`` from the folder ``videos``: its steps, in their order."""
+
+    def __init__(self, videos: Path, capture: Path, options: PrepareOptions, steps: Steps) -> None:
+        self.videos, self.capture, self.options, self.steps = videos, capture, options, steps
+        self.examination: Examination | None = None  # which two steps look at
+        self._opened: FrameSource | None = None
 
     def find(self) -> Footage:
+        """The cameras; names and numbers of cameras that are not there are refused before anything takes time."""
         self.steps.begin("find")
-        footage = find_footage(self.videos, picture_fps=self.options.fps)
-        self._check_names(self.options.without, footage, purpose="leave out")
-        footage = footage.only([name for name in footage.cameras if name not in self.options.without])
-        held_out, distance = self.options.held_out, self.options.distance
-        self._check_names(() if held_out == ("auto",) else held_out, footage, purpose="hold out")
+        options, distance = self.options, self.options.distance
+        held_out = () if options.held_out == ("auto",) else options.held_out
+        footage = find_footage(self.videos, picture_fps=options.fps)
+        self._check_names(options.without, footage, purpose="leave out")
+        footage = footage.only([name for name in footage.cameras if name not in options.without])
+        self._check_names(held_out, footage, purpose="hold out")
         self._check_names(
             () if distance is None else (distance.first, distance.second), footage, purpose="measure from"
         )
         check_enough(footage)
-        self._check_trained(footage)
+        if len(footage.cameras) - len(set(held_out)) < MIN_CAMERAS:
+            raise ConfigError(
+                f"{self.videos} has {len(footage.cameras)} cameras, {len(set(held_out))} of them held out; a "
+                f"reconstruction needs {MIN_CAMERAS} or more to train on: hold out fewer."
+            )
         mark_output(self.capture, self.videos)
         turns = describe_turns(footage)
         self.steps.end("find", _described(footage) + (f"; {turns}" if turns else ""))
         return footage
 
     def _check_names(self, names: Collection[str], footage: Footage, *, purpose: str) -> None:
-        """Refuses cameras that are not there, before anything takes time."""
         if unknown := [name for name in names if name not in footage.cameras]:
             raise ConfigError(
                 f"{self.videos} has no {listed(unknown)} to {purpose}; its cameras are {', '.join(footage.cameras)}."
-            )
-
-    def _check_trained(self, footage: Footage) -> None:
-        """Refuses to hold out more cameras than can be spared, before anything takes time."""
-        held_out = set(self.options.held_out) - {"auto"}
-        if len(footage.cameras) - len(held_out) < MIN_CAMERAS:
-            raise ConfigError(
-                f"{self.videos} has {len(footage.cameras)} cameras, {len(held_out)} of them held out; a reconstruction "
-                f"needs {MIN_CAMERAS} or more to train on: hold out fewer."
             )
 
     def synchronize(self, footage: Footage, method: str | Calibration) -> Clocks:
@@ -134,19 +143,11 @@ class CameraSteps:
     def synchronize_again(
         self, footage: Footage, clocks: Clocks, method: str | Calibration, solved: SolvedCalibration
     ) -> Clocks:
-        """By motion again when the calibration is known, which makes it exact.
-
-        Raises:
-            CaptureError: not even so.
-        """
+        """By motion again when the calibration is known, which makes it exact."""
         if clocks.method != "motion" or not isinstance(method, str):
             return clocks
-        return self._clocks(
-            "clocks",
-            {},
-            lambda: synchronized(footage, self.options, cameras=solved.cameras),
-            after=("scale",),
-        )
+        again = lambda: synchronized(footage, self.options, cameras=solved.cameras)  # noqa: E731
+        return self._clocks("clocks", {}, again, after=("scale",))
 
     def _clocks(
         self, step: str, inputs: Mapping[str, object], find: Callable[[], Clocks], after: tuple[str, ...] = ()
@@ -157,7 +158,8 @@ class CameraSteps:
         )  # fmt: skip
 
     def calibrate(self, footage: Footage, clocks: Clocks, method: str | Calibration) -> SolvedCalibration:
-        options = self.options
+        """Poses, intrinsics and lenses, refined and in a unit where that is asked for."""
+        options, distance = self.options, self.options.distance
         name = method if isinstance(method, str) else method.where.name
         inputs = {
             "method": method if isinstance(method, str) else calibration_key(method),
@@ -170,35 +172,34 @@ class CameraSteps:
         focals = stated_focals(footage) if method == "sfm" else {}
         if focals:
             inputs["focals"] = focals
-        solved = self._solved(
-            "calibrate",
-            inputs,
-            lambda: (_first(method, footage, clocks, options, focals), describe_focals(focals, footage)),
-            describe=lambda found, detail: f"{name}: {summary(found)}" + (f"; {detail}" if detail else ""),
-            after="synchronize",
-        )
-        last = "calibrate"
+
+        def solve() -> tuple[SolvedCalibration, str]:
+            if not isinstance(method, str):
+                return given_cameras(method, footage), ""
+            found = check_complete(solve_cameras(method, footage, clocks, options, focals=focals), footage)
+            return found, describe_focals(focals, footage)
+
+        def describe(found: SolvedCalibration, detail: str) -> str:
+            return f"{name}: {summary(found)}" + (f"; {detail}" if detail else "")
+
+        solved = self._solved("calibrate", inputs, solve, describe=describe, after="synchronize")
         if options.refine:
-            solved = self._solved(
-                last := "refine",
-                {},
-                lambda: refined(solved, footage, clocks, options),
-                describe=lambda found, detail: detail,
-                after="calibrate",
-            )
-        distance = options.distance
+            refine = lambda: refined(solved, footage, clocks, options)  # noqa: E731
+            refined_ = self._solved("refine", {}, refine, describe=lambda found, detail: detail, after="calibrate")
+        else:
+            refined_ = solved
 
         def scale() -> tuple[SolvedCalibration, str]:
             if distance is None:
-                return solved, ""
-            return with_distance(solved, distance.first, distance.second, metres=distance.metres), ""
+                return refined_, ""
+            return with_distance(refined_, distance.first, distance.second, metres=distance.metres), ""
 
         return self._solved(
             "scale",
             {"distance": None if distance is None else asdict(distance)},
             scale,
             describe=lambda found, _: "metres" if found.metres else "arbitrary units; --distance A B 3.2m gives metres",
-            after=last,
+            after="refine" if options.refine else "calibrate",
         )
 
     def _solved(
@@ -224,94 +225,6 @@ class CameraSteps:
             after=(after,),
         )
         return found[0]
-
-
-def chosen_method(footage: Footage, options: PrepareOptions) -> str | Calibration:
-    """``sfm``, ``board``, or the calibration to use.
-
-    Raises:
-        CalibrationError: the requested calibration is missing or broken.
-    """
-    if str(options.calibration) not in METHODS:
-        return require_calibration(Path(options.calibration))
-    if options.calibration != "auto":
-        return str(options.calibration)
-    if options.board_videos is not None:
-        return "board"
-    return find_calibration(footage.where) or "sfm"
-
-
-def check_used(method: str | Calibration, footage: Footage, options: PrepareOptions) -> None:
-    """
-    Raises:
-        ConfigError: an option has no effect, so that its user expects another capture.
-    """
-    if options.fps is not None and footage.tracks:
-        raise ConfigError(
-            f"The videos of {footage.where} state the time of each frame, and --fps is the rate of folders of "
-            "pictures; leave out --fps."
-        )
-    if options.board_videos is not None and method != "board":
-        raise ConfigError(
-            "Videos of a board (--board-videos) calibrate by --calibration board alone; choose that, or leave them out."
-        )
-    if options.intrinsics != "own" and method != "sfm":
-        raise ConfigError(
-            "Shared intrinsics (--intrinsics) are estimated by structure from motion alone; choose --calibration sfm, "
-            "or leave them out."
-        )
-    if options.lens is not None and isinstance(method, Calibration) and not options.refine:
-        raise ConfigError(
-            f"{method.where} states the lenses, so --lens {options.lens} has no effect; add --refine to adjust them to "
-            "the pictures, choose --calibration sfm, or leave out --lens."
-        )
-
-
-def check_enough(footage: Footage) -> None:
-    """
-    Raises:
-        CalibrationError: too few cameras for poses that can be checked.
-    """
-    if len(footage.cameras) < MIN_SOLVED:
-        raise CalibrationError(
-            f"{footage.where} has {listed(footage.cameras)} alone; a capture needs {MIN_SOLVED} or more, as two "
-            "cameras cannot confirm each other's calibration: film with more."
-        )
-
-
-def _first(
-    method: str | Calibration,
-    footage: Footage,
-    clocks: Clocks,
-    options: PrepareOptions,
-    focals: Mapping[str, float],
-) -> SolvedCalibration:
-    if isinstance(method, str):
-        return check_complete(solve_cameras(method, footage, clocks, options, focals=focals), footage)
-    return given_cameras(method, footage)
-
-
-def _described(footage: Footage) -> str:
-    sizes = sorted({footage.size(name) for name in footage.cameras})
-    shown = ", ".join(f"{width}x{height}" for width, height in sizes[:3])
-    lengths = [len(footage.stamps(name)) for name in footage.cameras]
-    frames = f"{min(lengths)}" if min(lengths) == max(lengths) else f"{min(lengths)} to {max(lengths)}"
-    kind = "videos" if footage.tracks else "folders of pictures"
-    return f"{len(footage.cameras)} {kind}, {shown}, {frames} frames, {footage.fps:g} a second"
-
-
-POINTS = "points.npy"
-NEAR_SHARE = 0.5  # of the depth of the nearest points: what comes closer later is still drawn
-
-
-class CaptureSteps:
-    """The steps of one preparation from a calibration on."""
-
-    def __init__(self, job: Job) -> None:
-        self.videos, self.capture, self.options = job.videos, job.capture, job.options
-        self.steps = job.steps
-        self.examination: Examination | None = None  # which two steps look at
-        self._opened: FrameSource | None = None
 
     def link(self, footage: Footage, content: PreparedCapture) -> None:
         self.steps.begin("link")
@@ -383,8 +296,6 @@ class CaptureSteps:
         return content
 
     def check(self, content: PreparedCapture) -> tuple[Finding, ...]:
-        from structgstream.preparation.report import write_report
-
         def look() -> tuple[Finding, ...]:
             source = self._source(content)
             checked = check_capture(source, unit=content.unit, listener=self.steps, examination=self.examination)
@@ -435,23 +346,67 @@ class _Grown(WithRig):
         return self.found
 
 
+def chosen_method(footage: Footage, options: PrepareOptions) -> str | Calibration:
+    """``sfm``, ``board``, or the calibration to use."""
+    if str(options.calibration) not in METHODS:
+        return require_calibration(Path(options.calibration))
+    if options.calibration != "auto":
+        return str(options.calibration)
+    if options.board_videos is not None:
+        return "board"
+    return find_calibration(footage.where) or "sfm"
+
+
+def check_used(method: str | Calibration, footage: Footage, options: PrepareOptions) -> None:
+    """Refuses options that have no effect, so that their user expects another capture."""
+    if options.fps is not None and footage.tracks:
+        raise ConfigError(
+            f"The videos of {footage.where} state the time of each frame, and --fps is the rate of folders of "
+            "pictures; leave out --fps."
+        )
+    if options.board_videos is not None and method != "board":
+        raise ConfigError(
+            "Videos of a board (--board-videos) calibrate by --calibration board alone; choose that, or leave them out."
+        )
+    if options.intrinsics != "own" and method != "sfm":
+        raise ConfigError(
+            "Shared intrinsics (--intrinsics) are estimated by structure from motion alone; choose --calibration sfm, "
+            "or leave them out."
+        )
+    if options.lens is not None and isinstance(method, Calibration) and not options.refine:
+        raise ConfigError(
+            f"{method.where} states the lenses, so --lens {options.lens} has no effect; add --refine to adjust them to "
+            "the pictures, choose --calibration sfm, or leave out --lens."
+        )
+
+
+def check_enough(footage: Footage) -> None:
+    """Refuses too few cameras for poses that can be checked."""
+    if len(footage.cameras) < MIN_SOLVED:
+        raise CalibrationError(
+            f"{footage.where} has {listed(footage.cameras)} alone; a capture needs {MIN_SOLVED} or more, as two "
+            "cameras cannot confirm each other's calibration: film with more."
+        )
+
+
+def _described(footage: Footage) -> str:
+    sizes = sorted({footage.size(name) for name in footage.cameras})
+    shown = ", ".join(f"{width}x{height}" for width, height in sizes[:3])
+    lengths = [len(footage.stamps(name)) for name in footage.cameras]
+    frames = f"{min(lengths)}" if min(lengths) == max(lengths) else f"{min(lengths)} to {max(lengths)}"
+    kind = "videos" if footage.tracks else "folders of pictures"
+    return f"{len(footage.cameras)} {kind}, {shown}, {frames} frames, {footage.fps:g} a second"
+
+
 def held_out_of(options: PrepareOptions, rig: CameraRig) -> frozenset[str]:
     """The cameras to hold out."""
     return frozenset({best_surrounded(rig)} if options.held_out == ("auto",) else options.held_out)
 
 
 def assembled(
-    footage: Footage,
-    clocks: Mapping[str, Clock],
-    solved: SolvedCalibration,
-    options: PrepareOptions,
+    footage: Footage, clocks: Mapping[str, Clock], solved: SolvedCalibration, options: PrepareOptions
 ) -> PreparedCapture:
-    """The content of ``capture.json`` with the usual near plane, without points.
-
-    Raises:
-        ConfigError: a field of view or size that cannot be.
-        CalibrationError: a lens that cannot be undistorted.
-    """
+    """The content of ``capture.json`` with the usual near plane, without points."""
     cameras = {}
     for name in footage.cameras:
         filmed = solved.cameras[name]
@@ -487,12 +442,11 @@ class Preparation:
 def prepare_capture(
     videos: Path, capture: Path, *, options: PrepareOptions | None = None, listener: Listener | None = None
 ) -> Preparation:
-    """Makes the capture, or goes on with one that was interrupted.
+    """Makes the capture, or goes on with one that was interrupted; the same call again does only what has changed.
 
     Args:
         videos: the folder of the cameras' videos or pictures, see ``preparation.footage``.
-        capture: the folder to make; the same call again does only what has changed.
-        options: of the preparation.
+        capture: the folder to make.
         listener: receives steps and progress.
 
     Raises:
@@ -502,42 +456,25 @@ def prepare_capture(
     """
     options = options or PrepareOptions()
     job = Job(videos, capture, options, Steps(capture, listener or Silent()))
-    find = CameraSteps(job)
-    footage = find.find()
+    footage = job.find()
     method = chosen_method(footage, options)
     check_used(method, footage, options)
     if method == "board":
         options.board.opencv_board()  # raises, before anything takes time, for markers that OpenCV does not have
     with lock_output(capture):
-        return _made(job, find, footage, method)
-
-
-def _made(job: Job, find: CameraSteps, footage: Footage, method: str | Calibration) -> Preparation:
-    """The steps from the clocks on."""
-    options = job.options
-    first = find.synchronize(footage, method)
-    solved = find.calibrate(footage, first, method)
-    clocks = find.synchronize_again(footage, first, method, solved)
-    content = assembled(footage, clocks.clocks, solved, options)
-    make = CaptureSteps(job)
-    make.link(footage, content)
-    content = make.points(make.near(content))
-    findings = make.check(content)
-    return Preparation(
-        job.capture, findings, job.steps.summaries, tuple(job.steps.skipped), job.capture / REPORT / "index.html"
-    )
+        first = job.synchronize(footage, method)
+        solved = job.calibrate(footage, first, method)
+        clocks = job.synchronize_again(footage, first, method, solved)
+        content = assembled(footage, clocks.clocks, solved, options)
+        job.link(footage, content)
+        content = job.points(job.near(content))
+        findings = job.check(content)
+    report = capture / REPORT / "index.html"
+    return Preparation(capture, findings, job.steps.summaries, tuple(job.steps.skipped), report)
 
 
 def check_folder(path: Path, *, report: Path | None, listener: Listener | None = None) -> Checked:
-    """The check of a capture.
-
-    Args:
-        report: folder for the report; None writes none.
-
-    Raises:
-        CaptureError: the capture cannot be opened or read.
-        StorageError: the report cannot be written.
-    """
+    """The check of a capture, whose report goes to the folder ``report``; None writes none."""
     listener = listener or Silent()
     listener.begin("check", skipped=False)
     unit = read_prepared(path).unit if recognizes_prepared(path) else None

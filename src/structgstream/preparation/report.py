@@ -5,6 +5,7 @@ The page states what is wrong first, then every number and picture. It loads not
 
 import json
 import re
+import textwrap
 from collections.abc import Collection, Mapping, Sequence
 from html import escape
 from pathlib import Path
@@ -14,25 +15,19 @@ from urllib.parse import quote
 import numpy as np
 
 from structgstream.atomic_files import atomic_write
-from structgstream.data.matching import Pair, level_normal
+from structgstream.data.matching import Pair, epipolar_errors, fundamental_matrix, level_normal
 from structgstream.errors import StorageError
 from structgstream.figure import COLORS, FAINT, INK, OTHER, figure_of, save_figure, without_frame
 from structgstream.geometry import Floats
-from structgstream.preparation.checking.check import CameraCheck, Checked, CheckReport, Examination
+from structgstream.pose_check.tracks import pair_errors
+from structgstream.preparation.checking.check import Checked, CheckReport, Examination
 from structgstream.preparation.checking.overlap import cameras_per_point
 from structgstream.preparation.checking.times import SIGMAS
-from structgstream.preparation.steps import Listener, Silent
+from structgstream.preparation.output_folder import Listener, Silent
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-import textwrap
-from typing import TYPE_CHECKING
-
-from structgstream.data.matching import epipolar_errors, fundamental_matrix
-from structgstream.pose_check.tracks import pair_errors
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 LIMIT_MS = 5.0
 MAX_NUMBERED = 16  # cameras
@@ -126,8 +121,7 @@ def draw_coverage(path: Path, examined: Examination, *, near: float, unit: str) 
 def draw_colors(path: Path, report: CheckReport) -> None:
     """Exposure and white balance of each camera against the median camera."""
     names = [name for name, camera in report.cameras.items() if camera.exposure_stops is not None]
-    figure = figure_of(max(6.0, 0.36 * len(names) + 2.4), 3.6)
-    axis = figure.subplots()
+    figure, axis = _chart(names, "Exposure and white balance", "stops against the median camera")
     at = np.arange(len(names))
     kinds = (("exposure_stops", "exposure", OTHER), ("red_stops", "red / green", COLORS[3]),
              ("blue_stops", "blue / green", COLORS[0]))  # fmt: skip
@@ -136,11 +130,6 @@ def draw_colors(path: Path, report: CheckReport) -> None:
         axis.bar(at + 0.27 * (number - 1), values, width=0.25, color=color, label=label)
     largest = max((abs(getattr(report.cameras[name], key)) for name in names for key, _, _ in kinds), default=0)
     axis.set_ylim(-max(0.4, 1.15 * largest), max(0.4, 1.15 * largest))
-    axis.axhline(0, color=INK, linewidth=0.8)
-    axis.set_xticks(at, names, rotation=90 if len(names) > 12 else 0, fontsize=8)
-    axis.set_ylabel("stops against the median camera", fontsize=8)
-    axis.set_title("Exposure and white balance", fontsize=10, loc="left", color=INK)
-    without_frame(axis)
     axis.legend(fontsize=8, frameon=False, ncols=3, loc="upper right")
     save_figure(figure, path)
 
@@ -152,15 +141,14 @@ def draw_times(path: Path, report: CheckReport) -> None:
     values = np.array([camera.offset_ms for camera in known.values()], float)
     spread = np.array([camera.offset_uncertainty_ms or 0.0 for camera in known.values()], float)
     late = (np.abs(values) > LIMIT_MS) & (np.abs(values) >= SIGMAS * spread)  # as in time_findings
-    figure = figure_of(max(6.0, 0.36 * len(names) + 2.4), 3.6)
-    axis = figure.subplots()
+    title = "Time against the other cameras (bars: two standard deviations)"
+    figure, axis = _chart(names, title, "late by, milliseconds")
     axis.axhspan(-LIMIT_MS, LIMIT_MS, color="#e8f4ec", zorder=0)
     for side in (-LIMIT_MS, LIMIT_MS):
         axis.axhline(side, color=COLORS[2], linewidth=1, linestyle="--")
     axis.annotate(
         "5 ms", (1.0, LIMIT_MS), xycoords=("axes fraction", "data"), fontsize=8, color=COLORS[2], ha="left", va="center"
     )
-    axis.axhline(0, color=INK, linewidth=0.8)
     for mask, color in ((~late, COLORS[0]), (late, COLORS[3])):
         if mask.any():
             axis.errorbar(
@@ -168,11 +156,19 @@ def draw_times(path: Path, report: CheckReport) -> None:
             )
     limit = max(2 * LIMIT_MS, 1.2 * float((np.abs(values) + 2 * spread).max(initial=0)))
     axis.set_ylim(-limit, limit)
-    axis.set_xticks(range(len(names)), names, rotation=90 if len(names) > 12 else 0, fontsize=8)
-    axis.set_ylabel("late by, milliseconds", fontsize=8)
-    axis.set_title("Time against the other cameras (bars: two standard deviations)", fontsize=10, loc="left", color=INK)
-    without_frame(axis)
     save_figure(figure, path)
+
+
+def _chart(names: Sequence[str], title: str, label: str) -> "tuple[Figure, Axes]":
+    """A chart with a value for each camera."""
+    figure = figure_of(max(6.0, 0.36 * len(names) + 2.4), 3.6)
+    axis = figure.subplots()
+    axis.axhline(0, color=INK, linewidth=0.8)
+    axis.set_xticks(range(len(names)), names, rotation=90 if len(names) > 12 else 0, fontsize=8)
+    axis.set_ylabel(label, fontsize=8)
+    axis.set_title(title, fontsize=10, loc="left", color=INK)
+    without_frame(axis)
+    return figure, axis
 
 
 def _level_frame(examined: Examination, centers: Floats) -> Floats:
@@ -208,7 +204,8 @@ def _draw_labels(
     for group in _near_ones([order.index(name) for name in labels], places, reach=LABEL_REACH * radius):
         names = [order[number] for number in group]
         first, away = group[0], 5 + 4 * len(names)
-        ahead_of = _unit(ahead[first])
+        length = float(np.linalg.norm(ahead[first]))
+        ahead_of = ahead[first] / length if length > 1e-9 else np.array([0.0, -1.0])
         axis.annotate(
             "\n".join(names), tuple(places[first] - 0.05 * radius * ahead[first]), fontsize=7,
             color=COLORS[3] if off.intersection(names) else INK, ha="center", va="center",
@@ -226,11 +223,6 @@ def _near_ones(numbers: Sequence[int], places: Floats, *, reach: float) -> list[
         else:
             group.append(number)
     return groups
-
-
-def _unit(vector: Floats) -> Floats:
-    length = float(np.linalg.norm(vector))
-    return vector / length if length > 1e-9 else np.array([0.0, -1.0])
 
 
 WIDTH_INCHES = 7.0
@@ -252,15 +244,9 @@ def draw_overlay(path: Path, examined: Examination, report: CheckReport, name: s
     if len(own):
         order = own[np.argsort(tracks.residuals[own])]
         shown = axis.scatter(
-            *tracks.pixels[order].T,
-            c=np.minimum(tracks.residuals[order], limit),
-            cmap="plasma",
-            vmin=0,
-            vmax=limit,
-            s=16,
-            edgecolors="white",
-            linewidths=0.4,
-        )
+            *tracks.pixels[order].T, c=np.minimum(tracks.residuals[order], limit), cmap="plasma", vmin=0, vmax=limit,
+            s=16, edgecolors="white", linewidths=0.4,
+        )  # fmt: skip
         bar = figure.colorbar(shown, ax=axis, shrink=0.8, pad=0.01, aspect=30, extend="max")
         bar.set_label("reprojection error, pixels", fontsize=8, color=INK)
         bar.ax.tick_params(labelsize=8)
@@ -371,25 +357,28 @@ td.text { text-align: left; white-space: normal; }
 
 
 def page(report: CheckReport, *, off: Sequence[str], sections: Mapping[str, Sequence[str]]) -> str:
-    """The page's HTML.
-
-    Args:
-        off: cameras to mark.
-        sections: heading to file names of pictures in the folder.
-    """
+    """The page's HTML; cameras ``off`` are marked, and ``sections`` map a heading to file names of pictures in the
+    folder."""
+    findings = "".join(f"<li class={found.severity}>{escape(found.sentence)}</li>" for found in report.findings)
     parts = [
         f"<!doctype html>\n<html lang=en><meta charset=utf-8><title>{escape(report.capture)}: check</title>",
         "<meta name=viewport content='width=device-width'>",
         f"<style>{STYLE}</style><h1>{escape(report.capture)}</h1>",
         f"<p class=sub>{escape(_facts(report))}</p>",
-        _findings(report),
+        f"<ul class=findings>{findings or '<li class=fine>Nothing is wrong.</li>'}</ul>",
     ]
     if report.steps:
         rows = "".join(
             f"<tr><td>{escape(step)}<td class=text>{escape(str(summary))}" for step, summary in report.steps.items()
         )
         parts.append(f"<h2>Preparation</h2><table>{rows}</table>")
-    parts.append(f"<h2>Cameras</h2><div class=wide>{_table(report, off)}</div>")
+    head = "".join(f"<th>{title}" for title, _, _ in COLUMNS)
+    rows = ""
+    for name, camera in report.cameras.items():
+        values = ((getattr(camera, key), text) for _, key, text in COLUMNS)
+        cells = "".join(f"<td>{'-' if value is None else text.format(value)}" for value, text in values)
+        rows += f"<tr{' class=off' if name in off else ''}><td>{escape(name)}{cells}"
+    parts.append(f"<h2>Cameras</h2><div class=wide><table><tr><th>camera{head}{rows}</table></div>")
     for heading, pictures in sections.items():
         if pictures:
             images = "".join(f"<img src='{quote(name)}' alt='{escape(name)}' loading=lazy>" for name in pictures)
@@ -415,13 +404,6 @@ def _facts(report: CheckReport) -> str:
     )
 
 
-def _findings(report: CheckReport) -> str:
-    if not report.findings:
-        return "<ul class=findings><li class=fine>Nothing is wrong.</li></ul>"
-    items = "".join(f"<li class={found.severity}>{escape(found.sentence)}</li>" for found in report.findings)
-    return f"<ul class=findings>{items}</ul>"
-
-
 COLUMNS = (
     ("error, px", "reprojection_pixels", "{:.2f}"),
     ("90 %, px", "reprojection_pixels_90", "{:.2f}"),
@@ -435,29 +417,11 @@ COLUMNS = (
 )
 
 
-def _table(report: CheckReport, off: Sequence[str]) -> str:
-    head = "".join(f"<th>{title}" for title, _, _ in COLUMNS)
-    rows = "".join(
-        f"<tr{' class=off' if name in off else ''}><td>{escape(name)}{_cells(camera)}"
-        for name, camera in report.cameras.items()
-    )
-    return f"<table><tr><th>camera{head}{rows}</table>"
-
-
-def _cells(camera: CameraCheck) -> str:
-    values = ((getattr(camera, key), text) for _, key, text in COLUMNS)
-    return "".join(f"<td>{'-' if value is None else text.format(value)}" for value, text in values)
-
-
 PAGE, NUMBERS = "index.html", "report.json"
 
 
 def write_report(folder: Path, checked: Checked, *, listener: Listener | None = None) -> Path:
-    """The report in ``folder``, in place of an earlier one; returns the page.
-
-    Raises:
-        StorageError: a file cannot be written.
-    """
+    """The report in ``folder``, in place of an earlier one; returns the page."""
     report, examined = checked.report, checked.examination
     _empty(folder)
     listener = listener or Silent()
@@ -466,7 +430,7 @@ def write_report(folder: Path, checked: Checked, *, listener: Listener | None = 
     overlays, lines = [], []
     for number, name in enumerate(examined.cameras):
         listener.progress(number, total, f"picture of {name}")
-        overlays.append(f"camera_{_file_name(name)}.png")
+        overlays.append(f"camera_{re.sub(r'[^0-9A-Za-z._-]', '_', name)}.png")
         draw_overlay(folder / overlays[-1], examined, report, name)
     for number, pair in enumerate(pairs):
         listener.progress(len(examined.cameras) + number, total, "epipolar lines")
@@ -504,8 +468,3 @@ def _empty(folder: Path) -> None:
                 file.unlink()
     except OSError as error:
         raise StorageError(f"The report in {folder} cannot be written ({error.strerror}); choose another.") from None
-
-
-def _file_name(name: str) -> str:
-    """A camera's name as part of a file's."""
-    return re.sub(r"[^0-9A-Za-z._-]", "_", name)

@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras by the method that is chosen: solved from the pictures that it needs, or given by a file."""
+"""Clocks and cameras by the method that is chosen: solved from the pictures that it needs, or given by a file.
+
+What the pictures do not allow is a ``CalibrationError``, what cannot be read or synchronised a ``CaptureError``.
+"""
 
 import shlex
 from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,24 +19,90 @@ from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.posed_capture import filmed_by, orientations
 from structgstream.data.prepared import FILE as PREPARED
 from structgstream.data.prepared import LENSES, camera_of, filmed_entry, read_prepared
+from structgstream.data.timeline import Clock
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.calibration.board_solving import solve_board
-from structgstream.preparation.calibration.refinement import refine
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
-from structgstream.preparation.calibration.structure import solve_structure
-from structgstream.preparation.clocks import (
-    Clocks,
+from structgstream.preparation.calibration.structure import refine, solve_structure
+from structgstream.preparation.footage import (
+    Footage,
     Picture,
     Shots,
+    find_footage,
     shared_seconds,
     shots_of,
     spread_moments,
     still_pictures,
-    synchronized,
 )
-from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import PrepareOptions
-from structgstream.preparation.steps import Stored
+from structgstream.preparation.output_folder import Stored
+from structgstream.preparation.synchronization.synchronize import Method, synchronize
+
+TIMESTAMPS = "timestamps.csv"
+SURE_PERIODS = 0.5
+"""Standard error of a clock, in frame periods, up to which pictures of one moment can be chosen by it."""
+
+
+@dataclass(frozen=True)
+class Clocks:
+    """The clocks of all cameras."""
+
+    clocks: Mapping[str, Clock]  # by camera
+    method: str  # how they were found, see ``preparation.synchronization``
+    summary: str  # the method and its warnings, for users
+    sure: bool = True  # whether pictures of one moment can be chosen by them
+
+
+def synchronized(
+    footage: Footage, options: PrepareOptions, *, cameras: Mapping[str, LensCamera] | None = None
+) -> Clocks:
+    """The clocks of the cameras by the method of the options, with their calibration where it is known.
+
+    Raises:
+        CaptureError: they cannot be synchronised so, or have no moment in common.
+    """
+    single = all(len(footage.stamps(name)) == 1 for name in footage.cameras)
+    chosen: Method = "none" if single else options.synchronize
+    table = footage.where / TIMESTAMPS
+    try:
+        found = synchronize(footage, method=chosen, timestamps=table if table.is_file() else None, cameras=cameras)
+    except CaptureError as error:
+        if chosen != "auto":
+            raise
+        raise CaptureError(f"{error} Cameras that one signal starts need none of this: --synchronize none.") from None
+    shared_seconds(footage, found.clocks)
+    summary = " ".join([f"{found.method}: {found.reason}" + ("." if found.warnings else ""), *found.warnings])
+    sure = found.method != "motion" or max(found.uncertainty_seconds.values()) <= SURE_PERIODS / footage.fps
+    return Clocks(found.clocks, found.method, summary, sure)
+
+
+def first_clocks(footage: Footage, options: PrepareOptions) -> Clocks:
+    """The clocks of cameras whose calibration is to be found without them: by motion they may be unsure, or unknown.
+
+    Motion is inexact without a calibration, and poses come from what stands still. So a failure by motion is no error
+    here: motion is compared again once the calibration is known.
+    """
+    try:
+        return synchronized(footage, options)
+    except CaptureError as error:
+        if options.synchronize not in ("auto", "motion") or (footage.where / TIMESTAMPS).is_file():
+            raise
+        summary = f"motion: not without the calibration. {error}"
+        return Clocks({name: Clock() for name in footage.cameras}, "motion", summary, sure=False)
+
+
+def packed_clocks(found: Clocks) -> Stored:
+    """The clocks as plain values."""
+    return Stored(asdict(found))
+
+
+def unpacked_clocks(stored: Stored) -> Clocks:
+    """The reverse of :func:`packed_clocks`."""
+    values = stored.values
+    clocks = {name: Clock(**clock) for name, clock in values["clocks"].items()}
+    summary = values["summary"] if "summary" in values else values["told"]  # the former name
+    return Clocks(clocks, values["method"], summary, values["sure"])
+
 
 BOARD_SECONDS = 0.4
 """Between pictures of the board: it moves slowly, and neighbouring pictures show the same."""
@@ -40,22 +110,10 @@ BOARD_MOMENTS = 60
 
 
 def solve_cameras(
-    method: str,
-    footage: Footage,
-    clocks: Clocks,
-    options: PrepareOptions,
-    *,
-    focals: Mapping[str, float] | None = None,
+    method: str, footage: Footage, clocks: Clocks, options: PrepareOptions, *, focals: Mapping[str, float]
 ) -> SolvedCalibration:
-    """Cameras by ``sfm`` or ``board``.
-
-    Args:
-        focals: focal lengths in pixels that cameras state, with which structure from motion begins.
-
-    Raises:
-        CalibrationError: the cameras see too little in common, or too little of the board.
-        CaptureError: pictures cannot be read.
-    """
+    """Cameras by ``sfm``, which begins with ``focals``, the focal lengths in pixels that cameras state, or
+    ``board``."""
     if method == "sfm":
         pictures = matched_pictures(footage, clocks, options)
         return solve_structure(pictures, lens=options.lens or "radial", intrinsics=options.intrinsics, focals=focals)
@@ -71,18 +129,9 @@ def solve_cameras(
 def refined(
     solved: SolvedCalibration, footage: Footage, clocks: Clocks, options: PrepareOptions
 ) -> tuple[SolvedCalibration, str]:
-    """The calibration adjusted to the pictures, and a sentence on what that changed.
-
-    Raises:
-        CalibrationError: too few matches agree with the calibration.
-        CaptureError: pictures cannot be read.
-    """
-    found = refine(
-        matched_pictures(footage, clocks, options),
-        solved.cameras,
-        lens=options.lens,
-        metres=solved.metres,
-    )
+    """The calibration adjusted to the pictures, and a sentence on what that changed."""
+    pictures = matched_pictures(footage, clocks, options)
+    found = refine(pictures, solved.cameras, lens=options.lens, metres=solved.metres)
     summary = (
         f"{found.held_out} held-out matches lie {found.before_pixels:.2f} px from their epipolar lines before, "
         f"{found.after_pixels:.2f} after"
@@ -94,11 +143,7 @@ def matched_pictures(
     footage: Footage, clocks: Clocks, options: PrepareOptions
 ) -> Mapping[str, Shots] | Mapping[str, list[Picture]]:
     """What structure from motion looks at: pictures of the same moments, or of what stands still while clocks are
-    unsure.
-
-    Raises:
-        CaptureError: the cameras have no moment in common, or a picture cannot be read.
-    """
+    unsure."""
     if not clocks.sure:
         return still_pictures(footage)
     first, last = shared_seconds(footage, clocks.clocks)
@@ -106,12 +151,7 @@ def matched_pictures(
 
 
 def board_footage(footage: Footage, options: PrepareOptions) -> Footage:
-    """The videos in which the board is shown.
-
-    Raises:
-        CaptureError: a camera has none.
-        CalibrationError: they have another size.
-    """
+    """The videos in which the board is shown."""
     assert options.board_videos is not None, "checked before"
     found = find_footage(options.board_videos, picture_fps=options.fps)
     if missing := [name for name in footage.cameras if name not in found.cameras]:
@@ -131,11 +171,7 @@ def board_footage(footage: Footage, options: PrepareOptions) -> Footage:
 
 
 def check_complete(solved: SolvedCalibration, footage: Footage) -> SolvedCalibration:
-    """The calibration itself.
-
-    Raises:
-        CalibrationError: cameras could not be placed.
-    """
+    """The calibration itself; a ``CalibrationError`` where cameras could not be placed."""
     missing = [name for name in footage.cameras if name not in solved.cameras]
     if missing:
         raise CalibrationError(
@@ -147,11 +183,7 @@ def check_complete(solved: SolvedCalibration, footage: Footage) -> SolvedCalibra
 
 
 def stated_focals(footage: Footage) -> dict[str, float]:
-    """Focal lengths in pixels of those cameras whose first picture states one (Exif); videos do not.
-
-    Raises:
-        CaptureError: a picture cannot be read.
-    """
+    """Focal lengths in pixels of those cameras whose first picture states one (Exif); videos do not."""
     stated = {name: read_exif(files[0]).focal_pixels for name, files in footage.stills.items()}
     return {name: focal for name, focal in stated.items() if focal is not None}
 
@@ -172,9 +204,6 @@ def describe_turns(footage: Footage) -> str:
     """Which cameras' pictures are to be turned to be seen upright (Exif), for users; empty for none.
 
     A prepared capture has pixels as they are stored, so pictures are never turned, only reported.
-
-    Raises:
-        CaptureError: a picture cannot be read.
     """
     turned = [name for name, files in footage.stills.items() if read_exif(files[0]).orientation != 1]
     if not turned:
@@ -198,11 +227,7 @@ def summary(solved: SolvedCalibration) -> str:
 def packed(solved: SolvedCalibration) -> Stored:
     """The calibration as plain values."""
     cameras = {name: filmed_entry(filmed) for name, filmed in solved.cameras.items()}
-    seen = solved.observations
-    arrays = {
-        "points": solved.points, "point": seen.point, "camera": seen.camera, "pixels": seen.pixels,
-        "instant": seen.instant,
-    }  # fmt: skip
+    arrays = {"points": solved.points, **vars(solved.observations)}
     return Stored({"cameras": cameras, "missing": list(solved.missing), "metres": solved.metres}, arrays)
 
 
@@ -213,18 +238,13 @@ def unpacked(stored: Stored) -> SolvedCalibration:
         lens = dict(entry["lens"])
         kind = LENSES[lens.pop("model")]
         cameras[name] = LensCamera(camera_of(entry["viewmat"], entry["K"], entry["size"]), kind(**lens))
-    arrays = stored.arrays
-    seen = Observations(arrays["point"], arrays["camera"], arrays["pixels"], arrays["instant"])
-    missing = tuple(stored.values["missing"])
-    return SolvedCalibration(cameras, arrays["points"], seen, missing, bool(stored.values["metres"]))
+    seen = {name: array for name, array in stored.arrays.items() if name != "points"}
+    missing, metres = tuple(stored.values["missing"]), bool(stored.values["metres"])
+    return SolvedCalibration(cameras, stored.arrays["points"], Observations(**seen), missing, metres)
 
 
 def find_calibration(where: Path) -> Calibration | None:
-    """The calibration in a folder or one folder below, or that a file holds; None when there is none that is known.
-
-    Raises:
-        CalibrationError: it is broken, or a pickle.
-    """
+    """The calibration in a folder or one folder below, or that a file holds; None when there is none that is known."""
     folder, file = (where, None) if where.is_dir() else (where.parent, where)
 
     def meant(name: str) -> bool:
@@ -243,11 +263,7 @@ def find_calibration(where: Path) -> Calibration | None:
 
 
 def require_calibration(where: Path) -> Calibration:
-    """As :func:`find_calibration`.
-
-    Raises:
-        CalibrationError: there is none, or it is broken.
-    """
+    """As :func:`find_calibration`; a ``CalibrationError`` where there is none."""
     if not where.exists():
         raise CalibrationError(f"The calibration {where} does not exist; give a file or a folder of docs/captures.md.")
     found = find_calibration(where)

@@ -20,8 +20,7 @@ from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Route
 
 from structgstream.data.images import opencv
-from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import select_cameras
+from structgstream.data.source import FrameSource, select_cameras
 from structgstream.errors import CaptureError, StreamError
 from structgstream.frames import MultiViewFrame
 from structgstream.serve.listening import LOOPBACK_NAMES

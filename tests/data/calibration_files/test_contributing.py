@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from structgstream.data.calibration import PosedCamera, intrinsics, rigid
-from structgstream.data.calibration_files.reading import CalibrationFormat
+from structgstream.data.calibration import CalibrationFormat, PosedCamera, intrinsics, rigid
 from structgstream.data.lenses import from_integer_centers
 from structgstream.data.text_files import number, read_text
 from structgstream.data.text_files import pixels as picture_pixels

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from structgstream.data.calibration import PosedCamera
+from structgstream.data.calibration import PosedCamera, calibration_of
 from structgstream.data.calibration_files import reading
-from structgstream.data.calibration_files.reading import calibration_of, json_files_with, readable
-from structgstream.data.text_files import Unreadable, reason
+from structgstream.data.calibration_files.reading import json_files_with
+from structgstream.data.text_files import Unreadable, readable, reason
 from structgstream.errors import CalibrationError
 
 FILE = Path("rig.json")

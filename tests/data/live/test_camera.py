@@ -17,8 +17,7 @@ import av.error
 import numpy as np
 import pytest
 
-from structgstream.data.live.camera import MAX_UNSTAMPED, CameraFeed
-from structgstream.data.live.clock import ClockMapper
+from structgstream.data.live.camera import MAX_UNSTAMPED, CameraFeed, ClockMapper
 from structgstream.data.live.rig_file import LiveCamera, TimeBase
 from structgstream.data.live.status import FaultLog
 from structgstream.data.live.synchronizer import LivePicture

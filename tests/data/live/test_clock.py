@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from structgstream.data.live.clock import ClockMapper, ClockResets, PictureTime
+from structgstream.data.live.camera import ClockMapper, ClockResets, PictureTime
 from structgstream.data.live.rig_file import TimeBase
 from structgstream.data.live.status import Fault
 from tests.support.properties import examples

@@ -24,7 +24,7 @@ from structgstream.data.live.synchronizer import LivePicture, PictureSet
 from structgstream.data.open import open_capture
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
 from structgstream.data.source import frame_count, is_recording
-from structgstream.data.video_pictures import srgb
+from structgstream.data.video import srgb
 from structgstream.errors import CaptureError, ConfigError, StorageError
 from tests.support.rigs import arc_rig
 from tests.support.sender_modules import moving_pictures, sender, sent_loops, sent_stream

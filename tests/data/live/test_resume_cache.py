@@ -30,12 +30,12 @@ def some_frame(index: int = 7) -> MultiViewFrame:
     return MultiViewFrame(index, 0.25, images, {"b": random.random((12, 17)) < 0.5}, 1.7e9)
 
 
-def test_pictures_masks_times_and_facts_come_back(tmp_path: Path) -> None:
+def test_pictures_masks_and_times_come_back(tmp_path: Path) -> None:
     path, frame = tmp_path / "x", some_frame()
     write_pictures(path, frame, origin_seconds=4.5)
-    read, facts = read_pictures(path)
+    read, origin = read_pictures(path)
     assert (read.index, read.pts_seconds, read.captured_unix_seconds) == (7, 0.25, 1.7e9)
-    assert facts == {"origin_seconds": 4.5}
+    assert origin == 4.5
     assert [*read.images] == ["a", "b"]
     assert all((read.images[name] == frame.images[name]).all() for name in "ab")
     assert (read.masks["b"] == frame.masks["b"]).all()
@@ -60,7 +60,7 @@ def test_a_plane_leaves_nothing_but_its_edges() -> None:
 def test_files_of_an_earlier_version_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, frame = tmp_path / "x", some_frame()
     monkeypatch.setattr(resume_cache, "residuals", lambda image: image)
-    write_pictures(path, frame)
+    write_pictures(path, frame, origin_seconds=0.0)
     path.write_bytes(path.read_bytes().replace(FORMAT.encode(), WITHOUT_RESIDUALS.encode()))
     read, _ = read_pictures(path)
     assert all((read.images[name] == frame.images[name]).all() for name in "ab")
@@ -68,7 +68,7 @@ def test_files_of_an_earlier_version_are_read(tmp_path: Path, monkeypatch: pytes
 
 def test_a_file_that_is_cut_or_changed_anywhere_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "x"
-    write_pictures(path, some_frame())
+    write_pictures(path, some_frame(), origin_seconds=0.0)
     whole = path.read_bytes()
     for cut in range(0, len(whole), 37):
         path.write_bytes(whole[:cut])
@@ -86,7 +86,7 @@ def test_a_file_that_is_cut_or_changed_anywhere_is_refused(tmp_path: Path) -> No
 )
 def test_a_header_of_other_numbers_is_refused(tmp_path: Path, old: bytes, new: bytes) -> None:
     path = tmp_path / "x"
-    write_pictures(path, some_frame())
+    write_pictures(path, some_frame(), origin_seconds=0.0)
     assert old in path.read_bytes()
     path.write_bytes(path.read_bytes().replace(old, new))
     with pytest.raises(CaptureError, match="damaged"):
@@ -95,7 +95,7 @@ def test_a_header_of_other_numbers_is_refused(tmp_path: Path, old: bytes, new: b
 
 def test_what_cannot_be_written_or_found_is_said(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="cannot be written"):
-        write_pictures(tmp_path / "none" / "x", some_frame())
+        write_pictures(tmp_path / "none" / "x", some_frame(), origin_seconds=0.0)
     with pytest.raises(CaptureError, match="are missing"):
         read_pictures(tmp_path / "x")
 

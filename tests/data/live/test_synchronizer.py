@@ -30,8 +30,8 @@ class Rig:
             count=self._count,
         )
 
-    def _count(self, camera: str, fault: Fault, times: int) -> None:
-        self.counted[camera, fault] += times
+    def _count(self, camera: str, fault: Fault) -> None:
+        self.counted[camera, fault] += 1
 
     def send(self, camera: str, seconds: float, arrived: float | None = None) -> None:
         self.synchronizer.add(camera, LivePicture(seconds, seconds if arrived is None else arrived, (camera, seconds)))

@@ -11,7 +11,7 @@ from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, Radial
 from structgstream.errors import CalibrationError
 from structgstream.preparation.calibration.board import Board
 from structgstream.preparation.calibration.board_solving import solve_board
-from structgstream.preparation.calibration.colmap import LensModel
+from structgstream.preparation.calibration.lens_terms import LensModel
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from tests.support.calibration_errors import calibration_errors
 from tests.support.filmed import Film, board_plane, ring, turned

@@ -8,7 +8,6 @@ from structgstream.preparation.calibration.solved import (
     Observations,
     SolvedCalibration,
     normalized,
-    upright,
     with_distance,
 )
 from tests.support.filmed import ring
@@ -29,7 +28,7 @@ def solved(*, off: float = 0.0) -> SolvedCalibration:
 
 
 def test_other_coordinates_change_no_error() -> None:
-    for moved in (solved(off=0.5).aligned(TURN), normalized(solved(off=0.5)), upright(solved(off=0.5))):
+    for moved in (solved(off=0.5).aligned(TURN), normalized(solved(off=0.5))):
         np.testing.assert_allclose(moved.errors(), solved(off=0.5).errors(), atol=1e-9)
 
 
@@ -50,11 +49,3 @@ def test_a_distance_gives_metres() -> None:
         with_distance(solved(), "cam00", "cam09", metres=2.0)
     with pytest.raises(CalibrationError, match="gives no scale"):
         with_distance(solved(), "cam00", "cam01", metres=-1.0)
-
-
-def test_upright_puts_up_along_minus_y() -> None:
-    """The ring's cameras have no roll in the world whose y points down."""
-    found = upright(solved().aligned(TURN))
-    for filmed in found.cameras.values():
-        assert abs(float(filmed.camera.viewmat[0, 1])) < 1e-9  # x axes are level
-        assert float(filmed.camera.viewmat[1, 1]) > 0.9  # and pictures are not upside down

@@ -4,8 +4,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from structgstream.preparation.calibration import matching
-from structgstream.preparation.calibration.matching import all_matches, guided_matches
+from structgstream.preparation.calibration import keypoints
+from structgstream.preparation.calibration.keypoints import all_matches, guided_matches
 from tests.support.repetitive import POINTS, keypoints_of, ring
 
 
@@ -34,7 +34,7 @@ def test_matches_share_an_instant() -> None:
 
 
 def test_cameras_that_look_apart_are_not_matched(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(matching, "FACING_DEGREES", 20.0)
+    monkeypatch.setattr(keypoints, "FACING_DEGREES", 20.0)
     cameras = ring()
     found = guided_matches(keypoints_of(cameras), cameras, pixels=2.0, workers=1)
     assert ("cam0", "cam1") in found

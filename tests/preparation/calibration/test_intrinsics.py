@@ -2,13 +2,8 @@
 import numpy as np
 import pytest
 
-from structgstream.preparation.calibration.colmap import (
-    LensModel,
-    field_of_view,
-    filmed_camera,
-    guessed_camera,
-    pycolmap_module,
-)
+from structgstream.preparation.calibration.colmap import field_of_view, filmed_camera, guessed_camera, pycolmap_module
+from structgstream.preparation.calibration.lens_terms import LensModel
 
 
 @pytest.mark.parametrize(("lens", "degrees"), [("pinhole", 60), ("radial", 85), ("opencv", 40), ("fisheye", 150)])

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 
-from structgstream.preparation.calibration.keypoints import Keypoints
-from structgstream.preparation.calibration.matching import all_matches, keypoint_matches
+from structgstream.preparation.calibration.keypoints import Keypoints, all_matches, keypoint_matches
 
 
 def made(looks: list[int], seen: list[list[int]]) -> Keypoints:

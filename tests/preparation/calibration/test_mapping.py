@@ -11,15 +11,16 @@ from structgstream.data.lenses import LensCamera
 from structgstream.preparation.calibration.colmap import colmap_camera
 from structgstream.preparation.calibration.mapping import (
     Mapper,
+    PosedGraph,
     adjust,
     cameras_of,
     filtered,
     mapped,
+    posed_model,
     size_of,
     verified_pairs,
     write_database,
 )
-from structgstream.preparation.calibration.triangulation import PosedGraph, posed_model
 from tests.support.calibration_errors import calibration_errors
 from tests.support.filmed import ring
 from tests.support.views_made import cloud, keypoints_of, matches_of

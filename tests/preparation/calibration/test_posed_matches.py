@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from structgstream.data.lenses import Fisheye, LensCamera, RadialTangential
-from structgstream.preparation.calibration.matching import (
+from structgstream.preparation.calibration.keypoints import (
     agreeing_matches,
     camera_rays,
     epipolar_angles,

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from dataclasses import replace
 from functools import cache
+from itertools import count
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ import torch
 from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import LensCamera, RadialTangential
 from structgstream.errors import CalibrationError, ConfigError
-from structgstream.preparation.calibration.refinement import Refinement, refine
+from structgstream.preparation.calibration import structure
+from structgstream.preparation.calibration.structure import Refinement, refine
 from tests.support.calibration_errors import calibration_errors
 from tests.support.filmed import filmed_room
 
@@ -59,10 +61,10 @@ def test_perturbed_poses_come_back_where_they_were() -> None:
 
 def test_tracks_that_judged_are_adjusted_to_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
     """One in five is held back until the refinement is accepted; what is returned is made from all."""
-    from structgstream.preparation.calibration import refinement
-
     given, found = refined()
-    monkeypatch.setattr(refinement, "_completed", lambda graph, refined, terms, **options: refined)
+    judge, calls = structure._judged, count()
+    # The third judgement is that of what is made from all.
+    monkeypatch.setattr(structure, "_judged", lambda *of: judge(*of) if next(calls) < 2 else float("inf"))
     judged = refine(filmed_room()[1], given)
     assert found.changed
     assert (found.after_pixels, found.held_out) == (judged.after_pixels, judged.held_out)
@@ -81,11 +83,9 @@ def test_a_lens_that_was_not_known_is_found() -> None:
 
 def test_what_refining_makes_worse_is_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """An adjustment that goes wrong is noticed by the matches that it did not see."""
-    from structgstream.preparation.calibration import refinement
-
     rig, pictures = filmed_room()
     wrong = perturbed(rig, degrees=0.5, percent=1.0)
-    monkeypatch.setattr(refinement, "cameras_of", lambda model: wrong)
+    monkeypatch.setattr(structure, "cameras_of", lambda model: wrong)
     found = refine(pictures, rig, metres=True)
     assert not found.changed
     assert found.after_pixels > found.before_pixels

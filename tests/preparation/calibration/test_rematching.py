@@ -5,11 +5,11 @@ from functools import partial
 import numpy as np
 import pytest
 
-from structgstream.preparation.calibration import triangulation
+from structgstream.preparation.calibration import mapping
 from structgstream.preparation.calibration.bundle import Limits, adjust_together
 from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DOWN, FOCAL
+from structgstream.preparation.calibration.mapping import rematched
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
-from structgstream.preparation.calibration.triangulation import rematched
 from tests.support.calibration_errors import calibration_errors
 from tests.support.repetitive import keypoints_of, points, ring
 
@@ -50,7 +50,7 @@ def test_more_points_than_stood_out_at_first_make_cameras_more_exact() -> None:
 
 
 def test_a_solution_with_enough_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(triangulation, "ENOUGH", FEW // 2)
+    monkeypatch.setattr(mapping, "ENOUGH", FEW // 2)
     first = first_solution()
     assert rematched(first, {}, limits=LIMITS, adjust=ADJUST, workers=1) is first
 
@@ -58,7 +58,7 @@ def test_a_solution_with_enough_stays(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_solution_stays_if_little_is_gained_or_a_camera_loses(monkeypatch: pytest.MonkeyPatch) -> None:
     first, keypoints = first_solution(), keypoints_of(ring(COUNT))
     with monkeypatch.context() as patched:
-        patched.setattr(triangulation, "MIN_GAIN", 100.0)
+        patched.setattr(mapping, "MIN_GAIN", 100.0)
         assert rematched(first, keypoints, limits=LIMITS, adjust=ADJUST, workers=1) is first
 
     def losing(found: SolvedCalibration) -> SolvedCalibration:

@@ -7,8 +7,7 @@ import numpy as np
 
 from structgstream.data.lenses import RadialTangential
 from structgstream.preparation.calibration.colmap import colmap_camera
-from structgstream.preparation.calibration.mapping import observed, verified_pairs
-from structgstream.preparation.calibration.triangulation import PosedGraph, posed_model, without
+from structgstream.preparation.calibration.mapping import PosedGraph, observed, posed_model, verified_pairs, without
 from tests.support.filmed import ring
 from tests.support.views_made import cloud, keypoints_of, matches_of
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.frames import MultiViewFrame
-from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.check import Finding
 from structgstream.pose_check.tracks import gather
 from structgstream.preparation.checking.bumps import bump_findings, picture_movement
 from tests.support.filmed import Film, Plane, noise_texture, ring, room, turned

@@ -11,7 +11,7 @@ import torch
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.frames import MultiViewFrame
-from structgstream.pose_check.findings import explain
+from structgstream.pose_check.check import explain
 from structgstream.pose_check.tracks import gather
 from structgstream.pose_check.verdicts import judge
 from structgstream.preparation.checking.check import Checked, check_capture

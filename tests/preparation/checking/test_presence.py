@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from structgstream.data.source import WithoutPoints
 from structgstream.data.timeline import Clock
 from structgstream.data.video import synchronised
 from structgstream.data.video_index import scan_videos
-from structgstream.data.wrappers import WithoutPoints
 from structgstream.preparation.checking.presence import (
     passed_frames,
     presence_findings,

@@ -9,7 +9,7 @@ import numpy as np
 from structgstream.cameras import Camera
 from structgstream.data.lenses import LensCamera, Pinhole, RadialTangential
 from structgstream.data.matching import epipolar_errors, fundamental_matrix
-from structgstream.preparation.synchronization.motion_signals import CalibratedGeometry, StaticGeometry, static_features
+from structgstream.preparation.synchronization.motion import CalibratedGeometry, StaticGeometry, static_features
 from tests.support.takes import lenses, ring
 
 POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))

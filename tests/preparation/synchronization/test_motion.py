@@ -12,12 +12,14 @@ from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.correlation import Signal
 from structgstream.preparation.synchronization.motion import (
+    CalibratedGeometry,
+    Changes,
     PairSignals,
     agreeing_cameras,
     pair_signals,
+    picture_changes,
     solve_by_motion,
 )
-from structgstream.preparation.synchronization.motion_signals import CalibratedGeometry, Changes, picture_changes
 from tests.support.takes import MadeStreams, lenses, ring
 
 VIEWS = ring(4)

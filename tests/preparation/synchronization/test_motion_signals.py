@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from structgstream.preparation.synchronization.motion_signals import (
+from structgstream.preparation.synchronization.motion import (
     BUNDLES,
     CalibratedGeometry,
     Changes,

@@ -8,7 +8,7 @@ import pytest
 
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError, ConfigError
-from structgstream.preparation.synchronization import synchronize
+from structgstream.preparation.synchronization.synchronize import synchronize
 from tests.support.takes import MadeStreams, heard, lenses, ring
 
 VIEWS = ring(3, degrees=60)

@@ -13,7 +13,7 @@ from rich.console import Console
 from structgstream.cli import main
 from structgstream.cli.options import CaptureOptions, resolve_config
 from structgstream.data.dataset_layouts import bundled_clip
-from structgstream.data.wrappers import WithRig
+from structgstream.data.source import WithRig
 from structgstream.kernels.backend import select_backend
 from structgstream.session.presets import PRESETS, StreamConfig
 from structgstream_studies.cli.experiment import Display, ExperimentOptions, capture_part, print_sheet

@@ -12,15 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from structgstream.data.calibration import PosedCamera, rigid
-from structgstream.data.calibration_files.reading import (
-    LARGEST_BYTES,
-    CalibrationFormat,
-    NoPose,
-    common_folder,
-    may_be_storage,
-    read_storage,
-)
+from structgstream.data.calibration import CalibrationFormat, NoPose, PosedCamera, common_folder, rigid
+from structgstream.data.calibration_files.reading import LARGEST_BYTES, may_be_storage, read_storage
 from structgstream.data.calibration_files.tools import EXTRINSICS, INTRINSICS, decompose_projection
 from structgstream.data.lenses import fisheye_lens, from_integer_centers, opencv_lens
 from structgstream.data.text_files import Unreadable, number, pixels, read_text, reason

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How calibration files are read: a format, errors that name file, camera and remedy, and parsers.
+"""Parsers of calibration files: OpenCV's ``FileStorage``, YAML, and pickled arrays.
 
 OpenCV's own reader of its ``FileStorage`` writes beyond its memory where a file states another size of a matrix than it
 holds, and its YAML has a header and a type that other readers do not know: so :func:`read_storage`.
@@ -8,29 +8,20 @@ Note [Pickles are programs]
 ~~~~~~~~~~~~~~~~~~~~~~~~~~~
 A pickle names functions and calls them, so that opening one from elsewhere can do whatever its author likes.
 Dictionaries, lists, text and numbers need no function; arrays need those of :data:`KNOWN`, which are replaced by ones
-that make an empty array, a type of numbers, or text, and nothing else. Any other name ends the reading."""
+that make an empty array, a type of numbers, or text, and nothing else. Any other name ends the reading.
+"""
 
-import logging
-import operator
-import os
 import pickle
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from structgstream.data.calibration import Calibration, PosedCamera, listed
-from structgstream.data.text_files import BROKEN, Unreadable, mapping, number, read_json, read_text, reason, whole
+from structgstream.data.text_files import Unreadable, mapping, number, read_json, read_text, whole
 from structgstream.errors import CalibrationError, MissingExtraError
-
-Entry = TypeVar("Entry")
-log = logging.getLogger(__name__)
 
 LARGEST_BYTES = 50_000_000  # of a file that is searched to recognise it
 
@@ -43,118 +34,6 @@ def json_files_with(folder: Path, key: str) -> Iterator[tuple[Path]]:
                 yield (file,)
         except (OSError, Unreadable):
             continue  # no file of these
-
-
-@dataclass(frozen=True)
-class CalibrationFormat:
-    """The calibration files of a tool."""
-
-    find: Callable[[Path], Iterator[tuple[Path, ...]]]
-    """Gives the sets of files in a folder that are a calibration of the tool each."""
-    entries: Callable[[tuple[Path, ...]], Iterable[tuple[str, Any]]]
-    """Gives the cameras of such a set by name, with what the files state of them."""
-    camera: Callable[[str, Any], PosedCamera]  # makes the camera of an entry
-    expected: str  # what the files contain, for messages
-    turned_by_exif: bool | None = None  # see :class:`~structgstream.data.calibration.Calibration`
-    where: Callable[[tuple[Path, ...]], Path] = operator.itemgetter(0)  # gives the file or folder that messages name
-
-    def read(self, files: tuple[Path, ...]) -> Calibration:
-        """The cameras of a set of files.
-
-        Raises:
-            CalibrationError: a file is missing or broken, or a camera has a model that is not known here.
-        """
-        where = self.where(files)
-        with readable(where, self.expected):
-            entries = list(self.entries(files))
-        calibration = calibration_of(entries, self.camera, file=where, expected=self.expected)
-        return replace(calibration, turned_by_exif=self.turned_by_exif)
-
-
-def common_folder(files: tuple[Path, ...]) -> Path:
-    """The one file, or the folder of several."""
-    return files[0] if len(files) == 1 else Path(os.path.commonpath(files))
-
-
-class NoPose(Unreadable):
-    """A file has no pose of a camera, since it was not calibrated with the others."""
-
-
-@contextmanager
-def readable(what: Path | str, expected: str) -> Iterator[None]:
-    """Converts what the body raises for a broken file to a sentence that states what was expected.
-
-    Args:
-        what: the file or its part, for the message.
-        expected: what it should contain.
-
-    Raises:
-        CalibrationError: it is broken.
-        NoPose: the body raised it.
-    """
-    try:
-        with np.errstate(all="ignore"):  # what overflows is not finite, which is refused
-            yield
-    except (CalibrationError, NoPose):
-        raise
-    except BROKEN as error:
-        raise CalibrationError(f"{what} cannot be read ({reason(error)}); expected {expected}.") from None
-
-
-def calibration_of(
-    entries: Iterable[tuple[str, Entry]], read: Callable[[str, Entry], PosedCamera], *, file: Path, expected: str
-) -> Calibration:
-    """The cameras of a file, in its order; those without a pose are left out with a warning.
-
-    Raises:
-        CalibrationError: an entry is broken, naming its camera; or there is none, or none with a pose.
-    """
-    cameras, unposed = [], []
-    for name, entry in entries:
-        try:
-            with readable(f"Camera {name!r} of {file}", expected):
-                camera = read(name, entry)
-                if not (np.isfinite(camera.viewmat).all() and np.isfinite(camera.K).all()):
-                    raise Unreadable("a number that is not finite (NaN or infinity)")
-            cameras.append(camera)
-        except NoPose:
-            unposed.append(name)
-    if not cameras:
-        found = f"no pose of {listed(unposed)}" if unposed else "no cameras"
-        raise CalibrationError(f"{file} holds {found}; expected {expected}.")
-    if unposed:
-        log.warning("%s has no pose of %s; left out", file, listed(unposed))
-    return Calibration(file, tuple(cameras), unposed=tuple(unposed))
-
-
-def read_array(file: Path) -> NDArray[np.float64]:
-    """The numbers of an ``.npy`` file.
-
-    Raises:
-        Unreadable: it holds something else, or is cut.
-        OSError: it cannot be read.
-    """
-    try:
-        return np.asarray(np.load(file, allow_pickle=False), dtype=np.float64)
-    except OSError:
-        raise
-    except Exception:  # a damaged header can raise anything
-        raise Unreadable("it is no array of numbers, or is cut") from None
-
-
-def positive(content: Mapping[str, Any], key: str) -> float:
-    """The number of a key.
-
-    Raises:
-        Unreadable: it is not positive, or not finite.
-    """
-    try:
-        found = number(content[key])
-    except Unreadable as error:
-        raise Unreadable(f"{key}: {error}") from None
-    if found <= 0:
-        raise Unreadable(f"{key} {found:g}")
-    return found
 
 
 MAX_ENTRIES = 1_000_000  # of a matrix
@@ -174,12 +53,7 @@ def may_be_storage(file: Path) -> bool:
 
 
 def read_storage(file: Path) -> dict[str, Any]:
-    """Everything in the file: matrices as arrays, maps, lists, and text, also that of numbers.
-
-    Raises:
-        Unreadable: it cannot be parsed, or a matrix has not as many numbers as it states.
-        OSError: it cannot be read.
-    """
+    """Everything in the file: matrices as arrays, maps, lists, and text, also that of numbers."""
     text = read_text(file)
     if "<opencv_storage" in text[:400]:
         return _of_xml(text)
@@ -187,11 +61,7 @@ def read_storage(file: Path) -> dict[str, Any]:
 
 
 def parsed_yaml(text: str) -> Any:
-    """The content of YAML, with or without OpenCV's header; every scalar is text.
-
-    Raises:
-        Unreadable: it is not YAML.
-    """
+    """The content of YAML, with or without OpenCV's header; every scalar is text."""
     try:
         import yaml
     except ImportError:
@@ -303,8 +173,6 @@ def load_plain(file: Path) -> Any:
 
     Raises:
         CalibrationError: it holds anything else.
-        Unreadable: it is not such a file, or is cut.
-        OSError: it cannot be read.
     """
     with file.open("rb") as stream:
         try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration files of other tools: a :class:`~.reading.CalibrationFormat` each.
+"""Calibration files of other tools: a :class:`~structgstream.data.calibration.CalibrationFormat` each.
 
 Most state OpenCV's intrinsics, distortion coefficients and poses (world to camera), under other keys. Files of OpenCV's
 ``FileStorage`` are read by :mod:`.opencv_cameras`, ``transforms.json`` and COLMAP models elsewhere.
@@ -15,20 +15,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from structgstream.data.calibration import PosedCamera, intrinsics, rigid
+from structgstream.data.calibration import CalibrationFormat, NoPose, PosedCamera, common_folder, intrinsics, rigid
 from structgstream.data.calibration_files.reading import (
     LARGEST_BYTES,
-    CalibrationFormat,
-    NoPose,
-    common_folder,
     json_files_with,
     load_plain,
     parsed_yaml,
     read_storage,
-    readable,
 )
 from structgstream.data.lenses import Lens, Pinhole, fisheye_lens, from_integer_centers, opencv_lens
-from structgstream.data.text_files import Unreadable, mapping, number, pixels, read_json, read_text, read_toml
+from structgstream.data.text_files import Unreadable, mapping, number, pixels, read_json, read_text, read_toml, readable
 from structgstream.errors import CalibrationError
 
 CENTIMETRE, MILLIMETRE = 0.01, 0.001
@@ -42,15 +38,10 @@ def opencv_camera(
 
     Args:
         K: intrinsics ``[3, 3]``, pixels, the top-left pixel's centre at (0, 0).
-        dist: coefficients in OpenCV's order, of any shape; None for none.
+        dist: coefficients in OpenCV's order, of any shape, or of its fisheye model; None for none.
         R: rotation, world to camera, as matrix ``[3, 3]`` or vector ``[3]``.
-        T: translation ``[3]``.
+        T: translation ``[3]``, in ``unit`` metres.
         size: width and height, pixels; None if unknown.
-        unit: of the translation, metres.
-        fisheye: whether the coefficients are of OpenCV's fisheye model.
-
-    Raises:
-        Unreadable: values of other shapes.
     """
     coefficients = [] if dist is None else np.ravel(dist).tolist()
     return PosedCamera(
@@ -324,11 +315,7 @@ def _projection_camera(name: str, matrix: ArrayLike) -> PosedCamera:
 
 def decompose_projection(matrix: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Intrinsics ``[3, 3]`` and world to camera ``[4, 4]`` of ``[3, 4]`` numbers, or of the first rows of ``[4, 4]``
-    (Hartley and Zisserman, section 6.2.4).
-
-    Raises:
-        Unreadable: it is of another shape, singular, or a pose without intrinsics.
-    """
+    (Hartley and Zisserman, section 6.2.4)."""
     P = np.ravel(np.array(matrix, np.float64))
     if P.size not in (12, 16) or not np.isfinite(P).all():
         raise Unreadable(f"a matrix of shape {np.shape(matrix)}, or with numbers that are not finite")

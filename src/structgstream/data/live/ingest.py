@@ -5,12 +5,11 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from structgstream.data.live.camera import CameraFeed, OpenCamera
-from structgstream.data.live.clock import ClockMapper, ClockResets
+from structgstream.data.live.camera import CameraFeed, ClockMapper, ClockResets, OpenCamera
 from structgstream.data.live.recorder import Recording
 from structgstream.data.live.rig_file import LiveRig
 from structgstream.data.live.status import Fault, FaultLog
-from structgstream.data.live.synchronizer import FrameSynchronizer, LivePicture, PictureSet, SetTimes
+from structgstream.data.live.synchronizer import FrameSynchronizer, LivePicture, PictureSet
 from structgstream.frames import MultiViewFrame
 
 TICK_SECONDS = 0.02
@@ -21,8 +20,7 @@ JOIN_SECONDS = 1.0
 class FrameBuffer:
     """Holds the newest set of pictures until it is taken; a newer one replaces it. Thread-safe.
 
-    Args:
-        convert: makes the frame of a set: sRGB pictures, and the presentation time on the common clock.
+    ``convert`` makes the frame of a set: sRGB pictures, and the presentation time on the common clock.
     """
 
     def __init__(self, convert: Callable[[PictureSet], MultiViewFrame]) -> None:
@@ -31,8 +29,8 @@ class FrameBuffer:
         self._changed = threading.Condition()
         self.skipped = 0
         """Number of sets that were replaced by a newer one."""
-        self.times: SetTimes | None = None
-        """Times of the set that was taken last; None before the first."""
+        self.times: tuple[float, float] | None = None
+        """When the last picture of the set that was taken last arrived, and when it was complete; monotonic seconds."""
 
     def put(self, pictures: PictureSet) -> None:
         """Stores a set."""
@@ -49,7 +47,7 @@ class FrameBuffer:
             pictures, self._newest = self._newest, None
         if pictures is None:
             return None
-        self.times = pictures.times
+        self.times = pictures.arrived, pictures.matched
         return self._convert(pictures)
 
     @property
@@ -96,7 +94,8 @@ class Ingest:
         self._stop = threading.Event()
         self._last_arrival = now()
         self._failure: BaseException | None = None
-        self.sets = self.small_sets = 0
+        self.sets = 0
+        self.small_sets = 0  # with pictures of too few training cameras for a frame
         resets = ClockResets()
         common: dict[str, Any] = {
             "receiver": self, "faults": faults, "base": rig.clock, "now": now, "unix_offset": unix_offset,
@@ -145,10 +144,6 @@ class Ingest:
     def others_changed_at(self, camera: str) -> float:
         """See ``camera.Receiver``."""
         return max((feed.changed_at for name, feed in self.feeds.items() if name != camera), default=-float("inf"))
-
-    def count_small_set(self) -> None:
-        """A set had pictures of too few training cameras."""
-        self.small_sets += 1
 
     @property
     def queue_lengths(self) -> dict[str, int]:

@@ -43,19 +43,16 @@ STAMPS, FRAMES = "timestamps.csv", "frames.jsonl"
 
 
 class Recording:
-    """The folder of a recording.
-
-    Args:
-        folder: created; a recording in it is continued in its next part.
+    """The folder of a recording, which is made; a recording in it is continued in its next part.
 
     Raises:
-        StorageError: the folder cannot be written.
+        StorageError: it cannot be written, here or later.
     """
 
     def __init__(self, folder: Path, calibration: PreparedCapture, *, fps: float) -> None:
         self._folder, self._calibration, self._fps = folder, calibration, fps
         self._starts: list[float] = []  # of the parts, on the common clock
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._first = 0
         while (_part(folder, self._first) / FILE).exists():
             self._first += 1
@@ -72,7 +69,11 @@ class Recording:
     def part_at(self, common_seconds: float) -> int:
         """The number of the part of an instant of the common clock."""
         with self._lock:
-            return self._part_at(common_seconds)
+            if not self._starts:
+                self._starts = [common_seconds - LEAD_SECONDS]
+            while common_seconds - self._starts[-1] >= PART_SECONDS:
+                self._starts.append(self._starts[-1] + PART_SECONDS)
+            return max(bisect_right(self._starts, common_seconds) - 1, 0)
 
     def time_in_part(self, number: int, common_seconds: float) -> float:
         """Seconds from the start of a part to an instant of the common clock."""
@@ -82,18 +83,11 @@ class Recording:
     def next_part(self, part: int, common_seconds: float) -> int | None:
         """The part in which a new file may start at an instant, after one in ``part``; None if none may yet."""
         with self._lock:
-            number = self._part_at(common_seconds)
+            number = self.part_at(common_seconds)
             if number == part == len(self._starts) - 1:
                 self._starts.append(common_seconds)
                 return number + 1
             return number if number > part and common_seconds >= self._starts[number] else None
-
-    def _part_at(self, common_seconds: float) -> int:
-        if not self._starts:
-            self._starts = [common_seconds - LEAD_SECONDS]
-        while common_seconds - self._starts[-1] >= PART_SECONDS:
-            self._starts.append(self._starts[-1] + PART_SECONDS)
-        return max(bisect_right(self._starts, common_seconds) - 1, 0)
 
     def folder(self, number: int, files: Mapping[str, str]) -> Path:
         """The folder of a part, whose ``capture.json`` then names these files of cameras, and those before."""
@@ -128,11 +122,7 @@ class Recording:
         self.add_line(number, FRAMES, json.dumps(entry) + "\n")
 
     def add_line(self, number: int, file: str, line: str) -> None:
-        """Appends a line to a text file of a part.
-
-        Raises:
-            StorageError: it cannot be written.
-        """
+        """Appends a line to a text file of a part."""
         if number not in self._files:
             self.folder(number, {})
         path = _part(self._folder, self._first + number) / file

@@ -17,7 +17,7 @@ by two running sums, and halves the compressed size.
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -47,15 +47,14 @@ def resume_folder(stream: Path) -> Path:
 
 
 class ResumeCache:
-    """The last frames of a live run in a folder.
+    """The last frames of a live run in a folder, which is made with the first frame.
+
+    What cannot be written, and a folder that holds files of others, is a ``StorageError``; a damaged file is a
+    ``CaptureError``.
 
     Args:
-        folder: created with the first frame.
         cameras: names of the cameras whose pictures are stored: held-out ones are not needed.
         resume: whether existing files are of this stream; else they are removed with the first frame.
-
-    Raises:
-        StorageError: the folder cannot be used, or holds files of others.
     """
 
     def __init__(self, folder: Path, *, cameras: tuple[str, ...], resume: bool) -> None:
@@ -69,14 +68,8 @@ class ResumeCache:
         self._first, self._last = frozenset(first), max(last + LAST - 1, LAST)
 
     def store(self, frame: MultiViewFrame, *, origin_seconds: float) -> None:
-        """Stores a frame's pictures, and removes those that are no longer needed.
-
-        Args:
-            origin_seconds: the common clock at presentation time 0.
-
-        Raises:
-            StorageError: they cannot be written.
-        """
+        """Stores a frame's pictures, and removes those that are no longer needed; ``origin_seconds`` is the common
+        clock at presentation time 0."""
         images = {name: image for name, image in frame.images.items() if name in self._cameras}
         if len(frame.showing(self._cameras)) < min(MIN_CAMERAS, len(self._cameras)):  # nothing is visible
             images = {name: np.zeros_like(image) for name, image in images.items()}
@@ -92,11 +85,7 @@ class ResumeCache:
         self._remove({n: file for n, file in files if n > frame.index or (n < oldest and n not in self._first)})
 
     def frames(self, start: int) -> Iterator[MultiViewFrame]:
-        """The stored frames from index ``start`` on, without a gap; none if ``start`` is the next live frame.
-
-        Raises:
-            CaptureError: a file is damaged, or frame ``start`` is in the past and not stored.
-        """
+        """The stored frames from index ``start`` on, without a gap; none if ``start`` is the next live frame."""
         index = start
         while self._path(index).is_file():
             yield self._read(index)[0]
@@ -108,18 +97,14 @@ class ResumeCache:
             )
 
     def last(self) -> tuple[float, float] | None:
-        """Presentation time of the last stored frame, and the common clock at presentation time 0; None if empty.
-
-        Raises:
-            CaptureError: its file is damaged.
-        """
+        """Presentation time of the last stored frame, and the common clock at presentation time 0; None if empty."""
         files = self._files()
         if not files:
             return None
-        frame, facts = self._read(max(files))
-        return frame.pts_seconds, float(facts["origin_seconds"])
+        frame, origin = self._read(max(files))
+        return frame.pts_seconds, origin
 
-    def _read(self, index: int) -> tuple[MultiViewFrame, dict[str, float]]:
+    def _read(self, index: int) -> tuple[MultiViewFrame, float]:
         try:
             return read_pictures(self._path(index))
         except CaptureError as error:
@@ -140,50 +125,35 @@ class ResumeCache:
             raise StorageError(f"{error.filename} cannot be removed ({error.strerror}).") from None
 
 
-def write_pictures(path: Path, frame: MultiViewFrame, **facts: Any) -> None:
-    """Writes a frame's pictures atomically and durably.
-
-    Args:
-        frame: its pictures ``[H, W, 3]`` and masks ``[H, W]``.
-        facts: plain JSON values to store with them.
-
-    Raises:
-        StorageError: the file cannot be written.
-    """
-    arrays: dict[str, Mapping[str, NDArray[Any]]] = {"images": frame.images, "masks": frame.masks}
+def write_pictures(path: Path, frame: MultiViewFrame, *, origin_seconds: float) -> None:
+    """Writes a frame's pictures ``[H, W, 3]`` and masks ``[H, W]`` atomically and durably."""
     compressor = zstandard.ZstdCompressor(level=LEVEL, write_checksum=True)
-    packed = {
-        "images": {name: compressor.compress(residuals(image).tobytes()) for name, image in frame.images.items()},
-        "masks": {name: compressor.compress(mask.tobytes()) for name, mask in frame.masks.items()},
-    }
-    entries = {
-        kind: {name: [list(array.shape), len(packed[kind][name])] for name, array in own.items()}
-        for kind, own in arrays.items()
-    }
+    entries: dict[str, dict[str, Any]] = {"images": {}, "masks": {}}
+    packed = []
+    for kind, arrays in (("images", frame.images), ("masks", frame.masks)):
+        for name, array in arrays.items():
+            packed.append(compressor.compress((residuals(array) if kind == "images" else array).tobytes()))
+            entries[kind][name] = [list(array.shape), len(packed[-1])]
     header = {"format": FORMAT, "index": frame.index, "pts_seconds": frame.pts_seconds,
-              "captured_unix_seconds": frame.captured_unix_seconds, **facts, **entries}  # fmt: skip
-    content = [json.dumps(header).encode() + b"\n", *(data for own in packed.values() for data in own.values())]
-    atomic_write(path, content, called="The pictures", sync=True)
+              "captured_unix_seconds": frame.captured_unix_seconds, "origin_seconds": origin_seconds,
+              **entries}  # fmt: skip
+    atomic_write(path, [json.dumps(header).encode() + b"\n", *packed], called="The pictures", sync=True)
 
 
-def read_pictures(path: Path) -> tuple[MultiViewFrame, dict[str, Any]]:
-    """The frame of a file, and the JSON values stored with it.
-
-    Raises:
-        CaptureError: the file is missing or damaged.
-    """
+def read_pictures(path: Path) -> tuple[MultiViewFrame, float]:
+    """The frame of a file, and the common clock at presentation time 0."""
     try:
         with path.open("rb") as file:
             header: dict[str, Any] = json.loads(file.readline(MAX_HEADER))
-            written = header.pop("format")
+            written = header["format"]
             if written not in (FORMAT, WITHOUT_RESIDUALS):
                 raise ValueError("another format")
-            images = {name: _read(file, entry, np.uint8, (3,)) for name, entry in header.pop("images").items()}
-            masks = {name: _read(file, entry, np.bool_, ()) for name, entry in header.pop("masks").items()}
+            images = {name: _read(file, entry, np.uint8, (3,)) for name, entry in header["images"].items()}
+            masks = {name: _read(file, entry, np.bool_, ()) for name, entry in header["masks"].items()}
         if written == FORMAT:
             images = {name: restored(image) for name, image in images.items()}
-        times = float(header.pop("pts_seconds")), header.pop("captured_unix_seconds")
-        return MultiViewFrame(int(header.pop("index")), times[0], images, masks, times[1]), header
+        times = float(header["pts_seconds"]), header["captured_unix_seconds"]
+        return MultiViewFrame(int(header["index"]), times[0], images, masks, times[1]), float(header["origin_seconds"])
     except FileNotFoundError:
         raise CaptureError(f"The pictures {path} are missing.") from None
     except (OSError, ValueError, KeyError, TypeError, zstandard.ZstdError) as error:

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rig file of a live run: where each camera's pictures come from, and their calibration (docs/live.md)."""
+"""The rig file of a live run: where each camera's pictures come from, and their calibration (docs/live.md).
+
+A file that cannot be read, or that does not fit the calibration, is a ``CaptureError`` with file and key.
+"""
 
 import math
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from enum import StrEnum
 from pathlib import Path
@@ -81,11 +84,7 @@ class LiveRig:
 
 
 def read_rig(path: Path) -> LiveRig:
-    """The content of a rig file.
-
-    Raises:
-        CaptureError: it is missing or not TOML, has a key that is not known, lacks one, or has a value of another kind.
-    """
+    """The content of a rig file."""
     try:
         content = read_toml(path)
     except (OSError, Unreadable) as error:
@@ -100,11 +99,7 @@ def read_rig(path: Path) -> LiveRig:
 
 
 def check_cameras(rig: LiveRig, calibrated: Collection[str], path: Path) -> None:
-    """Check that the rig file names the cameras of the calibration, each once.
-
-    Raises:
-        CaptureError: naming one that the calibration, or the file, lacks.
-    """
+    """Check that the rig file names the cameras of the calibration, each once."""
     if unknown := [name for name in (*rig.cameras, *rig.without) if name not in calibrated]:
         raise CaptureError(
             f"The rig file {path} names camera {unknown[0]!r}, which the calibration {rig.calibration} lacks; its "
@@ -120,22 +115,13 @@ def check_cameras(rig: LiveRig, calibrated: Collection[str], path: Path) -> None
 
 
 def _resolved(rig: LiveRig, path: Path) -> LiveRig:
-    """Files and folders are relative to the rig file; names of devices stay."""
-    folder = path.parent
-    cameras = {
-        name: _in_folder(camera, folder) if camera.is_session or _is_path(camera, folder) else camera
-        for name, camera in rig.cameras.items()
-    }
-    return replace(rig, calibration=folder / rig.calibration, cameras=cameras)
-
-
-def _is_path(camera: LiveCamera, folder: Path) -> bool:
-    """Whether the URL is a path; with a format it may be the name of a device."""
-    return not SCHEME.match(camera.url) and (camera.format is None or (folder / camera.url).is_file())
-
-
-def _in_folder(camera: LiveCamera, folder: Path) -> LiveCamera:
-    return replace(camera, url=str(folder / camera.url))
+    """Files and folders are relative to the rig file; names of devices, which may come with a format, stay."""
+    cameras = dict(rig.cameras)
+    for name, camera in cameras.items():
+        file = path.parent / camera.url
+        if not SCHEME.match(camera.url) and (camera.is_session or camera.format is None or file.is_file()):
+            cameras[name] = replace(camera, url=str(file))
+    return replace(rig, calibration=path.parent / rig.calibration, cameras=cameras)
 
 
 def _parse(kind: type[Parsed], entry: Any, *, where: str) -> Parsed:
@@ -152,11 +138,12 @@ def _parse(kind: type[Parsed], entry: Any, *, where: str) -> Parsed:
 
 
 def _checked(key: str, value: Any, where: str) -> Any:
+    check, expected = CHECKS[key]
     try:
-        return CHECKS[key](value)
+        return check(value)
     except (ValueError, TypeError):
         found = "..." if key in ("url", "options") else repr(value)  # these may have a password
-        raise CaptureError(f"{key} = {found} in {where} is invalid; expected {EXPECTED[key]}.") from None
+        raise CaptureError(f"{key} = {found} in {where} is invalid; expected {expected}.") from None
 
 
 def _text(value: Any) -> str:
@@ -201,40 +188,22 @@ def _texts(value: Any) -> dict[str, str]:
     return {_text(key): _text(item) for key, item in value.items()}
 
 
-SECONDS = "seconds, more than 0"
-CHECKS: Mapping[str, Any] = {
-    "url": _text,
-    "offset_seconds": _number,
-    "format": _text,
-    "options": _texts,
-    "follow": _flag,
-    "name": _text,
-    "calibration": lambda value: Path(_text(value)),
-    "cameras": dict,
-    "fps": _positive,
-    "clock": TimeBase,
-    "tolerance_seconds": _positive,
-    "deadline_seconds": _positive,
-    "queue_frames": _count,
-    "stuck_seconds": _positive,
-    "silent_seconds": _positive,
-    "start_seconds": _positive,
-    "end_seconds": _positive,
-    "without": _names,
-}
-EXPECTED = {
-    "url": "a text, such as rtsp://10.0.0.11/stream",
-    "offset_seconds": "seconds",
-    "format": "the name of a container or device, such as mpegts",
-    "options": "a table of texts",
-    "follow": "true or false",
-    "name": "a text",
-    "calibration": "the folder of a capture",
-    "fps": "frames a second, more than 0",
-    "clock": "arrival, stream or unix",
-    "queue_frames": "a whole number from 2 to 10000",
-    "without": "a list of names",
+CHECKS: Mapping[str, tuple[Callable[[Any], Any], str]] = {
+    "url": (_text, "a text, such as rtsp://10.0.0.11/stream"),
+    "offset_seconds": (_number, "seconds"),
+    "format": (_text, "the name of a container or device, such as mpegts"),
+    "options": (_texts, "a table of texts"),
+    "follow": (_flag, "true or false"),
+    "name": (_text, "a text"),
+    "calibration": (lambda value: Path(_text(value)), "the folder of a capture"),
+    "cameras": (dict, "a table for each camera"),
+    "fps": (_positive, "frames a second, more than 0"),
+    "clock": (TimeBase, "arrival, stream or unix"),
+    "queue_frames": (_count, "a whole number from 2 to 10000"),
+    "without": (_names, "a list of names"),
     **{
-        f"{key}_seconds": SECONDS for key in ("tolerance", "deadline", "stuck", "silent", "start", "end")
+        f"{key}_seconds": (_positive, "seconds, more than 0")
+        for key in ("tolerance", "deadline", "stuck", "silent", "start", "end")
     },
-}  # fmt: skip
+}
+"""What reads the value of a key, and what it expects."""

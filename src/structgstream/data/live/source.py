@@ -21,7 +21,7 @@ from structgstream.data.live.recorder import Recording
 from structgstream.data.live.resume_cache import ResumeCache, resume_folder
 from structgstream.data.live.rig_file import LiveRig, TimeBase, check_cameras, read_rig
 from structgstream.data.live.status import CameraStatus, Fault, FaultLog, LiveStatus
-from structgstream.data.live.synchronizer import PictureSet, SetTimes
+from structgstream.data.live.synchronizer import PictureSet
 from structgstream.data.masks import FOLDER, with_masks
 from structgstream.data.open import open_capture, selected
 from structgstream.data.prepared import (
@@ -33,10 +33,9 @@ from structgstream.data.prepared import (
     undistorted,
 )
 from structgstream.data.source import FrameSource
-from structgstream.data.undistortion import UndistortedSource
+from structgstream.data.undistortion import lenses_of
+from structgstream.data.video import srgb
 from structgstream.data.video_index import load_av
-from structgstream.data.video_pictures import srgb
-from structgstream.data.wrappers import SourceWrapper
 from structgstream.errors import CaptureError, StorageError
 from structgstream.frames import MIN_CAMERAS, MultiViewFrame
 
@@ -60,15 +59,12 @@ class LivePictures:
 
 
 def read_calibration(folder: Path) -> PreparedCapture:
-    """Lenses and pinholes of the cameras of a capture of any layout.
-
-    Raises:
-        CaptureError: it cannot be opened. A prepared capture needs its ``capture.json`` alone.
-    """
+    """Lenses and pinholes of the cameras of a capture of any layout; of a prepared one ``capture.json`` is all that is
+    needed."""
     if recognizes_prepared(folder):
         return read_prepared(folder)
     source = open_capture(folder)
-    lenses = _lenses(source)
+    lenses = lenses_of(source) or {}
     rig = source.rig
     cameras = {
         name: PreparedCamera(name, lenses.get(name, LensCamera(rig[name], Pinhole())), rig[name]) for name in rig
@@ -91,26 +87,10 @@ def with_calibration(
     scale: float,
     near: float | None,
 ) -> FrameSource:
-    """Live pictures undistorted and masked as those of a prepared capture are.
-
-    Args:
-        pictures: those of ``prepared.filmed_rig``.
-        capture: the calibration, read in ``folder``; other arguments as of ``open_capture``.
-
-    Raises:
-        CaptureError: masks that do not fit.
-        ConfigError: an invalid option.
-    """
+    """Live ``pictures`` of ``prepared.filmed_rig``, undistorted and masked as those of a prepared capture in ``folder``
+    are; other arguments as of ``open_capture``."""
     source = with_masks(undistorted(pictures, folder, capture), folder / FOLDER)
     return selected(source, held_out=held_out, scale=scale, near=near)
-
-
-def _lenses(source: FrameSource) -> Mapping[str, LensCamera]:
-    while isinstance(source, SourceWrapper):
-        if isinstance(source, UndistortedSource):
-            return source.filmed
-        source = source.source
-    return {}
 
 
 log = logging.getLogger(__name__)
@@ -143,9 +123,9 @@ class LiveSource:
         unix: Unix time, asked once.
 
     Raises:
-        CaptureError: the rig file or the calibration is broken.
+        CaptureError: the rig file or the calibration is broken; while reading, a frame of the past is not cached.
         ConfigError: an invalid option.
-        StorageError: a folder cannot be used.
+        StorageError: a folder cannot be used, or pictures cannot be written.
     """
 
     def __init__(
@@ -191,12 +171,7 @@ class LiveSource:
         return self._stopped.is_set()
 
     def frames(self, start: int = 0) -> Iterator[MultiViewFrame]:
-        """If the stream is resumed, the cached frames from ``start`` on; then live ones.
-
-        Raises:
-            CaptureError: a frame of the past is not cached.
-            StorageError: pictures cannot be written.
-        """
+        """If the stream is resumed, the cached frames from ``start`` on; then live ones."""
         index, end = start, self._options.frames
         for frame in self._cache.frames(start) if self._options.resume else ():
             if end is not None and index >= end:
@@ -287,13 +262,13 @@ class LiveSource:
             return seconds - before - 1 / self.fps
         return origin
 
-    def _measure_delivery(self, frame: MultiViewFrame, times: SetTimes | None) -> None:
+    def _measure_delivery(self, frame: MultiViewFrame, times: tuple[float, float] | None) -> None:
         now = self._now()
         if frame.captured_unix_seconds is not None:
             captured = frame.captured_unix_seconds - self._unix_offset
             self._ages = {
-                "arrived_seconds": None if times is None else times.arrived - captured,
-                "matched_seconds": None if times is None else times.matched - captured,
+                "arrived_seconds": None if times is None else times[0] - captured,
+                "matched_seconds": None if times is None else times[1] - captured,
                 "delay_seconds": now - captured,
             }
             self._captured[frame.index] = frame.captured_unix_seconds
@@ -337,7 +312,7 @@ class LiveSource:
             if is_first and now - started < self._live.start_seconds and {*absent} & {*sending}:
                 continue
             if len(frame.showing(self.rig.training)) < MIN_CAMERAS:
-                ingest.count_small_set()
+                ingest.small_sets += 1
                 continue
             if is_first and absent:
                 missing = ", ".join(absent)

@@ -32,25 +32,21 @@ class Fault(StrEnum):
 
 
 class FaultLog:
-    """Counts faults by camera, and logs each kind at most once in ``interval_seconds``. Thread-safe.
+    """Counts faults by camera, and logs each kind at most once in :data:`REPORT_INTERVAL_SECONDS`. Thread-safe.
 
-    Args:
-        now: monotonic seconds.
-        interval_seconds: after which a kind of fault of a camera is logged again.
+    ``now`` gives monotonic seconds.
     """
 
-    def __init__(
-        self, name: str, *, now: Callable[[], float], interval_seconds: float = REPORT_INTERVAL_SECONDS
-    ) -> None:
-        self._name, self._now, self._interval = name, now, interval_seconds
+    def __init__(self, name: str, *, now: Callable[[], float]) -> None:
+        self._name, self._now = name, now
         self._counts: defaultdict[str, Counter[str]] = defaultdict(Counter)
         self._reported: dict[tuple[str, str], float] = {}
         self._lock = threading.Lock()
 
-    def count(self, camera: str, fault: Fault, times: int = 1) -> None:
+    def count(self, camera: str, fault: Fault) -> None:
         """Counts without logging."""
         with self._lock:
-            self._counts[camera][fault.value] += times
+            self._counts[camera][fault.value] += 1
 
     def report(self, camera: str, fault: Fault, text: str) -> None:
         """Counts, and logs unless this fault of this camera was logged a short time ago."""
@@ -61,7 +57,7 @@ class FaultLog:
         """Logs without counting, as rarely as :meth:`report`."""
         with self._lock:
             now, last = self._now(), self._reported.get((camera, kind))
-            if last is not None and now - last < self._interval:
+            if last is not None and now - last < REPORT_INTERVAL_SECONDS:
                 return
             self._reported[camera, kind] = now
         log.warning("%s: camera %r %s", self._name, camera, text)

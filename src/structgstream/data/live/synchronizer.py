@@ -18,7 +18,6 @@ from structgstream.data.live.status import Fault
 
 MIN_SPACING = 0.75
 """Minimum share of a frame period between two instants: of a faster reference camera, pictures are left out."""
-Count = Callable[[str, Fault, int], None]
 
 
 @dataclass(frozen=True)
@@ -39,17 +38,9 @@ class PictureSet:
     matched: float  # when the set was complete, monotonic seconds
 
     @property
-    def times(self) -> "SetTimes":
-        """When its last picture arrived, and when it was complete."""
-        return SetTimes(max(picture.arrived for picture in self.pictures.values()), self.matched)
-
-
-@dataclass(frozen=True)
-class SetTimes:
-    """When the last picture of a set arrived, and when the set was complete; monotonic seconds."""
-
-    arrived: float
-    matched: float
+    def arrived(self) -> float:
+        """When its last picture arrived, monotonic seconds."""
+        return max(picture.arrived for picture in self.pictures.values())
 
 
 @dataclass
@@ -80,7 +71,7 @@ class FrameSynchronizer:
         tolerance_seconds: float,
         deadline_seconds: float,
         queue_frames: int,
-        count: Count,
+        count: Callable[[str, Fault], None],
         started: float = -float("inf"),
     ) -> None:
         self._queues = {name: _Queue(last_arrived=started) for name in cameras}
@@ -96,7 +87,7 @@ class FrameSynchronizer:
         queue.pictures.append(picture)
         if len(queue.pictures) > self._max_queue:
             queue.pictures.popleft()
-            self._count(camera, Fault.OVERFLOW, 1)
+            self._count(camera, Fault.OVERFLOW)
 
     def mark_absent(self, camera: str) -> None:
         """Sets do not wait for the camera until it sends again."""
@@ -167,4 +158,4 @@ class FrameSynchronizer:
 
     def _drop_first(self, name: str) -> None:
         self._queues[name].pictures.popleft()
-        self._count(name, Fault.UNMATCHED, 1)
+        self._count(name, Fault.UNMATCHED)

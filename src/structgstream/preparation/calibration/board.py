@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,11 +68,7 @@ class Board:
         )
 
     def opencv_board(self) -> Any:
-        """The board as OpenCV's.
-
-        Raises:
-            ConfigError: a dictionary that OpenCV lacks, or with too few markers.
-        """
+        """The board as OpenCV's."""
         aruco = opencv().aruco
         number = getattr(aruco, self.dictionary, None)
         if not self.dictionary.startswith("DICT_") or not isinstance(number, int):
@@ -126,7 +122,9 @@ def board_sightings(
         detections = pool.map(lambda task: _sighted(pictures[task[0]][task[1]], board), tasks)
         for (name, instant), (corners, pixels, ids) in zip(tasks, detections, strict=True):
             markers[name] |= ids
-            if len(corners) >= MIN_CORNERS and not _collinear(corners, board):
+            across, down = corners % (board.columns - 1), corners // (board.columns - 1)
+            is_line = len(np.unique(across)) < 2 or len(np.unique(down)) < 2
+            if len(corners) >= MIN_CORNERS and not is_line:
                 found[name].append(Sighting(instant, corners, pixels))
             elif len(ids) >= MANY_MARKERS and len(corners) == 0:
                 without_corners += 1
@@ -171,11 +169,6 @@ def _sighted(picture: NDArray[np.uint8], board: Board) -> tuple[NDArray[np.intp]
     if corners is None or len(corners) == 0:
         return np.empty(0, np.intp), np.empty((0, 2)), read
     return np.ravel(corners).astype(np.intp), np.reshape(pixels, (-1, 2)).astype(np.float64) + 0.5, read
-
-
-def _collinear(corners: NDArray[np.intp], board: Board) -> bool:
-    across, down = corners % (board.columns - 1), corners // (board.columns - 1)
-    return len(set(across.tolist())) < 2 or len(set(down.tolist())) < 2
 
 
 def _check_markers(
@@ -252,13 +245,12 @@ PAPERS_MM: dict[Paper, tuple[float, float]] = {
 MM_PER_INCH = 25.4
 MARGIN_MM = 6.0
 FOOT_MM = 14.0
-BAR_MM = 100.0
+BAR_MM, TICK_MM = 100.0, 0.3
 OVERLAP = 1e-4  # of a square, between rows of a marker, so that no hairline shows there
 
 
-@dataclass(frozen=True)
-class Rectangle:
-    """A black rectangle of the page: left, bottom, width and height in mm from the page's lower left corner."""
+class Rectangle(NamedTuple):
+    """A black rectangle of the page, in mm from the page's lower left corner."""
 
     left: float
     bottom: float
@@ -274,28 +266,27 @@ def write_board_pdf(path: Path, board: Board, paper: Paper = "A4") -> None:
         StorageError: the file cannot be written.
     """
     width, height = board_page(board, paper)
-    figure, canvas = _figure(width, height)
-    for cell in (*board_rectangles(board, paper), *_bar(board, paper)):
-        figure.add_artist(_drawn(cell, width, height))
-    figure.text((MARGIN_MM + BAR_MM + 6) / width, (MARGIN_MM + 4.5) / height, board.text, fontsize=8, va="bottom")
-    figure.text(
-        (MARGIN_MM + BAR_MM + 6) / width,
-        MARGIN_MM / height,
-        f"Print at 100 %, without fitting to the page: the bar is {BAR_MM:g} mm long. Glue it to something flat.",
-        fontsize=6.5,
-        va="bottom",
-    )
+    try:
+        from matplotlib.backends.backend_pdf import FigureCanvasPdf
+        from matplotlib.figure import Figure
+        from matplotlib.patches import Rectangle as Patch
+    except ImportError:
+        raise MissingExtraError("matplotlib", "report") from None
+    figure = Figure(figsize=(width / MM_PER_INCH, height / MM_PER_INCH))
+    for left, bottom, across, down in (*board_rectangles(board, paper), *_bar()):
+        corner = left / width, bottom / height
+        figure.add_artist(Patch(corner, across / width, down / height, color="black", linewidth=0))
+    left = (MARGIN_MM + BAR_MM + 6) / width
+    advice = f"Print at 100 %, without fitting to the page: the bar is {BAR_MM:g} mm long. Glue it to something flat."
+    figure.text(left, (MARGIN_MM + 4.5) / height, board.text, fontsize=8, va="bottom")
+    figure.text(left, MARGIN_MM / height, advice, fontsize=6.5, va="bottom")
     content = BytesIO()
-    canvas.print_pdf(content, metadata={"CreationDate": None, "Title": f"ChArUco board, {board.text}"})
+    FigureCanvasPdf(figure).print_pdf(content, metadata={"CreationDate": None, "Title": f"ChArUco board, {board.text}"})
     atomic_write(path, content.getvalue(), called="The board", new_folder=True)
 
 
 def board_page(board: Board, paper: Paper) -> tuple[float, float]:
-    """Width and height of the page in mm, lying.
-
-    Raises:
-        ConfigError: an unknown paper, or one that is too small.
-    """
+    """Width and height of the page in mm, lying."""
     if paper not in PAPERS_MM:
         raise ConfigError(f"{paper!r} is no paper size; expected one of {', '.join(PAPERS_MM)}.")
     width, height = PAPERS_MM[paper]
@@ -316,19 +307,12 @@ def board_rectangles(board: Board, paper: Paper) -> tuple[Rectangle, ...]:
     side = 1000 * board.square_metres
     left = (width - board.columns * side) / 2
     top = height - MARGIN_MM - (height - 2 * MARGIN_MM - FOOT_MM - board.rows * side) / 2
-    cells = [*_squares(board), *_markers(board)]
-    return tuple(
-        Rectangle(left + x * side, top - (y + down) * side, across * side, down * side) for x, y, across, down in cells
-    )
-
-
-def _squares(board: Board) -> Iterator[tuple[float, float, float, float]]:
-    """Black squares as left, top, width and height in squares: those without a marker."""
     marked = {(int(x), int(y)) for x, y in _marker_corners(board)}
-    for row in range(board.rows):
-        for column in range(board.columns):
-            if (column, row) not in marked:
-                yield column, row, 1.0, 1.0
+    squares = [(x, y, 1.0, 1.0) for y in range(board.rows) for x in range(board.columns) if (x, y) not in marked]
+    return tuple(
+        Rectangle(left + x * side, top - (y + down) * side, across * side, down * side)
+        for x, y, across, down in (*squares, *_markers(board))
+    )
 
 
 def _markers(board: Board) -> Iterator[tuple[float, float, float, float]]:
@@ -343,12 +327,8 @@ def _markers(board: Board) -> Iterator[tuple[float, float, float, float]]:
         for row in range(cells):
             edges = np.flatnonzero(np.diff(np.concatenate([[False], black[row], [False]]).astype(int)))
             for start, end in edges.reshape(-1, 2):
-                yield (
-                    x + start * step,
-                    y + row * step,
-                    (end - start) * step,
-                    step + (OVERLAP if row + 1 < cells else 0.0),
-                )
+                below = OVERLAP if row + 1 < cells else 0.0
+                yield x + start * step, y + row * step, (end - start) * step, step + below
 
 
 def _marker_corners(board: Board) -> list[tuple[float, float]]:
@@ -357,30 +337,10 @@ def _marker_corners(board: Board) -> list[tuple[float, float]]:
     return [(float(x), float(y)) for x, y in found]
 
 
-def _bar(board: Board, paper: Paper) -> Iterator[Rectangle]:
+def _bar() -> Iterator[Rectangle]:
     """A bar with a tick at each centimetre."""
     yield Rectangle(MARGIN_MM, MARGIN_MM, BAR_MM, 0.4)
     for step in range(11):
-        tall = 4.0 if step % 5 == 0 else 2.5
-        wide = 0.3
-        left = MARGIN_MM + step * BAR_MM / 10 - wide / 2
-        left = min(max(left, MARGIN_MM), MARGIN_MM + BAR_MM - wide)  # the bar's ends are those of its end ticks
-        yield Rectangle(left, MARGIN_MM, wide, tall)
-
-
-def _figure(width: float, height: float) -> tuple[Any, Any]:
-    try:
-        from matplotlib.backends.backend_pdf import FigureCanvasPdf
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingExtraError("matplotlib", "report") from None
-    figure = Figure(figsize=(width / MM_PER_INCH, height / MM_PER_INCH))
-    return figure, FigureCanvasPdf(figure)
-
-
-def _drawn(cell: Rectangle, width: float, height: float) -> Any:
-    from matplotlib.patches import Rectangle as Patch
-
-    return Patch(
-        (cell.left / width, cell.bottom / height), cell.width / width, cell.height / height, color="black", linewidth=0
-    )
+        # The bar's ends are those of its end ticks.
+        left = min(max(step * BAR_MM / 10 - TICK_MM / 2, 0.0), BAR_MM - TICK_MM)
+        yield Rectangle(MARGIN_MM + left, MARGIN_MM, TICK_MM, 4.0 if step % 5 == 0 else 2.5)

@@ -25,26 +25,14 @@ from structgstream.preparation.calibration.bundle import (
     posed_problem,
     solved,
 )
-from structgstream.preparation.calibration.colmap import (
-    LensModel,
-    colmap_camera,
-    filmed_camera,
-    guessed_camera,
-    pycolmap_module,
-)
-from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL
+from structgstream.preparation.calibration.colmap import colmap_camera, filmed_camera, guessed_camera, pycolmap_module
+from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL, LensModel
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
 
 Sightings = Mapping[str, Sequence[Sighting]]
 
 
-FIELDS_OF_VIEW: Mapping[LensModel, tuple[float, ...]] = {
-    "pinhole": (30.0, 50.0, 70.0, 90.0),
-    "radial": (30.0, 50.0, 70.0, 90.0),
-    "opencv": (30.0, 50.0, 70.0, 90.0),
-    "brown": (30.0, 50.0, 70.0, 90.0),
-    "fisheye": (60.0, 90.0, 120.0, 150.0, 175.0),
-}
+FIELDS_OF_VIEW, FISHEYE_FIELDS_OF_VIEW = (30.0, 50.0, 70.0, 90.0), (60.0, 90.0, 120.0, 150.0, 175.0)
 MAX_SIGHTINGS_ALONE = 24
 POSE_PIXELS = 0.02  # of the longer side: coarse, since the lens is not known yet
 OUTLIER_PIXELS = 2.0
@@ -57,18 +45,16 @@ def solve_board(
     *,
     lens: LensModel = "opencv",
 ) -> SolvedCalibration:
-    """Poses, intrinsics and lenses from pictures of ``board`` at many instants.
+    """Poses, intrinsics and lenses from pictures of ``board`` at many instants, in metres and the axes of the first
+    camera.
 
     The lens of each camera is estimated from its own sightings, poses between cameras from the instants that they
     share, and all of them, with the board's pose at each instant, are then adjusted together, at last with what alike
-    lenses share (lens_terms.py, Note [Alike lenses]).
+    lenses share (lens_terms.py, Note [Alike lenses]). The points are the board's corners at each instant.
 
     Args:
         pictures: camera name to pictures ``[H, W, 3]`` of the same instants for all cameras.
         lens: which distortion is estimated.
-
-    Returns:
-        the calibration in metres, in the axes of the first camera; the points are the board's corners at each instant.
 
     Raises:
         CalibrationError: a camera that does not show the board well enough, or at no instant at which it connects to
@@ -80,7 +66,10 @@ def solve_board(
     views = {name: _own_view(name, sightings[name], board, size, lens) for name, size in sizes.items()}
     sensors = _connected_sensors(views)
     poses = _rig_poses(views, sensors, sightings)
-    filmed = {name: _placed(view.filmed, sensors[name]) for name, view in views.items()}
+    filmed = {
+        name: replace(view.filmed, camera=replace(view.filmed.camera, viewmat=torch.from_numpy(sensors[name].copy())))
+        for name, view in views.items()
+    }
     inliers: Sightings = {name: [s for s in sightings[name] if s.instant in view.poses] for name, view in views.items()}
     for _ in range(2):
         filmed, poses = adjust_board(board, inliers, filmed, poses, lens=lens, rough=True)
@@ -108,7 +97,7 @@ def _own_view(
     picks = np.linspace(0, len(chosen) - 1, min(len(chosen), MAX_SIGHTINGS_ALONE)).round().astype(int)
     sample = [chosen[index] for index in picks]
     best: tuple[float, LensCamera] | None = None
-    for degrees in FIELDS_OF_VIEW[lens]:
+    for degrees in FISHEYE_FIELDS_OF_VIEW if lens == "fisheye" else FIELDS_OF_VIEW:
         camera = filmed_camera(guessed_camera(lens, 1, size, degrees), pycolmap_module().Rigid3d())
         poses = _poses(camera, sample, board)
         if len(poses) < max(3, len(sample) // 2):
@@ -204,10 +193,6 @@ def _rig_poses(views: Mapping[str, _View], sensors: Mapping[str, Floats], sighti
     return {instant: best[instant][1] for instant in sorted(best)}
 
 
-def _placed(filmed: LensCamera, viewmat: Floats) -> LensCamera:
-    return replace(filmed, camera=replace(filmed.camera, viewmat=torch.from_numpy(viewmat.copy())))
-
-
 def _solved(
     board: Board, sightings: Sightings, filmed: Mapping[str, LensCamera], poses: Mapping[int, Floats]
 ) -> SolvedCalibration:
@@ -255,9 +240,7 @@ def adjust_board(
 ) -> tuple[dict[str, LensCamera], dict[int, Floats]]:
     """Cameras and board-to-world poses ``[4, 4]`` by instant, adjusted together; the first camera is the world.
 
-    Args:
-        lens: which distortion is estimated.
-        rough: a few steps only, with the usual noise and differences of lenses; else these are estimated, too.
+    ``rough`` takes a few steps only, with the usual noise and differences of lenses; else these are estimated, too.
     """
     number = {instant: index for index, instant in enumerate(poses)}
     seen = [(index, sighting) for index, name in enumerate(cameras) for sighting in sightings[name]]
@@ -279,9 +262,9 @@ def adjust_board(
     )
     parameters = solved(bundle, parameters, max_steps=ROUGH_STEPS) if rough else estimated(bundle, parameters)[1]
     parameters = _from_first(parameters)
-    return cameras_in(parameters, cameras, bundle.lens), dict(
-        zip(poses, _matrices(parameters.body_rotations, parameters.body_positions), strict=True)
-    )
+    matrices = np.tile(np.eye(4), (len(poses), 1, 1))
+    matrices[:, :3, :3], matrices[:, :3, 3] = parameters.body_rotations, parameters.body_positions
+    return cameras_in(parameters, cameras, bundle.lens), dict(zip(poses, matrices, strict=True))
 
 
 def _from_first(parameters: Parameters) -> Parameters:
@@ -297,9 +280,3 @@ def _from_first(parameters: Parameters) -> Parameters:
         body_rotations=turn @ parameters.body_rotations,
         body_positions=parameters.body_positions @ turn.T + move,
     )
-
-
-def _matrices(body_rotations: Floats, body_positions: Floats) -> Floats:
-    found = np.tile(np.eye(4), (len(body_rotations), 1, 1))
-    found[:, :3, :3], found[:, :3, 3] = body_rotations, body_positions
-    return found

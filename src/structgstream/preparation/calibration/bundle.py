@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import Fisheye, LensCamera
-from structgstream.geometry import Floats
+from structgstream.geometry import Floats, cross_matrices
 from structgstream.preparation.calibration.lens_terms import (
     LensPrior,
     derivatives,
@@ -192,9 +192,9 @@ def _derivatives(bundle: Bundle, parameters: Parameters) -> tuple[Floats, Floats
     turned = np.einsum("mab,mb->ma", parameters.rotations[own], on_body + parameters.body_positions[seen.body])
     local = turned + parameters.translations[own]
     by_point, by_row = derivatives(local, parameters.rows[lens], bundle.sizes[own], bundle.fisheye[own], bundle.free)
-    by_camera = np.concatenate([by_point @ _crosses(-turned), by_point, by_row], 2)
+    by_camera = np.concatenate([by_point @ cross_matrices(-turned), by_point, by_row], 2)
     by_world = by_point @ parameters.rotations[own]
-    by_body = np.concatenate([by_world @ _crosses(-on_body), by_world], 2) if bundle.rotating else by_world
+    by_body = np.concatenate([by_world @ cross_matrices(-on_body), by_world], 2) if bundle.rotating else by_world
     free = len(bundle.free)
     columns = np.concatenate([6 * own[:, None] + np.arange(6), poses + free * lens[:, None] + np.arange(free)], 1)
     return by_camera, by_body, columns
@@ -230,15 +230,7 @@ def _moved(bundle: Bundle, parameters: Parameters, step: Floats, body_step: Floa
     )
 
 
-def _crosses(vectors: Floats) -> Floats:
-    """Matrices ``[M, 3, 3]`` of the cross product from the left."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3)
-
-
 _log = logging.getLogger(__name__)
-
 
 MAX_PIXELS = 3.0
 ROUNDS, STEPS, SAME = 8, 2, 0.05
@@ -259,26 +251,23 @@ class Limits:
 
 
 def adjust_together(
-    found: SolvedCalibration,
-    *,
-    lens: Sequence[int],
-    free: Sequence[int],
-    limits: Limits,
+    found: SolvedCalibration, *, lens: Sequence[int], free: Sequence[int], limits: Limits
 ) -> SolvedCalibration:
-    """``found`` with poses, points and the free terms of its lenses adjusted, without the observations that are off.
-
-    Args:
-        lens: number of the lens of each camera; cameras with shared intrinsics have one.
-        free: the terms of ``lens_terms.py`` that are estimated.
-    """
+    """``found`` with poses, points and the free terms (``lens_terms.py``) of its lenses adjusted, without the
+    observations that are off. ``lens`` has the number of the lens of each camera; cameras with shared intrinsics have
+    one."""
     bundle, parameters = _problem(found, np.asarray(lens, np.intp), tuple(free))
     bundle, parameters = estimated(bundle, parameters)
-    adjusted = _result(found, bundle, parameters)
+    adjusted = replace(
+        found, cameras=cameras_in(parameters, found.cameras, bundle.lens), points=parameters.body_positions
+    )
     inliers = cleaned(adjusted, limits)
     _log_adjustment(adjusted, inliers, bundle)
     again, parameters = _problem(inliers, bundle.lens, bundle.free)
     again = replace(again, prior=bundle.prior, noise=bundle.noise)
-    return cleaned(_result(inliers, again, solved(again, parameters)), limits)
+    parameters = solved(again, parameters)
+    cameras = cameras_in(parameters, inliers.cameras, again.lens)
+    return cleaned(replace(inliers, cameras=cameras, points=parameters.body_positions), limits)
 
 
 def cleaned(found: SolvedCalibration, limits: Limits) -> SolvedCalibration:
@@ -314,11 +303,8 @@ def posed_problem(
     free: tuple[int, ...],
     rotating: bool,
 ) -> tuple[Bundle, Parameters]:
-    """The problem of cameras that see bodies, with the usual prior of their lenses.
-
-    Args:
-        bodies: rotations ``[B, 3, 3]`` and positions ``[B, 3]``.
-    """
+    """The problem of cameras that see ``bodies``, rotations ``[B, 3, 3]`` and positions ``[B, 3]``, with the usual
+    prior of their lenses."""
     _, first = np.unique(lens, return_index=True)
     rows = np.stack([row_of(cameras[index]) for index in first])
     sizes = np.array([[filmed.camera.width, filmed.camera.height] for filmed in cameras], np.float64)
@@ -350,10 +336,6 @@ def _with_noise(bundle: Bundle, parameters: Parameters) -> Bundle:
     poses, lenses, size = bundle.columns
     left = max(0.1, 1 - (poses + lenses + size * len(parameters.body_positions)) / (2 * len(residuals)))
     return replace(bundle, noise=max(float(np.median(residuals)) / NORMAL_MEDIAN / np.sqrt(left), 1e-3))
-
-
-def _result(found: SolvedCalibration, bundle: Bundle, parameters: Parameters) -> SolvedCalibration:
-    return replace(found, cameras=cameras_in(parameters, found.cameras, bundle.lens), points=parameters.body_positions)
 
 
 def cameras_in(

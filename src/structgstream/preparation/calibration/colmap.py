@@ -6,10 +6,9 @@ camera poses with OpenCV axes, so nothing is converted but names and orders of p
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import astuple
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,9 +17,7 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
 from structgstream.errors import MissingExtraError
-
-LensModel = Literal["pinhole", "radial", "opencv", "brown", "fisheye"]
-"""What is estimated of a lens: nothing; k1, k2; k1, k2, p1, p2; the same and k3; k1 to k4 of a fisheye."""
+from structgstream.preparation.calibration.lens_terms import LensModel
 
 MODELS: dict[LensModel, str] = {
     "pinhole": "PINHOLE",
@@ -29,6 +26,7 @@ MODELS: dict[LensModel, str] = {
     "brown": "OPENCV",  # none of COLMAP's ends at k3, which is added after its models (bundle.py)
     "fisheye": "OPENCV_FISHEYE",
 }
+TERMS_OF = {"PINHOLE": 0, "RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 4, "FULL_OPENCV": 8}  # of distortion
 QUIET = 3  # COLMAP logs every step and every failed start; results are reported by the callers
 
 
@@ -45,21 +43,18 @@ def pycolmap_module() -> ModuleType:
 def colmap_camera(filmed: LensCamera, number: int, *, model: str | None = None) -> Any:
     """``filmed``'s intrinsics and lens as a camera of pycolmap with the id ``number``.
 
-    Args:
-        model: a name of COLMAP's, at least as general as the lens; by default the smallest that holds it.
+    ``model`` is a name of COLMAP's, at least as general as the lens; by default the smallest that holds it.
     """
     K = filmed.camera.K.numpy()
     model = model or holding(filmed.lens)
-    if model == "RADIAL":
-        parameters = [(K[0, 0] + K[1, 1]) / 2, K[0, 2], K[1, 2], *_terms(filmed.lens, model)]
-    else:
-        parameters = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *_terms(filmed.lens, model)]
+    focal = [(K[0, 0] + K[1, 1]) / 2] if model == "RADIAL" else [K[0, 0], K[1, 1]]
+    terms = ([float(value) for value in astuple(filmed.lens)] + [0.0] * 8)[: TERMS_OF[model]]
     return pycolmap_module().Camera(
         camera_id=number,
         model=model,
         width=filmed.camera.width,
         height=filmed.camera.height,
-        params=parameters,
+        params=[*focal, K[0, 2], K[1, 2], *terms],
         has_prior_focal_length=True,
     )
 
@@ -76,14 +71,15 @@ def holding(lens: Lens) -> str:
 def filmed_camera(camera: Any, cam_from_world: Any) -> LensCamera:
     """A camera of pycolmap and a pose as a :class:`LensCamera`."""
     values = [float(value) for value in camera.params]
-    name = camera.model_name
-    if name == "RADIAL":
-        focal, across, down = [values[0]] * 2, values[1], values[2]
-        lens: Lens = RadialTangential(*values[3:])
-    else:
-        focal, across, down = values[:2], values[2], values[3]
-        lens = _lens(name, values[4:])
-    K = torch.tensor([[focal[0], 0.0, across], [0.0, focal[1], down], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    if camera.model_name == "RADIAL":
+        values = [values[0], *values]
+    fx, fy, cx, cy, *terms = values
+    lens: Lens = Pinhole()
+    if camera.model_name == "OPENCV_FISHEYE":
+        lens = Fisheye(*terms)
+    elif any(terms) or camera.model_name == "RADIAL":
+        lens = RadialTangential(*terms)
+    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3] = torch.from_numpy(np.array(cam_from_world.matrix()))
     return LensCamera(Camera(viewmat, K, camera.width, camera.height), lens)
@@ -93,17 +89,6 @@ def colmap_pose(viewmat: NDArray[np.float64]) -> Any:
     """A world-to-camera matrix ``[4, 4]`` as a rigid motion of pycolmap."""
     pycolmap = pycolmap_module()
     return pycolmap.Rigid3d(pycolmap.Rotation3d(np.ascontiguousarray(viewmat[:3, :3])), viewmat[:3, 3])
-
-
-def _terms(lens: Lens, model: str) -> Sequence[float]:
-    counts = {"PINHOLE": 0, "RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 4, "FULL_OPENCV": 8}
-    return ([float(value) for value in astuple(lens)] + [0.0] * 8)[: counts[model]]
-
-
-def _lens(name: str, terms: Sequence[float]) -> Lens:
-    if name == "OPENCV_FISHEYE":
-        return Fisheye(*terms)
-    return RadialTangential(*terms) if any(terms) else Pinhole()
 
 
 def guessed_camera(lens: LensModel, number: int, size: tuple[int, int], degrees: float) -> Any:

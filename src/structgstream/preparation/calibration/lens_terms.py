@@ -17,6 +17,7 @@ where the pictures distinguish lenses they differ, and where they do not they ar
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -25,8 +26,9 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
 from structgstream.geometry import Floats
-from structgstream.preparation.calibration.colmap import LensModel
 
+LensModel = Literal["pinhole", "radial", "opencv", "brown", "fisheye"]
+"""What is estimated of a lens: nothing; k1, k2; k1, k2, p1, p2; the same and k3; k1 to k4 of a fisheye."""
 FOCAL, ASPECT, ACROSS, DOWN = range(4)
 K1, K2, P1, P2, K3 = range(4, 9)
 TERMS = 12
@@ -163,13 +165,9 @@ USUAL: Mapping[int, tuple[float, float]] = {
     K3: (1.0, 0.02),
 }
 USUAL_FISHEYE: Mapping[int, tuple[float, float]] = {
-    ASPECT: (0.005, 0.0005),
-    ACROSS: (0.01, 0.002),
-    DOWN: (0.01, 0.002),
+    **{term: USUAL[term] for term in (ASPECT, ACROSS, DOWN)},
     4: (0.2, 0.005),
-    5: (0.1, 0.005),
-    6: (0.1, 0.005),
-    7: (0.1, 0.005),
+    **dict.fromkeys((5, 6, 7), (0.1, 0.005)),
 }
 WORTH = 2.0  # lenses that the usual differences count as, in addition to those of the rig
 MIN_DIFFERENCE = 0.01  # of the usual differences

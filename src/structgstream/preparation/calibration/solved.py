@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from structgstream.data.calibration import Alignment, alignment
 from structgstream.data.lenses import LensCamera
-from structgstream.data.matching import level_normal
 from structgstream.errors import CalibrationError
 from structgstream.geometry import Floats
 
@@ -108,21 +107,3 @@ def with_distance(solved: SolvedCalibration, first: str, second: str, *, metres:
     if not metres > 0 or first == second or distance == 0:
         raise CalibrationError(f"A distance of {metres:g} m between {first!r} and {second!r} gives no scale.")
     return solved.aligned(Alignment(metres / distance, np.eye(3), np.zeros(3)), metres=True)
-
-
-def upright(solved: SolvedCalibration) -> SolvedCalibration:
-    """Turned so that up is -y, as estimated from the cameras' horizontal axes; the origin stays."""
-    up = level_normal({name: filmed.camera for name, filmed in solved.cameras.items()})
-    if np.linalg.norm(up) < 0.5:
-        return solved
-    return solved.aligned(Alignment(1.0, _turn(up, np.array([0.0, -1.0, 0.0])), np.zeros(3)))
-
-
-def _turn(start: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The smallest rotation that turns one unit vector to another."""
-    axis, cosine = np.cross(start, end), float(start @ end)
-    if cosine < -1 + 1e-9:
-        return np.diag([1.0, -1.0, -1.0])
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + cross + cross @ cross / (1 + cosine)

@@ -24,7 +24,7 @@ from structgstream.data.matching import (
 )
 from structgstream.frames import MultiViewFrame
 from structgstream.geometry import Floats
-from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.check import Finding
 from structgstream.pose_check.tracks import AGREE_PIXELS, Evidence, gather, pixel_scale
 
 KEYPOINTS = 1200
@@ -82,11 +82,8 @@ def picture_movement(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> Moveme
 def bump_findings(
     first: MultiViewFrame, last: MultiViewFrame, evidence: Evidence, cameras: Mapping[str, Camera]
 ) -> list[Finding]:
-    """Cameras that were bumped between two frames, and once those for which that cannot be measured.
-
-    Args:
-        first: the frame of ``evidence``.
-    """
+    """Cameras that were bumped between two frames, and once those for which that cannot be measured; ``first`` is the
+    frame of ``evidence``."""
     names = [name for name in cameras if name in first.images and name in last.images]
     movements = {name: picture_movement(first.images[name], last.images[name]) for name in names}
     moved = {name: movement for name, movement in movements.items() if movement is not None and not movement.stayed}
@@ -99,10 +96,21 @@ def bump_findings(
     for name, movement in moved.items():
         judged = _judged(name, movement, (evidence, later), cameras)
         if judged == "bumped" or (judged == "unknown" and background):
-            findings.append(_bumped(name, movement, (first.index, last.index)))
+            sentence = (
+                f"Camera {name!r} was bumped between frame {first.index} and frame {last.index}: its picture is "
+                f"shifted by {movement.pixels:.1f} pixels; use the frames before, or film again with the camera fixed."
+            )
+            findings.append(Finding("error", sentence, (name,)))
         elif judged == "unknown":
             unknown.append(name)
-    return findings + ([_undecided(unknown, (first.index, last.index))] if unknown else [])
+    if unknown:
+        sentence = (
+            f"It cannot be determined whether {listed(unknown)} stood still between frame {first.index} and frame "
+            f"{last.index}: nearly all that their pictures show moved, and no other camera confirms it; let something "
+            "with texture stand still in the pictures."
+        )
+        findings.append(Finding("note", sentence, tuple(unknown)))
+    return findings
 
 
 def _judged(
@@ -141,22 +149,3 @@ def _votes(name: str, change: Floats, evidence: Evidence, cameras: Mapping[str, 
 def _moved(pixels: Floats, homography: NDArray[np.float64]) -> Floats:
     moved = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ homography.T
     return moved[:, :2] / moved[:, 2:]
-
-
-def _bumped(name: str, movement: Movement, frames: tuple[int, int]) -> Finding:
-    return Finding(
-        "error",
-        f"Camera {name!r} was bumped between frame {frames[0]} and frame {frames[1]}: its picture is shifted by "
-        f"{movement.pixels:.1f} pixels; use the frames before, or film again with the camera fixed.",
-        (name,),
-    )
-
-
-def _undecided(names: list[str], frames: tuple[int, int]) -> Finding:
-    return Finding(
-        "note",
-        f"It cannot be determined whether {listed(names)} stood still between frame {frames[0]} and frame {frames[1]}: "
-        "nearly all that their pictures show moved, and no other camera confirms it; let something with texture stand "
-        "still in the pictures.",
-        tuple(names),
-    )

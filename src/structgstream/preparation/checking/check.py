@@ -8,11 +8,9 @@ from typing import Any
 import numpy as np
 
 from structgstream.cameras import Camera
-from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import select_cameras
+from structgstream.data.source import FrameSource, select_cameras
 from structgstream.frames import MultiViewFrame
-from structgstream.pose_check.check import examine_poses
-from structgstream.pose_check.findings import Finding, explain, worst_first
+from structgstream.pose_check.check import Finding, examine_poses, explain, worst_first
 from structgstream.pose_check.tracks import MIN_VIEWS, Evidence, Tracks, pair_errors
 from structgstream.pose_check.verdicts import Suspects, Verdict
 from structgstream.preparation.checking.bumps import bump_findings
@@ -40,7 +38,7 @@ from structgstream.preparation.checking.times import (
     check_synchronization,
     time_findings,
 )
-from structgstream.preparation.steps import Listener, Silent
+from structgstream.preparation.output_folder import Listener, Silent
 
 
 @dataclass(frozen=True)
@@ -74,18 +72,15 @@ class CameraCheck:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """The numbers of a check; ``as_json`` is what ``report.json`` holds.
+    """The numbers of a check; ``as_json`` is what ``report.json`` holds. Lengths are in the capture's units.
 
     Args:
         capture: its name.
         frame: the frame that was looked at.
         cameras: by name, in the order of the rig.
         pairs: all pairs that were matched.
-        coverage: of the points.
         findings: the worst first.
-        rig_radius: in the capture's units.
-        near: near plane, in the capture's units.
-        nearest: depth that 0.5 % of the points fall below, in the capture's units; None without points.
+        nearest: depth that 0.5 % of the points fall below; None without points.
         unit: of length, where the capture states it.
         steps: summaries of the preparation's steps, where there was one.
     """
@@ -160,11 +155,7 @@ def examine(frame: MultiViewFrame, cameras: Mapping[str, Camera]) -> Examination
 
 
 def examine_capture(source: FrameSource) -> Examination:
-    """The examination of the first frame of a capture that all cameras have.
-
-    Raises:
-        CaptureError: a frame cannot be read.
-    """
+    """The examination of the first frame of a capture that all cameras have."""
     presence = stated_presence(source)
     return replace(examine(whole_frame(source, presence), source.rig.cameras), presence=presence)
 
@@ -176,14 +167,8 @@ def check_capture(
     listener: Listener | None = None,
     examination: Examination | None = None,
 ) -> Checked:
-    """Checks the first frame that all cameras have and the last; held-out cameras are checked, too.
-
-    Args:
-        unit: of length, where it is known.
-
-    Raises:
-        CaptureError: a frame cannot be read.
-    """
+    """Checks the first frame that all cameras have and the last; held-out cameras are checked, too. ``unit`` is that of
+    length, where it is known."""
     cameras = source.rig.cameras
     listener = listener or Silent()
     listener.progress(0, 3, "first frame")
@@ -192,10 +177,15 @@ def check_capture(
     findings = explain(first.evidence, first.cameras, first.verdict)
     findings += overlap_findings(first.evidence.overlapping(), list(first.cameras))
     depths = observed_depths(first.tracks, first.cameras, off=first.suspects.off)
-    radius = _radius(first.cameras, first.suspects)
+    off = () if first.suspects.everything else first.suspects.off
+    centers = np.stack([camera.center.numpy() for name, camera in first.cameras.items() if name not in off])
+    middle = centers.mean(0)
+    radius = float(np.linalg.norm(centers - middle, axis=1).max())
     if not first.suspects.everything:
         seen = {name: cameras[name] for name in first.cameras}  # with the near plane of now
-        points = None if _any_far_away(first.cameras, first.suspects, radius) else source.points
+        # A camera that is off may stand as in another unit: points that were estimated with it are as wrong.
+        away = [float(np.linalg.norm(first.cameras[name].center.numpy() - middle)) for name in off]
+        points = None if max(away, default=0.0) > FAR_AWAY * radius else source.points
         findings += scale_findings(depths, points, seen, radius=radius, unit=unit)
     findings += color_findings(first.colors)
     listener.progress(1, 3, "last frame")
@@ -208,12 +198,13 @@ def check_capture(
     times = _measured_times(source, first.suspects)
     findings += time_findings(times)
     listener.progress(3, 3, "")
+    solid = first.tracks.points[first.tracks.views >= MIN_VIEWS]
     report = CheckReport(
         capture=source.name,
         frame=first.frame.index,
         cameras=_camera_checks(first, source, times, presence),
         pairs=_pair_checks(first),
-        coverage=coverage(_solid_points(first.tracks), first.cameras),
+        coverage=coverage(solid if len(solid) else first.tracks.points, first.cameras),
         findings=worst_first(findings),
         rig_radius=radius,
         near=float(np.median([camera.near for camera in cameras.values()])),
@@ -229,32 +220,6 @@ def _measured_times(source: FrameSource, suspects: Suspects) -> SynchronizationC
     if suspects.everything or len(good) < MIN_TIMED or len(source) < MIN_FRAMES:
         return None
     return check_synchronization(select_cameras(source, good) if suspects.off else source)
-
-
-def _radius(cameras: Mapping[str, Camera], suspects: Suspects) -> float:
-    """Largest distance of a camera that is not off to the middle of these."""
-    centers = _sound_centers(cameras, suspects)
-    return float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
-
-
-def _any_far_away(cameras: Mapping[str, Camera], suspects: Suspects, radius: float) -> bool:
-    """Whether a camera that is off stands as in another unit: points that were estimated with it are as wrong."""
-    middle = _sound_centers(cameras, suspects).mean(0)
-    far = [float(np.linalg.norm(cameras[name].center.numpy() - middle)) for name in suspects.off]
-    return max(far, default=0.0) > FAR_AWAY * radius
-
-
-def _sound_centers(cameras: Mapping[str, Camera], suspects: Suspects) -> np.ndarray:
-    """Of the cameras that are not off, ``[C, 3]``; of all where all look off."""
-    off = () if suspects.everything else suspects.off
-    return np.stack([camera.center.numpy() for name, camera in cameras.items() if name not in off])
-
-
-def _solid_points(tracks: Tracks) -> np.ndarray:
-    """Points that at least three cameras observed, or two where that is all there is."""
-    views = tracks.views
-    solid = tracks.points[views >= MIN_VIEWS]
-    return solid if len(solid) else tracks.points
 
 
 def _camera_checks(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from structgstream.data.images import opencv
 from structgstream.geometry import Floats
-from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.check import Finding
 from structgstream.pose_check.tracks import Evidence
 
 PATCH = 7

@@ -11,7 +11,7 @@ from structgstream.cameras import Camera
 from structgstream.data.calibration import listed
 from structgstream.data.matching import Pair, connected_groups, inside, project
 from structgstream.geometry import Floats
-from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.check import Finding
 from structgstream.pose_check.tracks import MIN_VIEWS, Tracks
 
 MIN_OVERLAPS = 2
@@ -65,24 +65,18 @@ def overlap_findings(pairs: Collection[Pair], names: Collection[str]) -> list[Fi
     whole, *others = connected_groups(names, pairs)
     single = [group[0] for group in others if len(group) == 1]
     for group in ([single] if single else []) + [group for group in others if len(group) > 1]:
-        findings.append(
-            Finding(
-                "warning",
-                f"The pictures of {listed(group)} have no matches with those of the others, so their poses are not "
-                "checked; move them closer to the others, or film a calibration board there.",
-                tuple(group),
-            )
+        sentence = (
+            f"The pictures of {listed(group)} have no matches with those of the others, so their poses are not "
+            "checked; move them closer to the others, or film a calibration board there."
         )
+        findings.append(Finding("warning", sentence, tuple(group)))
     for name, count in overlaps(pairs, names).items():
         if name in whole and count < MIN_OVERLAPS <= len(names) - 1:
-            findings.append(
-                Finding(
-                    "warning",
-                    f"Camera {name!r} has matches with {count} other camera only; what it alone sees has no depth: "
-                    "move it closer to its neighbours.",
-                    (name,),
-                )
+            sentence = (
+                f"Camera {name!r} has matches with {count} other camera only; what it alone sees has no depth: "
+                "move it closer to its neighbours."
             )
+            findings.append(Finding("warning", sentence, (name,)))
     return findings
 
 
@@ -126,12 +120,10 @@ def scale_findings(
     radius: float,
     unit: str | None,
 ) -> list[Finding]:
-    """What contradicts in lengths.
+    """What contradicts in lengths, which are in ``unit`` where the capture states it.
 
-    Args:
-        depths: of points that the pictures confirm, see :func:`observed_depths`.
-        points: ``[P, 3]`` that came with the capture, or None.
-        unit: of length, where the capture states it.
+    ``depths`` are of points that the pictures confirm (:func:`observed_depths`), ``points`` ``[P, 3]`` came with the
+    capture.
     """
     findings = []
     near = float(np.median([camera.near for camera in cameras.values()]))
@@ -172,7 +164,7 @@ def scale_findings(
 
 def _foreign(points: Floats, depths: Floats, cameras: Mapping[str, Camera]) -> str | None:
     """A sentence when the points that came along are not of these cameras."""
-    fits = _share_seen(points, cameras)
+    fits = float((cameras_per_point(points, cameras) >= 2).mean())
     if len(depths) < MIN_POINTS:
         return None
     typical = float(np.median(depths))
@@ -198,7 +190,3 @@ def _foreign(points: Floats, depths: Floats, cameras: Mapping[str, Camera]) -> s
 
 def _typical_depth(points: Floats, cameras: Mapping[str, Camera]) -> float:
     return max(float(np.median([np.abs(project(camera, points)[1]) for camera in cameras.values()])), 1e-12)
-
-
-def _share_seen(points: Floats, cameras: Mapping[str, Camera]) -> float:
-    return float((cameras_per_point(points, cameras) >= 2).mean())

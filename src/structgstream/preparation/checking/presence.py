@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.images import ImageSource
-from structgstream.data.source import FrameSource
+from structgstream.data.source import FrameSource, unwrapped
 from structgstream.data.video import VideoSource
-from structgstream.data.wrappers import unwrapped
 from structgstream.frames import MultiViewFrame
-from structgstream.pose_check.findings import Finding
+from structgstream.pose_check.check import Finding
 
 Presence = dict[str, NDArray[np.bool_]]
 MAX_TRIED = 4  # frames, where pictures that should be there cannot be decoded
@@ -55,9 +54,6 @@ def whole_frame(source: FrameSource, presence: Presence) -> MultiViewFrame:
 
     Where there is none it is one of those with most pictures, and the others come from other frames: cameras stand
     still. What turns out not to be decodable is noted in ``presence``.
-
-    Raises:
-        CaptureError: a frame cannot be read.
     """
     counts = np.sum(list(presence.values()), axis=0)
     fullest = np.flatnonzero(counts == counts.max())
@@ -88,38 +84,62 @@ def presence_findings(
 
     Where many drop frames, as phones do, one warning has them all. Cameras are never stopped in the same instant: those
     that end within :func:`_slack` of the last one are in one note, which states what all have. Another one has
-    those whose clocks run slow.
-
-    Args:
-        presence: by camera, whether it has a picture of each frame.
-        fps: frames a second.
-        passed: what cameras lack without having dropped it, see :func:`passed_frames`.
+    those whose clocks run slow, by what they lack without having dropped it (``passed``, of :func:`passed_frames`).
     """
-    passed = passed or {}
+    passed, findings = passed or {}, []
     ends = {name: int(np.flatnonzero(own)[-1]) + 1 for name, own in presence.items() if own.any()}
     slack = _slack(max(map(len, presence.values()), default=0), fps)
-    early = {name: end for name, end in ends.items() if 0 < len(presence[name]) - end <= slack}
-    findings = [_stopped(early, max(ends.values()), fps)] if early else []
+    if early := {name: end for name, end in ends.items() if 0 < len(presence[name]) - end <= slack}:
+        names, first = list(early), min(early.values())
+        shown = ", ".join(map(repr, names[:8])) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
+        sentence = (
+            f"{shown} {'end' if len(names) > 1 else 'ends'} up to {(max(ends.values()) - first) / fps:.2f} s before "
+            "the last camera, as cameras do that are stopped by hand; all of these have pictures up to frame "
+            f"{first - 1} ({(first - 1) / fps:.2f} s)."
+        )
+        findings.append(Finding("note", sentence, tuple(names)))
     presence = {name: own[: early.get(name, len(own))] for name, own in presence.items()}
     if passed:
-        findings.append(_slow(passed, fps))
+        shown = ", ".join(
+            f"{name!r} {len(frames)}, the first at {frames[0] / fps:.2f} s" for name, frames in passed.items()
+        )
+        sentence = (
+            f"Frames without a picture of cameras that dropped none: {shown}. Their clocks run slower than those of "
+            "the others, so that their pictures pass from one frame to the next."
+        )
+        findings.append(Finding("note", sentence, tuple(passed)))
     lacking = {name: np.flatnonzero(~own[: ends.get(name, 0)]) for name, own in presence.items()}
     lacking = {name: np.setdiff1d(gaps, passed.get(name, [])) for name, gaps in lacking.items()}
     dropping = {name: gaps for name, gaps in lacking.items() if len(gaps)}
     for name, present in presence.items():
+        end, total = ends.get(name, 0), len(present)
         sentences = []
-        if not present.any():
+        if not end:
             sentences.append(
                 f"Camera {name!r} has no picture of any frame that can be read; leave it out, or restore its files."
             )
         if name in dropping and len(dropping) <= MAX_SINGLE:
-            sentences.append(_dropped(name, dropping[name], len(present), fps))
-        if 0 < ends.get(name, 0) < len(present):
-            sentences.append(_ended(name, ends[name], len(present), fps))
+            first = dropping[name][0]
+            sentences.append(
+                f"Camera {name!r} lacks {len(dropping[name])} of {total} frames, the first of them frame {first} "
+                f"({first / fps:.2f} s): it dropped or damaged them, and the others alone see what happens there; "
+                "film with a faster card or a lower data rate."
+            )
+        if 0 < end < total:
+            sentences.append(
+                f"Camera {name!r} ends with frame {end - 1} ({(end - 1) / fps:.2f} s) and is absent from the "
+                f"{total - end} frames after that; use the frames before, or leave it out."
+            )
         if sentences:
             findings.append(Finding("warning", " ".join(sentences), (name,)))
     if len(dropping) > MAX_SINGLE:
-        findings.append(_all_dropped(dropping, max(map(len, presence.values()))))
+        names = sorted(dropping, key=lambda name: -len(dropping[name]))
+        shown = ", ".join(f"{name!r} {len(dropping[name])}" for name in names)
+        sentence = (
+            f"{len(names)} cameras lack some of {max(map(len, presence.values()))} frames ({shown}): they dropped or "
+            "damaged them, and the others alone see what happens there; film with faster cards or a lower data rate."
+        )
+        findings.append(Finding("warning", sentence, tuple(names)))
     if late := tuple(name for name, own in presence.items() if own.any() and not own[0]):
         findings.append(_without_start(late, presence))
     return findings
@@ -136,63 +156,10 @@ def _passed(own: Sequence[int | None], stamps: Sequence[int]) -> NDArray[np.intp
     return np.concatenate([np.arange(frames[at] + 1, frames[at + 1]) for at in whole] or [np.empty(0, np.intp)])
 
 
-def _slow(passed: Mapping[str, NDArray[np.intp]], fps: float) -> Finding:
-    listed = ", ".join(
-        f"{name!r} {len(frames)}, the first at {frames[0] / fps:.2f} s" for name, frames in passed.items()
-    )
-    return Finding(
-        "note",
-        f"Frames without a picture of cameras that dropped none: {listed}. Their clocks run slower than those of the "
-        "others, so that their pictures pass from one frame to the next.",
-        tuple(passed),
-    )
-
-
 def _slack(frames: int, fps: float) -> int:
     """Frames that a camera may lack at the end: half a second or 5 % of the take, whichever is more, and never more
     than a quarter of it."""
     return round(min(max(LOST_SECONDS * fps, LOST_SHARE * frames), MAX_LOST_SHARE * frames))
-
-
-def _stopped(ends: Mapping[str, int], last: int, fps: float) -> Finding:
-    """What cameras that end a little early leave, by the number of frames at which each ends."""
-    names = list(ends)
-    listed = ", ".join(map(repr, names[:8])) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
-    first = min(ends.values())
-    return Finding(
-        "note",
-        f"{listed} {'end' if len(names) > 1 else 'ends'} up to {(last - first) / fps:.2f} s before the last camera, as "
-        f"cameras do that are stopped by hand; all of these have pictures up to frame {first - 1} "
-        f"({(first - 1) / fps:.2f} s).",
-        tuple(names),
-    )
-
-
-def _dropped(name: str, gaps: NDArray[np.intp], total: int, fps: float) -> str:
-    return (
-        f"Camera {name!r} lacks {len(gaps)} of {total} frames, the first of them frame {gaps[0]} "
-        f"({gaps[0] / fps:.2f} s): it dropped or damaged them, and the others alone see what happens there; "
-        "film with a faster card or a lower data rate."
-    )
-
-
-def _all_dropped(dropping: Mapping[str, NDArray[np.intp]], total: int) -> Finding:
-    """What many cameras lack, those that lack most first."""
-    names = sorted(dropping, key=lambda name: -len(dropping[name]))
-    listed = ", ".join(f"{name!r} {len(dropping[name])}" for name in names)
-    return Finding(
-        "warning",
-        f"{len(names)} cameras lack some of {total} frames ({listed}): they dropped or damaged them, and the others "
-        "alone see what happens there; film with faster cards or a lower data rate.",
-        tuple(names),
-    )
-
-
-def _ended(name: str, end: int, total: int, fps: float) -> str:
-    return (
-        f"Camera {name!r} ends with frame {end - 1} ({(end - 1) / fps:.2f} s) and is absent from the {total - end} "
-        "frames after that; use the frames before, or leave it out."
-    )
 
 
 def _without_start(late: tuple[str, ...], presence: Presence) -> Finding:

@@ -10,20 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.lenses import LensCamera, Pinhole
-from structgstream.data.source import FrameSource
-from structgstream.data.wrappers import apart_seconds
-from structgstream.pose_check.findings import Finding
+from structgstream.data.source import FrameSource, apart_seconds
+from structgstream.pose_check.check import Finding
 from structgstream.preparation.synchronization.correlation import require_scipy
 from structgstream.preparation.synchronization.motion import (
-    agreeing_cameras,
-    pair_signals,
-    solve_by_motion,
-)
-from structgstream.preparation.synchronization.motion_signals import (
     CalibratedGeometry,
     Changes,
+    agreeing_cameras,
+    pair_signals,
     reduced_changes,
     reduced_grey,
+    solve_by_motion,
 )
 from structgstream.preparation.synchronization.synchronize import WARNED_SECONDS
 
@@ -76,9 +73,6 @@ def check_synchronization(source: FrameSource) -> SynchronizationCheck:
     """By how much each camera of a calibrated capture is late, from its first frames.
 
     Held-out cameras are checked, too: nothing is fitted to their pictures.
-
-    Raises:
-        CaptureError: the pictures cannot be read.
     """
     require_scipy()
     period = 1 / source.fps

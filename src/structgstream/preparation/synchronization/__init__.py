@@ -1,11 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
 """Clocks of cameras that run freely, from tables, time stamps, sound or motion."""
-
-from structgstream.preparation.synchronization.synchronize import (
-    METHODS,
-    Method,
-    Synchronization,
-    synchronize,
-)
-
-__all__ = ["METHODS", "Method", "Synchronization", "synchronize"]

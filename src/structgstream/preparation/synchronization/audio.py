@@ -212,12 +212,8 @@ class Sound(Recording):
 
 
 class UnusableSoundError(CaptureError):
-    """The sound of cameras cannot synchronise them.
-
-    Args:
-        reason: a sentence without its full stop.
-        remedy: what to do, the rest of the sentence.
-    """
+    """The sound of cameras cannot synchronise them; ``reason`` is a sentence without its full stop, ``remedy`` its
+    rest."""
 
     def __init__(self, reason: str, remedy: str) -> None:
         super().__init__(f"{reason}; {remedy}.")
@@ -225,11 +221,7 @@ class UnusableSoundError(CaptureError):
 
 
 def sound_of(name: str, audio: tuple[NDArray[np.float32], float]) -> Sound:
-    """What camera ``name`` recorded.
-
-    Raises:
-        UnusableSoundError: silence, or less than a second.
-    """
+    """What camera ``name`` recorded; silence, or less than a second, is an :class:`UnusableSoundError`."""
     samples, rate = audio
     if len(samples) < MIN_OVERLAP_SECONDS * rate:
         raise UnusableSoundError(
@@ -253,12 +245,11 @@ def audio_lags(sounds: Mapping[str, Sound]) -> list[PairLag]:
 def solve_by_audio(
     takes: Mapping[str, tuple[float, float]], lags: Sequence[PairLag], *, drift: bool = True
 ) -> Solution:
-    """Clocks by sound.
+    """Clocks by sound, with rates other than 1 where ``drift`` is considered.
 
     Args:
         takes: camera to the first and last second of its take.
         lags: what :func:`audio_lags` gives; they must connect all cameras (:func:`connected_by`).
-        drift: whether rates other than 1 are considered.
     """
     # A wrong peak is off by as much in all windows of a pair: drift is estimated from windows, offsets from pairs.
     sharp = solve_clocks(takes, _matches(lags, [0.0] * len(lags)), drift=drift, slack_seconds=SLACK_SECONDS)

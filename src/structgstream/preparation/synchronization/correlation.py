@@ -57,10 +57,7 @@ class Lag:
 
 
 def require_scipy() -> None:
-    """
-    Raises:
-        MissingExtraError: scipy is not installed.
-    """
+    """A ``MissingExtraError`` where scipy is not installed."""
     try:
         import scipy  # noqa: F401
     except ImportError:
@@ -81,15 +78,9 @@ def resampled(values: Floats, stamps: Floats, *, step: float) -> Signal:
 def best_lag(
     first: Signal, second: Signal, *, within: tuple[float, float] | None = None, min_overlap: int = 8
 ) -> Lag | None:
-    """The lag of the largest correlation; None if there is no overlap, no change in
-    it, or no peak.
-
-    Args:
-        first: a signal.
-        second: another, of the same step and channels.
-        within: smallest and largest lag in seconds; None for all.
-        min_overlap: smallest number of samples in common.
-    """
+    """The lag of the largest correlation of signals of one step and as many channels, with ``min_overlap`` samples or
+    more in common; None if there is no overlap, no change in it, or no peak ``within`` the smallest and largest lag in
+    seconds."""
     score, numerators, energy, counts, lags = _scores(first, second, min_overlap)
     seconds = second.start - first.start + lags * first.step
     if within is not None:
@@ -119,16 +110,13 @@ def best_lag(
 
 
 def lag_changes(first: Signal, second: Signal, lag_seconds: float, edges: Floats) -> Floats:
-    """By how much the lag of the largest correlation grows without each block of the take, ``[K]`` seconds.
+    """By how much the lag of the largest correlation, at ``lag_seconds`` of :func:`best_lag`, grows without each block
+    of the take, ``[K]`` seconds.
 
     Blocks that all pairs of cameras share show errors that all pairs of a camera share: of things that move for less
     than a frame one camera's frames see other parts than another's. Leaving out channels does not show these.
 
-    Args:
-        first: a signal.
-        second: another, of the same step and channels.
-        lag_seconds: what :func:`best_lag` found.
-        edges: ``[K + 1]`` bounds of the blocks by the first signal's time.
+    ``edges`` are the ``[K + 1]`` bounds of the blocks by the first signal's time.
     """
     best = round((lag_seconds - second.start + first.start) / first.step)
     blocks = len(edges) - 1
@@ -284,8 +272,6 @@ def fitted_line(
     """The line that agrees best with two signals; None where they overlap or move too little.
 
     Args:
-        first: a signal.
-        second: another, of the same step and channels.
         expected_seconds: time in the second signal minus time in the first, known to two samples.
         edges: ``[K + 1]`` bounds of the blocks by the first signal's time.
         rates: whether the lag may change.

@@ -79,12 +79,11 @@ def solve_clocks(
     drift: bool,
     slack_seconds: float,
 ) -> Solution:
-    """The clocks of all cameras.
+    """The clocks of all cameras, with rates other than 1 where ``drift`` is considered.
 
     Args:
         takes: camera to the first and last second of its take, by its own clock.
         matches: instants of pairs; they must connect all cameras.
-        drift: whether rates other than 1 are considered.
         slack_seconds: how far right correspondences may be off before rates are known.
     """
     names = list(takes)

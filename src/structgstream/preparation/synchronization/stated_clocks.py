@@ -41,15 +41,11 @@ class StatedClock:
 
 
 def read_timestamps(file: Path, stamps: Mapping[str, Floats]) -> dict[str, StatedClock]:
-    """The clocks that a table states.
-
-    Args:
-        stamps: camera to the seconds ``[T]`` of all its frames by its own clock.
+    """The clocks that a table states for cameras whose frames are at ``stamps`` ``[T]``, seconds by their own clocks.
 
     Raises:
         CaptureError: the file cannot be read, lacks a camera or names a frame that its camera does not have, or its
-        times do
-            not follow the frames.
+            times do not follow the frames.
     """
     rows = _rows(file)
     clocks = {}
@@ -58,8 +54,7 @@ def read_timestamps(file: Path, stamps: Mapping[str, Floats]) -> dict[str, State
             others = ", ".join(repr(other) for other in sorted(rows)) or "none"
             raise CaptureError(
                 f"{file} has no row for camera {name!r}; it has cameras {others}. Add a row of one of its frames, "
-                "or remove "
-                "the camera."
+                "or remove the camera."
             )
         clocks[name] = _clock(file, name, rows[name], own)
     return clocks
@@ -101,8 +96,7 @@ def _clock(file: Path, name: str, rows: Mapping[int, float], stamps: Floats) -> 
         wrong = frames[0] if frames[0] < 0 else frames[-1]
         raise CaptureError(
             f"{file} has a time for frame {wrong} of camera {name!r}, whose frames are 0 to {len(stamps) - 1}; "
-            "frames count "
-            "from 0. Correct the numbers, or give the whole video."
+            "frames count from 0. Correct the numbers, or give the whole video."
         )
     own, period = stamps[frames], period_seconds(stamps)
     rate = 1.0
@@ -114,8 +108,7 @@ def _clock(file: Path, name: str, rows: Mapping[int, float], stamps: Floats) -> 
     if abs(rate - 1) > MAX_DRIFT:
         raise CaptureError(
             f"By {file} the clock of camera {name!r} runs {rate:.4g} times as fast as its video; frames lack in the "
-            "video or in "
-            "the numbers of frames, or the rate of the video is wrong."
+            "video or in the numbers of frames, or the rate of the video is wrong."
         )
     offset = float(np.mean(seconds - rate * own))
     off = seconds - offset - rate * own
@@ -123,8 +116,8 @@ def _clock(file: Path, name: str, rows: Mapping[int, float], stamps: Floats) -> 
     if abs(off[worst]) > MAX_DEVIATION * period:
         raise CaptureError(
             f"By {file} frame {frames[worst]} of camera {name!r} is {abs(off[worst]):.4f} s off a steady clock, "
-            "more than half a "
-            f"frame period ({period / 2:.4f} s); frames lack in the video, or numbers in the table are wrong."
+            f"more than half a frame period ({period / 2:.4f} s); frames lack in the video, or numbers in the table "
+            "are wrong."
         )
     return StatedClock(Clock(offset, rate), float(np.std(off)), "table")
 
@@ -135,11 +128,9 @@ _TIMECODE = re.compile(r"(\d{2}):(\d{2}):(\d{2})([:;.])(\d{2,3})")
 
 
 def wall_clocks(stamps: Mapping[str, Floats], metadata: Mapping[str, Mapping[str, str]]) -> dict[str, StatedClock]:
-    """The clocks of all cameras by the best stamps that all their files have.
+    """The clocks of all cameras, with frames at ``stamps`` ``[T]``, by the best stamps that all their files have.
 
-    Args:
-        stamps: camera to the seconds ``[T]`` of its frames.
-        metadata: camera to what its file states, by lower-case key.
+    ``metadata`` is by camera what its file states, by lower-case key.
 
     Raises:
         CaptureError: the files have no stamps of a common clock.
@@ -159,8 +150,7 @@ def wall_clocks(stamps: Mapping[str, Floats], metadata: Mapping[str, Mapping[str
     lacking = next((name for name in stamps if codes[name] is None), "")
     raise CaptureError(
         f"The time stamps of the files share no clock: that of camera {lacking!r} has no timecode and not all state "
-        "when they "
-        "were made to fractions of a second, and their frames count from 0. Synchronise by audio, motion or "
+        "when they were made to fractions of a second, and their frames count from 0. Synchronise by audio, motion or "
         "timestamps.csv."
     )
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera
@@ -27,18 +26,16 @@ from structgstream.preparation.synchronization.audio import (
 )
 from structgstream.preparation.synchronization.correlation import require_scipy
 from structgstream.preparation.synchronization.motion import (
-    pair_signals,
-    solve_by_motion,
-)
-from structgstream.preparation.synchronization.motion_signals import (
     CalibratedGeometry,
     Changes,
     Geometry,
     StaticGeometry,
+    pair_signals,
     picture_changes,
+    solve_by_motion,
     static_features,
 )
-from structgstream.preparation.synchronization.stated_clocks import read_timestamps, wall_clocks
+from structgstream.preparation.synchronization.stated_clocks import StatedClock, read_timestamps, wall_clocks
 
 WARNED_SECONDS = 5e-3
 
@@ -67,11 +64,7 @@ def synchronization(
     reason: str,
     warnings: tuple[str, ...] = (),
 ) -> Synchronization:
-    """The result, with what remains after choosing nearest frames.
-
-    Raises:
-        CaptureError: two cameras have no instant in common.
-    """
+    """The result, with what remains after choosing nearest frames."""
     common = {name: clocks[name].common_seconds(own) for name, own in stamps.items()}
     _require_overlap(common)
     residuals = frame_residuals(common)
@@ -95,14 +88,16 @@ def synchronization(
 def frame_residuals(common: Mapping[str, Floats]) -> dict[str, float]:
     """For each camera by how much its nearest frames are late, at worst: the misalignment that choosing frames leaves.
 
-    Args:
-        common: camera to the common seconds ``[T]`` of its frames. The instants have the rate of the slowest camera
-            and the phase that suits all cameras best.
+    ``common`` are the common seconds ``[T]`` of each camera's frames. The instants have the rate of the slowest camera
+    and the phase that suits all cameras best.
     """
     period = 1 / (counted_rate(list(common.values())) or 30.0)  # one frame a camera: any rate is right
     start = max(times[0] for times in common.values())
     end = min(times[-1] for times in common.values())
-    turns = [np.exp(2j * np.pi * _inside(times, start, end) / period).mean() for times in common.values()]
+    inside = {name: own[(own >= start - 1e-9) & (own <= end + 1e-9)] for name, own in common.items()}
+    turns = [
+        np.exp(2j * np.pi * (inside[name] if len(inside[name]) else common[name]) / period).mean() for name in common
+    ]
     phase = float(np.angle(np.sum(turns))) / (2 * np.pi) * period
     first = np.ceil((start - phase) / period - 0.5)
     instants = phase + period * np.arange(first, first + max(int((end - start) / period), 1))
@@ -118,11 +113,6 @@ def frame_residuals(common: Mapping[str, Floats]) -> dict[str, float]:
     return residuals
 
 
-def _inside(times: Floats, start: float, end: float) -> Floats:
-    inside = times[(times >= start - 1e-9) & (times <= end + 1e-9)]
-    return inside if len(inside) else times
-
-
 def _require_overlap(common: Mapping[str, Floats]) -> None:
     for first, second in combinations(common, 2):
         one, other = common[first], common[second]
@@ -135,7 +125,6 @@ def _require_overlap(common: Mapping[str, Floats]) -> None:
 
 
 _log = logging.getLogger(__name__)
-
 Method = Literal["auto", "csv", "stamps", "audio", "motion", "none"]
 METHODS: tuple[Method, ...] = ("auto", "csv", "stamps", "audio", "motion", "none")
 
@@ -175,11 +164,14 @@ def synchronize(
         if not len(own):
             raise CaptureError(f"Camera {name!r} has no frames; add them or remove the camera.")
     if timestamps is not None and method in ("auto", "csv"):
-        return _by_csv(timestamps, stamps)
+        table = read_timestamps(timestamps, stamps)
+        return _stated(stamps, table, method="csv", reason=f"{timestamps.name} states times")
     if method == "none":
         return _unchanged(stamps)
     if method == "stamps":
-        return _by_stamps(footage, stamps)
+        found = wall_clocks(stamps, {name: footage.metadata(name) for name in stamps})
+        reason = f"stamps of the files ({next(iter(found.values())).kind}) are said to share a clock"
+        return _stated(stamps, found, method="stamps", reason=reason)
     require_scipy()
     if method == "motion":
         return _by_motion(footage, stamps, cameras, "motion was requested")
@@ -189,9 +181,7 @@ def synchronize(
 
 
 def _automatic(
-    footage: Footage,
-    stamps: Mapping[str, NDArray[np.float64]],
-    cameras: Mapping[str, LensCamera] | None,
+    footage: Footage, stamps: Mapping[str, Floats], cameras: Mapping[str, LensCamera] | None
 ) -> Synchronization:
     try:
         return _by_audio(footage, stamps, "all cameras have sound")
@@ -205,34 +195,19 @@ def _automatic(
         raise CaptureError(f"{problem} Nor can sound be used: {unusable}.") from None
 
 
-def _by_csv(file: Path, stamps: Mapping[str, NDArray[np.float64]]) -> Synchronization:
-    stated = read_timestamps(file, stamps)
-    return synchronization(
-        stamps,
-        {name: own.clock for name, own in stated.items()},
-        {name: own.sigma_seconds for name, own in stated.items()},
-        method="csv",
-        reason=f"{file.name} states times",
-    )
+def _stated(
+    stamps: Mapping[str, Floats], found: Mapping[str, StatedClock], *, method: str, reason: str
+) -> Synchronization:
+    clocks, sigmas = ({name: getattr(own, key) for name, own in found.items()} for key in ("clock", "sigma_seconds"))
+    return synchronization(stamps, clocks, sigmas, method=method, reason=reason)
 
 
-def _unchanged(stamps: Mapping[str, NDArray[np.float64]]) -> Synchronization:
+def _unchanged(stamps: Mapping[str, Floats]) -> Synchronization:
     clocks, exact = dict.fromkeys(stamps, Clock()), dict.fromkeys(stamps, 0.0)
     return synchronization(stamps, clocks, exact, method="none", reason="the cameras are said to be synchronous")
 
 
-def _by_stamps(footage: Footage, stamps: Mapping[str, NDArray[np.float64]]) -> Synchronization:
-    found = wall_clocks(stamps, {name: footage.metadata(name) for name in stamps})
-    return synchronization(
-        stamps,
-        {name: own.clock for name, own in found.items()},
-        {name: own.sigma_seconds for name, own in found.items()},
-        method="stamps",
-        reason=f"stamps of the files ({next(iter(found.values())).kind}) are said to share a clock",
-    )
-
-
-def _by_audio(footage: Footage, stamps: Mapping[str, NDArray[np.float64]], reason: str) -> Synchronization:
+def _by_audio(footage: Footage, stamps: Mapping[str, Floats], reason: str) -> Synchronization:
     recorded = {name: footage.audio(name) for name in stamps}
     mute = next((name for name, sound in recorded.items() if sound is None), None)
     if mute is not None:
@@ -263,10 +238,7 @@ def _by_audio(footage: Footage, stamps: Mapping[str, NDArray[np.float64]], reaso
 
 
 def _by_motion(
-    footage: Footage,
-    stamps: Mapping[str, NDArray[np.float64]],
-    cameras: Mapping[str, LensCamera] | None,
-    reason: str,
+    footage: Footage, stamps: Mapping[str, Floats], cameras: Mapping[str, LensCamera] | None, reason: str
 ) -> Synchronization:
     if len(stamps) < 2:
         return _unchanged(stamps)
@@ -288,20 +260,16 @@ def _by_motion(
 
 
 def require_motion(changes: Mapping[str, Changes]) -> None:
-    """
-    Raises:
-        CaptureError: in a camera hardly anything moves.
-    """
+    """Refuses cameras in which hardly anything moves."""
     still = [name for name, change in changes.items() if not change.moving]
     if still:
         raise CaptureError(
             f"Too little moves in the pictures of {', '.join(repr(name) for name in still)} to synchronise by "
-            "motion; film people "
-            "who move, a clap for audio, or give timestamps.csv."
+            "motion; film people who move, a clap for audio, or give timestamps.csv."
         )
 
 
-def _static_geometry(footage: Footage, stamps: Mapping[str, NDArray[np.float64]]) -> StaticGeometry:
+def _static_geometry(footage: Footage, stamps: Mapping[str, Floats]) -> StaticGeometry:
     features = {}
     for name, own in stamps.items():
         indices = np.unique(np.linspace(0, len(own) - 1, STATIC_PICTURES).round().astype(int))

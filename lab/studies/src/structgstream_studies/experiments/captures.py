@@ -43,7 +43,7 @@ class CapturePart:
             CaptureError: the folder holds no capture, or not these frames or cameras.
         """
         from structgstream.data.open import open_capture
-        from structgstream.data.wrappers import every_nth_frame
+        from structgstream.data.source import every_nth_frame
 
         whole = open_capture(
             self.folder,

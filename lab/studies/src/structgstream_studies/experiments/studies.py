@@ -260,7 +260,7 @@ def _write_details(
     path: Path, runs: Sequence[VariantRun | PeerRun], *, titles: Mapping[str, str], backend: "Backend"
 ) -> None:
     """Each run's picture, at the first held-out camera, of the frame in which the runs of one seed differ most."""
-    from structgstream.data.wrappers import select_cameras
+    from structgstream.data.source import select_cameras
     from structgstream.evaluation.evaluate import rendered
 
     results = {run: found for run in runs if (found := read_result(run.result)) is not None}
