@@ -9,17 +9,20 @@
 int sgs_cuda_anchor_inputs(
     const float* positions, const float* log_offset_scales, const float* log_base_scales, const float* offsets,
     const float* features, const float* intervals, int anchors, int offsets_per_anchor, int feature_size,
-    int distance_input,
-    const float* viewmat, const float* intrinsics, const float* center, int width, int height, float near,
+    int distance_input, int views,
+    const float* viewmats, const float* intrinsics, const float* centers, int width, int height, float near,
     const uint8_t* tiles, float* inputs, uint8_t* seen, void* stream) {
     using namespace structgstream::cuda;
     const int columns = feature_size + 3 + (distance_input ? 1 : 0);
-    const Seen see = {positions, log_offset_scales, log_base_scales, offsets, intervals, offsets_per_anchor, viewmat,
-                      intrinsics, {width, height}, near, tiles, seen};
-    const int error = for_each(see, anchors, stream);
+    const int64_t rows = static_cast<int64_t>(views) * anchors;
+    const Seen first = {positions, log_offset_scales, log_base_scales, offsets, intervals, offsets_per_anchor, viewmats,
+                        intrinsics, {width, height}, near, tiles, seen};
+    const int64_t tile_count =
+        static_cast<int64_t>((width + kTilePixels - 1) / kTilePixels) * ((height + kTilePixels - 1) / kTilePixels);
+    const int error = for_each(SeenInViews{first, anchors, tile_count}, rows, stream);
     if (error) return error;
-    const Input input = {positions, features, center, feature_size, columns, inputs};
-    return for_each(input, static_cast<int64_t>(anchors) * columns, stream);
+    const Input input = {positions, features, centers, anchors, feature_size, columns, inputs};
+    return for_each(input, rows * columns, stream);
 }
 
 int sgs_cuda_anchor_inputs_backward(
@@ -33,13 +36,13 @@ int sgs_cuda_anchor_inputs_backward(
 
 int sgs_cuda_anchor_outputs(
     const float* positions, const float* log_offset_scales, const float* log_base_scales, const float* offsets,
-    int anchors, int offsets_per_anchor, const float* opacity, const float* color, const float* covariance,
+    int anchors, int offsets_per_anchor, int views, const float* opacity, const float* color, const float* covariance,
     const uint8_t* seen, float* means, float* quats, float* scales, float* opacities, float* colors,
     float* raw_opacities, int64_t* ids, void* stream) {
     using namespace structgstream::cuda;
-    const Output output = {positions, log_offset_scales, log_base_scales, offsets, offsets_per_anchor, opacity, color,
-                           covariance, seen, means, quats, scales, opacities, colors, raw_opacities, ids};
-    return for_each(output, static_cast<int64_t>(anchors) * offsets_per_anchor, stream);
+    const Output output = {positions, log_offset_scales, log_base_scales, offsets, anchors, offsets_per_anchor, opacity,
+                           color, covariance, seen, means, quats, scales, opacities, colors, raw_opacities, ids};
+    return for_each(output, static_cast<int64_t>(views) * anchors * offsets_per_anchor, stream);
 }
 
 int sgs_cuda_anchor_outputs_backward(

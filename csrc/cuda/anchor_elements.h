@@ -90,20 +90,35 @@ struct Seen {
     SGS_ELEMENT void operator()(int64_t i) const { seen[i] = reaches(i) ? 1 : 0; }
 };
 
-// One number of the MLPs' inputs: the feature, the direction to the anchor, and its distance.
+// The same in several views of one size, anchor by anchor.
+struct SeenInViews {
+    Seen first;
+    int64_t anchors, tile_count;
+
+    SGS_ELEMENT void operator()(int64_t n) const {
+        const int64_t view = n / anchors;
+        Seen of_view = first;
+        of_view.viewmat += 16 * view, of_view.intrinsics += 9 * view, of_view.seen += anchors * view;
+        if (of_view.tiles != nullptr) of_view.tiles += tile_count * view;
+        of_view(n % anchors);
+    }
+};
+
+// One number of the MLPs' inputs: the feature, the direction to the anchor, and its distance; in view after view.
 struct Input {
-    const float *positions, *features, *center;
+    const float *positions, *features, *centers;
+    int64_t anchors;
     int feature_size, width;
     float* inputs;
 
     SGS_ELEMENT void operator()(int64_t n) const {
-        const int64_t i = n / width;
-        const int column = static_cast<int>(n - i * width);
+        const int64_t row = n / width, i = row % anchors;
+        const int column = static_cast<int>(n - row * width);
         if (column < feature_size) {
             inputs[n] = features[i * feature_size + column];
             return;
         }
-        const float* p = positions + 3 * i;
+        const float *p = positions + 3 * i, *center = centers + 3 * (row / anchors);
         const float to[3] = {p[0] - center[0], p[1] - center[1], p[2] - center[2]};
         const float distance = most(length(to[0], to[1], to[2]), kLeastLength);
         const int axis = column - feature_size;
@@ -133,9 +148,10 @@ struct InputBackward {
     }
 };
 
-// One Gaussian of an anchor.
+// One Gaussian of an anchor, in view after view.
 struct Output {
     const float *positions, *log_offset_scales, *log_base_scales, *offsets;
+    int64_t anchors;
     int k;
     const float *opacity, *color, *covariance;
     const uint8_t* seen;
@@ -143,12 +159,12 @@ struct Output {
     int64_t* ids;
 
     SGS_ELEMENT void operator()(int64_t n) const {
-        const int64_t i = n / k;
-        const float raw = seen[i] ? tanhf(opacity[n]) : -1.0f;
+        const int64_t i = n / k % anchors, id = n % (anchors * k);
+        const float raw = seen[n / k] ? tanhf(opacity[n]) : -1.0f;
         const bool drawn = raw > 0.0f;
         const float* q = covariance + 7 * n;
         for (int axis = 0; axis < 3; ++axis) {
-            means[3 * n + axis] = positions[3 * i + axis] + offsets[3 * n + axis] * expf(log_offset_scales[3 * i + axis]);
+            means[3 * n + axis] = positions[3 * i + axis] + offsets[3 * id + axis] * expf(log_offset_scales[3 * i + axis]);
             scales[3 * n + axis] = drawn ? expf(log_base_scales[3 * i + axis]) * sigmoid(q[axis]) : 0.0f;
             colors[3 * n + axis] = sigmoid(color[3 * n + axis]);
         }
@@ -156,7 +172,7 @@ struct Output {
         for (int part = 0; part < 4; ++part) quats[4 * n + part] = q[3 + part] / norm;
         opacities[n] = drawn ? raw : 0.0f;
         raw_opacities[n] = raw;
-        ids[n] = n;
+        ids[n] = id;
     }
 };
 

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Pictures without gradients on a GPU. Plain pointers to its memory; `stream` is a cudaStream_t. Arguments are those of
- * sgs_raster_forward and sgs_raster_weights in structgstream.h. All return 0, or CUDA's error number. */
+/* Several views without gradients on a GPU, each kernel once for all of them. Plain pointers to its memory, but for the array of
+ * views, which lies in that of the host; `stream` is a cudaStream_t. Both return 0, or CUDA's error number. */
 #pragma once
 
 #include <stdint.h>
@@ -9,18 +9,38 @@
 extern "C" {
 #endif
 
-/* Out: radii [N]. Waits for nothing. */
-int sgs_cuda_radii(
-    int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
-    const float* viewmat, const float* K, int width, int height, float near_plane, const float* intervals, float* radii,
-    void* stream);
-/* Out: image [H,W,3], alpha [H,W] and radii [N], each or null; weights [N,channels] of maps [H,W,channels], if channels is not
- * 0. Waits once, for the number of pairs. */
-int sgs_cuda_picture(
-    int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
-    const float* colors, const float* viewmat, const float* K, int width, int height, float near_plane,
-    const float* background, const float* intervals, const float* maps, int channels, float* weights, float* image,
-    float* alpha, float* radii, void* stream);
+/* Gaussians of a view, as in sgs_raster_forward of structgstream.h. ids [count] int64. colors, intervals and ids may be null. */
+struct sgs_cuda_gaussians {
+    const float *means, *quats, *scales, *opacities, *colors, *intervals;
+    const int64_t* ids;
+    int64_t count;
+};
+/* tiles: bytes of those that are drawn, or null; background [3] or null. Out, each or null: image [H,W,3] and alpha [H,W], of which
+ * the image stays what it is where nothing is drawn; radii of both sets; sums [., channels] of maps [H,W,channels], at the ids of the
+ * first set, which needs all tiles. */
+struct sgs_cuda_view {
+    struct sgs_cuda_gaussians gaussians, statics;
+    const float *viewmat, *K, *background, *maps;
+    const uint8_t* tiles;
+    float *image, *alpha, *radii, *sums;
+    int32_t width, height, channels;
+    float near_plane;
+};
+/* Waits once, for the numbers of pairs. */
+int sgs_cuda_views(const struct sgs_cuda_view* views, int count, void* stream);
+
+/* The tiles that Gaussians reach (reference_raster.reached_tiles): K of the picture, reduced_K of the one on which extents are
+ * measured, visible: a byte for each id. Out: tiles, a byte each, 1 where one is reached, else what they are. */
+struct sgs_cuda_reach {
+    struct sgs_cuda_gaussians gaussians;
+    const float *viewmat, *K, *reduced_K;
+    const uint8_t* visible;
+    uint8_t* tiles;
+    int32_t width, height, reduced_width, reduced_height;
+    float near_plane, margin;
+};
+/* Waits for nothing. */
+int sgs_cuda_reached_tiles(const struct sgs_cuda_reach* views, int count, void* stream);
 
 #ifdef __cplusplus
 }

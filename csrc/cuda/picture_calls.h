@@ -1,7 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-// The interface of picture.h: the lists and the drawing of the fit, for Gaussians that are given. picture.cu compiles it for
-// a GPU, emulate_fit.cpp for a CPU.
+// The interface of picture.h: the lists and the drawing of the fit, for Gaussians of several views that are given. picture.cu
+// compiles it for a GPU, emulate_fit.cpp for a CPU.
 #pragma once
+
+#include <algorithm>
+#include <new>
+#include <vector>
 
 #include "fit_memory.h"
 #include "fit_raster.h"
@@ -15,19 +19,34 @@ constexpr int kMapsAtOnce = 8;
 
 struct Project {
     Camera camera;
-    const float *means, *quats, *scales, *opacities, *colors, *intervals;
-    Splat* splats;    // or null
+    sgs_cuda_gaussians given;
+    const uint8_t* drawn;  // or null: all tiles are
+    Splat* splats;
     int32_t *counts, *slots;
-    float* radii;     // or null
+    float* radii;          // or null
 
     SGS_LANES_FN void operator()(int64_t i) const {
-        const float black[3] = {};
-        const Splat s = projected(
-            camera, means + 3 * i, quats + 4 * i, scales + 3 * i, opacities[i], colors == nullptr ? black : colors + 3 * i,
-            intervals == nullptr ? nullptr : intervals + i, radii == nullptr ? nullptr : radii + i);
-        if (splats == nullptr) return;
+        float radius = 0.0f;
+        const Splat s = splat_of(given, camera, i, &radius);
         splats[i] = s, slots[i] = slots_of(s);
-        count_tiles(s, nullptr, camera.columns(), counts);
+        count_tiles(s, drawn, camera.columns(), counts);
+        if (radii != nullptr) radii[i] = reaches_drawn(s) ? radius : 0.0f;
+    }
+
+    static SGS_LANES_FN Splat splat_of(const sgs_cuda_gaussians& g, const Camera& camera, int64_t i, float* radius) {
+        const float black[3] = {};
+        return projected(
+            camera, g.means + 3 * i, g.quats + 4 * i, g.scales + 3 * i, g.opacities[i],
+            g.colors == nullptr ? black : g.colors + 3 * i, g.intervals == nullptr ? nullptr : g.intervals + i, radius);
+    }
+
+    // A splat between pixel centres reaches none, and counts.
+    SGS_LANES_FN bool reaches_drawn(const Splat& s) const {
+        if (drawn == nullptr || s.tiles[0] >= s.tiles[2]) return true;
+        for (int y = s.tiles[1]; y < s.tiles[3]; ++y)
+            for (int x = s.tiles[0]; x < s.tiles[2]; ++x)
+                if (drawn[y * camera.columns() + x]) return true;
+        return false;
     }
 };
 
@@ -71,100 +90,262 @@ struct Weigh {
 struct SumWeights {
     const Splat* splats;
     const int32_t* slots;
+    const int64_t* ids;
     const float* sums;
     int channels;
-    float* weights;
+    float* weights;  // by id
 
     SGS_ELEMENT void operator()(int64_t i) const {
         const int count = slots_of(splats[i]);
         for (int k = 0; k < channels; ++k) {
             float total = 0.0f;
             for (int64_t slot = slots[i]; slot < int64_t{slots[i]} + count; ++slot) total += sums[slot * channels + k];
-            weights[i * channels + k] = total;
+            weights[ids[i] * channels + k] = total;
         }
     }
 };
 
-struct Complement {
+// From transmittance to coverage, which is zero where nothing is drawn.
+struct Cover {
+    const uint8_t* drawn;
+    int width, columns;
     float* values;
-    SGS_ELEMENT void operator()(int64_t i) const { values[i] = 1.0f - values[i]; }
+
+    SGS_ELEMENT void operator()(int64_t i) const {
+        const int64_t tile = i / width / kTilePixels * columns + i % width / kTilePixels;
+        values[i] = drawn == nullptr || drawn[tile] ? 1.0f - values[i] : 0.0f;
+    }
 };
 
-// The memory of a picture, which is released in the end.
-class Picture {
+// Marks the tiles within the margin of a Gaussian, which is truncated at two standard deviations (0.6 of its extent).
+struct Reach {
+    sgs_cuda_reach view;
+
+    SGS_LANES_FN void operator()(int64_t i) const {
+        if (view.visible[view.gaussians.ids[i]] == 0) return;
+        const Camera reduced = {
+            view.viewmat, view.reduced_K, nullptr, view.near_plane, view.reduced_width, view.reduced_height};
+        float radius = 0.0f;
+        Project::splat_of(view.gaussians, reduced, i, &radius);
+        if (!(radius > 0.0f)) return;
+        const float *m = view.gaussians.means + 3 * i, *v = view.viewmat;
+        float p[3];
+        for (int axis = 0; axis < 3; ++axis)
+            p[axis] = v[4 * axis] * m[0] + v[4 * axis + 1] * m[1] + v[4 * axis + 2] * m[2] + v[4 * axis + 3];
+        const float ratio = static_cast<float>(view.width) / static_cast<float>(view.reduced_width);
+        const float reach = 0.6f * radius * ratio + view.margin;
+        const int limits[2] = {(view.width + kTilePixels - 1) / kTilePixels, (view.height + kTilePixels - 1) / kTilePixels};
+        int first[2], last[2];
+        for (int axis = 0; axis < 2; ++axis) {
+            const float center = view.K[4 * axis] * p[axis] / p[2] + view.K[3 * axis + 2];
+            const float most = static_cast<float>(limits[axis] - 1);
+            const float low = floorf((center - reach) / kTilePixels), high = floorf((center + reach) / kTilePixels);
+            if (!(high >= 0.0f && low <= most)) return;
+            first[axis] = static_cast<int>(fmaxf(low, 0.0f)), last[axis] = static_cast<int>(fminf(high, most));
+        }
+        for (int y = first[1]; y <= last[1]; ++y)
+            for (int x = first[0]; x <= last[0]; ++x) view.tiles[y * limits[0] + x] = 1;
+    }
+};
+
+// A kernel of each view, and its number of elements or blocks.
+template <typename Kernel>
+struct Counted {
+    Kernel kernel;
+    int64_t count;
+};
+
+template <typename Kernel>
+struct EachElement {
+    const Counted<Kernel>* kernels;
+    int64_t most;
+
+    SGS_LANES_FN void operator()(int64_t i) const {
+        const Counted<Kernel>& of_view = kernels[i / most];
+        if (i % most < of_view.count) of_view.kernel(i % most);
+    }
+};
+
+template <typename Kernel>
+struct EachBlock {
+    static constexpr int kThreads = Kernel::kThreads;
+    using Shared = typename Kernel::Shared;
+    const Counted<Kernel>* kernels;
+    int64_t most;
+
+    SGS_LANES_FN void operator()(int block, Shared& s, const Threads& threads) const {
+        const Counted<Kernel>& of_view = kernels[block / most];
+        if (block % most < of_view.count) of_view.kernel(static_cast<int>(block % most), s, threads);
+    }
+};
+
+// Runs the kernels of all views in one launch.
+template <typename Kernel, typename Launch>
+int launch(const std::vector<Counted<Kernel>>& kernels, void* stream, const Launch& run) {
+    int64_t most = 0;
+    for (const Counted<Kernel>& of_view : kernels) most = std::max(most, of_view.count);
+    void* memory = nullptr;
+    const size_t bytes = sizeof(Counted<Kernel>) * kernels.size();
+    if (most == 0) return 0;
+    if (const int error = allocate(&memory, bytes, stream)) return error;
+    int error = to_device(memory, kernels.data(), bytes, stream);
+    if (error == 0) error = run(static_cast<const Counted<Kernel>*>(memory), most, most * static_cast<int64_t>(kernels.size()));
+    const int released = release(memory, stream);
+    return error ? error : released;
+}
+template <typename Kernel>
+int each_element(const std::vector<Counted<Kernel>>& kernels, void* stream) {
+    return launch(kernels, stream, [&](const Counted<Kernel>* on_device, int64_t most, int64_t all) {
+        return for_each(EachElement<Kernel>{on_device, most}, all, stream);
+    });
+}
+template <typename Kernel>
+int each_block(const std::vector<Counted<Kernel>>& kernels, void* stream) {
+    return launch(kernels, stream, [&](const Counted<Kernel>* on_device, int64_t most, int64_t all) {
+        return for_blocks(EachBlock<Kernel>{on_device, most}, all, stream);
+    });
+}
+
+// The memory of several views, which is released in the end.
+class Views {
   public:
-    explicit Picture(void* stream) : stream_(stream) {}
-    ~Picture() {
+    Views(const sgs_cuda_view* views, int count, void* stream) : stream_(stream) {
+        for (int v = 0; v < count; ++v) views_.push_back({views[v]});
+    }
+    ~Views() {
         for (void* memory : {memory_, pair_memory_}) release(memory, stream_);
     }
-    Picture(const Picture&) = delete;
-    Picture& operator=(const Picture&) = delete;
+    Views(const Views&) = delete;
+    Views& operator=(const Views&) = delete;
 
-    int draw(Project project, int64_t count, const float* background, const float* maps, int channels, float* weights,
-             float* image, float* alpha) {
-        camera_ = project.camera, count_ = count;
-        Arena sizes(nullptr);
-        lay_out(sizes, alpha == nullptr);
-        if (const int error = allocate(&memory_, sizes.size(), stream_)) return error;
-        Arena arena(memory_);
-        lay_out(arena, alpha == nullptr);
-        if (const int error = fill(counts_, 0, sizeof(int32_t) * camera_.tiles(), stream_)) return error;
-        project.splats = splats_, project.counts = counts_, project.slots = slots_;
-        if (const int error = for_each(project, count, stream_)) return error;
-        const Starts starts = {counts_, camera_.tiles(), starts_, cursors_, count, slots_, nullptr, nullptr, 0,
-                               kMostPairs, nullptr, totals_, totals_ + 1};
-        if (const int error = for_blocks(starts, 1, stream_)) return error;
-        int64_t totals[2];
-        if (const int error = to_host(totals, totals_, sizeof totals, stream_)) return error;
-        if (const int error = wait(stream_)) return error;
-        if (totals[0] > kMostPairs || totals[1] > kMostPairs) return kNoMemory;
-        Arena pair_sizes(nullptr);
-        lay_out_pairs(pair_sizes, totals, channels);
-        if (const int error = allocate(&pair_memory_, pair_sizes.size(), stream_)) return error;
-        Arena pairs(pair_memory_);
-        lay_out_pairs(pairs, totals, channels);
-        const Scatter scatter = {nullptr, splats_, nullptr, camera_.columns(), cursors_, keys_};
-        if (const int error = for_each(scatter, count, stream_)) return error;
-        const Sort sort = {nullptr, nullptr, starts_, keys_, nullptr, nullptr, 0, rows_};
-        if (const int error = for_blocks(sort, camera_.tiles(), stream_)) return error;
-        const Tiles tiles = {nullptr, nullptr, camera_.columns(), camera_.width, camera_.height, count, splats_, nullptr,
-                             starts_, nullptr, rows_, background};
-        if (image != nullptr) {
-            float* rest = alpha == nullptr ? transmittance_ : alpha;
-            if (const int error = for_blocks(Draw{tiles, image, rest}, camera_.tiles(), stream_)) return error;
+    int draw() {
+        if (const int error = list()) return error;
+        std::vector<Counted<Draw>> draws;
+        std::vector<Counted<Cover>> covers;
+        std::vector<Counted<SumWeights>> sums;
+        int channels = 0;
+        for (const Of& o : views_) {
+            const sgs_cuda_view& v = o.view;
+            if (v.image != nullptr)
+                draws.push_back({{o.lists(), v.image, v.alpha == nullptr ? o.transmittance : v.alpha}, o.camera().tiles()});
+            if (v.alpha != nullptr)
+                covers.push_back({{v.tiles, v.width, o.camera().columns(), v.alpha}, int64_t{v.width} * v.height});
+            if (v.channels > 0)
+                sums.push_back({{o.splats, o.slots, v.gaussians.ids, o.sums, v.channels, v.sums}, v.gaussians.count});
+            channels = std::max(channels, v.channels);
         }
-        if (alpha != nullptr)
-            if (const int error = for_each(Complement{alpha}, int64_t{camera_.width} * camera_.height, stream_)) return error;
+        if (const int error = each_block(draws, stream_)) return error;
+        if (const int error = each_element(covers, stream_)) return error;
         for (int first = 0; first < channels; first += kMapsAtOnce) {
-            const int some = channels - first < kMapsAtOnce ? channels - first : kMapsAtOnce;
-            const Weigh weigh = {tiles, slots_, maps, channels, first, some, sums_};
-            if (const int error = for_blocks(weigh, camera_.tiles(), stream_)) return error;
+            std::vector<Counted<Weigh>> weighs;
+            for (const Of& o : views_) {
+                const int some = std::min(o.view.channels - first, kMapsAtOnce);
+                if (some > 0)
+                    weighs.push_back(
+                        {{o.lists(), o.slots, o.view.maps, o.view.channels, first, some, o.sums}, o.camera().tiles()});
+            }
+            if (const int error = each_block(weighs, stream_)) return error;
         }
-        return channels == 0 ? 0 : for_each(SumWeights{splats_, slots_, sums_, channels, weights}, count, stream_);
+        return each_element(sums, stream_);
     }
 
   private:
-    void lay_out(Arena& a, bool transmittance) {
-        const int64_t tiles = camera_.tiles();
-        splats_ = a.take<Splat>(count_), slots_ = a.take<int32_t>(count_);
-        counts_ = a.take<int32_t>(tiles), starts_ = a.take<int32_t>(tiles + 1), cursors_ = a.take<int32_t>(tiles);
-        totals_ = a.take<int64_t>(2);
-        if (transmittance) transmittance_ = a.take<float>(int64_t{camera_.width} * camera_.height);
+    struct Of {
+        sgs_cuda_view view;
+        Splat* splats = nullptr;
+        int32_t *slots = nullptr, *counts = nullptr, *starts = nullptr, *cursors = nullptr, *rows = nullptr;
+        int64_t* totals = nullptr;  // entries of lists, and slots
+        uint64_t* keys = nullptr;
+        float *transmittance = nullptr, *sums = nullptr;
+
+        Camera camera() const { return {view.viewmat, view.K, nullptr, view.near_plane, view.width, view.height}; }
+        int64_t count() const { return view.gaussians.count + view.statics.count; }
+        Tiles lists() const {
+            return {nullptr, view.tiles, camera().columns(), view.width, view.height, view.gaussians.count, splats,
+                    splats + view.gaussians.count, starts, nullptr, rows, view.background};
+        }
+    };
+
+    // The lists of all tiles.
+    int list() {
+        const size_t count = views_.size();
+        if (const int error = lay_out(&memory_, [&](Arena& a) {
+                counts_ = a.take<int32_t>(all_tiles()), totals_ = a.take<int64_t>(2 * count);
+                int32_t* counts = counts_;
+                for (size_t n = 0; n < count; ++n) {
+                    Of& o = views_[n];
+                    const int64_t tiles = o.camera().tiles();
+                    o.counts = counts, o.totals = totals_ + 2 * n;
+                    if (counts != nullptr) counts += tiles;
+                    o.splats = a.take<Splat>(o.count()), o.slots = a.take<int32_t>(o.count());
+                    o.starts = a.take<int32_t>(tiles + 1), o.cursors = a.take<int32_t>(tiles);
+                    if (o.view.image != nullptr && o.view.alpha == nullptr)
+                        o.transmittance = a.take<float>(int64_t{o.view.width} * o.view.height);
+                }
+            }))
+            return error;
+        if (const int error = fill(counts_, 0, sizeof(int32_t) * all_tiles(), stream_)) return error;
+        std::vector<Counted<Project>> projects;
+        std::vector<Counted<Starts>> starts;
+        for (const Of& o : views_) {
+            const sgs_cuda_view& v = o.view;
+            const int64_t first = v.gaussians.count;
+            projects.push_back({{o.camera(), v.gaussians, v.tiles, o.splats, o.counts, o.slots, v.radii}, first});
+            projects.push_back(
+                {{o.camera(), v.statics, v.tiles, o.splats + first, o.counts, o.slots + first,
+                  v.radii == nullptr ? nullptr : v.radii + first},
+                 v.statics.count});
+            starts.push_back(
+                {{o.counts, o.camera().tiles(), o.starts, o.cursors, first, o.slots, nullptr, nullptr, 0, kMostPairs, nullptr,
+                  o.totals, o.totals + 1},
+                 1});
+        }
+        if (const int error = each_element(projects, stream_)) return error;
+        if (const int error = each_block(starts, stream_)) return error;
+        std::vector<int64_t> totals(2 * count);
+        if (const int error = to_host(totals.data(), totals_, sizeof(int64_t) * totals.size(), stream_)) return error;
+        if (const int error = wait(stream_)) return error;
+        for (const int64_t total : totals)
+            if (total > kMostPairs) return kNoMemory;
+        if (const int error = lay_out(&pair_memory_, [&](Arena& a) {
+                for (size_t n = 0; n < count; ++n) {
+                    Of& o = views_[n];
+                    o.keys = a.take<uint64_t>(totals[2 * n]), o.rows = a.take<int32_t>(totals[2 * n]);
+                    o.sums = a.take<float>(totals[2 * n + 1] * o.view.channels);
+                }
+            }))
+            return error;
+        std::vector<Counted<Scatter>> scatters;
+        std::vector<Counted<Sort>> sorts;
+        for (const Of& o : views_) {
+            scatters.push_back({{nullptr, o.splats, o.view.tiles, o.camera().columns(), o.cursors, o.keys}, o.count()});
+            sorts.push_back(
+                {{nullptr, o.view.tiles, o.starts, o.keys, nullptr, nullptr, 0, o.rows}, o.camera().tiles()});
+        }
+        if (const int error = each_element(scatters, stream_)) return error;
+        return each_block(sorts, stream_);
     }
-    void lay_out_pairs(Arena& a, const int64_t (&totals)[2], int channels) {
-        keys_ = a.take<uint64_t>(totals[0]), rows_ = a.take<int32_t>(totals[0]);
-        sums_ = a.take<float>(totals[1] * channels);
+
+    template <typename Layout>
+    int lay_out(void** memory, const Layout& layout) {
+        Arena sizes(nullptr);
+        layout(sizes);
+        if (const int error = allocate(memory, sizes.size(), stream_)) return error;
+        Arena arena(*memory);
+        layout(arena);
+        return 0;
+    }
+    int64_t all_tiles() const {
+        int64_t tiles = 0;
+        for (const Of& o : views_) tiles += o.camera().tiles();
+        return tiles;
     }
 
     void* stream_;
-    Camera camera_ = {};
-    int64_t count_ = 0;
+    std::vector<Of> views_;
     void *memory_ = nullptr, *pair_memory_ = nullptr;
-    Splat* splats_ = nullptr;
-    int32_t *slots_ = nullptr, *counts_ = nullptr, *starts_ = nullptr, *cursors_ = nullptr, *rows_ = nullptr;
+    int32_t* counts_ = nullptr;
     int64_t* totals_ = nullptr;
-    uint64_t* keys_ = nullptr;
-    float *transmittance_ = nullptr, *sums_ = nullptr;
 };
 
 }  // namespace fit
@@ -173,25 +354,19 @@ class Picture {
 
 extern "C" {
 
-int sgs_cuda_radii(
-    int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
-    const float* viewmat, const float* K, int width, int height, float near_plane, const float* intervals, float* radii,
-    void* stream) {
-    using namespace structgstream::cuda;
-    const fit::Camera camera = {viewmat, K, nullptr, near_plane, width, height};
-    const fit::Project project = {camera, means, quats, scales, opacities, nullptr, intervals, nullptr, nullptr, nullptr, radii};
-    return for_each(project, count, stream);
+int sgs_cuda_views(const sgs_cuda_view* views, int count, void* stream) try {
+    return structgstream::cuda::fit::Views(views, count, stream).draw();
+} catch (const std::bad_alloc&) {
+    return structgstream::cuda::fit::kNoMemory;
 }
 
-int sgs_cuda_picture(
-    int64_t count, const float* means, const float* quats, const float* scales, const float* opacities,
-    const float* colors, const float* viewmat, const float* K, int width, int height, float near_plane,
-    const float* background, const float* intervals, const float* maps, int channels, float* weights, float* image,
-    float* alpha, float* radii, void* stream) {
-    using namespace structgstream::cuda;
-    const fit::Camera camera = {viewmat, K, nullptr, near_plane, width, height};
-    const fit::Project project = {camera, means, quats, scales, opacities, colors, intervals, nullptr, nullptr, nullptr, radii};
-    return fit::Picture(stream).draw(project, count, background, maps, channels, weights, image, alpha);
+int sgs_cuda_reached_tiles(const sgs_cuda_reach* views, int count, void* stream) try {
+    using namespace structgstream::cuda::fit;
+    std::vector<Counted<Reach>> reaches;
+    for (int v = 0; v < count; ++v) reaches.push_back({{views[v]}, views[v].gaussians.count});
+    return each_element(reaches, stream);
+} catch (const std::bad_alloc&) {
+    return structgstream::cuda::fit::kNoMemory;
 }
 
 }  // extern "C"

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gaussians after activation for one camera: the input of a rasteriser."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
 
-def row_indices(rows: Tensor) -> Tensor:
-    """Indices ``[n]`` of the rows of a mask ``[N]``; indices are returned unchanged.
+def row_indices(rows: Tensor, like: Tensor) -> Tensor:
+    """Indices ``[n]`` of the rows of a mask ``[N]`` on the device of ``like``; indices stay what they are.
 
-    Indexing a tensor by a mask counts its rows each time, for which the host waits for the GPU.
+    Indexing a tensor by a mask counts its rows each time, for which the host waits for the GPU where the mask lies.
     """
-    return rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows
+    return (rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows).to(like.device)
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class Gaussians:
 
     def select(self, rows: Tensor) -> "Gaussians":
         """The rows of a mask ``[N]`` or of indices ``[n]``."""
-        rows = row_indices(rows)
+        rows = row_indices(rows, self.means)
         return Gaussians(**{name: value[rows] for name, value in self.columns().items()})
 
 
@@ -66,3 +67,12 @@ def concatenate(first: Gaussians, second: Gaussians) -> Gaussians:
     ones, others = first.columns(), second.columns()
     assert ones.keys() == others.keys(), (sorted(ones), sorted(others))
     return Gaussians(**{name: torch.cat([value, others[name]]) for name, value in ones.items()})
+
+
+def select_each(sets: Sequence[Gaussians], rows: Tensor) -> list[Gaussians]:
+    """Of several sets the rows of one mask ``[N]`` over all of them, on the processor."""
+    lengths = list(map(len, sets))
+    counts = [int(mask.sum()) for mask in rows.split(lengths)]
+    columns, selected = [of.columns() for of in sets], row_indices(rows, sets[0].means)
+    parts = [torch.cat([of[name] for of in columns])[selected].split(counts) for name in columns[0]]
+    return [Gaussians(**dict(zip(columns[0], of, strict=True))) for of in zip(*parts, strict=True)]

@@ -53,7 +53,7 @@ def cuda_without_waiting() -> Backend:
 @pytest.mark.parametrize("build", [*BUILDERS, cuda_backend, cuda_without_waiting])
 def test_signatures_are_those_of_the_table(build: Callable[[], Backend]) -> None:
     backend = build()
-    assert len(Backend.operations()) == 17
+    assert len(Backend.operations()) == 20
     for name, operation in Backend.operations().items():
         wanted = inspect.signature(operation.oracle)
         found = inspect.signature(getattr(backend, name))
@@ -143,7 +143,10 @@ def test_weights_of_blending_have_no_graph(build: Callable[[], Backend]) -> None
     weights = build().blending_weights(gaussians, camera.viewport(gaussians.means), maps)
     assert weights.shape == (len(gaussians), 2)
     assert not weights.requires_grad
-    picture, again = build().picture_and_weights(gaussians, camera.viewport(gaussians.means), maps)
+    views = [gaussians], [camera.viewport(gaussians.means)], maps[None]
+    slots = int(gaussians.ids.max()) + 1
+    (picture,), (again,) = build().draw_and_weigh_views(*views, slots=slots)
     assert picture.shape == (camera.height, camera.width, 3)
     assert not picture.requires_grad
-    torch.testing.assert_close(again, weights)
+    torch.testing.assert_close(again[gaussians.ids], weights)
+    assert torch.equal(build().weigh_views(*views, slots=slots)[0], again)

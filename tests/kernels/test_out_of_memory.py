@@ -68,7 +68,7 @@ CALLS: dict[str, tuple[object, str, int | None, Callable[[], object]]] = {
         cpu_motion,
         "sgs_picture_residual",
         1,
-        lambda: cpu_motion.picture_residual(Z(8, 8, 3), Z(8, 8, 3).byte()),
+        lambda: cpu_motion.picture_residuals(Z(1, 8, 8, 3), Z(1, 8, 8, 3).byte()),
     ),
     "lift": (
         cpu_motion,

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Changed pixels, residuals and consistent flow of the reference, beside what is known by hand."""
 
+from typing import Any
+
 import numpy as np
 import torch
 
 from structgstream.flow import ABSOLUTE, RELATIVE, consistency_mask
-from structgstream.kernels.reference_motion import changed_pixels, confident_flow, picture_residual
+from structgstream.kernels.reference_motion import changed_pixels, confident_flow, picture_residuals
 from structgstream.kernels.values import TileSelection
 
 
@@ -27,17 +29,22 @@ def test_darker_is_a_change_as_brighter_is_and_a_corner_has_fewer_neighbours() -
     assert changed_pixels(before, now, threshold=0.06, reach_pixels=0).sum() == 1
 
 
+def residual_of(rendering: torch.Tensor, picture: torch.Tensor, **options: Any) -> torch.Tensor:
+    """The residual of one view."""
+    return picture_residuals([rendering], picture[None], **{name: value[None] for name, value in options.items()})[0]
+
+
 PICTURE = torch.randint(256, (6, 7, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
 
 
 def test_equal_pictures_have_no_residual() -> None:
-    assert not picture_residual(PICTURE.float() / 255.0, PICTURE).any()
+    assert not residual_of(PICTURE.float() / 255.0, PICTURE).any()
 
 
 def test_a_difference_is_a_mean_over_the_pixels_around() -> None:
     rendering = torch.zeros(6, 7, 3)
     rendering[0, 0] = torch.tensor([0.9, 0.3, 0.6])
-    found = picture_residual(rendering, torch.zeros(6, 7, 3, dtype=torch.uint8))
+    found = residual_of(rendering, torch.zeros(6, 7, 3, dtype=torch.uint8))
     torch.testing.assert_close(found[0, 0], torch.tensor(0.6 / 4))
     torch.testing.assert_close(found[0, 1], torch.tensor(0.6 / 6))
     torch.testing.assert_close(found[1, 1], torch.tensor(0.6 / 9))
@@ -48,22 +55,22 @@ def test_a_difference_is_a_mean_over_the_pixels_around() -> None:
 def test_a_rendering_is_what_the_camera_records_of_it() -> None:
     white = torch.full((6, 7, 3), 255, dtype=torch.uint8)
     gains, biases = torch.tensor([2.0, 1.0, 4.0]), torch.tensor([0.0, 0.5, -0.2])
-    assert not picture_residual(torch.full((6, 7, 3), 0.7), white, gains=gains, biases=biases).any(), "not above white"
-    found = picture_residual(torch.full((6, 7, 3), 0.3), white, gains=gains, biases=biases)
+    assert not residual_of(torch.full((6, 7, 3), 0.7), white, gains=gains, biases=biases).any(), "not above white"
+    found = residual_of(torch.full((6, 7, 3), 0.3), white, gains=gains, biases=biases)
     torch.testing.assert_close(found, torch.full((6, 7), (0.4 + 0.2 + 0.0) / 3))
 
 
 def test_a_larger_rendering_is_averaged() -> None:
     rendering = torch.zeros(12, 14, 3)
     rendering[::2, ::2] = 1.0
-    found = picture_residual(rendering, torch.zeros(6, 7, 3, dtype=torch.uint8))
+    found = residual_of(rendering, torch.zeros(6, 7, 3, dtype=torch.uint8))
     torch.testing.assert_close(found, torch.full((6, 7), 0.25))
 
 
 def test_outside_of_tiles_it_is_another_picture() -> None:
     tiles = TileSelection(torch.tensor([[True, False]]), 32, 16)
     black = torch.zeros(16, 32, 3, dtype=torch.uint8)
-    found = picture_residual(torch.ones(16, 32, 3), black, tiles=tiles, outside=black)
+    (found,) = picture_residuals([torch.ones(16, 32, 3)], black[None], tiles=[tiles], outside=[black])
     assert (found[:, :15] == 1.0).all()
     assert not found[:, 17:].any()
 
@@ -73,7 +80,7 @@ def test_masked_pixels_do_not_differ_and_touch_no_others() -> None:
     mask[2, 3] = False
     rendering = torch.zeros(6, 7, 3)
     rendering[2, 3] = 1.0
-    assert not picture_residual(rendering, torch.zeros(6, 7, 3, dtype=torch.uint8), mask=mask).any()
+    assert not residual_of(rendering, torch.zeros(6, 7, 3, dtype=torch.uint8), masks=mask).any()
 
 
 def shift(x: float, y: float, height: int = 6, width: int = 9) -> torch.Tensor:

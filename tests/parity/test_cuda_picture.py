@@ -1,46 +1,133 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Radii and blending weights of the GPU's kernels, run on the processor, beside those of the cpu back-end."""
+"""Several views drawn and weighed by the GPU's kernels, run on the processor, beside what the cpu back-end finds."""
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
+from torch import Tensor
 
-from structgstream.kernels import cpu_raster, cuda_picture
+from structgstream.gaussians import Gaussians
+from structgstream.kernels import cpu_raster, cuda_anchors, cuda_picture
+from structgstream.kernels.backend import Backend, cpu_backend
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.native import native_reason
-from tests.support.backends import quickest_backend
+from structgstream.kernels.values import RasterOutput, TileSelection, tile_grid
+from structgstream.scene.sampling import RigSampling
+from structgstream.scene.scene import Scene
+from tests.support.rigs import random_scene
 from tests.support.worlds import moving_world
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+RIG = moving_world(2).rig
+CAMERAS = [RIG[name] for name in RIG.training]
+VIEWPORTS = [camera.viewport(torch.zeros(0)) for camera in CAMERAS]
+SIZE = (CAMERAS[0].height, CAMERAS[0].width)
+
+
+def scene(*, filtered: bool = False) -> Scene:
+    made = random_scene(60, free=3, cameras=len(CAMERAS), seed=4)
+    return replace(made, sampling=RigSampling.of(RIG)) if filtered else made
+
+
+def selections(seed: int) -> list[TileSelection]:
+    generator = torch.Generator().manual_seed(seed)
+    masks = torch.rand(len(CAMERAS), *tile_grid(SIZE[1], SIZE[0]), generator=generator) < 0.5
+    return [TileSelection(mask, SIZE[1], SIZE[0]) for mask in masks]
+
+
+def in_both_orders(
+    emulation: Callable[[int], KernelLibrary], run: Callable[[KernelLibrary], list[Tensor]]
+) -> list[Tensor]:
+    """What ``run`` finds, after a check that the order of threads does not matter."""
+    found, again = (run(emulation(order)) for order in (0, 1))
+    assert all(torch.equal(one, two) for one, two in zip(found, again, strict=True))
+    return found
 
 
 @pytest.mark.parametrize("channels", [1, 7, 9])
 @pytest.mark.parametrize("filtered", [False, True])
-def test_what_the_cpu_finds(emulation: Callable[[int], KernelLibrary], channels: int, filtered: bool) -> None:
-    world = moving_world(2)
-    camera = world.rig["cam01"]
-    gaussians = world.scene.gaussians(camera, quickest_backend())
+def test_pictures_and_weights(emulation: Callable[[int], KernelLibrary], channels: int, filtered: bool) -> None:
+    cpu, shown = cpu_backend(), scene(filtered=filtered)
+    gaussians, static = (part.gaussians_of_views(CAMERAS, cpu) for part in (shown, random_scene(20, seed=5)))
     if filtered:
-        gaussians = replace(gaussians, sampling_intervals=0.05 + 0.1 * torch.rand(len(gaussians)))
-    view = camera.viewport(gaussians.means)
-    background = torch.tensor([0.1, 0.2, 0.3])
-    maps = torch.rand(camera.height, camera.width, channels, generator=torch.Generator().manual_seed(1))
-    found = []
-    for order in (0, 1):
-        library = emulation(order)
-        radii = cuda_picture.projected_radii(library, gaussians, view)
-        weights = cuda_picture.blending_weights(library, gaussians, view, maps)
-        image, same = cuda_picture.picture_and_weights(library, gaussians, view, maps, background=background)
-        assert torch.equal(weights, same)
-        found.append((radii, weights, image))
-    assert all(torch.equal(one, two) for one, two in zip(*found, strict=True))
-    radii, weights, image = found[0]
-    drawn = cuda_picture.rasterize(emulation(0), cpu_raster.rasterize, gaussians, view, background=background)
-    assert all(torch.equal(one, two) for one, two in ((drawn.image, image), (drawn.radii, radii)))
-    assert torch.allclose(drawn.alpha, cpu_raster.rasterize(gaussians, view).alpha, atol=1e-6)
-    assert torch.allclose(radii, cpu_raster.projected_radii(gaussians, view), rtol=1e-5)
-    exact, exact_weights = cpu_raster.picture_and_weights(gaussians, view, maps, background=background)
-    assert (image - exact).abs().max() < 1e-6
-    assert (weights - exact_weights).norm() <= 1e-5 * exact_weights.norm()
+        static = [replace(of, sampling_intervals=torch.full((len(of),), 0.05)) for of in static]
+    slots = 60 * shown.anchors.offsets_per_anchor + 3
+    generator = torch.Generator().manual_seed(1)
+    maps = torch.rand(len(CAMERAS), *SIZE, channels, generator=generator)
+    backgrounds = torch.rand(len(CAMERAS), 3, generator=generator)
+
+    def run(library: KernelLibrary) -> list[Tensor]:
+        images, sums = cuda_picture.draw_and_weigh_views(
+            library, gaussians, VIEWPORTS, maps, slots=slots, backgrounds=backgrounds
+        )
+        assert torch.equal(cuda_picture.weigh_views(library, gaussians, VIEWPORTS, maps, slots=slots), sums)
+        behind = cuda_picture.weigh_views(library, gaussians, VIEWPORTS, maps, slots=slots, static=static)
+        one = cuda_picture.blending_weights(library, gaussians[1], VIEWPORTS[1], maps[1])
+        assert torch.equal(one, sums[1, gaussians[1].ids])
+        return [images, sums, behind]
+
+    images, sums, behind = in_both_orders(emulation, run)
+    exact, exact_sums = cpu.draw_and_weigh_views(gaussians, VIEWPORTS, maps, slots=slots, backgrounds=backgrounds)
+    exact_behind = cpu.weigh_views(gaussians, VIEWPORTS, maps, slots=slots, static=static)
+    assert (images - exact).abs().max() < 1e-6
+    for ours, theirs in ((sums, exact_sums), (behind, exact_behind)):
+        assert (ours - theirs).norm() <= 1e-5 * theirs.norm()
+    assert not torch.equal(sums, behind)
+
+
+@pytest.mark.parametrize(("tiled", "onto"), [(False, False), (True, False), (True, True)])
+def test_drawings(emulation: Callable[[int], KernelLibrary], tiled: bool, onto: bool) -> None:
+    cpu = cpu_backend()
+    gaussians, static = (part.gaussians_of_views(CAMERAS, cpu) for part in (scene(), random_scene(20, seed=5)))
+    pictures = torch.rand(len(CAMERAS), *SIZE, 3, generator=torch.Generator().manual_seed(2))
+    tiles = selections(3) if tiled else None
+
+    def drawn(draw: Callable[..., list[RasterOutput]]) -> list[Tensor]:
+        given = list(pictures.clone()) if onto else None
+        found = draw(gaussians, VIEWPORTS, static=static, tiles=tiles, onto=given)
+        assert given is None or all(torch.equal(of.image, one) for of, one in zip(found, given, strict=True))
+        return [tensor for of in found for tensor in (of.image, of.alpha, of.radii)]
+
+    found = in_both_orders(emulation, lambda library: drawn(partial(cuda_picture.draw_views, library)))
+    for ours, theirs in zip(found, drawn(cpu.draw_views), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-6)
+    (one,) = cuda_picture.draw_views(emulation(0), gaussians[:1], VIEWPORTS[:1])
+    single = cuda_picture.rasterize(emulation(0), cpu_raster.rasterize, gaussians[0], VIEWPORTS[0])
+    assert torch.equal(single.image, one.image)
+
+
+@pytest.mark.parametrize("tiled", [False, True])
+@pytest.mark.parametrize("filtered", [False, True])
+def test_generated_gaussians(emulation: Callable[[int], KernelLibrary], tiled: bool, filtered: bool) -> None:
+    cpu, shown, tiles = cpu_backend(), scene(filtered=filtered), selections(4) if tiled else None
+
+    def of_views(backend: Backend) -> list[Gaussians]:
+        return shown.gaussians_of_views(CAMERAS, backend, tiles=tiles)
+
+    def run(library: KernelLibrary) -> list[Tensor]:
+        kernels = cpu.with_functions(generate_views=partial(cuda_anchors.generate_views, library))
+        return [column for gaussians in of_views(kernels) for column in gaussians.columns().values()]
+
+    columns = list(of_views(cpu)[0].columns())
+    found = in_both_orders(emulation, run)
+    for n, theirs in enumerate(of_views(cpu)):
+        every = Gaussians(**dict(zip(columns, found[n * len(columns) : (n + 1) * len(columns)], strict=True)))
+        assert len(every) == 60 * shown.anchors.offsets_per_anchor + 3
+        ours = every.select(every.opacities > 0)
+        for name, column in theirs.columns().items():
+            torch.testing.assert_close(getattr(ours, name), column, rtol=1e-4, atol=1e-6)
+
+
+def test_reached_tiles(emulation: Callable[[int], KernelLibrary]) -> None:
+    cpu, shown, cameras = cpu_backend(), scene(), [camera.scaled(4.0) for camera in CAMERAS]
+    gaussians, like = shown.gaussians_of_views(cameras, cpu), torch.zeros(0)
+    slots = 60 * shown.anchors.offsets_per_anchor + 3
+    visible = torch.rand(len(cameras), slots, generator=torch.Generator().manual_seed(6)) < 0.05
+    views = gaussians, [camera.viewport(like) for camera in cameras], visible
+    options = {"reduced": [camera.scaled(0.25).viewport(like) for camera in cameras], "margin_pixels": 2}
+    (found,) = in_both_orders(emulation, lambda library: [cuda_picture.reached_tiles(library, *views, **options)])
+    assert torch.equal(found, cpu.reached_tiles(*views, **options))
+    assert 0 < found.sum() < found.numel()

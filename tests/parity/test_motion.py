@@ -35,16 +35,19 @@ def test_changed_pixels_are_the_same(size: tuple[int, int], reach_pixels: int) -
 def test_residual(size: tuple[int, int], reduced: tuple[int, int], corrected: bool, tiled: bool, masked: bool) -> None:
     g = torch.Generator().manual_seed(2)
     height, width = size
-    rendering = torch.rand(*size, 3, generator=g) * 1.4 - 0.2  # Beyond what a picture can show.
-    picture = torch.randint(256, (*reduced, 3), generator=g, dtype=torch.uint8)
-    tiles = TileSelection(torch.rand(tile_grid(width, height), generator=g) < 0.5, width, height) if tiled else None
-    outside = torch.randint(256, (*size, 3), generator=g, dtype=torch.uint8) if tiled else None
-    mask = torch.rand(reduced, generator=g) < 0.8 if masked else None
-    color = (torch.rand(3, generator=g) + 0.5, torch.rand(3, generator=g) * 0.2) if corrected else (None, None)
-    given = {"gains": color[0], "biases": color[1], "tiles": tiles, "outside": outside, "mask": mask}
-    exact = reference_motion.picture_residual(rendering, picture, **given)
-    ours = cpu_motion.picture_residual(rendering, picture, **given)
-    assert ours.shape == exact.shape == reduced
+    renderings = torch.rand(2, *size, 3, generator=g) * 1.4 - 0.2  # Beyond what a picture can show.
+    pictures = torch.randint(256, (2, *reduced, 3), generator=g, dtype=torch.uint8)
+    selections = torch.rand(2, *tile_grid(width, height), generator=g) < 0.5
+    given = {
+        "gains": torch.rand(2, 3, generator=g) + 0.5 if corrected else None,
+        "biases": torch.rand(2, 3, generator=g) * 0.2 if corrected else None,
+        "tiles": [TileSelection(mask, width, height) for mask in selections] if tiled else None,
+        "outside": torch.randint(256, (2, *size, 3), generator=g, dtype=torch.uint8) if tiled else None,
+        "masks": torch.rand(2, *reduced, generator=g) < 0.8 if masked else None,
+    }
+    exact = reference_motion.picture_residuals(renderings, pictures, **given)
+    ours = cpu_motion.picture_residuals(renderings, pictures, **given)
+    assert ours.shape == exact.shape == (2, *reduced)
     torch.testing.assert_close(ours, exact, atol=2e-6, rtol=0)
     assert exact.max() > 0.05 or (masked and min(reduced) == 1)
 

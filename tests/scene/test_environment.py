@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from structgstream.kernels.backend import reference_backend
-from structgstream.scene.environment import background, environment, pixel_directions
+from structgstream.scene.environment import environment, pixel_directions
 from structgstream.scene.render import draw, render
 from tests.support.rigs import arc_rig, random_scene
 from tests.support.spheres import fibonacci_sphere
@@ -53,4 +53,4 @@ def test_a_smooth_one_is_nearly_one_colour_for_a_picture() -> None:
     assert covered.any()
     shown = render(scene, CAMERA, BACKEND).image
     torch.testing.assert_close(trained.image[covered], shown[covered], atol=1 / 255, rtol=0)
-    assert background(None, CAMERA) is None
+    assert replace(scene, environment=None).background(CAMERA) is None

@@ -18,8 +18,9 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
-from structgstream.kernels import cpu_raster, cuda, cuda_anchors, cuda_fit, cuda_library, cuda_picture
-from structgstream.kernels.backend import Backend, reference_backend
+from structgstream.kernels import backend as backends
+from structgstream.kernels import cpu_raster, cuda, cuda_anchors, cuda_fit, cuda_library
+from structgstream.kernels.backend import Backend, native_functions, reference_backend
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.values import FitFrame, RasterOutput
 from tests.support.pretended_gpu import DEVICE, lies_there, pretended_device, rasterize, values_of
@@ -57,8 +58,9 @@ class Counts:
         if not (there or any(lies_there(leaf) for leaf in tree_leaves(found))) or name in _VIEWS.split():
             return
         indices = args[1] if name in ("index", "index_put", "index_put_", "_index_put_impl_") else ()
-        by_mask = any(isinstance(i, Tensor) and i.dtype in (torch.bool, torch.uint8) for i in indices or ())
+        by_mask = any(lies_there(i) and i.dtype in (torch.bool, torch.uint8) for i in indices or ())
         to_host = there and name == "_to_copy" and not any(lies_there(leaf) for leaf in tree_leaves(found))
+        to_host = to_host and not (kwargs or {}).get("non_blocking")  # ``kernels.backend.on_processor`` waits once.
         self.add(name, 5 if by_mask else _LAUNCHES.get(name, 1), int(name in _WAITS or by_mask or to_host))
 
     @contextmanager
@@ -77,9 +79,12 @@ class _Library(KernelLibrary):
     counts: Counts
 
     def call(self, name: str, *arguments: Any, device: torch.device) -> None:
-        launches = {"sgs_cuda_anchor_inputs": 2, "sgs_cuda_l1_ssim": 2, "sgs_cuda_picture": 8}.get(name, 1)
-        self.counts.add(name, launches, waits=int(name == "sgs_cuda_picture"))
+        launches = {"sgs_cuda_anchor_inputs": 2, "sgs_cuda_l1_ssim": 2, "sgs_cuda_views": 8}.get(name, 1)
+        self.counts.add(name, launches, waits=int(name == "sgs_cuda_views"))
         super().call(name, *(values_of(argument) for argument in arguments), device=device)
+
+    def addresses(self, *tensors: Tensor | None) -> list[int | None]:
+        return super().addresses(*map(values_of, tensors))
 
     def check_devices(self, *tensors: Tensor | None) -> None:
         assert all(tensor is None or lies_there(tensor) for tensor in tensors)
@@ -168,6 +173,7 @@ def counted_gpu(
     draw = _counted_rasterizer(counts)
     patch.setattr(cuda_library, "kernel_library", lambda: (library, "emulated"))
     patch.setattr(cuda, "rasterize", draw)
+    patch.setattr(backends, "wait_for", lambda device: counts.add("wait", 0, waits=int(device == DEVICE)))
     plain = KernelLibrary(emulation, "cpu", lambda device: 0)
     backend = replace(
         reference_backend(),
@@ -176,10 +182,7 @@ def counted_gpu(
         recorder=lambda: _Recorder(counts),
         iterations=partial(_counted_iterations, plain, counts) if native else None,
     ).with_functions(
-        rasterize=partial(cuda_picture.rasterize, library, draw),
-        projected_radii=partial(cuda_picture.projected_radii, library),
-        blending_weights=partial(cuda_picture.blending_weights, library),
-        picture_and_weights=partial(cuda_picture.picture_and_weights, library),
+        **native_functions(library, draw),
         adam_step=cuda.adam_step,
         generate_structured=partial(cuda_anchors.generate_structured, library),
         l1_ssim=partial(cuda.l1_ssim, library),

@@ -20,9 +20,10 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 from structgstream.cameras import Viewport
 from structgstream.gaussians import Gaussians
-from structgstream.kernels import reference_raster
-from structgstream.kernels.backend import Backend, reference_backend
+from structgstream.kernels import reference_anchors
+from structgstream.kernels.backend import Backend, functions_of, reference_backend
 from structgstream.kernels.cuda_tiles import PairBudget
+from structgstream.kernels.reference_views import ViewByView
 from structgstream.kernels.values import Rasterizer, RasterOutput, TileSelection
 
 # Autograd has no threads for a GPU that is not there; for this device it works on the calling one.
@@ -205,8 +206,5 @@ def pretended_gpu(on_processor: Rasterizer) -> Backend:
     """The torch parts of the cuda back-end on ``DEVICE``, with the rasteriser ``on_processor``."""
     there = partial(rasterize, on_processor)
     return replace(reference_backend(), name="cuda", device=DEVICE).with_functions(
-        rasterize=there,
-        projected_radii=partial(reference_raster.radii_by_drawing, there),
-        blending_weights=partial(reference_raster.weights_by_gradient, there),
-        picture_and_weights=partial(reference_raster.picture_and_weights_by_gradient, there),
+        **functions_of(ViewByView.by_drawing(reference_anchors.generate_structured, there)),
     )

@@ -8,11 +8,10 @@ import torch
 
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
 from structgstream.kernels.native import native_reason
-from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig, SpawnConfig, SpawnRules, ThinSpawnConfig
 from structgstream.training.online.patching import IDS_PER_FRAME
-from structgstream.training.online.spawn import SpawnResult, prune_and_spawn
+from structgstream.training.online.spawn import SpawnResult, Sweep, prune_and_spawn
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
 from structgstream.training.residuals import ResidualFloor, residual_floor
 from structgstream.training.views import training_views
@@ -81,13 +80,13 @@ def test_what_emerges_before_something_that_frame_0_drew_badly_is_spawned_if_the
 
 
 def test_where_no_picture_lacks_anything_nothing_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn: list[str] = []
+    drawn, draw = list[str](), Sweep._draw
 
     def counting(*arguments, **options):
         drawn.append("once")
         return draw(*arguments, **options)
 
-    monkeypatch.setattr("structgstream.training.online.spawn.draw", counting)
+    monkeypatch.setattr(Sweep, "_draw", counting)
     assert not len(renewed(quickest_backend(), config=replace(CONFIG, missing_threshold=10.0)).new_free)
     assert not drawn
     assert len(renewed(quickest_backend()).new_free)

@@ -15,7 +15,7 @@ from structgstream.training.online.spawn import (
     _merge_points,
     outlier_mask,
     spawn_by_sweep,
-    view_residual,
+    view_residuals,
 )
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.views import View, training_views
@@ -44,7 +44,8 @@ def spoiled(view: View) -> torch.Tensor:
 
 def compared(picture: torch.Tensor, view: View, *, rules: SpawnRules, floor: ResidualFloor | None) -> ViewResidual:
     color = CameraColor.identity(view.index + 1)
-    return view_residual(picture, view, color, floor=floor, rules=rules, backend=reference_backend())
+    (found,) = view_residuals([picture], [view], color, floor=floor, rules=rules, backend=reference_backend())
+    return found
 
 
 def test_what_is_missing_is_what_differs_by_more_than_frame_0_did() -> None:

@@ -64,11 +64,11 @@ def test_what_another_sweep_has_drawn_is_not_drawn_again() -> None:
     found = swept.missing()
     assert any(entry.drawn is not None for entry in found)
 
-    def rasterize(*args: Any, **options: Any) -> RasterOutput:
+    def draw_views(*args: Any, **options: Any) -> list[RasterOutput]:
         drawings.append(options["tiles"])
-        return swept.backend.rasterize(*args, **options)
+        return swept.backend.draw_views(*args, **options)
 
-    counted = replace(swept, backend=swept.backend.with_functions(rasterize=rasterize))
+    counted = replace(swept, backend=swept.backend.with_functions(draw_views=draw_views))
     known = {entry.view.index: entry for entry in found}
     for first, second in zip(found, replace(counted, known=known).missing(), strict=True):
         assert torch.equal(first.residual.missing_share, second.residual.missing_share)
@@ -90,7 +90,7 @@ def test_without_room_nothing_is_spawned_and_with_room_as_much_as_there_is() -> 
 def test_a_depth_map_is_infinite_where_nothing_is_drawn() -> None:
     swept = sweep()
     camera = swept.views[0].camera
-    depth = swept.depth_map(swept.views[0])
+    (depth,) = swept.depth_maps(swept.views[:1])
     assert depth.shape == (camera.height, camera.width)
     assert bool(depth.isinf().any())
     solid = depth[depth.isfinite()]

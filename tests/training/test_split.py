@@ -9,7 +9,6 @@ import torch
 
 from structgstream.kernels.backend import Backend, cpu_backend, reference_backend
 from structgstream.kernels.native import native_reason
-from structgstream.kernels.values import TileSelection
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.render import draw
 from structgstream.scene.state import PAPER_DYNAMIC, state_of
@@ -108,9 +107,11 @@ def test_active_tiles_draw_and_learn_what_the_whole_picture_would(build: Callabl
 
 def test_changed_tiles_are_those_that_hold_a_changed_pixel() -> None:
     """40 x 24 pixels are three by two tiles of 16, the last ones partial; the mask is at half the size."""
-    tiles = TileSelection(torch.tensor([[True, True, True], [True, True, False]]), 40, 24)
-    changed = torch.zeros(12, 20, dtype=torch.bool)
-    assert changed_tiles(tiles, None) == tiles
-    assert changed_tiles(tiles, changed) == tiles  # Nothing changed: all of them, since none would teach nothing.
+    tiles = torch.tensor([[[True, True, True], [True, True, False]]]).repeat(3, 1, 1)
+    still, changed = torch.zeros(2, 12, 20, dtype=torch.bool)
     changed[3, 9] = changed[9, 1] = changed[10, 18] = True  # The last one lies in a tile that is not among them.
-    assert changed_tiles(tiles, changed).mask.tolist() == [[False, True, False], [True, False, False]]
+    found = changed_tiles(tiles, [None, still, changed], (24, 40))
+    assert torch.equal(found[0], tiles[0])
+    assert torch.equal(found[1], tiles[1])  # Nothing changed: all of them, since none would teach nothing.
+    assert found[2].tolist() == [[False, True, False], [True, False, False]]
+    assert torch.equal(changed_tiles(tiles, [None] * 3, (24, 40)), tiles)

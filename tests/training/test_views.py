@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from structgstream.frames import MultiViewFrame
-from structgstream.training.views import View, area_mean, coarse_to_fine, reduced, shuffled_views, training_views
+from structgstream.training.views import View, area_mean, coarse_to_fine, shuffled_views, training_views
 from tests.support.rigs import arc_rig
 
 RIG = arc_rig()
@@ -68,7 +68,7 @@ def test_reduction_averages_areas_and_keeps_the_camera() -> None:
     camera = arc_rig()["cam01"]
     image = torch.zeros(32, 48, 3, dtype=torch.uint8)
     image[::2] = 200
-    small = reduced(View(1, camera, image), 0.5)
+    small = View(1, camera, image).reduced(0.5)
     assert small.image.shape == (16, 24, 3)
     assert (small.image == 100).all()
     assert torch.allclose(small.camera.K[:2], camera.K[:2] * 0.5)
@@ -80,7 +80,7 @@ def test_bytes_are_averaged_as_torch_does(scale: float) -> None:
     image = torch.randint(0, 256, (32, 48, 3), generator=generator, dtype=torch.uint8)
     size = (round(32 * scale), round(48 * scale))
     expected = torch.nn.functional.interpolate(image.permute(2, 0, 1)[None].float(), size=size, mode="area")
-    found = reduced(View(0, rig["cam01"], image), scale).image
+    found = View(0, rig["cam01"], image).reduced(scale).image
     assert (found.dtype, found.shape) == (torch.uint8, (*size, 3))
     assert (found - expected[0].permute(1, 2, 0)).abs().max() <= 0.5 + 1e-4
 

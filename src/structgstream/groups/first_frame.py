@@ -33,7 +33,7 @@ from structgstream.training.online.patching import IDS_PER_FRAME
 from structgstream.training.online.preprocess import PictureChange, flow_views
 from structgstream.training.online.scene_flow import residual_flow
 from structgstream.training.online.select import select_dynamic
-from structgstream.training.online.spawn import outlier_mask, prune_and_spawn, view_residual
+from structgstream.training.online.spawn import outlier_mask, prune_and_spawn, view_residuals
 from structgstream.training.online.split import DynamicSplit, find_active_tiles, with_displacements
 from structgstream.training.parameters import pixel_size
 from structgstream.training.residuals import ResidualFloor
@@ -94,7 +94,9 @@ def _outlier_anchors(
         active = active_tiles.get(view.index)
         if active is None:
             continue
-        found = view_residual(active.picture, view, dynamic.camera_color, floor=floor, rules=rules, backend=backend)
+        (found,) = view_residuals(
+            [active.picture], [view], dynamic.camera_color, floor=floor, rules=rules, backend=backend
+        )
         small = found.view
         pixels = found.wrong.to(active.picture)
         counting = torch.ones_like(pixels) if small.mask is None else small.mask.to(pixels)

@@ -18,7 +18,7 @@ from torch import Tensor
 from structgstream.cameras import CameraRig, enlargement
 from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians
-from structgstream.kernels.backend import Backend
+from structgstream.kernels.backend import Backend, on_processor
 from structgstream.kernels.values import TileSelection
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import FlowConfig, LiftConfig, MotionConfig
@@ -235,9 +235,10 @@ def _rendered_flow(tracker: Tracker, scene: Scene, seen: _ViewEvidence, velociti
     picture = seen.tiles.choose(blackened(rendered, view.mask), view.image)
     small = view.evidence(tracker.config.picture_scale)
     size = (small.camera.height, small.camera.width)
-    found = flow_map(picture, view.image, counting, size, mask=counting, config=FLOW, backend=backend)
+    here = on_processor(picture, view.image, counting)  # Where flow is searched.
+    found = flow_map(*here, size, mask=here[2], config=FLOW, backend=backend)
     inside = area_mean(counting[None, None].float(), size)[0, 0]
-    maps = torch.cat([found.maps, inside[..., None], small.colors * inside[..., None]], dim=-1)
+    maps = torch.cat([found.maps.to(inside.device), inside[..., None], small.colors * inside[..., None]], dim=-1)
     sums = accumulate(moved, small.camera, maps, backend)
     sums *= _pixel_area(view, size)
     return sum_by_primitive(sums, seen.primitives, scene)

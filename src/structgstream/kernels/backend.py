@@ -28,12 +28,15 @@ from types import ModuleType
 from typing import Any, Generic, Literal, ParamSpec, TypeVar, overload
 
 import torch
+from torch import Tensor
 
 from structgstream.errors import BackendError
 from structgstream.kernels import reference_anchors, reference_losses, reference_motion, reference_raster
 from structgstream.kernels.cuda_graph import GraphMemory, Recorder
+from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.cuda_tiles import PairBudget
-from structgstream.kernels.values import FitFrame
+from structgstream.kernels.reference_views import ORACLE, ViewByView
+from structgstream.kernels.values import FitFrame, Rasterizer
 
 _log = logging.getLogger(__name__)
 
@@ -84,9 +87,12 @@ class Backend:
     iterations: Callable[[FitFrame], Callable[[int, int], None]] | None = None
 
     rasterize = Operation(reference_raster.rasterize)  # cuda: gsplat; own kernels without gradients
-    projected_radii = Operation(reference_raster.projected_radii)  # cuda: own kernels, or a picture of gsplat
     blending_weights = Operation(reference_raster.blending_weights)  # cuda: own kernels, or gsplat's gradients
-    picture_and_weights = Operation(reference_raster.picture_and_weights)  # cuda: own kernels, or gsplat
+    generate_views = Operation(ORACLE.generate_views)  # cuda: own kernels, or view by view; as the four below
+    draw_views = Operation(ORACLE.draw_views)
+    weigh_views = Operation(ORACLE.weigh_views)
+    draw_and_weigh_views = Operation(ORACLE.draw_and_weigh_views)
+    reached_tiles = Operation(ORACLE.reached_tiles)
     generate_structured = Operation(reference_anchors.generate_structured)  # cuda: own kernels
     l1_ssim = Operation(reference_losses.l1_ssim)  # cuda: own kernels
     volume = Operation(reference_losses.volume)
@@ -95,9 +101,9 @@ class Backend:
     change_bits = Operation(reference_losses.change_bits)
     adam_step = Operation(reference_losses.adam_step)  # cuda: torch's fused kernel
     changed_pixels = Operation(reference_motion.changed_pixels)
-    picture_residual = Operation(reference_motion.picture_residual)
+    picture_residuals = Operation(reference_motion.picture_residuals)
     confident_flow = Operation(reference_motion.confident_flow)  # cuda: on the CPU, where flow is estimated
-    lift = Operation(reference_motion.lift)
+    lift = Operation(reference_motion.lift)  # cuda: own kernel
     sweep = Operation(reference_motion.sweep)  # cuda: own kernels
     plane_scores = Operation(reference_motion.plane_scores)  # cuda: on the CPU
 
@@ -114,8 +120,8 @@ class Backend:
         return replace(self, functions={**self.functions, **functions})
 
 
-def _functions_of(*modules: ModuleType) -> dict[str, Callable[..., Any]]:
-    """The modules' functions that have the name of an operation."""
+def functions_of(*modules: ModuleType | ViewByView) -> dict[str, Callable[..., Any]]:
+    """The functions that have the name of an operation."""
     return {name: getattr(module, name) for module in modules for name in Backend.operations() if hasattr(module, name)}
 
 
@@ -134,8 +140,15 @@ def cpu_backend() -> Backend:
     from structgstream.kernels.native import native_library
 
     native_library()
-    functions = _functions_of(cpu_raster, cpu_anchors, cpu_losses, cpu_motion)
-    return Backend("cpu", torch.device("cpu"), functions, iterations=cpu_fit.iterations)
+    functions = functions_of(cpu_raster, cpu_anchors, cpu_losses, cpu_motion)
+    views = ViewByView(
+        cpu_anchors.generate_structured,
+        cpu_raster.rasterize,
+        cpu_raster.projected_radii,
+        cpu_raster.blending_weights,
+        cpu_raster.picture_and_weights,
+    )
+    return Backend("cpu", torch.device("cpu"), {**functions, **functions_of(views)}, iterations=cpu_fit.iterations)
 
 
 def processor_backend() -> Backend:
@@ -155,7 +168,7 @@ def cuda_backend(*, native: bool = False) -> Backend:
     Raises:
         BackendError: no GPU, or gsplat is not installed or does not load; with ``native``, the kernels do not compile.
     """
-    from structgstream.kernels import cuda, cuda_anchors, cuda_fit, cuda_library, cuda_picture
+    from structgstream.kernels import cuda, cuda_anchors, cuda_fit, cuda_library
 
     reason = cuda.cuda_reason(needs_gsplat=not native)
     if reason is not None:
@@ -165,16 +178,16 @@ def cuda_backend(*, native: bool = False) -> Backend:
         raise BackendError(f"The cuda back-end has no iterations of its own here: {sentence}")
     _log.log(logging.WARNING if library is None else logging.INFO, sentence)
     processor, rasterize = processor_backend(), partial(cuda.rasterize, library=library)
+    generate = reference_anchors.generate_structured
+    if library is not None:
+        generate = partial(cuda_anchors.generate_structured, library)
     backend = replace(
         reference_backend(),
         name="cuda",
         device=torch.device("cuda"),
         recorder=GraphMemory(torch.device("cuda")).recorder,
     ).with_functions(
-        rasterize=rasterize,
-        projected_radii=partial(reference_raster.radii_by_drawing, rasterize),
-        blending_weights=partial(reference_raster.weights_by_gradient, rasterize),
-        picture_and_weights=partial(reference_raster.picture_and_weights_by_gradient, rasterize),
+        **functions_of(ViewByView.by_drawing(generate, rasterize)),
         adam_step=cuda.adam_step,
         confident_flow=processor.confident_flow,
         plane_scores=processor.plane_scores,
@@ -182,18 +195,39 @@ def cuda_backend(*, native: bool = False) -> Backend:
     if library is None:
         return backend
     backend = backend.with_functions(
-        generate_structured=partial(cuda_anchors.generate_structured, library),
         l1_ssim=partial(cuda.l1_ssim, library),
         sweep=partial(cuda.sweep, library),
     )
     if not native:
         return backend
     return replace(backend, iterations=partial(cuda_fit.iterations, library)).with_functions(
-        rasterize=partial(cuda_picture.rasterize, library, rasterize),
-        projected_radii=partial(cuda_picture.projected_radii, library),
-        blending_weights=partial(cuda_picture.blending_weights, library),
-        picture_and_weights=partial(cuda_picture.picture_and_weights, library),
+        **native_functions(library, rasterize)
     )
+
+
+def native_functions(library: KernelLibrary, rasterize: Rasterizer) -> dict[str, Callable[..., Any]]:
+    """The functions of a cuda back-end that draws without gradients in this package's kernels; ``rasterize`` has
+    gradients."""
+    from structgstream.kernels import cuda, cuda_anchors, cuda_picture
+
+    functions = functions_of(cuda_picture)
+    del functions["rasterize"]
+    functions |= {"generate_views": cuda_anchors.generate_views, "lift": cuda.lift}
+    of_library = {name: partial(function, library) for name, function in functions.items()}
+    return {**of_library, "rasterize": partial(cuda_picture.rasterize, library, rasterize)}
+
+
+def on_processor(*tensors: Tensor) -> list[Tensor]:
+    """Copies on the processor, for all of which the host waits once; a tensor that lies there stays what it is."""
+    copies = [tensor.to("cpu", non_blocking=True) for tensor in tensors]
+    wait_for(tensors[0].device)
+    return copies
+
+
+def wait_for(device: torch.device) -> None:
+    """Until ``device`` has done all that was queued."""
+    if device.type == "cuda":
+        torch.cuda.current_stream(device).synchronize()
 
 
 def nonblocking(backend: Backend, budget: PairBudget) -> Backend:

@@ -46,40 +46,43 @@ def changed_pixels(before: Tensor, now: Tensor, *, threshold: float, reach_pixel
     """
     assert before.shape == now.shape, (before.shape, now.shape)
     assert before.dtype == now.dtype == torch.uint8, (before.dtype, now.dtype)
-    height, width = now.shape[:2]
-    changed = torch.empty(height, width, dtype=torch.uint8)
-    pictures, limits = (before.contiguous(), now.contiguous()), (threshold, reach_pixels)
-    if native_library().sgs_changed_pixels(*pictures, height, width, *limits, changed, torch.get_num_threads()):
-        raise OutOfMemoryError("to compare two pictures")
+    size, limits = now.shape[-3:-1], (threshold, reach_pixels)
+    changed = torch.empty(now.shape[:-1], dtype=torch.uint8)
+    pictures = (t.contiguous().reshape(-1, *t.shape[-3:]) for t in (before, now))
+    for of_view, *pair in zip(changed.view(-1, *size), *pictures, strict=True):
+        if native_library().sgs_changed_pixels(*pair, *size, *limits, of_view, torch.get_num_threads()):
+            raise OutOfMemoryError("to compare two pictures")
     return changed.bool()
 
 
-def picture_residual(
-    rendering: Tensor,
-    picture: Tensor,
+def picture_residuals(
+    renderings: Sequence[Tensor],
+    pictures: Tensor,
     *,
     gains: Tensor | None = None,
     biases: Tensor | None = None,
-    tiles: TileSelection | None = None,
-    outside: Tensor | None = None,
-    mask: Tensor | None = None,
+    tiles: Sequence[TileSelection] | None = None,
+    outside: Sequence[Tensor] | None = None,
+    masks: Tensor | None = None,
 ) -> Tensor:
-    """See ``reference_motion.picture_residual``.
+    """See ``reference_motion.picture_residuals``.
 
     Raises:
         OutOfMemoryError: there is no memory for the differences.
     """
-    assert (tiles is None) == (outside is None), "tiles need a picture for the pixels outside them"
+    assert (tiles is None) == (outside is None), "tiles need pictures for the pixels outside them"
     assert (gains is None) == (biases is None), "gains and biases belong together"
-    assert picture.dtype == torch.uint8, picture.dtype
-    assert outside is None or outside.shape == rendering.shape, (outside.shape, rendering.shape)
-    assert mask is None or mask.shape == picture.shape[:2], (mask.shape, picture.shape)
-    floats = [constant(t) for t in (rendering, gains, biases)]
-    bytes_ = [None if t is None else t.contiguous() for t in (picture, tiles and tiles.mask, outside, mask)]
-    given = _Residual(*addresses(*floats, *bytes_), *rendering.shape[:2], *picture.shape[:2])
-    found = torch.empty(picture.shape[:2])
-    if native_library().sgs_picture_residual(ctypes.byref(given), found):
-        raise OutOfMemoryError("to compare a rendering with its picture")
+    assert pictures.dtype == torch.uint8, pictures.dtype
+    assert masks is None or masks.shape == pictures.shape[:3], (masks.shape, pictures.shape)
+    found, pictures = torch.empty(pictures.shape[:3]), pictures.contiguous()
+    for n, rendering in enumerate(renderings):
+        assert outside is None or outside[n].shape == rendering.shape, (outside[n].shape, rendering.shape)
+        floats = [constant(t) for t in (rendering, *(None if t is None else t[n] for t in (gains, biases)))]
+        bytes_ = [None if t is None else t[n].contiguous() for t in (outside, masks)]
+        mask = None if tiles is None else tiles[n].mask.contiguous()
+        given = _Residual(*addresses(*floats, pictures[n], mask, *bytes_), *rendering.shape[:2], *pictures.shape[1:3])
+        if native_library().sgs_picture_residual(ctypes.byref(given), found[n]):
+            raise OutOfMemoryError("to compare a rendering with its picture")
     return found
 
 

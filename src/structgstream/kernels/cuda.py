@@ -20,14 +20,24 @@ from structgstream.gaussians import Gaussians
 from structgstream.kernels.cpu_losses import Comparison
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.cuda_tiles import PairBudget, radii_reaching_tiles, tile_lists, tile_lists_in_kernels
-from structgstream.kernels.native import addresses, members
+from structgstream.kernels.native import constant, members
 from structgstream.kernels.reference_raster import (
     LOW_PASS_PIXELS,
     boxes_reaching_tiles,
     restrict_to_tiles,
     screen_low_pass,
 )
-from structgstream.kernels.values import TILE_PIXELS, RasterOutput, SweepView, Swept, TileSelection, tile_grid
+from structgstream.kernels.values import (
+    TILE_PIXELS,
+    Lifted,
+    Neighbors,
+    RasterOutput,
+    SweepView,
+    Swept,
+    TileSelection,
+    ViewFlows,
+    tile_grid,
+)
 
 
 def cuda_reason(*, needs_gsplat: bool = True) -> str | None:
@@ -278,7 +288,7 @@ def sweep(
         slot.height, slot.width = view.missing.shape
         assert view.colors.shape == (slot.height, slot.width, 3), view.colors.shape
         assert view.depths.shape == view.missing.shape, view.depths.shape
-        slot.colors, slot.missing, slot.depths, slot.viewmat, slot.K = addresses(*tensors)
+        slot.colors, slot.missing, slot.depths, slot.viewmat, slot.K = library.addresses(*tensors)
         slot.near_plane = view.near
     pixels, farthest = pixels.to(torch.int64).contiguous(), farthest.float().contiguous()
     library.check_devices(pixels, farthest)
@@ -290,6 +300,41 @@ def sweep(
         *(planes, min_supports, max_contradictions, votes, found.depths, found.costs),
         device=farthest.device,
     )
+    return found
+
+
+class _Lift(ctypes.Structure):
+    """``FlowLift`` of csrc/cpu/lift.h."""
+
+    _fields_ = (
+        *members(ctypes.c_void_p, "centers weights flows viewmats Ks near neighbours affinities priors"),
+        *members(ctypes.c_int64, "movers targets"),
+        *members(ctypes.c_int, "views neighbour_count"),
+        ("share", ctypes.c_float),
+        *members(ctypes.c_void_p, "displacements inlier_share agreeing_views"),
+    )
+
+
+def lift(
+    library: KernelLibrary, centers: Tensor, seen: ViewFlows, neighbors: Neighbors, priors: Tensor, *, share: float
+) -> Lifted:
+    """See ``reference_motion.lift``; float32. Results repeat bit for bit."""
+    (views, dynamic), (targets, count) = seen.weights.shape, neighbors.rows.shape
+    assert centers.shape == (dynamic, 3), centers.shape
+    assert seen.flows.shape == (views, dynamic, 2), seen.flows.shape
+    assert priors.shape == (targets, 3), priors.shape
+    tensors = [constant(centers), *map(constant, seen), neighbors.rows.to(torch.int64).contiguous()]
+    tensors += [constant(neighbors.affinities), constant(priors)]
+    found = Lifted(
+        torch.empty_like(tensors[-1]),
+        torch.empty(targets, device=priors.device),
+        torch.empty(targets, dtype=torch.int64, device=priors.device),
+    )
+    results = found.displacements, found.inlier_share, found.agreeing_views
+    library.check_devices(*tensors, *results)
+    at = library.addresses
+    given = _Lift(*at(*tensors), dynamic, targets, views, count, share, *at(*results))
+    library.call("sgs_cuda_lift", ctypes.addressof(given), device=priors.device)
     return found
 
 

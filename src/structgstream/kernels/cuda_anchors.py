@@ -12,6 +12,7 @@ and scale 0: every rasteriser skips them, they add nothing to the volume, and no
 number of drawn Gaussians is the count of ``opacities > 0``.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -95,7 +96,7 @@ class _Inputs(torch.autograd.Function):
         camera.library.call(
             "sgs_cuda_anchor_inputs",
             *(positions, log_offset_scales, log_base_scales, offsets, features, camera.intervals),
-            *(m, k, d, int(camera.distance_input)),
+            *(m, k, d, int(camera.distance_input), 1),
             *(view.viewmat, view.K, camera.center, view.width, view.height, view.near),
             *(camera.tiles, inputs, seen),
             device=positions.device,
@@ -135,7 +136,7 @@ class _Outputs(torch.autograd.Function):
         ids = torch.empty(m * k, dtype=torch.int64, device=positions.device)
         library.call(
             "sgs_cuda_anchor_outputs",
-            *(positions, log_offset_scales, log_base_scales, offsets, m, k, opacity, color, covariance, seen),
+            *(positions, log_offset_scales, log_base_scales, offsets, m, k, 1, opacity, color, covariance, seen),
             *(means, quats, scales, opacities, colors, raw, ids),
             device=positions.device,
         )
@@ -200,3 +201,51 @@ def generate_structured(
         return StructuredGaussians(gaussians, torch.arange(len(raw), device=raw.device), raw)
     drawn, visible = (opacities.detach() > 0).nonzero()[:, 0], seen.nonzero()[:, 0]
     return StructuredGaussians(gaussians.select(drawn), visible, raw[visible])
+
+
+def generate_views(
+    library: KernelLibrary,
+    anchors: Anchors,
+    mlps: MLPWeights,
+    viewports: Sequence[Viewport],
+    *,
+    free: Gaussians,
+    distance_input: bool,
+    tiles: Sequence[TileSelection] | None = None,
+    sampling_intervals: Tensor | None = None,
+) -> list[Gaussians]:
+    """See ``reference_views``: all ``M * K + F`` Gaussians in each view (Note [Shapes without waiting]); float32."""
+    count, (m, k), d = len(viewports), anchors.offsets.shape[:2], anchors.features.shape[1]
+    (width, height, near), device = viewports[0][3:], anchors.positions.device
+    assert all(viewport[3:] == (width, height, near) for viewport in viewports), "views of one size and near plane"
+    values = [value.detach().contiguous() for value in anchors]
+    viewmats, Ks, centers = (torch.stack(column) for column in zip(*(view[:3] for view in viewports), strict=True))
+    masks = None if tiles is None else torch.stack([of_view.mask for of_view in tiles])
+    library.check_devices(*values, viewmats, Ks, centers, masks, sampling_intervals)
+    inputs = torch.empty(count * m, d + 3 + distance_input, device=device)
+    seen = torch.empty(count * m, dtype=torch.bool, device=device)
+    library.call(
+        "sgs_cuda_anchor_inputs",
+        *(*values, sampling_intervals, m, k, d, int(distance_input), count, viewmats, Ks, centers),
+        *(width, height, near, masks, inputs, seen),
+        device=device,
+    )
+    outputs = [value.contiguous() for value in head_outputs(mlps, inputs)]
+    means, quats, scales, colors = (torch.empty(count, m * k, width, device=device) for width in (3, 4, 3, 3))
+    opacities, raw = torch.empty(count, m * k, device=device), torch.empty(count, m, k, device=device)
+    ids = torch.empty(count, m * k, dtype=torch.int64, device=device)
+    library.call(
+        "sgs_cuda_anchor_outputs",
+        *(*values[:4], m, k, count, *outputs, seen, means, quats, scales, opacities, colors, raw, ids),
+        device=device,
+    )
+    columns = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors, "ids": ids}
+    if sampling_intervals is not None:
+        columns["sampling_intervals"] = sampling_intervals.repeat_interleave(k).expand(count, -1)
+    if len(free):
+        of_free = free.columns()
+        columns = {
+            name: torch.cat([rows, of_free[name].expand(count, *of_free[name].shape)], dim=1)
+            for name, rows in columns.items()
+        }
+    return [Gaussians(**{name: rows[n] for name, rows in columns.items()}) for n in range(count)]

@@ -21,20 +21,21 @@ from torch import Tensor
 
 from structgstream.atomic_files import give_name
 from structgstream.errors import BackendError, OutOfMemoryError
-from structgstream.kernels.native import declare
+from structgstream.kernels.native import addresses, declare
 
 CUDA_PROTOTYPES: Mapping[str, tuple[str, str]] = {
     "sgs_cuda_l1_ssim": ("i", "pppiippppppp"),
     "sgs_cuda_l1_ssim_backward": ("i", "pppiipppppppp"),
     "sgs_cuda_error": ("s", "i"),
-    "sgs_cuda_radii": ("i", "lppppppiifppp"),
-    "sgs_cuda_picture": ("i", "lpppppppiifpppippppp"),
+    "sgs_cuda_lift": ("i", "pp"),
+    "sgs_cuda_views": ("i", "pip"),
+    "sgs_cuda_reached_tiles": ("i", "pip"),
     "sgs_cuda_fit_new": ("i", "plpp"),
     "sgs_cuda_fit_run": ("i", "pii"),
     "sgs_cuda_fit_free": ("v", "p"),
-    "sgs_cuda_anchor_inputs": ("i", "ppppppiiiipppiifpppp"),
+    "sgs_cuda_anchor_inputs": ("i", "ppppppiiiiipppiifpppp"),
     "sgs_cuda_anchor_inputs_backward": ("i", "piiipppp"),
-    "sgs_cuda_anchor_outputs": ("i", "ppppiipppppppppppp"),
+    "sgs_cuda_anchor_outputs": ("i", "ppppiiipppppppppppp"),
     "sgs_cuda_anchor_outputs_backward": ("i", "pppiipppppppppppppppp"),
     "sgs_cuda_sweep": ("i", "piippiiifpppp"),
     "sgs_cuda_tile_depths": ("i", "ppipp"),
@@ -72,6 +73,10 @@ class KernelLibrary:
     def call(self, name: str, *arguments: Tensor | int | float | None, device: torch.device) -> None:
         """Launch one function; errors are those of :meth:`check`."""
         self.check(getattr(self.library, name)(*arguments, self.stream(device)))
+
+    def addresses(self, *tensors: Tensor | None) -> list[int | None]:
+        """Address of each tensor's data on the device; None (null) for None."""
+        return addresses(*tensors)
 
     def check(self, error: int) -> None:
         """Check the number that a function returned.

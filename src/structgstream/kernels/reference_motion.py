@@ -7,64 +7,75 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d, grid_sample, interpolate, max_pool2d
 
-from structgstream.kernels.values import Lifted, Neighbors, SweepView, Swept, TileSelection, ViewFlows
+from structgstream.kernels.values import (
+    Lifted,
+    Neighbors,
+    SweepView,
+    Swept,
+    TileSelection,
+    ViewFlows,
+    tile_pixels,
+)
 
 
 def changed_pixels(before: Tensor, now: Tensor, *, threshold: float, reach_pixels: int) -> Tensor:
-    """Dilated mask ``[H, W]`` of the pixels that changed between two pictures ``[H, W, 3]`` uint8.
+    """Dilated masks ``[..., H, W]`` of the pixels that changed between two pictures ``[..., H, W, 3]`` uint8.
 
     A pixel has changed when the mean absolute difference over its 3 x 3 neighbourhood (inside the picture) and the
     channels exceeds ``threshold``. Sums are of integers, so every back-end gives the same mask.
 
     Args:
-        before: the camera's earlier picture.
+        before: each camera's earlier picture.
         now: its later picture.
         threshold: in 0 ... 1, above the sensor's noise.
         reach_pixels: half width of the square by which the mask is dilated, pixels.
     """
-    difference = (before.to(torch.int32) - now.to(torch.int32)).abs().sum(-1).float()[None, None]  # exact
+    difference = (before.to(torch.int32) - now.to(torch.int32)).abs().sum(-1).float()  # exact
+    difference = difference.reshape(-1, 1, *now.shape[-3:-1])
     ones = torch.ones(1, 1, 3, 3, device=difference.device)
     sums = conv2d(difference, ones, padding=1)
-    counts = conv2d(torch.ones_like(difference), ones, padding=1)
+    counts = conv2d(torch.ones_like(difference[:1]), ones, padding=1)
     limit = torch.tensor(threshold, dtype=torch.float32) * (255 * 3 * counts)
     marks = (sums > limit).float()
     size = 2 * reach_pixels + 1
-    return max_pool2d(marks, size, stride=1, padding=reach_pixels)[0, 0] > 0
+    return (max_pool2d(marks, size, stride=1, padding=reach_pixels) > 0).reshape(now.shape[:-1])
 
 
-def picture_residual(
-    rendering: Tensor,
-    picture: Tensor,
+def picture_residuals(
+    renderings: Sequence[Tensor],
+    pictures: Tensor,
     *,
     gains: Tensor | None = None,
     biases: Tensor | None = None,
-    tiles: TileSelection | None = None,
-    outside: Tensor | None = None,
-    mask: Tensor | None = None,
+    tiles: Sequence[TileSelection] | None = None,
+    outside: Sequence[Tensor] | None = None,
+    masks: Tensor | None = None,
 ) -> Tensor:
-    """Mean absolute difference ``[h, w]`` of a rendering to a picture, in 0 ... 1; without graph.
+    """Mean absolute difference ``[V, h, w]`` of renderings to pictures of ``V`` cameras, in 0 ... 1; without graph.
 
-    The mean is over channels and the 3 x 3 neighbourhood inside the picture. The rendering is compared as its camera
+    The mean is over channels and the 3 x 3 neighbourhood inside the picture. A rendering is compared as its camera
     would have recorded it: ``gains * rendering + biases``, clamped to 0 ... 1 and averaged down to the picture's size.
 
     Args:
-        rendering: ``[H, W, 3]``.
-        picture: ``[h, w, 3]`` uint8, not larger than the rendering.
-        gains: ``[3]``; one when None.
-        biases: ``[3]``; given with ``gains``.
-        tiles: ``outside`` replaces the rendering outside these tiles.
-        outside: ``[H, W, 3]`` uint8; given with ``tiles``.
-        mask: ``[h, w]`` bool; pixels where it is False do not differ.
+        renderings: ``V`` of ``[H, W, 3]``.
+        pictures: ``[V, h, w, 3]`` uint8, not larger than the renderings.
+        gains: ``[V, 3]``; one when None.
+        biases: ``[V, 3]``; given with ``gains``.
+        tiles: ``outside`` replaces a rendering outside these tiles.
+        outside: ``V`` of ``[H, W, 3]`` uint8; given with ``tiles``.
+        masks: ``[V, h, w]`` bool; pixels where it is False do not differ.
     """
-    recorded = rendering if gains is None or biases is None else rendering * gains + biases
+    recorded = torch.stack(list(renderings))
+    if gains is not None and biases is not None:
+        recorded = recorded * gains[:, None, None] + biases[:, None, None]
     recorded = recorded.clamp(0.0, 1.0)
     if tiles is not None and outside is not None:
-        recorded = tiles.choose(recorded, outside.to(recorded) / 255.0)
-    reduced = interpolate(recorded.permute(2, 0, 1)[None], size=picture.shape[:2], mode="area")[0].permute(1, 2, 0)
-    off = (reduced - picture.to(reduced) / 255.0).abs().mean(-1)
-    off = off if mask is None else torch.where(mask, off, 0.0)
-    found = avg_pool2d(off[None, None], 3, stride=1, padding=1, count_include_pad=False)[0, 0]
-    return found if mask is None else torch.where(mask, found, 0.0)
+        recorded = torch.where(tile_pixels(tiles)[..., None], recorded, torch.stack(list(outside)).to(recorded) / 255.0)
+    reduced = interpolate(recorded.permute(0, 3, 1, 2), size=pictures.shape[1:3], mode="area").permute(0, 2, 3, 1)
+    off = (reduced - pictures.to(reduced) / 255.0).abs().mean(-1)
+    off = off if masks is None else torch.where(masks, off, 0.0)
+    found = avg_pool2d(off[:, None], 3, stride=1, padding=1, count_include_pad=False)[:, 0]
+    return found if masks is None else torch.where(masks, found, 0.0)
 
 
 def confident_flow(flow: Tensor, back: Tensor, mask: Tensor | None, *, relative: float, absolute: float) -> Tensor:

@@ -42,11 +42,17 @@ class TileSelection:
     @classmethod
     def of(cls, pixels: Tensor) -> "TileSelection":
         """The tiles that contain a pixel of the mask ``[H, W]``."""
-        height, width = pixels.shape
+        return cls.of_each(pixels[None])[0]
+
+    @classmethod
+    def of_each(cls, pixels: Tensor) -> "list[TileSelection]":
+        """:meth:`of` of each of the masks ``[V, H, W]``."""
+        count, height, width = pixels.shape
         rows, columns = tile_grid(width, height)
-        padded = pixels.new_zeros(rows * TILE_PIXELS, columns * TILE_PIXELS)
-        padded[:height, :width] = pixels
-        return cls(padded.reshape(rows, TILE_PIXELS, columns, TILE_PIXELS).any(3).any(1), width, height)
+        padded = pixels.new_zeros(count, rows * TILE_PIXELS, columns * TILE_PIXELS)
+        padded[:, :height, :width] = pixels
+        masks = padded.reshape(count, rows, TILE_PIXELS, columns, TILE_PIXELS).any(4).any(2)
+        return [cls(mask, width, height) for mask in masks]
 
     def pixels(self) -> Tensor:
         """Mask ``[H, W]`` of the pixels in the selected tiles; the same tensor in every call."""
@@ -74,6 +80,12 @@ class TileSelection:
         heights[-1] -= rows * TILE_PIXELS - self.height
         widths[-1] -= columns * TILE_PIXELS - self.width
         return int(heights @ self.mask.to(torch.int64) @ widths)
+
+
+def tile_pixels(tiles: Sequence[TileSelection]) -> Tensor:
+    """Mask ``[V, H, W]`` of the pixels in the selected tiles of pictures of one size."""
+    rows = torch.stack([of_view.mask for of_view in tiles]).repeat_interleave(TILE_PIXELS, 1)
+    return rows.repeat_interleave(TILE_PIXELS, 2)[:, : tiles[0].height, : tiles[0].width]
 
 
 @dataclass(frozen=True)

@@ -46,12 +46,15 @@ class AnchorCloud:
 
     def select(self, rows: Tensor) -> "AnchorCloud":
         """The anchors of a mask ``[M]`` or of indices ``[m]``, contiguous."""
-        rows = row_indices(rows)
+        rows = row_indices(rows, self.positions)
         return AnchorCloud(**{name: column[rows].contiguous() for name, column in self._columns().items()})
 
     def with_rows(self, rows: Tensor, other: "AnchorCloud") -> "AnchorCloud":
         """A copy in which the anchors of the mask ``rows`` ``[M]`` are replaced by ``other``."""
-        rows, columns = row_indices(rows), {name: column.clone() for name, column in self._columns().items()}
+        rows, columns = (
+            row_indices(rows, self.positions),
+            {name: column.clone() for name, column in self._columns().items()},
+        )
         for name, column in columns.items():
             column[rows] = getattr(other, name)
         return AnchorCloud(**columns)

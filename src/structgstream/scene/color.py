@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Per-camera affine colour: real rigs differ in exposure and white balance."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -30,6 +31,11 @@ class CameraColor:
         """No correction for ``cameras`` cameras."""
         like = torch.zeros(0) if like is None else like
         return cls(gains=like.new_ones(cameras, 3), biases=like.new_zeros(cameras, 3))
+
+    def of_cameras(self, rows: Sequence[int]) -> "CameraColor":
+        """The correction of the cameras ``rows``."""
+        indices = torch.tensor(rows, device=self.gains.device)
+        return CameraColor(self.gains[indices], self.biases[indices])
 
     def gauged(self) -> "CameraColor":
         """The correction in the gauge of Note [Colour gauge]; differentiable."""

@@ -24,17 +24,6 @@ def environment(coefficients: Tensor, directions: Tensor) -> Tensor:
     return (0.5 + sh_basis(directions, degree) @ coefficients).clamp(0.0, 1.0)
 
 
-def background(coefficients: Tensor | None, camera: Camera) -> Tensor | None:
-    """One background colour ``[3]`` for a whole picture: the environment along ``camera``'s axis; None without one.
-
-    Used in training: a constant background costs nothing in the rasteriser, and is accurate enough because little of it
-    is visible.
-    """
-    if coefficients is None:
-        return None
-    return environment(coefficients, camera.viewport(coefficients).viewmat[2, :3])
-
-
 def pixel_directions(camera: Camera, pixels: Tensor) -> Tensor:
     """Unit directions ``[N, 3]``, in world axes, of the centres of ``pixels`` ``[N]`` (row-major indices).
 

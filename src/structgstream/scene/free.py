@@ -47,8 +47,12 @@ class FreeGaussians:
 
     def select(self, rows: Tensor) -> "FreeGaussians":
         """The rows of a mask ``[F]`` or of indices ``[f]``."""
-        rows = row_indices(rows)
+        rows = row_indices(rows, self.means)
         return FreeGaussians(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+    def to(self, device: torch.device) -> "FreeGaussians":
+        """The same on ``device``."""
+        return FreeGaussians(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
     def append(self, other: "FreeGaussians") -> "FreeGaussians":
         """These rows, then those of ``other``."""

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scene at one time step, independent of losses, files and optimisers."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,7 +13,7 @@ from structgstream.kernels.backend import Backend
 from structgstream.kernels.values import Anchors, MLPWeights, StructuredGaussians, TileSelection
 from structgstream.scene.anchors import AnchorCloud
 from structgstream.scene.color import CameraColor
-from structgstream.scene.environment import background
+from structgstream.scene.environment import environment
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.sampling import RigSampling
 
@@ -63,19 +64,27 @@ class Scene:
 
     def background(self, camera: Camera) -> Tensor | None:
         """The environment's colour ``[3]`` along ``camera``'s axis; None for black."""
-        return background(self.environment, camera)
+        colors = self.backgrounds([camera])
+        return None if colors is None else colors[0]
+
+    def backgrounds(self, cameras: Sequence[Camera]) -> Tensor | None:
+        """The environment's colour ``[V, 3]`` along the axis of each of ``cameras``; None for black.
+
+        Used in training: a constant background costs nothing in the rasteriser, and is accurate enough because little
+        of it is visible.
+        """
+        if self.environment is None:
+            return None
+        axes = torch.stack([camera.viewport(self.environment).viewmat[2, :3] for camera in cameras])
+        return environment(self.environment, axes)
 
     def structured(
         self, camera: Camera, backend: Backend, *, tiles: TileSelection | None = None
     ) -> StructuredGaussians:
         """The structured Gaussians of the anchors in ``camera``'s view, or of those that reach ``tiles``."""
-        cloud = self.anchors
-        anchors = Anchors(cloud.positions, cloud.log_offset_scales, cloud.log_base_scales, cloud.offsets, self.features)
-        intervals = self.anchor_intervals
-        if intervals is None and self.sampling is not None:
-            intervals = self.sampling.intervals(cloud.positions)
+        cloud, intervals = self.anchors, self._intervals_of_anchors()
         generated = backend.generate_structured(
-            anchors,
+            self._anchors_to_generate(),
             self.mlps,
             camera.viewport(cloud.positions),
             distance_input=self.distance_input,
@@ -86,6 +95,31 @@ class Scene:
             return generated
         of_anchor = generated.gaussians.ids // cloud.offsets_per_anchor
         return replace(generated, gaussians=replace(generated.gaussians, sampling_intervals=intervals[of_anchor]))
+
+    def gaussians_of_views(
+        self, cameras: Sequence[Camera], backend: Backend, *, tiles: Sequence[TileSelection] | None = None
+    ) -> list[Gaussians]:
+        """:meth:`gaussians` of each of ``cameras``, whose pictures have one size, without graph; structured ones of
+        anchors that reach ``tiles``."""
+        with torch.no_grad():
+            return backend.generate_views(
+                self._anchors_to_generate(),
+                self.mlps,
+                [camera.viewport(self.anchors.positions) for camera in cameras],
+                free=self.free_gaussians(),
+                distance_input=self.distance_input,
+                tiles=tiles,
+                sampling_intervals=self._intervals_of_anchors(),
+            )
+
+    def _anchors_to_generate(self) -> Anchors:
+        cloud = self.anchors
+        return Anchors(cloud.positions, cloud.log_offset_scales, cloud.log_base_scales, cloud.offsets, self.features)
+
+    def _intervals_of_anchors(self) -> Tensor | None:
+        if self.anchor_intervals is None and self.sampling is not None:
+            return self.sampling.intervals(self.anchors.positions)
+        return self.anchor_intervals
 
     def free_gaussians(self) -> Gaussians:
         """The free Gaussians after activation, with their ids (Note [Ids])."""

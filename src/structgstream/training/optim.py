@@ -15,6 +15,7 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor
 
+from structgstream.gaussians import row_indices
 from structgstream.kernels.backend import Backend
 from structgstream.kernels.cuda_graph import Recorder
 from structgstream.scene.state import ParameterName
@@ -106,13 +107,14 @@ class Adam(Generic[Name]):
 
     def replace_rows(self, added: Mapping[Name, Tensor], *, keep: Tensor) -> None:
         """In every leaf of ``added`` keep the rows of the mask ``keep`` and append the new rows with zero moments."""
+        kept_rows = row_indices(keep, next(iter(added.values())))
         for name, rows in added.items():
             old = self.values[name]
-            together = torch.cat([old.detach()[keep], rows.detach()])
+            together = torch.cat([old.detach()[kept_rows], rows.detach()])
             self.values[name] = together.contiguous().requires_grad_(old.requires_grad)
             for state in (self.first, self.second):
                 if name in state:
-                    kept = state[name][keep]
+                    kept = state[name][kept_rows]
                     state[name] = torch.cat([kept, kept.new_zeros(rows.shape)])
 
     def replace_values(self, name: Name, value: Tensor) -> None:

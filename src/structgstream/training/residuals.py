@@ -16,7 +16,7 @@ from structgstream.kernels.backend import Backend
 from structgstream.scene.color import CameraColor
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
-from structgstream.training.views import View
+from structgstream.training.views import View, in_groups, stacked_masks
 
 FLOOR_PIXELS = 5
 """Side, in pixels of its maps, of the square over which the floor takes the maximum residual."""
@@ -44,15 +44,18 @@ class ResidualFloor:
             changed: by view index, mask ``[h, w]`` of the changed pixels, at the maps' scale.
             medians: 0: no floor there.
         """
-        return replace(self, maps={i: _eased(floor, changed.get(i), medians) for i, floor in self.maps.items()})
+        changed = {index: mask for index, mask in changed.items() if index in self.maps}
 
+        def eased(indices: list[int]) -> Tensor:
+            floors = torch.stack([self.maps[index] for index in indices])
+            # Without what a mask left out. No median (everything is left out): fmin then keeps the floor.
+            usual = medians * torch.where(floors < 1.0, floors, torch.nan).flatten(1).nanmedian(1).values
+            return torch.where(
+                torch.stack([changed[index] for index in indices]), torch.fmin(floors, usual[:, None, None]), floors
+            )
 
-def _eased(floor: Tensor, changed: Tensor | None, medians: float) -> Tensor:
-    if changed is None:
-        return floor
-    # Without what a mask left out. No median (everything is left out): fmin then keeps the floor.
-    usual = medians * torch.where(floor < 1.0, floor, torch.nan).nanmedian()
-    return torch.where(changed, torch.fmin(floor, usual), floor)
+        found = in_groups(list(changed), lambda index: self.maps[index].shape, eased)
+        return replace(self, maps={**self.maps, **dict(zip(changed, found, strict=True))})
 
 
 def apply_camera_color(image: Tensor, color: CameraColor, view_index: int) -> Tensor:
@@ -64,18 +67,21 @@ def apply_camera_color(image: Tensor, color: CameraColor, view_index: int) -> Te
 
 
 def recorded(image: Tensor, gains: Tensor, biases: Tensor) -> Tensor:
-    """``gains * image + biases`` of a rendering ``[H, W, 3]``, without gradients to the two ``[3]``."""
+    """``gains * image + biases`` of a rendering ``[..., H, W, 3]``, without gradients to the two ``[..., 3]``."""
     # By rows instead of pixels of three numbers, which takes a sixth of the time.
-    width = image.shape[1]
-    return (image.flatten(1) * gains.detach().repeat(width) + biases.detach().repeat(width)).reshape(image.shape)
+    factors, summands = (
+        t.detach().repeat(*[1] * (t.dim() - 1), image.shape[-2]).unsqueeze(-2) for t in (gains, biases)
+    )
+    return (image.flatten(-2) * factors + summands).reshape(image.shape)
 
 
 def box_mean(values: Tensor, pixels: int) -> Tensor:
-    """Mean of ``values`` ``[H, W]`` over the ``pixels`` x ``pixels`` around each, inside the picture. By shifted sums,
-    which take a fifth of ``avg_pool2d``'s time."""
+    """Mean of ``values`` ``[..., H, W]`` over the ``pixels`` x ``pixels`` around each, inside the picture. By shifted
+    sums, which take a fifth of ``avg_pool2d``'s time."""
     reach = pixels // 2
-    rows, columns = (_sum_around(values.new_ones(size), 0, reach) for size in values.shape)
-    return _sum_around(_sum_around(values, 0, reach), 1, reach) / (rows[:, None] * columns)
+    rows, columns = (_sum_around(torch.ones(size), 0, reach) for size in values.shape[-2:])
+    counts = (rows[:, None] * columns).to(values)
+    return _sum_around(_sum_around(values, -2, reach), -1, reach) / counts
 
 
 def _sum_around(values: Tensor, dim: int, reach: int) -> Tensor:
@@ -96,8 +102,13 @@ def rendering_residual(gaussians: Gaussians, view: View, scene: Scene, backend: 
 def residual(drawn: Tensor, view: View, color: CameraColor, backend: Backend) -> Tensor:
     """Mean absolute difference ``[H, W]`` of a rendering ``[H, W, 3]`` to the picture of ``view``, over channels and
     3 x 3 pixels, after the correction ``color`` of its camera; 0 where pixels do not count."""
-    gains, biases = color.gains[view.index], color.biases[view.index]
-    return backend.picture_residual(drawn, view.image, gains=gains, biases=biases, mask=view.mask)
+    return residuals(drawn[None], [view], color, backend)[0]
+
+
+def residuals(drawn: Sequence[Tensor], views: Sequence[View], color: CameraColor, backend: Backend) -> Tensor:
+    """:func:`residual` of each of ``views`` of one size, ``[V, H, W]``."""
+    seen, pictures = color.of_cameras([view.index for view in views]), torch.stack([view.image for view in views])
+    return backend.picture_residuals(drawn, pictures, gains=seen.gains, biases=seen.biases, masks=stacked_masks(views))
 
 
 def mean_residual(scene: Scene, views: Sequence[View], *, scale: float, backend: Backend) -> float:

@@ -12,15 +12,20 @@ count. A pixel of a reduced picture counts if all of its pixels do.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, islice
+from typing import TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig, enlargement
 from structgstream.frames import MultiViewFrame
+
+Item, Found = TypeVar("Item"), TypeVar("Found")
 
 MAX_PHASES = 8
 """Ratios of sizes whose pattern repeats after more pixels than this are left to torch."""
@@ -45,11 +50,7 @@ class View:
 
     def reduced(self, scale: float) -> "View":
         """The view with its picture reduced by ``scale`` (area average) and its camera resized; cached."""
-        if scale == 1.0:
-            return self
-        if scale not in self._reduced:
-            self._reduced[scale] = reduced(self, scale)
-        return self._reduced[scale]
+        return reduced_views([self], scale)[0]
 
     @property
     def enlargement(self) -> float:
@@ -73,37 +74,83 @@ class View:
 
 def training_views(frame: MultiViewFrame, rig: CameraRig, device: torch.device) -> list[View]:
     """The frame's training views in rig order, without absent cameras; held-out pictures are not read."""
-    rows = {name: i for i, name in enumerate(rig.training)}
-    return [_view(rows[name], name, frame, rig[name], device) for name in frame.showing(rig.training)]
+    rows, names = {name: i for i, name in enumerate(rig.training)}, frame.showing(rig.training)
+    images = [torch.from_numpy(frame.images[name]) for name in names]
+    if device.type != "cpu":
+        images = in_groups(images, lambda image: image.shape, lambda same: torch.stack(same).to(device))
+    return [_view(rows[n], rig[n], image, frame.masks.get(n)) for n, image in zip(names, images, strict=True)]
 
 
-def _view(index: int, name: str, frame: MultiViewFrame, camera: Camera, device: torch.device) -> View:
-    image, mask = torch.from_numpy(frame.images[name]).to(device), frame.masks.get(name)
+def _view(index: int, camera: Camera, image: Tensor, mask: NDArray[np.bool_] | None) -> View:
     if mask is None or mask.all():
         return View(index, camera, image)
-    counts = torch.from_numpy(mask).to(device)
+    counts = torch.from_numpy(mask).to(image.device)
     return View(index, camera, blackened(image, counts), counts)
 
 
 def blackened(picture: Tensor, mask: Tensor | None) -> Tensor:
-    """``picture`` ``[H, W, 3]``, black where the mask ``[H, W]`` is False; None leaves it as it is."""
+    """``picture`` ``[..., 3]``, black where the mask ``[...]`` is False; None leaves it as it is."""
     return picture if mask is None else torch.where(mask[..., None], picture, 0)
 
 
 def mean_of_counting(values: Tensor, mask: Tensor | None) -> Tensor:
-    """Mean ``[]`` of ``values`` ``[H, W]`` over the pixels of the mask, outside of which they are 0."""
-    return values.mean() if mask is None else values.sum() / mask.sum().clamp(min=1)
+    """Mean ``[...]`` of ``values`` ``[..., H, W]`` over the pixels of the mask, outside of which they are 0."""
+    return values.mean((-2, -1)) if mask is None else values.sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
 
 
-def reduced(view: View, scale: float) -> View:
-    """The view with its picture reduced by ``scale`` (area average) and its camera resized."""
-    camera = view.camera.scaled(scale)
-    height, width = camera.height, camera.width
-    image = _reduced_picture(view.image, (height, width))
-    if view.mask is None:
-        return View(view.index, camera, image)
-    mask = area_mean(view.mask[None, None].float(), (height, width))[0, 0] > 1.0 - 1e-4
-    return View(view.index, camera, blackened(image, mask), mask)
+def in_groups(
+    items: Sequence[Item], group: Callable[[Item], Hashable], compute: Callable[[list[Item]], Iterable[Found]]
+) -> list[Found]:
+    """``compute`` of the items of each group together; its results are in the order of ``items``."""
+    rows: dict[Hashable, list[int]] = {}
+    for row, item in enumerate(items):
+        rows.setdefault(group(item), []).append(row)
+    found = {row: one for of in rows.values() for row, one in zip(of, compute([items[row] for row in of]), strict=True)}
+    return [found[row] for row in range(len(items))]
+
+
+def by_size(views: Sequence[View], compute: Callable[[list[View]], Iterable[Found]]) -> list[Found]:
+    """``compute`` of the views of each picture size together, as arrays of pictures."""
+    return in_groups(views, lambda view: (view.image.shape, view.camera.near), compute)
+
+
+def stacked_colors(views: Sequence[View]) -> Tensor:
+    """The pictures of views of one size in 0 ... 1, ``[V, H, W, 3]`` float32."""
+    return torch.stack([view.image for view in views]).float() / 255.0
+
+
+def stacked_masks(views: Sequence[View]) -> Tensor | None:
+    """The masks of views of one size, ``[V, H, W]``; None if all of their pixels count."""
+    if all(view.mask is None for view in views):
+        return None
+    every = torch.ones(views[0].image.shape[:2], dtype=torch.bool, device=views[0].image.device)
+    return torch.stack([every if view.mask is None else view.mask for view in views])
+
+
+def reduced_views(views: Sequence[View], scale: float) -> list[View]:
+    """:meth:`View.reduced` of each of ``views``."""
+    if scale == 1.0:
+        return list(views)
+    missing = [view for view in views if scale not in view._reduced]
+    for view, small in zip(missing, by_size(missing, lambda same: _reduced(same, scale)), strict=True):
+        view._reduced[scale] = small
+    return [view._reduced[scale] for view in views]
+
+
+def evidence_views(views: Sequence[View], scale: float) -> list[View]:
+    """:meth:`View.evidence` of each of ``views``."""
+    return by_size(views, lambda same: reduced_views(same, scale / same[0].enlargement))
+
+
+def _reduced(views: list[View], scale: float) -> Iterable[View]:
+    cameras = [view.camera.scaled(scale) for view in views]
+    size = (cameras[0].height, cameras[0].width)
+    images, masks = _reduced_pictures(torch.stack([view.image for view in views]), size), stacked_masks(views)
+    if masks is None:
+        return [View(view.index, camera, image) for view, camera, image in zip(views, cameras, images, strict=True)]
+    masks = area_mean(masks[:, None].float(), size)[:, 0] > 1.0 - 1e-4
+    pictures = zip(views, cameras, blackened(images, masks), masks, strict=True)
+    return [View(view.index, camera, *picture) for view, camera, *picture in pictures]
 
 
 def as_picture(image: Tensor) -> Tensor:
@@ -112,25 +159,25 @@ def as_picture(image: Tensor) -> Tensor:
     return image.clamp(0.0, 1.0).mul_(255.0).round_().to(torch.uint8)
 
 
-def _reduced_picture(picture: Tensor, size: tuple[int, int]) -> Tensor:
-    """The bytes ``[H, W, 3]`` averaged down to ``size``, h and w."""
-    height, width = picture.shape[:2]
+def _reduced_pictures(pictures: Tensor, size: tuple[int, int]) -> Tensor:
+    """The bytes ``[V, H, W, 3]`` averaged down to ``size``, h and w."""
+    count, height, width = pictures.shape[:3]
     factor = height // size[0]
     if factor > MAX_PHASES or (size[0] * factor, size[1] * factor) != (height, width):
-        small = area_mean(picture.permute(2, 0, 1)[None].float(), size)
-        return small[0].permute(1, 2, 0).round().to(torch.uint8).contiguous()
+        small = area_mean(pictures.permute(0, 3, 1, 2).float(), size)
+        return small.permute(0, 2, 3, 1).round().to(torch.uint8).contiguous()
     # Whole blocks of pixels: sums of integers, in an eighth of the time.
-    rows = torch.zeros(size[0], width, 3, dtype=torch.int16, device=picture.device)
+    rows = torch.zeros(count, size[0], width, 3, dtype=torch.int16, device=pictures.device)
     for first in range(factor):
-        rows += picture[first::factor]
-    total = torch.zeros(*size, 3, dtype=torch.int16, device=picture.device)
+        rows += pictures[:, first::factor]
+    total = torch.zeros(count, *size, 3, dtype=torch.int16, device=pictures.device)
     for first in range(factor):
-        total += rows[:, first::factor]
+        total += rows[:, :, first::factor]
     return (total.float() / factor**2).round().to(torch.uint8)
 
 
 def area_mean(planes: Tensor, size: tuple[int, int]) -> Tensor:
-    """``planes`` ``[1, C, H, W]`` averaged down to ``size``, h and w, as ``interpolate`` with mode ``area``: by adding
+    """``planes`` ``[N, C, H, W]`` averaged down to ``size``, h and w, as ``interpolate`` with mode ``area``: by adding
     strided rows and columns, which takes a seventh to a half of its time."""
     return _mean_along(_mean_along(planes, 2, size[0]), 3, size[1])
 

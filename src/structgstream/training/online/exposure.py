@@ -27,9 +27,10 @@ from torch.nn.functional import max_pool2d
 
 from structgstream.codec.fields.quantization import round_straight_through
 from structgstream.kernels.values import HeadWeights
+from structgstream.scene.color import CameraColor
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import ExposureConfig
-from structgstream.training.views import View
+from structgstream.training.views import View, by_size, evidence_views, stacked_colors, stacked_masks
 
 MIN_COMPARED_VIEWS = 3
 """Fewer views have no median that leaves one out."""
@@ -71,12 +72,12 @@ def with_exposure_of(
     head = scene.mlps.color
     so_far = (head.b2 - reference.biases).reshape(-1, 3)[0]
     found = _light_change(scene, views, reference, so_far, config)
-    least = config.MIN_FURTHER_CHANGE if bool(so_far.any()) else config.MIN_CHANGE
+    least = torch.where(so_far.any(), config.MIN_FURTHER_CHANGE, config.MIN_CHANGE)
     wanted = torch.where((found - so_far).abs() < least, so_far, found)
     biases = reference.biases + wanted.repeat(len(head.b2) // 3)
     if step is not None:
         biases = round_straight_through(biases, step)
-    if torch.equal(wanted, so_far) or torch.equal(biases, head.b2):
+    if not bool((wanted != so_far).any() & (biases != head.b2).any()):
         return scene
     return replace(scene, mlps=scene.mlps._replace(color=HeadWeights(head.w1, head.b1, head.w2, biases)))
 
@@ -85,31 +86,38 @@ def _light_change(
     scene: Scene, views: Sequence[View], reference: ExposureReference, so_far: Tensor, config: ExposureConfig
 ) -> Tensor:
     """Change ``[3]`` of the biases since frame 0; ``so_far`` if too few views can be compared."""
-    found = []
+    compared = evidence_views([view for view in views if view.index in reference.views], config.PICTURE_SCALE)
+    if len(compared) < MIN_COMPARED_VIEWS:
+        return so_far
     with torch.no_grad():
-        for view in views:
-            if view.index in reference.views:
-                gains, biases = scene.camera_color.gains[view.index], scene.camera_color.biases[view.index]
-                now, then = view.evidence(config.PICTURE_SCALE), reference.views[view.index]
-                change = _view_change(now, then, gains, biases, so_far, config)
-                found += [] if change is None else [change]
-    return torch.stack(found).quantile(0.5, dim=0) if len(found) >= MIN_COMPARED_VIEWS else so_far
+        changes = torch.stack(
+            by_size(
+                compared,
+                lambda now: _view_changes(
+                    now, [reference.views[view.index] for view in now], scene.camera_color, so_far, config
+                ),
+            )
+        )
+        enough = changes.isfinite().all(1).sum() >= MIN_COMPARED_VIEWS
+        return torch.where(enough, changes.nanquantile(0.5, dim=0), so_far)
 
 
-def _view_change(
-    now: View, then: View, gains: Tensor, biases: Tensor, so_far: Tensor, config: ExposureConfig
-) -> Tensor | None:
-    """The change that one camera saw (Note [Light]); None if its pictures have too little in common."""
-    colors = ((then.colors - biases) / gains).clamp(0.0, 1.0)
+def _view_changes(
+    now: Sequence[View], then: Sequence[View], color: CameraColor, so_far: Tensor, config: ExposureConfig
+) -> Tensor:
+    """The change ``[V, 3]`` that each camera saw (Note [Light]); NaN if its pictures have too little in common."""
+    seen = color.of_cameras([view.index for view in now])
+    gains, biases = seen.gains[:, None, None], seen.biases[:, None, None]
+    before = stacked_colors(then)
+    colors = ((before - biases) / gains).clamp(0.0, 1.0)
     sensitivity = gains * colors * (1.0 - colors)
-    difference = now.colors - then.colors
+    difference = stacked_colors(now) - before
     other = (difference - sensitivity * so_far).abs().mean(-1) > config.SAME_THRESHOLD
-    for mask in (now.mask, then.mask):
-        other = other if mask is None else other | ~mask
+    for masks in (stacked_masks(now), stacked_masks(then)):
+        other = other if masks is None else other | ~masks
     width = 2 * REACH_PIXELS + 1
-    same = max_pool2d(other[None].float(), width, stride=1, padding=REACH_PIXELS)[0] < 0.5
+    same = max_pool2d(other.float(), width, stride=1, padding=REACH_PIXELS) < 0.5
     squares = sensitivity.square()
-    weight = (squares * same[..., None]).sum((0, 1))
-    if not bool((weight > config.MIN_SHARE * squares.sum((0, 1))).all()):
-        return None
-    return (difference * sensitivity * same[..., None]).sum((0, 1)) / weight
+    weight = (squares * same[..., None]).sum((1, 2))
+    enough = (weight > config.MIN_SHARE * squares.sum((1, 2))).all(1, keepdim=True)
+    return torch.where(enough, (difference * sensitivity * same[..., None]).sum((1, 2)) / weight, torch.nan)

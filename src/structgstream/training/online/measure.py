@@ -8,8 +8,9 @@ first, then free Gaussians, ``M + F`` in all. A map is accumulated for a primiti
 with the blending weights of the primitive's Gaussians, so that occluded ones get nothing.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -21,8 +22,15 @@ from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.preprocess import PictureChange
-from structgstream.training.residuals import ResidualFloor, residual
-from structgstream.training.views import View, area_mean, mean_of_counting
+from structgstream.training.residuals import ResidualFloor, residuals
+from structgstream.training.views import (
+    View,
+    area_mean,
+    evidence_views,
+    in_groups,
+    mean_of_counting,
+    stacked_masks,
+)
 
 
 @dataclass(frozen=True)
@@ -75,6 +83,13 @@ def sum_by_primitive(sums: Tensor, primitives: Tensor, scene: Scene) -> Tensor:
     """Sums ``[N, C]`` of Gaussians as sums of primitives, ``[M + F, C]``; ``primitives`` as of :func:`primitive_of`."""
     found = sums.new_zeros(len(scene.anchors) + len(scene.free), sums.shape[1])
     return found.index_add_(0, primitives, sums)
+
+
+def primitive_sums(sums: Tensor, scene: Scene) -> Tensor:
+    """Sums ``[..., slots, C]`` by id as sums of primitives, ``[..., M + F, C]``."""
+    m, k = len(scene.anchors), scene.anchors.offsets_per_anchor
+    structured, free = sums.split([m * k, len(scene.free)], dim=-2)
+    return torch.cat([structured.unflatten(-2, (m, k)).sum(-2), free], dim=-2)
 
 
 VISIBLE_PIXELS = 0.3
@@ -176,62 +191,84 @@ def measure(
         backend: the compute back-end.
         floor: residuals of frame 0, for ``residual_threshold``; None for none.
     """
+    folded = scene.with_folded_appearance()
+
+    def kind(given: tuple[View, PictureChange | None]) -> Hashable:
+        view, change = given
+        new = floor is None or view.index not in floor.maps
+        return view.image.shape, view.camera.near, change is None, change is None or change.flow is None, new
+
     with torch.no_grad():
-        folded = scene.with_folded_appearance()
-        return [
-            _measure_view(folded, view, change, config=config, backend=backend, floor=floor)
-            for view, change in zip(views, changes, strict=True)
-        ]
+        measured = in_groups(
+            list(zip(views, changes, strict=True)),
+            kind,
+            lambda alike: _measure_views(folded, *zip(*alike), config=config, backend=backend, floor=floor),
+        )
+        shares = torch.stack([of_view for _, of_view in measured]).tolist()
+    return [
+        measurement(
+            change=ViewChange(None, wrong, repeated=False)
+            if change is None
+            else ViewChange(changed, wrong, repeated=change.repeated)
+        )
+        for (measurement, _), (changed, wrong), change in zip(measured, shares, changes, strict=True)
+    ]
 
 
-def _measure_view(
+def _measure_views(
     scene: Scene,
-    view: View,
-    change: PictureChange | None,
+    views: Sequence[View],
+    changes: Sequence[PictureChange | None],
     *,
     config: MotionConfig,
     backend: Backend,
     floor: ResidualFloor | None,
-) -> ViewMeasurement:
-    small = view.evidence(config.picture_scale)
-    gaussians = scene.gaussians(small.camera, backend)
-    size = (small.camera.height, small.camera.width)
-    valid = torch.ones(size).to(gaussians.means) if small.mask is None else small.mask.to(gaussians.means)
-    pixel_area = view.reference_area / valid.numel()
-    coverage = gaussians.means.new_zeros(slot_count(scene))
-    if change is None:
-        sums = pixel_area * accumulate(gaussians, small.camera, valid[..., None], backend)
-        coverage[gaussians.ids] = sums[:, 0]
-        covered = sum_by_primitive(sums, primitive_of(gaussians, scene), scene)[:, 0]
-        absent = ViewChange(None, 0.0, repeated=False)
-        return ViewMeasurement(view, coverage, covered, None, None, None, absent)
-    changed = area_mean(change.changed[None, None].to(gaussians.means), size)
-    changed_share = float(changed.mean() if view.mask is None else mean_of_counting(change.changed.float(), view.mask))
-    changed = changed[0, 0]
+) -> list[tuple[Callable[..., ViewMeasurement], Tensor]]:
+    """Measurements without ``change``, and shares ``[2]`` of changed and of wrong pixels, of views of one size, all or
+    none of which have a change, flow and a floor."""
+    small = evidence_views(views, config.picture_scale)
+    cameras, masks = [view.camera for view in small], stacked_masks(small)
+    gaussians = scene.gaussians_of_views(cameras, backend)
+    viewports = [camera.viewport(scene.anchors.positions) for camera in cameras]
+    size = (cameras[0].height, cameras[0].width)
+    valid = scene.anchors.positions.new_ones(len(views), *size) if masks is None else masks.to(scene.anchors.positions)
+    pixel_area, slots = views[0].reference_area / (size[0] * size[1]), slot_count(scene)
+    known = [change for change in changes if change is not None]
+    if not known:
+        sums = pixel_area * backend.weigh_views(gaussians, viewports, valid[..., None], slots=slots)
+        covered, none = primitive_sums(sums, scene)[..., 0], valid.new_zeros(2)
+        return [
+            (partial(ViewMeasurement, *of_view, None, None, None), none)
+            for of_view in zip(views, sums[..., 0], covered, strict=True)
+        ]
+    everywhere = torch.stack([change.changed for change in known]).to(valid)
+    changed = area_mean(everywhere[:, None], size)[:, 0]
+    changed_shares = changed.mean((1, 2)) if masks is None else mean_of_counting(everywhere, stacked_masks(views))
     maps = [valid[..., None], (changed * valid)[..., None]]
-    if change.flow is not None:
-        maps.append(change.flow)
-    viewport, background = small.camera.viewport(gaussians.means), scene.background(small.camera)
-    drawn, sums = backend.picture_and_weights(gaussians, viewport, torch.cat(maps, dim=-1), background=background)
-    wrong_share = 0.0
-    if floor is not None and view.index in floor.maps and config.residual_threshold > 0.0:
-        wrong = residual(drawn, small, scene.camera_color, backend) > config.residual_threshold + floor.maps[view.index]
+    flows = [change.flow for change in known if change.flow is not None]
+    if flows:
+        maps.append(torch.stack(flows))
+    backgrounds = scene.backgrounds(cameras)
+    drawn, sums = backend.draw_and_weigh_views(
+        gaussians, viewports, torch.cat(maps, dim=-1), slots=slots, backgrounds=backgrounds
+    )
+    wrong_shares = torch.zeros_like(changed_shares)
+    if floor is not None and views[0].index in floor.maps and config.residual_threshold > 0.0:
+        floors = torch.stack([floor.maps[view.index] for view in views])
+        wrong = residuals(drawn, small, scene.camera_color, backend) > config.residual_threshold + floors
         wrong = wrong.to(changed)
-        wrong_share = float(mean_of_counting(wrong, small.mask))
-        around = torch.maximum(changed, max_pool2d(wrong[None, None], 3, stride=1, padding=1)[0, 0])
-        # The picture had to be drawn first; the few pixels in question are accumulated by themselves.
+        wrong_shares = mean_of_counting(wrong, masks)
+        around = torch.maximum(changed, max_pool2d(wrong, 3, stride=1, padding=1))
+        # The pictures had to be drawn first; the few pixels in question are accumulated by themselves.
         beyond = ((around - changed) * valid)[..., None]
-        sums[:, 1:2] += accumulate(gaussians, small.camera, beyond, backend)
+        sums[..., 1:2] += backend.weigh_views(gaussians, viewports, beyond, slots=slots)
         changed = around
     sums *= pixel_area
-    coverage[gaussians.ids] = sums[:, 0]
-    sums = sum_by_primitive(sums, primitive_of(gaussians, scene), scene)
-    return ViewMeasurement(
-        view,
-        coverage,
-        covered=sums[:, 0],
-        covered_changed=sums[:, 1],
-        flow_sums=None if change.flow is None else sums[:, [2, 3, 4, 0, 5, 6, 7]],
-        changed=changed > 0.0,
-        change=ViewChange(changed_share, wrong_share, repeated=change.repeated),
-    )
+    of_primitives = primitive_sums(sums, scene)
+    flow_sums = of_primitives[..., [2, 3, 4, 0, 5, 6, 7]] if flows else [None] * len(views)
+    shares = torch.stack([changed_shares, wrong_shares], dim=1)
+    columns = sums[..., 0], of_primitives[..., 0], of_primitives[..., 1], flow_sums, changed > 0.0
+    return [
+        (partial(ViewMeasurement, *of_view), of_shares)
+        for *of_view, of_shares in zip(views, *columns, shares, strict=True)
+    ]

@@ -190,7 +190,7 @@ def _displace_parameters(parameters: Parameters, adam: Adam[ParameterName], star
     if not values["free_means"].requires_grad:
         return
     values["free_means"].data += start.displacements[anchors:]
-    if start.new_free is not None:
-        keep = torch.ones(len(start.scene.free), dtype=torch.bool, device=start.new_free.means.device)
+    if start.new_free is not None and len(start.new_free):
+        keep = torch.ones(len(start.scene.free), dtype=torch.bool)
         parameters.births = torch.cat([parameters.births, start.new_free.births])
         adam.replace_rows(values_of_rows(start.new_free, FREE_ROWS), keep=keep)

@@ -13,6 +13,8 @@ large motion are shares of the longer side. The floor of the margin is in pixels
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from math import floor, log2
 
 import numpy as np
@@ -23,9 +25,19 @@ from torch import Tensor
 from structgstream.cameras import CameraRig
 from structgstream.flow import ABSOLUTE, RELATIVE, block_search, dis_refinement, dis_search, same_color
 from structgstream.frames import MultiViewFrame
-from structgstream.kernels.backend import Backend
+from structgstream.kernels.backend import Backend, on_processor
 from structgstream.training.online.config import USUAL_FLOW, FlowConfig, MotionConfig, SceneFlowConfig
-from structgstream.training.views import View, area_mean, blackened, mean_of_counting, training_views
+from structgstream.training.views import (
+    View,
+    area_mean,
+    blackened,
+    evidence_views,
+    in_groups,
+    mean_of_counting,
+    stacked_colors,
+    stacked_masks,
+    training_views,
+)
 
 CONTEXT_SHARE, MIN_CONTEXT_PIXELS = 1 / 40, 16
 """Margin around the bounding box of the changed pixels, in which flow is estimated: share of the picture's longer side,
@@ -147,42 +159,63 @@ def detect_changes(
         flow_from: indices of the views in which flow is estimated.
         flow: how it is searched.
     """
-    changes: list[PictureChange | None] = []
     earlier = {last.index: last for last in before}
+
+    def changes(alike: list[View]) -> Sequence[PictureChange | None]:
+        if alike[0].index not in earlier:
+            return [None] * len(alike)
+        last = [earlier[view.index] for view in alike]
+        return _detect_changes(alike, last, config=config, backend=backend, flow_from=flow_from, flow=flow)
+
     with torch.no_grad():
-        for view in views:
-            last = earlier.get(view.index)
-            if last is None:
-                changes.append(None)
-                continue
-            both = _both(view.mask, last.mask)
-            then, now = blackened(last.image, both), blackened(view.image, both)
-            reach = round(config.REACH_PIXELS * view.enlargement)
-            changed = backend.changed_pixels(then, now, threshold=config.CHANGE_THRESHOLD, reach_pixels=reach)
-            changed = changed if both is None else changed & both
-            small, found, counts = view.evidence(config.picture_scale).camera, None, dict[str, int]()
-            if view.index in flow_from:
-                size = (small.height, small.width)
-                estimated = flow_map(then, now, changed, size, mask=both, config=flow, backend=backend)
-                found = torch.cat([estimated.maps, last.evidence(config.picture_scale).colors], dim=-1)
-                counts = estimated.counts
-            changes.append(PictureChange(changed, _is_repeated(then, now, changed, both), found, counts))
-    return changes
+        return in_groups(views, lambda view: (view.image.shape, view.camera.near, view.index in earlier), changes)
 
 
-def _is_repeated(then: Tensor, now: Tensor, changed: Tensor, mask: Tensor | None) -> bool:
-    """Whether ``now`` is ``then`` once more; ``changed`` as in :class:`PictureChange`, ``mask`` the pixels of both."""
-    if changed.any():
-        return False
-    levels = (now.int() - then.int()).abs().float().mean(-1)
-    return float(mean_of_counting(levels, mask)) < REPEATED_LEVELS
+def _detect_changes(
+    views: Sequence[View],
+    before: Sequence[View],
+    *,
+    config: MotionConfig,
+    backend: Backend,
+    flow_from: Collection[int],
+    flow: FlowConfig,
+) -> list[PictureChange]:
+    """Of views of one size, with their earlier pictures."""
+    masks, other_masks = stacked_masks(views), stacked_masks(before)
+    both = other_masks if masks is None else masks if other_masks is None else masks & other_masks
+    then, now = (blackened(torch.stack([view.image for view in some]), both) for some in (before, views))
+    reach = round(config.REACH_PIXELS * views[0].enlargement)
+    changed = backend.changed_pixels(then, now, threshold=config.CHANGE_THRESHOLD, reach_pixels=reach)
+    changed = changed if both is None else changed & both
+    repeated = _are_repeated(then, now, changed, both)
+    found = [PictureChange(*of_view) for of_view in zip(changed, repeated, strict=True)]
+    rows = [row for row, view in enumerate(views) if view.index in flow_from]
+    if not rows:
+        return found
+    small, last = (evidence_views([some[row] for row in rows], config.picture_scale) for some in (views, before))
+    size = (small[0].camera.height, small[0].camera.width)
+    everywhere = torch.ones_like(changed) if both is None else both
+    here = on_processor(*(given[rows] for given in (then, now, changed, everywhere)))  # Where flow is searched.
+    estimated = [
+        flow_map(*of_view, size, mask=mask, config=flow, backend=backend) for *of_view, mask in zip(*here, strict=True)
+    ]
+    maps = torch.stack([of_view.maps for of_view in estimated]).to(changed.device)
+    maps = torch.cat([maps, stacked_colors(last)], dim=-1)
+    for row, of_view, flow_maps in zip(rows, estimated, maps, strict=True):
+        found[row] = replace(found[row], flow=flow_maps, far_boxes=of_view.far_boxes)
+    return found
 
 
-def _both(mask: Tensor | None, other: Tensor | None) -> Tensor | None:
-    """Pixels of both masks; None for all."""
-    if mask is None or other is None:
-        return other if mask is None else mask
-    return mask & other
+def _are_repeated(then: Tensor, now: Tensor, changed: Tensor, masks: Tensor | None) -> list[bool]:
+    """Whether each of the pictures ``now`` is ``then`` once more; ``changed`` as in :class:`PictureChange`, ``masks``
+    the pixels of both."""
+    same = [row for row, any_changed in enumerate(changed.flatten(1).any(1).tolist()) if not any_changed]
+    if not same:
+        return [False] * len(changed)
+    levels = (now[same].int() - then[same].int()).abs().float().mean(-1)
+    means = mean_of_counting(levels, None if masks is None else masks[same]).tolist()
+    repeated = {row for row, mean in zip(same, means, strict=True) if mean < REPEATED_LEVELS}
+    return [row in repeated for row in range(len(changed))]
 
 
 @dataclass(frozen=True)
@@ -227,11 +260,11 @@ def flow_map(
     where these are small.
 
     Args:
-        first: ``[H, W, 3]`` uint8.
-        second: ``[H, W, 3]`` uint8.
-        changed: ``[H, W]`` bool, where the two differ.
+        first: ``[H, W, 3]`` uint8, on the processor.
+        second: ``[H, W, 3]`` uint8, on the processor.
+        changed: ``[H, W]`` bool, where the two differ, on the processor.
         size: h and w of the maps; flow is in pixels of the pictures.
-        mask: ``[H, W]`` bool, pixels that may have confidence; None for all.
+        mask: ``[H, W]`` bool, pixels that may have confidence, on the processor; None for all.
         config: of the search.
         backend: the compute back-end.
 
@@ -273,8 +306,7 @@ def flow_map(
         missing = torch.from_numpy(where[box]) & (maps[0][box] == 0.0)
         far_pixels += int((missing & (found[0] > 0.0)).sum())
         maps[:, *box] = torch.where(missing, found, maps[:, *box])
-    small = area_mean(maps[None], size)[0].permute(1, 2, 0).to(first.device)
-    return FlowMaps(small, len(far), far_pixels, recolored_pixels)
+    return FlowMaps(area_mean(maps[None], size)[0].permute(1, 2, 0), len(far))
 
 
 Box = tuple[slice, slice]
@@ -284,7 +316,7 @@ Edges = tuple[int, int, int, int]
 
 
 def _cut(picture: Tensor, box: Box) -> NDArray[np.uint8]:
-    return np.ascontiguousarray(picture[box].numpy(force=True))
+    return np.ascontiguousarray(picture[box].numpy())
 
 
 def _box(mask: Mask, context: int) -> list[Box]:

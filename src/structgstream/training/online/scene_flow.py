@@ -14,25 +14,31 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from structgstream.kernels.backend import Backend
-from structgstream.kernels.values import Neighbors, ViewFlows
+from structgstream.kernels.backend import Backend, on_processor
+from structgstream.kernels.values import Neighbors, ViewFlows, tile_pixels
 from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.scene import Scene
 from structgstream.training.neighbours import nearest
 from structgstream.training.online.config import LiftConfig, MotionConfig, SceneFlowConfig
 from structgstream.training.online.measure import (
     FlowEvidence,
-    accumulate,
     flow_evidence,
     primitive_centers,
-    primitive_of,
+    primitive_sums,
     slot_count,
-    sum_by_primitive,
 )
 from structgstream.training.online.preprocess import flow_map
 from structgstream.training.online.split import DynamicSplit, find_active_tiles
-from structgstream.training.residuals import apply_camera_color
-from structgstream.training.views import View, as_picture, blackened
+from structgstream.training.residuals import recorded
+from structgstream.training.views import (
+    View,
+    as_picture,
+    blackened,
+    by_size,
+    evidence_views,
+    stacked_colors,
+    stacked_masks,
+)
 
 
 @dataclass(frozen=True)
@@ -70,13 +76,14 @@ def lift_flow(
     Raises:
         MissingExtraError: SciPy is not installed.
     """
-    informed = (evidence.weights.amax(0) > 0).nonzero()[:, 0]
+    points, informed = on_processor(centers, evidence.weights.amax(0) > 0)  # Where neighbours are looked for.
+    informed = informed.nonzero()[:, 0]
     if not len(informed):
         return LiftedFlow(priors, torch.zeros(len(priors), dtype=torch.bool, device=priors.device))
-    near, distances = nearest(centers, centers[informed], config.neighbours)
+    near, distances = nearest(points, points[informed], config.neighbours)
+    neighbours, distances = informed[near].to(centers.device), distances.to(centers.device)
     spread = config.bandwidth * distances[:, -1:].clamp(min=1e-9)
     affinities = torch.exp(-0.5 * (distances / spread).square())
-    neighbours = informed[near]
     if config.color_bandwidth > 0.0:
         apart = (evidence.colors[neighbours] - evidence.colors[:, None]).square().sum(-1)
         affinities = affinities * torch.exp(-0.5 * apart / config.color_bandwidth**2)
@@ -193,21 +200,14 @@ def apply_scene_flow(
 
     moved = split.displaced(first.displacements)
     active_tiles = find_active_tiles(moved, views, config=motion, backend=backend)
-    displacements, corrected = first.displacements, 0
+    displacements, corrected = first.displacements, torch.zeros_like(first.lifted)
     if config.rounds > 1:
         second = residual_flow(
             moved.dynamic, views_with_flow, active_tiles, scale=motion.picture_scale, config=config, backend=backend
         )
-        displacements, corrected = displacements + second.displacements, int(second.lifted.sum())
-    return SceneFlow(
-        split.displaced(displacements),
-        displacements,
-        active_tiles,
-        lifted=int(first.lifted.sum()),
-        corrected=corrected,
-        fast=int(fast.sum()),
-        fast_lifted=int((fast & first.lifted).sum()),
-    )
+        displacements, corrected = displacements + second.displacements, second.lifted
+    counts = torch.stack([first.lifted, corrected, fast, fast & first.lifted]).sum(1).tolist()
+    return SceneFlow(split.displaced(displacements), displacements, active_tiles, *counts)
 
 
 def _is_fast(evidence: FlowEvidence, views: Sequence[View]) -> Tensor:
@@ -218,11 +218,13 @@ def _is_fast(evidence: FlowEvidence, views: Sequence[View]) -> Tensor:
     return (evidence.weights * speeds).sum(0) > FAST_SHARE * evidence.weights.sum(0)
 
 
-def _last_drawing(active: ActiveTiles, view: View, scene: Scene) -> Tensor:
-    """The last drawing of a view as its camera would record it, ``[H, W, 3]`` uint8; the view's picture where nothing
-    was drawn."""
-    drawn = as_picture(apply_camera_color(active.picture, scene.camera_color, view.index))
-    return active.tiles.choose(blackened(drawn, view.mask), view.image)
+def _last_drawings(actives: Sequence[ActiveTiles], views: Sequence[View], scene: Scene) -> Tensor:
+    """The last drawings of views of one size as their cameras would record them, ``[V, H, W, 3]`` uint8; the views'
+    pictures where nothing was drawn."""
+    color = scene.camera_color.of_cameras([view.index for view in views])
+    drawn = as_picture(recorded(torch.stack([active.picture for active in actives]), color.gains, color.biases))
+    inside = tile_pixels([active.tiles for active in actives])[..., None]
+    return torch.where(inside, blackened(drawn, stacked_masks(views)), torch.stack([view.image for view in views]))
 
 
 def residual_flow(
@@ -245,30 +247,53 @@ def residual_flow(
         backend: the compute back-end.
     """
     seen = [view for view in views if view.index in active_tiles]
-    folded = dynamic.with_folded_appearance()
-    sums, coverage = [], dynamic.anchors.positions.new_zeros(slot_count(dynamic))
-
-    def flow_of(view: View) -> Tensor:
-        picture = _last_drawing(active_tiles[view.index], view, dynamic)
-        inside, camera = active_tiles[view.index].tiles.pixels(), view.evidence(scale).camera
-        inside = inside if view.mask is None else inside & view.mask
-        size = (camera.height, camera.width)
-        return flow_map(picture, view.image, inside, size, mask=view.mask, config=config.FLOW, backend=backend).maps
-
-    threads = torch.get_num_threads()
-    with torch.no_grad(), ThreadPoolExecutor(threads) as pool:
-        flows = pool.map(flow_of, seen) if threads > 1 else map(flow_of, seen)
-        for view, flow in zip(seen, flows, strict=True):
-            active, small = active_tiles[view.index], view.evidence(scale)
-            gaussians = folded.gaussians(view.camera, backend)
-            counting = torch.ones_like(flow[..., 0]) if small.mask is None else small.mask.to(flow)
-            maps = torch.cat([flow, counting[..., None], small.colors], dim=-1)
-            found = accumulate(gaussians, small.camera, maps, backend, static=active.static)
-            found *= view.reference_area / counting.numel()
-            sums.append(sum_by_primitive(found, primitive_of(gaussians, folded), folded))
-            coverage[gaussians.ids] += found[:, 3]
     nothing = torch.zeros(len(dynamic.anchors) + len(dynamic.free), 3).to(dynamic.anchors.positions)
     if not seen:
         return LiftedFlow(nothing, torch.zeros(len(nothing), dtype=torch.bool, device=nothing.device))
-    evidence = flow_evidence(sums)
+    folded = dynamic.with_folded_appearance()
+    with torch.no_grad():
+        found = by_size(
+            seen,
+            lambda same: _weigh_residual_flow(folded, same, active_tiles, scale=scale, config=config, backend=backend),
+        )
+    evidence = flow_evidence([primitive_sums(of_view, folded) for of_view in found])
+    coverage = sum((of_view[:, 3] for of_view in found[1:]), start=found[0][:, 3])
     return lift_flow(evidence, primitive_centers(dynamic, coverage), nothing, seen, config=config.LIFT, backend=backend)
+
+
+def _weigh_residual_flow(
+    scene: Scene,
+    views: Sequence[View],
+    active_tiles: Mapping[int, ActiveTiles],
+    *,
+    scale: float,
+    config: SceneFlowConfig,
+    backend: Backend,
+) -> Tensor:
+    """The maps of :func:`flow_evidence` for views of one size, summed by id: ``[V, slots, 7]``."""
+    actives, small = [active_tiles[view.index] for view in views], evidence_views(views, scale)
+    cameras, masks, counting = [view.camera for view in small], stacked_masks(small), stacked_masks(views)
+    inside = tile_pixels([active.tiles for active in actives])
+    inside = inside if counting is None else inside & counting
+    pictures = torch.stack([view.image for view in views])
+    here = on_processor(
+        _last_drawings(actives, views, scene), pictures, inside, *([] if counting is None else [counting])
+    )
+    size = (cameras[0].height, cameras[0].width)
+
+    def flow_of(drawn: Tensor, picture: Tensor, changed: Tensor, mask: Tensor | None = None) -> Tensor:
+        return flow_map(drawn, picture, changed, size, mask=mask, config=config.FLOW, backend=backend).maps
+
+    threads = torch.get_num_threads()
+    with ThreadPoolExecutor(threads) as pool:
+        flows = torch.stack(list((pool.map if threads > 1 else map)(flow_of, *here))).to(pictures.device)
+    valid = torch.ones_like(flows[..., 0]) if masks is None else masks.to(flows)
+    sums = backend.weigh_views(
+        # Directions are those to the cameras, whose centre does not depend on the size of pictures.
+        scene.gaussians_of_views([view.camera for view in views], backend),
+        [camera.viewport(flows) for camera in cameras],
+        torch.cat([flows, valid[..., None], stacked_colors(small)], dim=-1),
+        slots=slot_count(scene),
+        static=[active.static for active in actives],
+    )
+    return sums.mul_(views[0].reference_area / (size[0] * size[1]))

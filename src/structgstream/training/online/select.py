@@ -31,7 +31,7 @@ import torch
 from torch import Tensor
 
 from structgstream.flow import picture_shift
-from structgstream.kernels.backend import Backend
+from structgstream.kernels.backend import Backend, on_processor
 from structgstream.scene.render import render, to_8bit_image
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import Granularity, fields_of, parameters_of
@@ -74,8 +74,8 @@ class DynamicSelection:
     """The dynamic primitives of a frame, and what was measured on the way.
 
     Args:
-        anchors: mask ``[M]`` of dynamic anchors.
-        free: mask ``[F]`` of dynamic free Gaussians.
+        anchors: mask ``[M]`` of dynamic anchors, on the processor.
+        free: mask ``[F]`` of dynamic free Gaussians, on the processor.
         visible: by index of each inlier view, mask ``[M * K + F]`` (Note [Ids]) of the visible Gaussians.
         inliers: positions of the views that are no outliers (Note [Outlier views]); only their votes count.
         scene_cut: whether most pictures changed everywhere, so that motion cannot be segmented.
@@ -100,7 +100,7 @@ class DynamicSelection:
 
     @property
     def primitives(self) -> Tensor:
-        """Indices (Note [Primitives]) of the dynamic ones, ascending."""
+        """Indices (Note [Primitives]) of the dynamic ones, ascending; on the processor."""
         return torch.cat([self.anchors, self.free]).nonzero()[:, 0]
 
 
@@ -124,7 +124,7 @@ def select_dynamic(
     anchors = len(scene.anchors)
     ease = torch.ones(anchors + len(scene.free), device=scene.anchors.positions.device)
     if older is not None:
-        ease[changed_primitives(older, scene)] = config.hysteresis
+        ease = torch.where(changed_primitives(older, scene), config.hysteresis, ease)
 
     view_changes = [of_view.change for of_view in measured]
     for number in outlier_candidates(view_changes):
@@ -132,21 +132,25 @@ def select_dynamic(
         view_changes[number] = replace(view_changes[number], shift_pixels=shift)
     inliers = [number for number, good in enumerate(inlier_views(view_changes)) if good]
 
-    votes, shown = (torch.zeros_like(ease, dtype=torch.int64) for _ in range(2))
-    for of_view in (measured[number] for number in inliers):
-        if of_view.covered_changed is not None:
-            enough = of_view.covered_changed > config.MIN_CHANGED_PIXELS * ease
-            votes += enough & (of_view.covered_changed > config.MIN_CHANGED_SHARE * ease * of_view.covered)
-            shown += of_view.covered > VISIBLE_PIXELS
-    dynamic = votes >= config.MIN_VOTES
-    occluded = occluded_dynamic(
-        scene.anchors.positions, dynamic[:anchors], shown[:anchors] >= config.MIN_VOTES, share=config.occluded_share
+    voters = [measured[number] for number in inliers if measured[number].covered_changed is not None]
+    none = ease.new_zeros(0, len(ease))
+    covered = torch.cat([none, *(of_view.covered[None] for of_view in voters)])
+    covered_changed = torch.cat([none, *(row[None] for m in voters if (row := m.covered_changed) is not None)])
+    moves = covered_changed > config.MIN_CHANGED_PIXELS * ease
+    moves &= covered_changed > config.MIN_CHANGED_SHARE * ease * covered
+    # From here on masks lie on the processor, where rows are counted without waiting for a GPU.
+    positions, dynamic, shown = on_processor(
+        scene.anchors.positions,
+        moves.sum(0) >= config.MIN_VOTES,
+        (covered > VISIBLE_PIXELS).sum(0) >= config.MIN_VOTES,
     )
+    occluded = occluded_dynamic(positions, dynamic[:anchors], shown[:anchors], share=config.occluded_share)
+    coverage = torch.stack([measured[number].coverage for number in inliers])
 
     found = DynamicSelection(
         anchors=dynamic[:anchors] | occluded,
         free=dynamic[anchors:],
-        visible={measured[n].view.index: measured[n].coverage > VISIBLE_PIXELS for n in inliers},
+        visible=dict(zip((measured[n].view.index for n in inliers), coverage > VISIBLE_PIXELS, strict=True)),
         inliers=tuple(inliers),
         scene_cut=is_scene_cut(view_changes),
         changed={measured[n].view.index: changed for n in inliers if (changed := measured[n].changed) is not None},
@@ -155,12 +159,11 @@ def select_dynamic(
     with_flow = [n for n in inliers if measured[n].flow_sums is not None]
     if not with_flow or found.scene_cut:
         return found
-    coverage = torch.stack([measured[n].coverage for n in inliers]).sum(0)
     return replace(
         found,
         evidence=flow_evidence([sums for n in with_flow if (sums := measured[n].flow_sums) is not None]),
         views_with_flow=tuple(measured[n].view.index for n in with_flow),
-        centers=primitive_centers(scene, coverage),
+        centers=primitive_centers(scene, coverage.sum(0)),
     )
 
 
@@ -173,12 +176,11 @@ def changed_primitives(older: Scene, scene: Scene) -> Tensor:
         changes = [one != other for one, other in pairs if one is not None and other is not None]
         return torch.stack([change if change.dim() == 1 else change.any(1) for change in changes]).any(0)
 
-    anchors = changed_rows("anchor", scene.anchors, older.anchors)
-    free = torch.ones_like(scene.free.births, dtype=torch.bool)
-    was = torch.isin(scene.free.births, older.free.births)
-    now, then = scene.free.select(was), older.free.select(torch.isin(older.free.births, scene.free.births))
-    free[was] = changed_rows("free", now, then)
-    return torch.cat([anchors, free])
+    anchors, births = changed_rows("anchor", scene.anchors, older.anchors), scene.free.births
+    if not len(births) or not len(older.free):
+        return torch.cat([anchors, torch.ones_like(births, dtype=torch.bool)])
+    before = older.free.select(torch.searchsorted(older.free.births, births).clamp(max=len(older.free) - 1))
+    return torch.cat([anchors, (before.births != births) | changed_rows("free", scene.free, before)])
 
 
 def outlier_candidates(changes: Sequence[ViewChange]) -> list[int]:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import Camera
-from structgstream.kernels.backend import Backend
+from structgstream.kernels.backend import Backend, on_processor
 from structgstream.scene.scene import Scene
 from structgstream.training.neighbours import nearest_others
 from structgstream.training.online.config import SmoothnessConfig
@@ -56,10 +56,11 @@ class MotionSmoothness:
         positions = scene.anchors.positions
         if config.weight == 0.0 or len(positions) < 2:
             return None
-        pixel = pixel_size(positions, cameras)
+        (points,) = on_processor(positions.detach())  # Where neighbours are looked for.
+        pixel = pixel_size(points, cameras)
         if pixel is None:
             return None
-        rows, distances = nearest_others(positions, config.NEIGHBOURS)
+        rows, distances = (found.to(positions.device) for found in nearest_others(points, config.NEIGHBOURS))
         spread = config.BANDWIDTH * distances[:, -1:].clamp(min=1e-9)
         affinities = torch.exp(-0.5 * (distances / spread).square())
         if config.FEATURE_BANDWIDTH > 0.0:

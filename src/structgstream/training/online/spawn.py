@@ -7,9 +7,8 @@ of such a pixel, in front of the rendered depth, at the depth where other views 
 Gaussians that are outliers in several views are pruned first.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,21 +16,20 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from structgstream.cameras import Camera
+from structgstream.cameras import Camera, Viewport
 from structgstream.errors import MissingExtraError
-from structgstream.gaussians import concatenate
-from structgstream.kernels.backend import Backend
+from structgstream.gaussians import Gaussians
+from structgstream.kernels.backend import Backend, on_processor
 from structgstream.kernels.values import SweepView, TileSelection
 from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
-from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import SpawnConfig, SpawnRules
-from structgstream.training.online.measure import VISIBLE_PIXELS, accumulate
+from structgstream.training.online.measure import VISIBLE_PIXELS, slot_count
 from structgstream.training.online.split import DynamicSplit, changed_tiles
 from structgstream.training.residuals import ResidualFloor, box_mean
-from structgstream.training.views import View, mean_of_counting
+from structgstream.training.views import View, by_size, in_groups, mean_of_counting, reduced_views, stacked_masks
 
 MASK_PIXELS = 5
 HIT_VOXELS = 1.8
@@ -49,56 +47,84 @@ class ViewResidual:
         view: the picture, reduced.
         wrong: ``[h, w]`` bool, pixels whose residual exceeds the threshold.
         missing_share: ``[h, w]`` share of the 5 x 5 pixels around whose residual exceeds frame 0's by the threshold.
+        missing_pixels: share of the pixels that count of which more than half is missing.
     """
 
     view: View
     wrong: Tensor
     missing_share: Tensor
+    missing_pixels: float = 0.0
 
 
-def view_residual(
-    drawn: Tensor | None,
-    view: View,
+def view_residuals(
+    drawn: Sequence[Tensor | None],
+    views: Sequence[View],
     color: CameraColor,
     *,
     floor: ResidualFloor | None,
     rules: SpawnRules,
     backend: Backend,
-    tiles: TileSelection | None = None,
-) -> ViewResidual:
-    """Compare a rendering ``[H, W, 3]`` with the picture of ``view``.
+    tiles: Sequence[TileSelection | None] | None = None,
+) -> list[ViewResidual]:
+    """Compare renderings ``[H, W, 3]`` with the pictures of ``views``.
 
     Args:
-        drawn: the rendering; None for one that is the picture itself.
-        view: in full size.
+        drawn: by view, the rendering; None for one that is the picture itself.
+        views: in full size.
         color: the colour correction of the cameras.
         floor: residuals of frame 0; None for none.
         rules: the rules.
         backend: the compute back-end.
-        tiles: the tiles that were drawn; elsewhere it is the picture. None for all.
+        tiles: by view, the tiles that were drawn; elsewhere it is the picture. None for all.
     """
-    scale = min(1.0, rules.picture_width / view.camera.width)
-    small = view.reduced(scale)
-    if drawn is None or (floor is not None and view.index not in floor.maps):
+    given = list(zip(drawn, views, [None] * len(views) if tiles is None else tiles, strict=True))
+
+    def kind(of_view: tuple[Tensor | None, View, TileSelection | None]) -> Hashable:
+        image, view, _ = of_view
+        return view.image.shape, image is None, floor is not None and view.index not in floor.maps
+
+    return in_groups(given, kind, lambda alike: _view_residuals(*zip(*alike), color, floor, rules, backend))
+
+
+def _view_residuals(
+    drawn: Sequence[Tensor | None],
+    views: Sequence[View],
+    tiles: Sequence[TileSelection | None],
+    color: CameraColor,
+    floor: ResidualFloor | None,
+    rules: SpawnRules,
+    backend: Backend,
+) -> list[ViewResidual]:
+    """Of views of one size, all or none of which were drawn and have a floor."""
+    small = reduced_views(views, min(1.0, rules.picture_width / views[0].camera.width))
+    pictures, masks = torch.stack([view.image for view in small]), stacked_masks(small)
+    images, selected = ([one for one in every if one is not None] for every in (drawn, tiles))
+    if not images or (floor is not None and views[0].index not in floor.maps):
         # Of a camera that was absent from frame 0 nothing is known to be new.
-        none = torch.zeros(small.image.shape[:2], device=small.image.device)
+        none = torch.zeros(pictures.shape[:3], device=pictures.device)
         nothing = torch.zeros_like(none, dtype=torch.bool)
-        known = small if drawn is None else View(small.index, small.camera, small.image, nothing)
-        return ViewResidual(known, nothing, none)
-    off = backend.picture_residual(
-        drawn,
-        small.image,
-        gains=color.gains[view.index],
-        biases=color.biases[view.index],
-        tiles=tiles,
-        outside=None if tiles is None else view.image,
-        mask=small.mask,
+        if images:
+            small = [replace(view, mask=mask) for view, mask in zip(small, nothing, strict=True)]
+        return [ViewResidual(*of_view) for of_view in zip(small, nothing, none, strict=True)]
+    seen = color.of_cameras([view.index for view in views])
+    off = backend.picture_residuals(
+        images,
+        pictures,
+        gains=seen.gains,
+        biases=seen.biases,
+        tiles=selected or None,
+        outside=[view.image for view in views] if selected else None,
+        masks=masks,
     )
-    limit = off.new_full((), rules.missing_threshold)
+    limits = off.new_full((), rules.missing_threshold)
     if floor is not None:
-        limit = limit + interpolate(floor.maps[view.index][None, None], size=off.shape, mode="bilinear")[0, 0]
-    missing = box_mean((off > limit).float(), MASK_PIXELS)
-    return ViewResidual(small, off > rules.residual_threshold, missing if small.mask is None else missing * small.mask)
+        floors = torch.stack([floor.maps[view.index] for view in views])[:, None]
+        limits = limits + interpolate(floors, size=off.shape[1:], mode="bilinear")[:, 0]
+    missing = box_mean((off > limits).float(), MASK_PIXELS)
+    missing = missing if masks is None else missing * masks
+    shares = mean_of_counting((missing > 0.5).float(), masks).tolist()
+    results = zip(small, off > rules.residual_threshold, missing, shares, strict=True)
+    return [ViewResidual(*of_view) for of_view in results]
 
 
 def outlier_mask(coverage: Tensor, wrong: Tensor, *, rules: SpawnRules) -> Tensor:
@@ -153,15 +179,15 @@ def spawn_by_sweep(
         MissingExtraError: SciPy is not installed.
     """
     views = [_sweep_view(entry, depths[entry.view.index], color) for entry in missing]
-    points, colors, spacings = [], [], []
-    for index, (entry, view) in enumerate(zip(missing, views)):
-        lacking = entry.missing_share > 0.5
-        rows, columns = (lacking & _strided_mask(rules.pixel_step, lacking)).nonzero().unbind(1)
-        if not len(rows):
+    values, costs = [], []
+    for index, view in enumerate(views):
+        if missing[index].missing_pixels == 0.0:
             continue
-        reachable = view.depths[view.depths.isfinite()]
-        beyond = float(reachable.max()) if len(reachable) else 1e3 * view.near
-        farthest = (1.02 * view.depths[rows, columns].clamp(max=beyond)).clamp(min=1.001 * view.near)
+        lacking = view.missing > 0.5
+        rows, columns = (lacking & _strided_mask(rules.pixel_step, lacking)).nonzero().unbind(1)
+        reachable = torch.where(view.depths.isfinite(), view.depths, -torch.inf).max()
+        beyond = torch.where(reachable.isfinite(), reachable, 1e3 * view.near)
+        farthest = (1.02 * torch.minimum(view.depths[rows, columns], beyond)).clamp(min=1.001 * view.near)
         swept = backend.sweep(
             views,
             index,
@@ -171,18 +197,22 @@ def spawn_by_sweep(
             min_supports=rules.min_supports,
             max_contradictions=rules.max_contradictions,
         )
-        good = swept.costs < rules.max_cost
-        z, x, y = swept.depths[good], columns[good] + 0.5, rows[good] + 0.5
+        z, x, y = swept.depths, columns + 0.5, rows + 0.5
         K, viewmat = view.K, view.viewmat
         local = torch.stack([(x - K[0, 2]) / K[0, 0] * z, (y - K[1, 2]) / K[1, 1] * z, z], -1)
-        points.append((local - viewmat[:3, 3]) @ viewmat[:3, :3])
-        colors.append(view.colors[rows[good], columns[good]])
-        spacings.append(rules.pixel_step * z / K[0, 0])
-    if not points or not sum(len(group) for group in points):
-        return Spawned(FreeGaussians.empty(views[0].colors))
-    return _merge_points(
-        torch.cat(points), torch.cat(colors), torch.cat(spacings), first_identity=first_identity, rules=rules
-    )
+        points, spacings = (local - viewmat[:3, 3]) @ viewmat[:3, :3], rules.pixel_step * z / K[0, 0]
+        values.append(torch.cat([points, view.colors[rows, columns], spacings[:, None]], dim=1))
+        costs.append(swept.costs)
+    none, like = Spawned(FreeGaussians.empty(views[0].colors)), views[0].colors
+    if not values:
+        return none
+    found, cost = on_processor(torch.cat(values), torch.cat(costs))  # Where points are merged.
+    found = found[cost < rules.max_cost]
+    if not len(found):
+        return none
+    points, colors, spacings = found.split([3, 3, 1], dim=1)
+    spawned = _merge_points(points, colors, spacings[:, 0], first_identity=first_identity, rules=rules)
+    return replace(spawned, free=spawned.free.to(like.device))
 
 
 def _sweep_view(entry: ViewResidual, depths: Tensor, color: CameraColor) -> SweepView:
@@ -205,13 +235,13 @@ def _strided_mask(step: int, like: Tensor) -> Tensor:
 def _merge_points(
     points: Tensor, colors: Tensor, spacings: Tensor, *, first_identity: int, rules: SpawnRules
 ) -> Spawned:
-    """One free Gaussian per voxel of the points, if at least ``min_hits`` points lie around it."""
+    """One free Gaussian per voxel of the points, if at least ``min_hits`` points lie around it; on the processor."""
     try:
         from scipy.spatial import KDTree
     except ImportError as error:
         raise MissingExtraError("scipy", "capture") from error
     values, voxel = torch.cat([points, colors, spacings[:, None]], dim=1), float(spacings.median())
-    tree = KDTree(points.double().numpy(force=True))
+    tree = KDTree(points.double().numpy())
     finest = None
     while True:
         means, hits = _cells(values, tree, voxel)
@@ -297,16 +327,15 @@ class Missing:
     picture: Tensor | None = None
     drawn: Tensor | None = None
 
-    @cached_property
+    @property
     def any(self) -> bool:
         """Whether there are any."""
-        return bool((self.residual.missing_share > 0.5).any())
+        return self.residual.missing_pixels > 0.0
 
 
 def missing_share(missing: Sequence[Missing]) -> float:
     """Share of the pixels of all views that are missing."""
-    shares = [mean_of_counting((m.residual.missing_share > 0.5).float(), m.residual.view.mask) for m in missing]
-    return float(torch.stack(shares).mean())
+    return float(torch.tensor([m.residual.missing_pixels for m in missing]).mean())
 
 
 @dataclass(frozen=True)
@@ -340,15 +369,15 @@ class Sweep:
             prunes: whether outliers will be pruned by wrong pixels, which then must be rendered again as well.
         """
         # The pictures are from before the second round: tiles without missing pixels then are assumed to have none.
-        found = [self._before(view, wrong=prunes) for view in self.views]
+        found = self._before(wrong=prunes)
         every = prunes and len(self.dynamic.free) > 0
         if not every and not self._enough(found):
             return found
-        return [self._drawn(entry) if every or entry.any else entry for entry in found]
+        return self._drawn(found, chosen=[every or entry.any for entry in found])
 
     def drawn(self, missing: Sequence[Missing]) -> list[Missing]:
         """The same views, drawn again."""
-        return [self._drawn(entry, again=True) for entry in missing]
+        return self._drawn(missing, chosen=[True] * len(missing), again=True)
 
     def spawn(self, missing: Sequence[Missing], *, first_identity: int, room: int) -> Spawned:
         """New free Gaussians where several views miss the same; at most ``room``."""
@@ -357,7 +386,7 @@ class Sweep:
         residuals = [entry.residual for entry in missing]
         return spawn_by_sweep(
             residuals,
-            {entry.view.index: self.depth_map(entry.view) for entry in residuals},
+            dict(zip((e.view.index for e in residuals), self.depth_maps([e.view for e in residuals]), strict=True)),
             self.dynamic.camera_color,
             first_identity=first_identity,
             rules=replace(self.rules, most=min(self.rules.most, room)),
@@ -368,62 +397,115 @@ class Sweep:
         """Whether enough views have missing pixels to spawn from."""
         return sum(entry.any for entry in missing) > self.rules.min_supports
 
-    def _before(self, view: View, *, wrong: bool) -> Missing:
-        """By the picture that is drawn already; ``wrong`` pixels make their tiles suspect, too."""
-        active, known = self.active_tiles.get(view.index), self.known.get(view.index)
-        if active is None:
-            return Missing(view, self._residual(view, None), None)
-        picture = active.picture if known is None or known.picture is None else known.picture
-        residual = self._residual(view, picture)
-        suspect = residual.missing_share > 0.5
-        tiles = changed_tiles(active.tiles, suspect | residual.wrong if wrong else suspect)
-        return Missing(view, residual, tiles, picture, None if known is None else known.drawn)
+    def _before(self, *, wrong: bool) -> list[Missing]:
+        """By the pictures that are drawn already; ``wrong`` pixels make their tiles suspect, too."""
+        found = []
+        for view in self.views:
+            active, known = self.active_tiles.get(view.index), self.known.get(view.index)
+            picture = (
+                None if active is None else active.picture if known is None or known.picture is None else known.picture
+            )
+            found.append((view, picture, None if known is None else known.drawn))
+        views, pictures, drawn = zip(*found, strict=True)
+        residuals = self._residuals(views, pictures)
 
-    def _drawn(self, entry: Missing, *, again: bool = False) -> Missing:
-        """By a rendering, in the suspect tiles; in those drawn before only ``again``."""
-        view, active = entry.view, self.active_tiles.get(entry.view.index)
-        if active is None or entry.picture is None:
-            return entry
-        tiles = entry.tiles or active.tiles
-        if entry.drawn is not None and not again:
-            tiles = replace(tiles, mask=tiles.mask & ~entry.drawn)
-            if not tiles.mask.any():
-                return entry
-        onto = replace(active, picture=entry.picture.clone(), tiles=tiles)
-        gaussians = self.dynamic.with_free_gaussians(self.dynamic.structured(view.camera, self.backend, tiles=tiles))
-        behind = self.dynamic.background(view.camera)
-        image = draw(gaussians, view.camera, self.backend, active=onto, background=behind).image
-        drawn = tiles.mask if entry.drawn is None else tiles.mask | entry.drawn
-        return replace(entry, residual=self._residual(view, image), picture=image, drawn=drawn)
+        def suspect_tiles(rows: list[int]) -> Sequence[TileSelection | None]:
+            if pictures[rows[0]] is None:
+                return [None] * len(rows)
+            pixels = torch.stack([residuals[row].missing_share for row in rows]) > 0.5
+            if wrong:
+                pixels = pixels | torch.stack([residuals[row].wrong for row in rows])
+            tiles = [self.active_tiles[views[row].index].tiles for row in rows]
+            size = (tiles[0].height, tiles[0].width)
+            masks = changed_tiles(torch.stack([of_view.mask for of_view in tiles]), list(pixels), size)
+            return [replace(of_view, mask=mask) for of_view, mask in zip(tiles, masks, strict=True)]
 
-    def _residual(self, view: View, image: Tensor | None) -> ViewResidual:
-        """Of a rendering ``[H, W, 3]`` within the active tiles; None for a view without one."""
-        active = self.active_tiles.get(view.index)
-        return view_residual(
-            None if active is None else image,
-            view,
+        tiles = in_groups(range(len(views)), lambda row: (views[row].image.shape, pictures[row] is None), suspect_tiles)
+        return list(map(Missing, views, residuals, tiles, pictures, drawn))
+
+    def _drawn(self, entries: Sequence[Missing], *, chosen: Sequence[bool], again: bool = False) -> list[Missing]:
+        """By renderings of the ``chosen`` ones in the suspect tiles; in those drawn before only ``again``."""
+        return in_groups(
+            list(zip(entries, chosen, strict=True)),
+            lambda given: (given[0].view.image.shape, given[0].picture is not None and given[1]),
+            lambda alike: (
+                self._draw([entry for entry, _ in alike], again=again)
+                if alike[0][1] and alike[0][0].picture is not None
+                else [entry for entry, _ in alike]
+            ),
+        )
+
+    def _draw(self, entries: Sequence[Missing], *, again: bool) -> list[Missing]:
+        """:meth:`_drawn` of views of one size that all have active tiles."""
+        tiles = [entry.tiles or self.active_tiles[entry.view.index].tiles for entry in entries]
+        masks = torch.stack([of_view.mask for of_view in tiles])
+        none = torch.zeros_like(masks[0])
+        before = torch.stack([none if entry.drawn is None else entry.drawn for entry in entries])
+        masks = masks if again else masks & ~before
+        rows = [row for row, some in enumerate(masks.flatten(1).any(1).tolist()) if some]
+        views, found = [entries[row].view for row in rows], list(entries)
+        if not rows:
+            return found
+        tiles = [replace(tiles[row], mask=masks[row]) for row in rows]
+        cameras = [view.camera for view in views]
+        drawn = self.backend.draw_views(
+            self.dynamic.gaussians_of_views(cameras, self.backend, tiles=tiles),
+            [camera.viewport(self.dynamic.anchors.positions) for camera in cameras],
+            static=[self.active_tiles[view.index].static for view in views],
+            backgrounds=self.dynamic.backgrounds(cameras),
+            tiles=tiles,
+            onto=list(torch.stack([picture for row in rows if (picture := entries[row].picture) is not None])),
+        )
+        images, together = [output.image for output in drawn], masks | before
+        for row, residual, image in zip(rows, self._residuals(views, images), images, strict=True):
+            found[row] = replace(entries[row], residual=residual, picture=image, drawn=together[row])
+        return found
+
+    def _residuals(self, views: Sequence[View], images: Sequence[Tensor | None]) -> list[ViewResidual]:
+        """Of renderings ``[H, W, 3]`` within the active tiles; None for a view without one."""
+        actives = [self.active_tiles.get(view.index) for view in views]
+        return view_residuals(
+            images,
+            views,
             self.dynamic.camera_color,
             floor=self.floor,
             rules=self.rules,
             backend=self.backend,
-            tiles=None if active is None else active.tiles,
+            tiles=[None if active is None else active.tiles for active in actives],
         )
 
-    def depth_map(self, view: View) -> Tensor:
+    def depth_maps(self, views: Sequence[View]) -> list[Tensor]:
         """Mean depth along z ``[h, w]`` of both parts drawn together; infinite where coverage is low.
 
         Of the static part only what reaches the active tiles is drawn, if there is one: beyond it nothing has changed,
         so a point that projects there is refused as if it were visible.
         """
-        camera, active = _reduced(view.camera), self.active_tiles.get(view.index)
-        at_rest = self.static.gaussians(camera, self.backend) if active is None else active.static
-        gaussians = concatenate(self.dynamic.gaussians(camera, self.backend), at_rest)
-        viewmat = camera.viewport(gaussians.means).viewmat
-        z = gaussians.means @ viewmat[2, :3] + viewmat[2, 3]
-        rendering = draw(replace(gaussians, colors=z[:, None].expand(-1, 3).contiguous()), camera, self.backend)
-        depth = rendering.image[..., 0] / rendering.alpha.clamp(min=MIN_COVERAGE)
-        depth = torch.where(rendering.alpha > MIN_COVERAGE, depth, torch.inf)
-        return interpolate(depth[None, None], size=(view.camera.height, view.camera.width))[0, 0]
+        return by_size(views, self._depth_maps)
+
+    def _depth_maps(self, views: Sequence[View]) -> Tensor:
+        cameras = [_reduced(view.camera) for view in views]
+        whole = [camera for view, camera in zip(views, cameras, strict=True) if view.index not in self.active_tiles]
+        of_whole = iter(self.static.gaussians_of_views(whole, self.backend) if whole else [])
+        actives = [self.active_tiles.get(view.index) for view in views]
+        static = [next(of_whole) if active is None else active.static for active in actives]
+        dynamic = self.dynamic.gaussians_of_views(cameras, self.backend)
+        viewports = [camera.viewport(self.dynamic.anchors.positions) for camera in cameras]
+        drawn = self.backend.draw_views(
+            list(map(_colored_by_depth, dynamic, viewports)),
+            viewports,
+            static=list(map(_colored_by_depth, static, viewports)),
+        )
+        alphas = torch.stack([output.alpha for output in drawn])
+        depths = torch.stack([output.image[..., 0] for output in drawn]) / alphas.clamp(min=MIN_COVERAGE)
+        depths = torch.where(alphas > MIN_COVERAGE, depths, torch.inf)
+        size = (views[0].camera.height, views[0].camera.width)
+        return interpolate(depths[:, None], size=size)[:, 0]
+
+
+def _colored_by_depth(gaussians: Gaussians, viewport: Viewport) -> Gaussians:
+    """The Gaussians with their depth along z as colour."""
+    z = gaussians.means @ viewport.viewmat[2, :3] + viewport.viewmat[2, 3]
+    return replace(gaussians, colors=z[:, None].expand(-1, 3).contiguous())
 
 
 def _reduced(camera: Camera) -> Camera:
@@ -435,7 +517,7 @@ class SpawnResult:
     """Which free Gaussians of a dynamic part stay, and the new ones.
 
     Args:
-        kept: mask ``[F]`` of those that stay.
+        kept: mask ``[F]`` of those that stay, on the processor.
         new_free: the spawned ones.
         thin_count: how many of them are thin content's.
         thin_refused_count: how many thin ones were not spawned because they would have been too many.
@@ -487,7 +569,7 @@ def prune_and_spawn(
         backend: the compute back-end.
     """
     dynamic, static = (part.with_folded_appearance() for part in (split.dynamic, split.static))
-    everything = torch.ones(len(dynamic.free), dtype=torch.bool, device=dynamic.free.means.device)
+    everything = torch.ones(len(dynamic.free), dtype=torch.bool)
     none = SpawnResult(everything, FreeGaussians.empty(dynamic.free.means))
     if not config.enabled or not active_tiles:
         return none
@@ -502,6 +584,7 @@ def prune_and_spawn(
         kept = everything
         if len(dynamic.free):
             kept = ~_outlier_mask(dynamic, missing, active_tiles, rules=rules, backend=backend)
+            (kept,) = on_processor(kept)
         if not kept.all():
             sweep = replace(sweep, dynamic=replace(dynamic, free=dynamic.free.select(kept)))
             missing = sweep.drawn(missing)
@@ -532,20 +615,25 @@ def _outlier_mask(
     rules: SpawnRules,
     backend: Backend,
 ) -> Tensor:
-    coverage, wrong = [], []
-    for entry in missing:
-        view = entry.residual.view
-        active, camera = active_tiles.get(view.index), view.camera
-        if active is None:
-            continue
+    seen = [entry.residual for entry in missing if entry.residual.view.index in active_tiles]
+    wrong = {entry.view.index: entry.wrong for entry in seen}
+    free, slots = dynamic.free_gaussians(), slot_count(dynamic)
+
+    def weighed(views: list[View]) -> Tensor:
+        cameras, masks = [view.camera for view in views], stacked_masks(views)
+        viewports = [camera.viewport(free.means) for camera in cameras]
         # Elsewhere free Gaussians cover nothing: maps that are zero there cost nothing.
-        free = dynamic.free_gaussians()
-        reached = backend.rasterize(free, camera.viewport(free.means)).alpha > 0.0
-        counting = reached if view.mask is None else reached & view.mask
-        maps = torch.stack([counting, counting & entry.residual.wrong], dim=-1).to(entry.residual.missing_share)
-        gaussians = dynamic.with_free_gaussians(dynamic.structured(camera, backend, tiles=TileSelection.of(reached)))
-        sums = accumulate(gaussians, camera, maps, backend, static=active.static)
-        of_free = sums[len(sums) - len(dynamic.free) :]  # Free Gaussians are the last, and all there.
-        coverage.append(of_free[:, 0])
-        wrong.append(of_free[:, 1])
-    return outlier_mask(torch.stack(coverage), torch.stack(wrong), rules=rules)
+        drawn = backend.draw_views([free] * len(views), viewports)
+        reached = torch.stack([output.alpha for output in drawn]) > 0.0
+        counting = reached if masks is None else reached & masks
+        maps = torch.stack([counting, counting & torch.stack([wrong[view.index] for view in views])], dim=-1)
+        return backend.weigh_views(
+            dynamic.gaussians_of_views(cameras, backend, tiles=TileSelection.of_each(reached)),
+            viewports,
+            maps.to(free.means),
+            slots=slots,
+            static=[active_tiles[view.index].static for view in views],
+        )
+
+    sums = torch.stack(by_size([entry.view for entry in seen], weighed))[:, slots - len(free) :]
+    return outlier_mask(sums[..., 0], sums[..., 1], rules=rules)

@@ -11,16 +11,15 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from structgstream.cameras import Camera, enlargement
-from structgstream.gaussians import concatenate
-from structgstream.kernels.backend import Backend
-from structgstream.kernels.values import TILE_PIXELS, TileSelection, tile_grid
+from structgstream.cameras import enlargement
+from structgstream.gaussians import row_indices, select_each
+from structgstream.kernels.backend import Backend, on_processor
+from structgstream.kernels.values import TILE_PIXELS, TileSelection
 from structgstream.scene.active_tiles import ActiveTiles
-from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.select import DynamicSelection
-from structgstream.training.views import View
+from structgstream.training.views import View, by_size
 
 REACH_SCALE = 0.25
 
@@ -82,100 +81,85 @@ def find_active_tiles(
     split: DynamicSplit, views: Sequence[View], *, config: MotionConfig, backend: Backend
 ) -> dict[int, ActiveTiles]:
     """By view index, the tiles that the dynamic part reaches; views that do not show it have none."""
-    selection, dynamic, static = (
-        split.selection,
-        split.dynamic.with_folded_appearance(),
-        split.static.with_folded_appearance(),
-    )
-    k = dynamic.anchors.offsets_per_anchor
-    rows = torch.cat([selection.anchors.repeat_interleave(k), selection.free])  # of the whole scene's Gaussians
     with torch.no_grad():
-        found = {
-            view.index: _active_tiles(
-                static,
-                dynamic,
-                selection.visible[view.index][rows],
-                selection.changed.get(view.index),
-                view.camera,
-                config,
-                backend,
-            )
-            for view in views
-        }
-    return {index: active for index, active in found.items() if active is not None}
+        found = by_size(views, lambda same: _active_tiles(split, same, config, backend))
+    return {view.index: active for view, active in zip(views, found, strict=True) if active is not None}
 
 
 def _active_tiles(
-    static: Scene,
-    dynamic: Scene,
-    visible: Tensor,
-    changed: Tensor | None,
-    camera: Camera,
-    config: MotionConfig,
-    backend: Backend,
-) -> ActiveTiles | None:
-    in_motion = dynamic.gaussians(camera, backend)
-    # Extents are those on a reduced picture.
-    small = camera.scaled(REACH_SCALE)
-    radii = backend.projected_radii(in_motion, small.viewport(in_motion.means)) * (camera.width / small.width)
-    enlarged = enlargement(camera.width, camera.height)
-    shown = visible[in_motion.ids] & (radii > 0)
-    tiles = reached_tiles(in_motion.means[shown], radii[shown], camera, round(config.MARGIN_PIXELS * enlarged))
-    if not tiles.mask.any():
-        return None
-    tiles_of_change = changed_tiles(tiles, changed)
-    if config.tiles_around >= 0:
-        tiles = replace(tiles, mask=tiles.mask & _grown(tiles_of_change.mask, round(config.tiles_around * enlarged)))
-    # The loss reads ten pixels beyond a tile: a ring of tiles around them is drawn once and kept.
-    ring = replace(tiles, mask=_grown(tiles.mask, 1))
-    at_rest = static.with_free_gaussians(static.structured(camera, backend, tiles=ring))
-    nothing = at_rest.select(torch.zeros(len(at_rest), dtype=torch.bool, device=ring.mask.device))
-    empty = at_rest.means.new_zeros(camera.height, camera.width, 3)
-    drawn, behind = concatenate(in_motion, at_rest), static.background(camera)
-    rendering = draw(drawn, camera, backend, active=ActiveTiles(ring, empty, nothing), background=behind)
-    # Anchors were culled as a whole; Gaussians that reach no tile are dropped.
-    return ActiveTiles(
-        tiles, rendering.image, at_rest.select(rendering.radii[len(in_motion) :] > 0), tiles_of_change, behind
+    split: DynamicSplit, views: Sequence[View], config: MotionConfig, backend: Backend
+) -> list[ActiveTiles | None]:
+    """Of views of one size; None where the dynamic part is not visible."""
+    selection = split.selection
+    dynamic, static = (part.with_folded_appearance() for part in (split.dynamic, split.static))
+    like, k = dynamic.anchors.positions, dynamic.anchors.offsets_per_anchor
+    of_dynamic = row_indices(torch.cat([selection.anchors.repeat_interleave(k), selection.free]), like)
+    cameras = [view.camera for view in views]
+    width, height = cameras[0].width, cameras[0].height
+    enlarged = enlargement(width, height)
+    in_motion = dynamic.gaussians_of_views(cameras, backend)
+    masks = backend.reached_tiles(
+        in_motion,
+        [camera.viewport(like) for camera in cameras],
+        torch.stack([selection.visible[view.index] for view in views])[:, of_dynamic],
+        # Extents are those on a reduced picture.
+        reduced=[camera.scaled(REACH_SCALE).viewport(like) for camera in cameras],
+        margin_pixels=round(config.MARGIN_PIXELS * enlarged),
     )
+    changed = changed_tiles(masks, [selection.changed.get(view.index) for view in views], (height, width))
+    if config.tiles_around >= 0:
+        masks = masks & _grown(changed, round(config.tiles_around * enlarged))
+    # The loss reads ten pixels beyond a tile: a ring of tiles around them is drawn once and kept.
+    tiles, tiles_of_change, rings = (
+        [TileSelection(mask, width, height) for mask in of_views] for of_views in (masks, changed, _grown(masks, 1))
+    )
+    at_rest, backgrounds = static.gaussians_of_views(cameras, backend, tiles=rings), static.backgrounds(cameras)
+    drawn = backend.draw_views(
+        in_motion,
+        [camera.viewport(like) for camera in cameras],
+        static=at_rest,
+        backgrounds=backgrounds,
+        tiles=rings,
+    )
+    # Anchors were culled as a whole; Gaussians that reach no tile are dropped.
+    radii = torch.cat([output.radii[len(of_view) :] for output, of_view in zip(drawn, in_motion, strict=True)])
+    reaching, shown = on_processor(radii > 0, masks.flatten(1).any(1))
+    kept = select_each(at_rest, reaching)
+    return [
+        ActiveTiles(
+            tiles[n],
+            drawn[n].image,
+            kept[n],
+            tiles_of_change[n],
+            None if backgrounds is None else backgrounds[n],
+        )
+        if shown[n]
+        else None
+        for n in range(len(views))
+    ]
 
 
-def _grown(mask: Tensor, by: int) -> Tensor:
-    """The mask ``[rows, columns]``, dilated by ``by`` tiles."""
-    return torch.nn.functional.max_pool2d(mask[None].float(), 2 * by + 1, stride=1, padding=by)[0] > 0
+def _grown(masks: Tensor, by: int) -> Tensor:
+    """The masks ``[V, rows, columns]``, dilated by ``by`` tiles."""
+    return torch.nn.functional.max_pool2d(masks.float(), 2 * by + 1, stride=1, padding=by) > 0
 
 
-def changed_tiles(tiles: TileSelection, changed: Tensor | None) -> TileSelection:
-    """Those of ``tiles`` that hold pixels of the mask ``changed`` ``[h, w]``, or all if none do or it is None."""
-    if changed is None:
-        return tiles
-    rows, columns = tiles.mask.shape
-    size = (rows * TILE_PIXELS, columns * TILE_PIXELS)
-    large = torch.nn.functional.interpolate(changed[None, None].float(), size=(tiles.height, tiles.width))
-    padded = torch.nn.functional.pad(large, (0, size[1] - tiles.width, 0, size[0] - tiles.height))
-    mask = tiles.mask & (torch.nn.functional.max_pool2d(padded, TILE_PIXELS)[0, 0] > 0.0)
-    return replace(tiles, mask=mask) if mask.any() else tiles
+def changed_tiles(masks: Tensor, changed: Sequence[Tensor | None], size: tuple[int, int]) -> Tensor:
+    """Those of the tiles ``[V, rows, columns]`` that hold pixels of a view's mask ``[h, w]``; all if none do or there
+    is no mask.
 
-
-def reached_tiles(means: Tensor, radii: Tensor, camera: Camera, margin_pixels: int) -> TileSelection:
-    """The tiles within ``margin_pixels`` of Gaussians at ``means`` ``[N, 3]``, ``radii`` ``[N]`` pixels large.
-
-    Gaussians are truncated at two standard deviations.
+    Args:
+        masks: tiles of each view.
+        changed: the mask of each view.
+        size: H and W of the pictures.
     """
-    rows, columns = tile_grid(camera.width, camera.height)
-    viewmat, K = camera.viewport(means)[:2]
-    points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
-    centers = (points @ K.T)[:, :2] / points[:, 2:]
-    reach = 0.6 * radii[:, None] + margin_pixels
-    none, last = centers.new_zeros(2), centers.new_tensor([columns - 1, rows - 1])
-    low = ((centers - reach) / TILE_PIXELS).floor()
-    high = ((centers + reach) / TILE_PIXELS).floor()
-    inside = ((high >= none) & (low <= last)).all(1)
-    low = low[inside].clamp(min=none, max=last).long()
-    high = high[inside].clamp(min=none, max=last).long() + 1
-    # Each box adds one at two of its corners and takes one at the others; running sums then count boxes.
-    corners = torch.zeros((rows + 1) * (columns + 1), device=centers.device)
-    one = torch.ones(len(low), device=centers.device)
-    for x, y, sign in ((low, low, 1), (high, high, 1), (low, high, -1), (high, low, -1)):
-        corners.index_add_(0, y[:, 1] * (columns + 1) + x[:, 0], sign * one)
-    counts = corners.reshape(rows + 1, columns + 1).cumsum(0).cumsum(1)[:rows, :columns]
-    return TileSelection(counts > 0.5, camera.width, camera.height)
+    known = [mask for mask in changed if mask is not None]
+    if not known:
+        return masks
+    everywhere = torch.ones_like(known[0])
+    pixels = torch.stack([everywhere if mask is None else mask for mask in changed])[:, None].float()
+    rows, columns = masks.shape[1:]
+    large = torch.nn.functional.interpolate(pixels, size=size)
+    padded = torch.nn.functional.pad(large, (0, columns * TILE_PIXELS - size[1], 0, rows * TILE_PIXELS - size[0]))
+    found = masks & (torch.nn.functional.max_pool2d(padded, TILE_PIXELS)[:, 0] > 0.0)
+    return torch.where(found.flatten(1).any(1)[:, None, None], found, masks)
