@@ -12,9 +12,7 @@ large motion are shares of the longer side. The floor of the margin is in pixels
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import floor, log2
 
 import numpy as np
@@ -202,7 +200,7 @@ def _detect_changes(
     maps = torch.stack([of_view.maps for of_view in estimated]).to(changed.device)
     maps = torch.cat([maps, stacked_colors(last)], dim=-1)
     for row, of_view, flow_maps in zip(rows, estimated, maps, strict=True):
-        found[row] = replace(found[row], flow=flow_maps, far_boxes=of_view.far_boxes)
+        found[row] = replace(found[row], flow=flow_maps, flow_counts=of_view.counts)
     return found
 
 
@@ -273,7 +271,7 @@ def flow_map(
     """
     maps = torch.zeros(3, *changed.shape)
     far_pixels = recolored_pixels = 0
-    where = changed.numpy(force=True)
+    where = changed.numpy()
     longer, level = max(where.shape), config.level_of(where.shape[1])
     context = max(MIN_CONTEXT_PIXELS, round(CONTEXT_SHARE * longer))
     radius = max(1, round(COLOR_SHARE * longer))
@@ -289,7 +287,7 @@ def flow_map(
         nonlocal recolored_pixels
         alike = torch.from_numpy(same_color(earlier, later, flow, radius=radius))
         recolored_pixels += int(where[box][~alike.numpy()].sum())
-        counts = alike if mask is None else alike & mask[box].cpu()
+        counts = alike if mask is None else alike & mask[box]
         forward, backward = torch.from_numpy(flow), torch.from_numpy(back)
         return backend.confident_flow(forward, backward, counts, relative=RELATIVE, absolute=ABSOLUTE)
 
@@ -306,7 +304,8 @@ def flow_map(
         missing = torch.from_numpy(where[box]) & (maps[0][box] == 0.0)
         far_pixels += int((missing & (found[0] > 0.0)).sum())
         maps[:, *box] = torch.where(missing, found, maps[:, *box])
-    return FlowMaps(area_mean(maps[None], size)[0].permute(1, 2, 0), len(far))
+    small = area_mean(maps[None], size)[0].permute(1, 2, 0)
+    return FlowMaps(small, len(far), far_pixels, recolored_pixels)
 
 
 Box = tuple[slice, slice]
