@@ -15,9 +15,8 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig, Similarity
-from structgstream.codec.fields.packet_fields import CODABLE, dequantize_state, quantize_state
+from structgstream.codec.fields.packet_fields import CODABLE, FREE_PARAMETERS, dequantize_state, quantize_state
 from structgstream.codec.fields.quantization import round_to_bins
-from structgstream.codec.fields.rows import FREE_PARAMETERS
 from structgstream.codec.fields.static_fields import UNCODED_FIELDS
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.codec.scene_coder import SceneEncoder
