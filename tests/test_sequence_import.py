@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from structgstream.cli import main
-from structgstream.codec.fields.rows import MAX_FREE
+from structgstream.codec.fields.packet_fields import MAX_FREE
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import open_stream
 from structgstream.errors import CaptureError

@@ -17,7 +17,6 @@ those of separate runs. Qualities fit a frame one after the other, so only the l
 """
 
 import math
-import re
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Generator, Hashable, Mapping, Sequence
@@ -53,8 +52,6 @@ from structgstream.session.presets import MAX_QUALITY, StreamConfig, with_budget
 from structgstream.session.struct_gstream import FrameZeroContext, StructGStream, stream_pipeline
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.result import FitResult, StepListener
-
-_GIVEN = re.compile(r"([^=]*)=([^=]*)")
 
 
 @dataclass(frozen=True)
@@ -93,11 +90,11 @@ def configured(config: StreamConfig, quality: Quality) -> StreamConfig:
 
 
 def _parsed(text: str) -> Quality:
-    match = _GIVEN.fullmatch(text)
+    name, _, number = text.partition("=")
     try:
-        name, fineness = ("", float("nan")) if match is None else (match[1], float(match[2]))
+        fineness = float(number)
     except ValueError:
-        name, fineness = "", float("nan")
+        fineness = math.nan
     if not is_quality_name(name) or not abs(fineness) <= MAX_QUALITY:
         raise ConfigError(
             f"--qualities {text} is no quality; expected NAME=Q, a name of letters, digits, '-' and '_' and a Q from "

@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig, normalizing_similarity
+from structgstream.codec.fields.packet_fields import MAX_FREE
 from structgstream.codec.fields.quantization import float32
-from structgstream.codec.fields.rows import MAX_FREE
 from structgstream.codec.fields.static_fields import UNCODED_FIELDS
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.codec.scene_coder import SceneEncoder

@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
+"""A decoded scene serves every camera until another frame or another back-end is asked for."""
+
 import os
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from structgstream.codec.container.records import PREFIX, RecordType, packed, prefix, scan_records
@@ -13,6 +17,9 @@ from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.scene_coder import SceneEncoder
 from structgstream.codec.sinks import MemorySink
 from structgstream.errors import StreamError
+from structgstream.kernels.backend import reference_backend
+from structgstream.scene.render import render, to_8bit_image
+from structgstream.scene.scene import Scene
 from tests.support.properties import THOROUGH
 from tests.support.streams import header_for, moved, same, small_scene, small_stream, write_stream
 
@@ -207,3 +214,29 @@ def test_a_file_that_became_another_is_noticed(tmp_path: Path) -> None:
     for ask in (reader.scene, reader.packets.__getitem__):
         with pytest.raises(StreamError, match="Packet 1 .* is damaged"):
             ask(1)
+
+
+def test_a_scene_is_decoded_when_frame_or_back_end_change_and_not_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    sink, scenes, backend = MemorySink(), [moved(small_scene(free=2), step) for step in range(2)], reference_backend()
+    write_stream(sink, scenes)
+    reader, decoded = StreamReader(sink.data), list[int]()
+    scene = reader.scene
+
+    def counted(index: int) -> Scene:
+        decoded.append(index)
+        return scene(index)
+
+    monkeypatch.setattr(reader, "scene", counted)
+    first, second, *_ = reader.header.rig
+    other = replace(backend, name="cpu")
+    for index, name, asked in (
+        (0, first, backend),
+        (0, second, backend),
+        (1, second, backend),
+        (1, second, other),
+        (1, first, other),
+    ):
+        picture = reader.render(index, name, backend=asked)
+        expected = to_8bit_image(render(scene(index), reader.header.camera(name), backend).image)
+        assert np.array_equal(picture, expected)
+    assert decoded == [0, 1, 1]

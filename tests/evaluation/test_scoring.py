@@ -1,12 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scores of a picture (``test_metrics`` and ``test_masks`` have each of them by itself)."""
+"""The scores of a picture (``test_metrics`` and ``test_masks`` have each of them by itself). Scores at half the size
+and at the stored size, of scenes that are drawn exactly."""
 
 import numpy as np
 import pytest
+import torch
 
 from structgstream.errors import CaptureError
+from structgstream.evaluation.evaluate import half_scores, halved, stored_size
 from structgstream.evaluation.metrics import PSNR_OF_EQUALS, counting, score
+from structgstream.evaluation.pictures import block_mask, block_means
+from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
+from structgstream.scene.render import render, to_8bit_image
+from tests.support.backends import quickest_backend
+from tests.support.memory_captures import MemoryCapture
+from tests.support.rigs import arc_rig
+from tests.support.worlds import World, moving_world
 
 
 def test_every_pixel_changed_leaves_no_still_one() -> None:
@@ -33,3 +43,59 @@ def test_what_a_mask_leaves_out_does_not_count() -> None:
     assert scores.psnr == PSNR_OF_EQUALS
     assert counting(mask, truth)[0].shape == (24 * 20, 1, 3)
     assert counting(None, truth)[0] is truth
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return moving_world(frames=2, speed=0.03)
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3, 5])
+def test_blocks_are_means_and_what_fills_none_is_left_out(factor: int) -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (31, 47, 3)).astype(np.uint8)
+    small = block_means(picture, factor)
+    height, width = 31 // factor, 47 // factor
+    whole = picture[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)
+    np.testing.assert_allclose(small, whole.mean((1, 3)), atol=0.5)
+    mask = np.ones((31, 47), np.bool_)
+    mask[7, 9] = False
+    reduced = block_mask(mask, factor)
+    assert reduced.shape == (height, width)
+    assert np.argwhere(~reduced).tolist() == [[7 // factor, 9 // factor]]
+
+
+def test_half_of_an_odd_picture_shows_the_same_places() -> None:
+    camera = arc_rig(3, width=47, height=31)["cam01"]
+    half = halved(camera)
+    assert (half.width, half.height) == (23, 15)
+    point = torch.tensor([0.1, -0.2, 2.0], dtype=torch.float64)
+    torch.testing.assert_close((half.K @ point)[:2] * 2, (camera.K @ point)[:2])
+
+
+def test_half_size_compares_with_the_mean_of_the_truth(world: World) -> None:
+    """A truth whose area mean is the small rendering scores as equal; one that is brighter as its offset says."""
+    backend, camera = quickest_backend(), world.rig["cam00"]
+    small = to_8bit_image(render(world.scene, halved(camera), backend).image)
+    truth = small.repeat(2, 0).repeat(2, 1)
+    scores = half_scores(world.scene, halved(camera), truth, backend=backend)
+    assert scores["psnr_half"] == PSNR_OF_EQUALS
+    assert scores["ssim_half"] == pytest.approx(1.0)
+    dark = np.where(truth > 20, truth - 20, truth).astype(np.uint8)
+    mask = np.min(truth, axis=2) > 20
+    masked = half_scores(
+        world.scene, halved(camera), np.where(mask[..., None], dark, 0).astype(np.uint8), backend=backend, mask=mask
+    )
+    assert masked["psnr_half"] == pytest.approx(20 * np.log10(255 / 20))
+
+
+def test_the_stored_size_is_scored_in_few_spread_frames(world: World) -> None:
+    backend = quickest_backend()
+    rig = world.rig.mapped({name: world.rig[name].resized(96, 64) for name in world.rig})
+    picture = to_8bit_image(render(world.scene, rig["cam00"], backend).image)
+    frames = [MultiViewFrame(i, i / 30, {"cam00": picture}) for i in range(20)]
+    large = stored_size(MemoryCapture(rig, frames), {"cam00": world.rig["cam00"]}, backend=backend, frames=20)
+    assert sorted(large.frames) == [0, 5, 10, 14, 19]
+    for index in (0, 1, 14):
+        scores = large.scores("cam00", world.scene, index=index)
+        assert scores == ({} if index == 1 else pytest.approx({"psnr_stored": PSNR_OF_EQUALS, "ssim_stored": 1.0}))
+    assert stored_size(large.source, large.views, backend=backend, frames=3).frames == {2}

@@ -194,7 +194,7 @@ def import_files(arguments: list[str]) -> None:
     check_new(output, overwrite=options.overwrite)
     if not 0.0 < options.fps <= 1000.0:
         raise UsageError(f"--fps {options.fps:g} is no number of frames per second.")
-    from structgstream.codec.fields.rows import MAX_FREE
+    from structgstream.codec.fields.packet_fields import MAX_FREE
     from structgstream.data.open import open_capture
     from structgstream.exporters.ply import find_sequence
     from structgstream.kernels.backend import select_backend

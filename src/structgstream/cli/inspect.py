@@ -222,9 +222,7 @@ def facts_table(header: Mapping[str, Any], rows: "Sequence[Row]", *, packets: Se
     table.add_row("dynamic", ", ".join(header["dynamic"]) or "-")
     changes = [packet["changes"] for packet in packets if packet["changes"]]
     if changes:
-        grown, removed, spawned, pruned = (
-            sum(one.get(name, 0) for one in changes) for name in ("grown", "removed", "spawned", "pruned")
-        )
+        grown, removed, spawned, pruned = (sum(one.get(name, 0) for one in changes) for name in CHANGES)
         anchors, free = change(grown, removed) or " (none)", change(spawned, pruned) or " (none)"
         table.add_row("came, went", f"anchors{anchors}, free Gaussians{free}, says the log")
     acts = Counter[str]()

@@ -26,11 +26,8 @@ from structgstream.evaluation.metrics import (
     both,
     channel_fit,
     counting,
-    decibels,
-    masked_ssim,
-    mean_of_squares,
+    psnr,
     score,
-    squared_errors,
     ssim,
 )
 from structgstream.evaluation.optional_metrics import (
@@ -77,8 +74,7 @@ def half_scores(
     """PSNR and SSIM, by their names in ``Scores``, of a rendering by ``camera`` (:func:`halved`, scene units) against
     the area mean of the truth ``[H, W, 3]``, which is black outside ``mask`` ``[H, W]``, the pixels that count."""
     small = None if mask is None else block_mask(mask, 2)
-    psnr, similarity = _psnr_and_ssim(scene, camera, block_means(truth, 2), small, backend)
-    return {"psnr_half": psnr, "ssim_half": similarity}
+    return _psnr_and_ssim(scene, camera, block_means(truth, 2), small, backend, size="half")
 
 
 @dataclass
@@ -104,8 +100,7 @@ class StoredSize:
                 f"The stored picture of camera {camera!r} in frame {index} of {self.source.name} has gone."
             )
         view = self.views[camera].resized(truth.shape[1], truth.shape[0])
-        psnr, similarity = _psnr_and_ssim(scene, view, blackened(truth, mask), mask, self.backend)
-        return {"psnr_stored": psnr, "ssim_stored": similarity}
+        return _psnr_and_ssim(scene, view, blackened(truth, mask), mask, self.backend, size="stored")
 
 
 def stored_size(source: FrameSource, views: Mapping[str, Camera], *, backend: Backend, frames: int) -> StoredSize:
@@ -116,15 +111,12 @@ def stored_size(source: FrameSource, views: Mapping[str, Camera], *, backend: Ba
 
 
 def _psnr_and_ssim(
-    scene: Drawable, camera: Camera, truth: Picture, mask: Mask | None, backend: Backend
-) -> tuple[float | None, float | None]:
+    scene: Drawable, camera: Camera, truth: Picture, mask: Mask | None, backend: Backend, *, size: str
+) -> dict[str, float | None]:
     if not truth.size or (mask is not None and not mask.any()):
-        return None, None
+        return {f"psnr_{size}": None, f"ssim_{size}": None}
     picture = blackened(to_8bit_image(render(scene, camera, backend).image), mask)
-    errors = squared_errors(picture, truth)
-    errors = errors if mask is None else errors[mask]
-    similarity = ssim(picture, truth, backend) if mask is None else masked_ssim(picture, truth, mask)
-    return decibels(mean_of_squares(int(errors.sum(dtype=np.int64)), errors.size)), similarity
+    return {f"psnr_{size}": psnr(picture, truth, mask), f"ssim_{size}": ssim(picture, truth, backend, mask)}
 
 
 @dataclass(frozen=True)

@@ -21,11 +21,9 @@ from structgstream.evaluation.metrics import (
     Mask,
     Picture,
     blackened,
-    decibels,
     differing,
     dilate,
-    mean_of_squares,
-    squared_errors,
+    psnr,
 )
 from structgstream.evaluation.pictures import block_mask, block_means
 
@@ -115,7 +113,8 @@ class GhostFinder:
         self.occupied[near] = index
         self.left = np.where(there[..., None], true, self.left)
         pixels = there.size if counting is None else int(np.count_nonzero(counting))
-        return Ghosts(disoccluded, ghosts, pixels, factor, _psnr(drawn, true, disoccluded))
+        psnr_there = psnr(drawn, true, disoccluded) if disoccluded.any() else None
+        return Ghosts(disoccluded, ghosts, pixels, factor, psnr_there)
 
 
 def pixels_of(share: float, picture: Picture) -> int:
@@ -142,13 +141,6 @@ def opened(mask: Mask, pixels: int) -> Mask:
 def reduction(picture: Picture) -> int:
     """The whole factor by which a picture ``[H, W, 3]`` is reduced."""
     return max(1, max(picture.shape[:2]) // SIDE)
-
-
-def _psnr(drawn: Picture, true: Picture, where: Mask) -> float | None:
-    count = int(np.count_nonzero(where))
-    if not count:
-        return None
-    return decibels(mean_of_squares(int(np.sum(squared_errors(drawn, true), where=where, dtype=np.int64)), count))
 
 
 @dataclass

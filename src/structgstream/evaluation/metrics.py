@@ -110,20 +110,21 @@ def squared_errors(picture: Picture, truth: Picture) -> NDArray[np.int32]:
     return squares[..., 0] + squares[..., 1] + squares[..., 2]  # many times faster than a sum over so short an axis
 
 
-def mean_of_squares(total: int, pixels: int) -> float:
-    """Mean squared error, full scale 1, from the sum ``total`` of squared 8-bit errors over ``pixels`` pixels."""
-    return total / (3 * 255**2 * pixels)
-
-
 def decibels(error: float) -> float:
     """The PSNR of a mean squared error (full scale 1); 100 dB for no error."""
     return -10.0 * math.log10(error) if error > 0.0 else PSNR_OF_EQUALS
 
 
-def psnr(picture: Picture, truth: Picture) -> float:
-    """Peak signal-to-noise ratio of two 8-bit pictures ``[H, W, 3]``, dB, over all pixels and channels."""
+def psnr_of(errors: NDArray[np.int32]) -> float:
+    """The PSNR of at least one pixel with these :func:`squared_errors`, dB."""
+    return decibels(int(errors.sum(dtype=np.int64)) / (3 * 255**2 * errors.size))
+
+
+def psnr(picture: Picture, truth: Picture, mask: Mask | None = None) -> float:
+    """Peak signal-to-noise ratio of two 8-bit pictures ``[H, W, 3]``, dB, over the channels of the pixels of ``mask``
+    ``[H, W]``, of which there is one at least; None for all."""
     errors = squared_errors(picture, truth)
-    return decibels(mean_of_squares(int(errors.sum(dtype=np.int64)), errors.size))
+    return psnr_of(errors if mask is None else errors[mask])
 
 
 def ssim_map(picture: Picture, truth: Picture) -> Tensor:
@@ -176,19 +177,14 @@ def ms_ssim(picture: Picture, truth: Picture) -> float | None:
     return float(product.mean())
 
 
-def masked_ssim(picture: Picture, truth: Picture, mask: Mask) -> float:
-    """Mean of :func:`ssim_map` over the pixels of ``mask`` ``[H, W]``, of pictures that are black in the others.
-
-    A pixel outside the mask is therefore treated as one beyond the border.
-    """
-    return float(ssim_map(picture, truth)[:, torch.from_numpy(mask)].mean())
-
-
-def ssim(picture: Picture, truth: Picture, backend: Backend) -> float:
+def ssim(picture: Picture, truth: Picture, backend: Backend, mask: Mask | None = None) -> float:
     """Mean of :func:`ssim_map` over pixels and channels, as Gaussian splatting papers report it.
 
-    On real pictures all back-ends agree within 1e-5; the C++ one is the nearest to float64.
+    On real pictures all back-ends agree within 1e-5; the C++ one is the nearest to float64. With a ``mask`` ``[H, W]``
+    the mean is over its pixels. Both pictures are black in the others, which therefore count as beyond the border.
     """
+    if mask is not None:
+        return float(ssim_map(picture, truth)[:, torch.from_numpy(mask)].mean())
     device = backend.device
     image, target = (torch.from_numpy(np.ascontiguousarray(p)).to(device) for p in (picture, truth))
     with torch.no_grad():
@@ -272,20 +268,17 @@ def score(
                 f"{other.shape[1]}x{other.shape[0]}; open the capture at the scale of the reconstruction."
             )
     errors, changed = squared_errors(picture, truth), changed_pixels(truth, first, both(mask, first_mask))
-    ssim_score = ssim(picture, truth, backend) if mask is None else masked_ssim(picture, truth, mask)
+    ssim_score = ssim(picture, truth, backend, mask)
     if mask is not None:
         errors, changed = errors[mask], changed[mask]
         picture, truth = counting(mask, picture, truth)
-    total, moving = int(errors.sum(dtype=np.int64)), int(np.count_nonzero(changed))
-    in_changed = int(np.sum(errors, where=changed, dtype=np.int64))
+    moving = int(np.count_nonzero(changed))
     return Scores(
-        psnr=decibels(mean_of_squares(total, errors.size)),
+        psnr=psnr_of(errors),
         ssim=ssim_score,
         psnr_affine=psnr_affine(picture, truth),
-        psnr_changed=decibels(mean_of_squares(in_changed, moving)) if moving else None,
-        psnr_still=decibels(mean_of_squares(total - in_changed, errors.size - moving))
-        if moving < errors.size
-        else None,
+        psnr_changed=psnr_of(errors[changed]) if moving else None,
+        psnr_still=psnr_of(errors[~changed]) if moving < errors.size else None,
         changed_share=moving / errors.size,
         render_seconds=seconds,
         psnr_camera_color=None if color is None else psnr_camera_color(picture, truth, color),

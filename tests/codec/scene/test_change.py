@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from structgstream.codec.fields.rows import Change, row_sizes
+from structgstream.codec.fields.packet_fields import Change, row_sizes
 
 RESIDUALS = np.array([[0, 0], [1, -2], [300, 300], [0, -1]], np.int32)
 

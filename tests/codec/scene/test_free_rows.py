@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from structgstream.codec.entropy.adaptive import AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.entropy.decisions import Models
-from structgstream.codec.fields import rows
-from structgstream.codec.fields.rows import MAX_FREE, Change, FreeBins, code_free
+from structgstream.codec.fields import packet_fields
+from structgstream.codec.fields.packet_fields import MAX_FREE, Change, FreeBins, code_free
 from structgstream.errors import StreamError
 from tests.support.properties import examples
 
@@ -146,7 +146,7 @@ def test_a_count_is_refused_before_anything_is_made_of_it() -> None:
 
 def test_the_most_that_few_bytes_can_make(monkeypatch: pytest.MonkeyPatch) -> None:
     """Births that differ by nothing take no bits: only the limit bounds them, also over several packets."""
-    monkeypatch.setattr(rows, "MAX_FREE", 2**12)
+    monkeypatch.setattr(packet_fields, "MAX_FREE", 2**12)
     many = FreeBins(np.arange(1, 2**12 + 1), np.zeros((2**12, 14), np.int32), Change.none(2**12, 14))
     writer = new_encoder()
     code_free(writer, many, FreeBins.none(), where="")

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from structgstream.codec.entropy.adaptive import AdaptiveDecoder, AdaptiveEncoder
 from structgstream.codec.entropy.decisions import Models
-from structgstream.codec.fields.rows import Change, code_change
+from structgstream.codec.fields.packet_fields import Change, code_change
 from structgstream.errors import StreamError
 from tests.support.properties import examples
 

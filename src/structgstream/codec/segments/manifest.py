@@ -230,6 +230,12 @@ class SegmentEntry:
     key_bytes: int  # length of its prefix with which its first frame can be shown
     frame_bytes: tuple[int, ...]  # length of each frame's records, in order
     sha256: str  # of its content
+    segments = 1  # as of a page
+
+    @property
+    def first_segment(self) -> int:
+        """Its own number, as of a page."""
+        return self.segment
 
 
 @dataclass(frozen=True)
@@ -367,17 +373,15 @@ def page_from_json(data: bytes, entry: HistoryEntry) -> tuple[SegmentEntry, ...]
     top = parse_object(data, entry.file, max_bytes=MAX_PAGE_BYTES)
     if top.text("format") != FORMAT or top.whole("version") != VERSION:
         top.refuse(f"is no history page of {FORMAT} {VERSION}")
+    found: tuple[SegmentEntry, ...] | tuple[HistoryEntry, ...]
     if entry.level:
-        pages = tuple(_page(one) for one in top.items("history", most=MAX_ENTRIES))
-        if any(page.level != entry.level - 1 for page in pages):
+        found = tuple(_page(one) for one in top.items("history", most=MAX_ENTRIES))
+        if any(page.level != entry.level - 1 for page in found):
             top.refuse(f"lists pages of other levels than {entry.level - 1}")
-        _check_run(pages, entry.first_segment, entry.first_frame, entry.file)
-        counts = sum(page.segments for page in pages), sum(page.frames for page in pages)
-        found: tuple[SegmentEntry, ...] | tuple[HistoryEntry, ...] = pages
     else:
-        segments = tuple(_segment(one) for one in top.items("segments", most=MAX_ENTRIES))
-        _check_run(segments, entry.first_segment, entry.first_frame, entry.file)
-        counts, found = (len(segments), sum(one.frames for one in segments)), segments
+        found = tuple(_segment(one) for one in top.items("segments", most=MAX_ENTRIES))
+    _check_run(found, entry.first_segment, entry.first_frame, entry.file)
+    counts = sum(one.segments for one in found), sum(one.frames for one in found)
     if counts != (entry.segments, entry.frames):
         top.refuse(f"has {counts[0]} segments of {counts[1]} frames; expected {entry.segments} of {entry.frames}")
     return found
@@ -488,15 +492,11 @@ def _check_run(
 ) -> tuple[int, int]:
     """Check that entries follow each other from this segment and frame on; returns those after the last."""
     for entry in entries:
-        if (entry.first_frame, _first_segment(entry)) != (frame, segment):
+        if (entry.first_frame, entry.first_segment) != (frame, segment):
             raise StreamError(
                 f"{name} lists {entry.file}, which begins with frame {entry.first_frame} and segment "
-                f"{_first_segment(entry)}, where frame {frame} and segment {segment} belong."
+                f"{entry.first_segment}, where frame {frame} and segment {segment} belong."
             )
-        segment += entry.segments if isinstance(entry, HistoryEntry) else 1
+        segment += entry.segments
         frame += entry.frames
     return segment, frame
-
-
-def _first_segment(entry: SegmentEntry | HistoryEntry) -> int:
-    return entry.first_segment if isinstance(entry, HistoryEntry) else entry.segment

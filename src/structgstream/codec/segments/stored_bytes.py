@@ -64,13 +64,12 @@ def _page(
     data = page_to_json(entries)
     sha256 = sha256_of(data)
     first = entries[0]
-    number = first.segment if isinstance(first, SegmentEntry) else first.first_segment
-    pages.append((history_name(number, sha256), data))
+    pages.append((history_name(first.first_segment, sha256), data))
     return HistoryEntry(
         file=pages[-1][0],
         level=level,
-        first_segment=number,
-        segments=sum(1 if isinstance(entry, SegmentEntry) else entry.segments for entry in entries),
+        first_segment=first.first_segment,
+        segments=sum(entry.segments for entry in entries),
         first_frame=first.first_frame,
         frames=sum(entry.frames for entry in entries),
         pts_seconds=(first.pts_seconds[0], entries[-1].pts_seconds[1]),

@@ -14,18 +14,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from structgstream.cameras import Camera, CameraRig
-from structgstream.codec.encoder import SceneEncoder
-from structgstream.codec.fields.packet_fields import CODABLE, dequantize_state, quantize_state
+from structgstream.cameras import Camera, CameraRig, Similarity
+from structgstream.codec.fields.packet_fields import CODABLE, FREE_PARAMETERS, dequantize_state, quantize_state
 from structgstream.codec.fields.quantization import round_to_bins
-from structgstream.codec.fields.rows import FREE_PARAMETERS
 from structgstream.codec.fields.static_fields import UNCODED_FIELDS
 from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.codec.scene_coder import SceneEncoder
 from structgstream.codec.sinks import MemorySink
 from structgstream.scene.order import morton_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, scene_of, state_of
-from structgstream.similarity import Similarity
 
 FOLDER = Path(__file__).parent / "fixtures"
 GROUP = 4

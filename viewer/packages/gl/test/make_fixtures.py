@@ -15,14 +15,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from structgstream.cameras import Camera, CameraRig
-from structgstream.codec.encoder import SceneEncoder
+from structgstream.cameras import Camera, CameraRig, Similarity
 from structgstream.codec.packets import PacketKind, StreamHeader
 from structgstream.codec.reader import open_stream
+from structgstream.codec.scene_coder import SceneEncoder
 from structgstream.codec.sinks import MemorySink
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, scene_of, state_of
-from structgstream.similarity import Similarity
 
 FOLDER = Path(__file__).parent / "fixtures"
 FRAMES = (0, 3, 6, 9)
