@@ -13,9 +13,9 @@ import numpy as np
 
 from structgstream.data.calibration import Calibration, PosedCamera, listed
 from structgstream.data.dataset_layouts import CAMERAS_FILE, MODELS_FILE, read_cameras, read_models
-from structgstream.data.found_calibrations import calibration_below, read_calibration
 from structgstream.data.images import read_exif
 from structgstream.data.lenses import LensCamera, Pinhole
+from structgstream.data.open import calibration_below, read_calibration
 from structgstream.data.posed_capture import filmed_by, orientations
 from structgstream.data.prepared import FILE as PREPARED
 from structgstream.data.prepared import LENSES, camera_of, filmed_entry, read_prepared
