@@ -125,8 +125,10 @@ def _parameters(model: str, where: Path) -> int:
     return PARAMETERS[model]
 
 
-def _image(name: str, pose: tuple[float, ...], camera: ColmapCamera) -> PosedCamera:
-    """From a quaternion (w, x, y, z) and a translation."""
+def _image(name: str, pose: tuple[float, ...], cameras: dict[int, ColmapCamera], own: int) -> PosedCamera:
+    """A picture of camera ``own``, from a quaternion (w, x, y, z) and a translation."""
+    if own not in cameras:
+        raise Unreadable(f"no camera {own} for a picture")
     if not 0 < (length := float(np.linalg.norm(pose[:4]))) < np.inf:
         raise Unreadable("a rotation that is no quaternion")
     w, x, y, z = np.array(pose[:4]) / length
@@ -137,7 +139,7 @@ def _image(name: str, pose: tuple[float, ...], camera: ColmapCamera) -> PosedCam
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     viewmat[:3, 3] = pose[4:]
-    return PosedCamera(name, viewmat, camera.K, camera.size, camera.lens)
+    return PosedCamera(name, viewmat, cameras[own].K, cameras[own].size, cameras[own].lens)
 
 
 def _lines(file: Path) -> Iterator[str]:
@@ -178,16 +180,10 @@ def _text_images(file: Path, cameras: dict[int, ColmapCamera]) -> list[PosedCame
         name = words[9].strip()
         try:
             pose = tuple(number(word) for word in words[1:8])
-            images.append(_image(name, pose, _of_image(cameras, whole(words[8]))))
+            images.append(_image(name, pose, cameras, whole(words[8])))
         except Unreadable as error:
             raise Unreadable(f"picture {name!r}: {error}") from None
     return images
-
-
-def _of_image(cameras: dict[int, ColmapCamera], own: int) -> ColmapCamera:
-    if own not in cameras:
-        raise Unreadable(f"no camera {own} for a picture")
-    return cameras[own]
 
 
 def _binary_cameras(file: Path) -> dict[int, ColmapCamera]:
@@ -210,7 +206,7 @@ def _binary_images(file: Path, cameras: dict[int, ColmapCamera]) -> list[PosedCa
     for _ in range(count):
         _, *pose, camera = struct.unpack_from("<i7di", data, offset)
         end = data.index(b"\0", offset + 64)
-        images.append(_image(data[offset + 64 : end].decode(), tuple(pose), _of_image(cameras, camera)))
+        images.append(_image(data[offset + 64 : end].decode(), tuple(pose), cameras, camera))
         (observations,) = struct.unpack_from("<Q", data, end + 1)
         offset = end + 9 + 24 * observations
     _check_end(data, offset)

@@ -195,7 +195,8 @@ def mark_output(capture: Path, videos: Path) -> None:
 
 @contextmanager
 def lock_output(capture: Path) -> Iterator[None]:
-    """No other process prepares the same marked capture within the block, or a ``StorageError`` says that one does."""
+    """No other process prepares the same marked capture within the block; where one does, a ``StorageError`` says
+    so."""
     try:
         file = open_lockable(capture / FOLDER / LOCK)
     except OSError as error:

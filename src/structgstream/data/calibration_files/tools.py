@@ -198,10 +198,6 @@ def _kalibr_lens(name: str, camera: dict[str, Any], file: Path) -> Lens:
 # kinect-color. Videos are hdVideos/hd_00_00.mp4, pictures hdImgs/00_00/00_00_00000000.jpg.
 
 
-def _cmu_entries(files: tuple[Path, ...]) -> Entries:
-    return ((str(entry["name"]), entry) for entry in read_json(files[0])["cameras"])
-
-
 def _cmu_camera(name: str, entry: dict[str, Any]) -> PosedCamera:
     file_name = f"{entry['type']}_{name}/{name}"  # of a video, or of a folder
     K, dist, R, T = (entry[key] for key in ("K", "distCoef", "R", "t"))
@@ -365,7 +361,7 @@ KALIBR = CalibrationFormat(
 )
 CMU_PANOPTIC = CalibrationFormat(
     partial(json_files_with, key="distCoef"),
-    _cmu_entries,
+    lambda files: ((str(entry["name"]), entry) for entry in read_json(files[0])["cameras"]),
     _cmu_camera,
     "a list of cameras with name, type, resolution, K, distCoef, R and t, as the Panoptic Studio has it",
 )

@@ -57,7 +57,7 @@ class Lag:
 
 
 def require_scipy() -> None:
-    """A ``MissingExtraError`` where scipy is not installed."""
+    """Refuses to go on without scipy, by a ``MissingExtraError``."""
     try:
         import scipy  # noqa: F401
     except ImportError:
