@@ -10,7 +10,6 @@ import logging
 import re
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -34,15 +33,6 @@ MODEL_NAMES = (
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
     "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE",
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class ColmapCamera:
-    """Intrinsics shared by images: ``K [3, 3]`` in pixels, the size they are for, and the lens."""
-
-    K: NDArray[np.float64]
-    size: tuple[int, int]
-    lens: Lens
 
 
 def find_model(path: Path) -> Path | None:
@@ -102,6 +92,11 @@ def read_model(folder: Path) -> Calibration:
     return Calibration(folder, ordered, points if len(points) else None, turned_by_exif=False)
 
 
+ColmapCamera = tuple[
+    NDArray[np.float64], tuple[int, int], Lens
+]  # ``K`` ``[3, 3]`` in pixels, the size it is for, the lens
+
+
 def _camera(model: str, width: int, height: int, params: tuple[float, ...], where: Path) -> ColmapCamera:
     params = tuple(map(number, params))
     if len(params) != _parameters(model, where):
@@ -112,7 +107,7 @@ def _camera(model: str, width: int, height: int, params: tuple[float, ...], wher
         lens = Fisheye(*coefficients)
     elif "PINHOLE" not in model:
         lens = RadialTangential(*coefficients)
-    return ColmapCamera(intrinsics(fx, fy, cx, cy), pixels((width, height)), lens)
+    return intrinsics(fx, fy, cx, cy), pixels((width, height)), lens
 
 
 def _parameters(model: str, where: Path) -> int:
@@ -139,7 +134,7 @@ def _image(name: str, pose: tuple[float, ...], cameras: dict[int, ColmapCamera],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     viewmat[:3, 3] = pose[4:]
-    return PosedCamera(name, viewmat, cameras[own].K, cameras[own].size, cameras[own].lens)
+    return PosedCamera(name, viewmat, *cameras[own])
 
 
 def _lines(file: Path) -> Iterator[str]:

@@ -102,8 +102,8 @@ def open_panoptic(path: Path) -> ImageSource:
             held_out += found
     names = sorted(cameras, key=natural)
     rig = calibrated_rig({name: cameras[name] for name in names}, held_out, where=path)
-    common = common_pictures({name: files[name] for name in names}, where=path, training=rig.training)
-    return ImageSource(path.name, rig, PANOPTIC_FPS, common.files, instants=common.instants)
+    common, instants = common_pictures({name: files[name] for name in names}, where=path, training=rig.training)
+    return ImageSource(path.name, rig, PANOPTIC_FPS, common, instants=instants)
 
 
 def _read_meta(meta: Path) -> tuple[dict[str, Camera], dict[str, dict[str, Path]]]:
