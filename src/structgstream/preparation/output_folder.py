@@ -29,7 +29,7 @@ from structgstream.errors import CaptureError, StorageError
 from structgstream.preparation.options import Link
 
 FOLDER = "work"
-VERSION = 4  # of the steps' results; a new one does all steps again
+VERSION = 5  # of the steps' results; a new one does all steps again
 Value = TypeVar("Value")
 
 

@@ -98,10 +98,8 @@ def packed_clocks(found: Clocks) -> Stored:
 
 def unpacked_clocks(stored: Stored) -> Clocks:
     """The reverse of :func:`packed_clocks`."""
-    values = stored.values
-    clocks = {name: Clock(**clock) for name, clock in values["clocks"].items()}
-    summary = values["summary"] if "summary" in values else values["told"]  # the former name
-    return Clocks(clocks, values["method"], summary, values["sure"])
+    clocks = {name: Clock(**clock) for name, clock in stored.values["clocks"].items()}
+    return Clocks(**{**stored.values, "clocks": clocks})
 
 
 BOARD_SECONDS = 0.4
