@@ -135,26 +135,19 @@ def board_sightings(
         )
     _check_markers(pictures, board, markers, found)
     _check_layout(board, found)
-    few = [name for name in pictures if len(found[name]) < MIN_SIGHTINGS]
-    if few:
-        raise CalibrationError(_too_few(board, {name: (len(found[name]), len(pictures[name])) for name in few}, found))
-    return {name: tuple(own_sightings) for name, own_sightings in found.items()}
-
-
-def _too_few(board: Board, seen: Mapping[str, tuple[int, int]], found: Mapping[str, Sequence[Sighting]]) -> str:
-    """The sentence for cameras with too few of their pictures that show the board."""
     if not any(found.values()):
-        largest = max(total for _, total in seen.values())
-        return (
-            f"No camera shows the board ({board.text}) in any of its {largest} pictures that were looked at; show it "
-            f"whole, closer and sharper ({MIN_CORNERS} corners are needed), name the board that was "
-            "filmed with --board, or the folder in which it was with --board-videos."
+        raise CalibrationError(
+            f"No camera shows the board ({board.text}) in any of its {max(map(len, pictures.values()))} pictures that "
+            f"were looked at; show it whole, closer and sharper ({MIN_CORNERS} corners are needed), name the board "
+            "that was filmed with --board, or the folder in which it was with --board-videos."
         )
-    counts = ", ".join(f"{name!r} in {count} of {total} pictures" for name, (count, total) in seen.items())
-    return (
-        f"The board ({board.text}) is seen too rarely: by {counts}, where {MIN_SIGHTINGS} with {MIN_CORNERS} corners "
-        "each are needed; show it whole, closer and sharper to each camera, tilted in several directions."
-    )
+    if few := [name for name in pictures if len(found[name]) < MIN_SIGHTINGS]:
+        counts = ", ".join(f"{name!r} in {len(found[name])} of {len(pictures[name])} pictures" for name in few)
+        raise CalibrationError(
+            f"The board ({board.text}) is seen too rarely: by {counts}, where {MIN_SIGHTINGS} with {MIN_CORNERS} "
+            "corners each are needed; show it whole, closer and sharper to each camera, tilted in several directions."
+        )
+    return {name: tuple(own_sightings) for name, own_sightings in found.items()}
 
 
 def _sighted(picture: NDArray[np.uint8], board: Board) -> tuple[NDArray[np.intp], NDArray[np.float64], set[int]]:
