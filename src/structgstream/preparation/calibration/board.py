@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from structgstream.atomic_files import atomic_write
 from structgstream.data.images import opencv
 from structgstream.errors import CalibrationError, ConfigError, MissingExtraError
-from structgstream.geometry import Floats
+from structgstream.geometry import Floats, Indices
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Sighting:
     """The board in one picture."""
 
     instant: int  # index of the picture
-    corners: NDArray[np.intp]  # ``[S]`` indices into the board's corners
+    corners: Indices  # ``[S]`` indices into the board's corners
     pixels: NDArray[np.float64]  # ``[S, 2]``, the top-left pixel's centre at (0.5, 0.5)
 
 
@@ -150,7 +150,7 @@ def board_sightings(
     return {name: tuple(own_sightings) for name, own_sightings in found.items()}
 
 
-def _sighted(picture: NDArray[np.uint8], board: Board) -> tuple[NDArray[np.intp], NDArray[np.float64], set[int]]:
+def _sighted(picture: NDArray[np.uint8], board: Board) -> tuple[Indices, NDArray[np.float64], set[int]]:
     """Corners, their pixels, and the markers that were read."""
     cv2 = opencv()
     grey = cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2GRAY)
