@@ -17,11 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from structgstream.data.calibration import CalibrationFormat, NoPose, PosedCamera, common_folder, intrinsics, rigid
 from structgstream.data.calibration_files.reading import (
-    LARGEST_BYTES,
     json_files_with,
     load_plain,
     parsed_yaml,
     read_storage,
+    recognized,
 )
 from structgstream.data.lenses import Lens, Pinhole, fisheye_lens, from_integer_centers, opencv_lens
 from structgstream.data.text_files import Unreadable, mapping, number, pixels, read_json, read_text, read_toml, readable
@@ -157,13 +157,9 @@ KALIBR_LENSES: Mapping[str, Any] = {"radtan": opencv_lens, "equidistant": fishey
 
 
 def _find_kalibr(folder: Path) -> Iterator[tuple[Path, ...]]:
-    for file in sorted(folder.iterdir()):
-        if file.suffix.lower() in (".yaml", ".yml") and file.is_file() and file.stat().st_size < LARGEST_BYTES:
-            try:
-                if "camchain" in file.stem or KALIBR_CHAIN.search(read_text(file)):
-                    yield (file,)
-            except (OSError, Unreadable):
-                continue  # no file of Kalibr
+    files = (file for file in folder.iterdir() if file.suffix.lower() in (".yaml", ".yml"))
+    found = recognized(files, lambda file: "camchain" in file.stem or KALIBR_CHAIN.search(read_text(file)))
+    return ((file,) for file in found)
 
 
 def _kalibr_entries(files: tuple[Path, ...]) -> Entries:
@@ -279,7 +275,7 @@ def _find_projections(folder: Path) -> Iterator[tuple[Path, ...]]:
     for file in sorted(folder.glob("cameras*.npz"))[-1:]:  # cameras_sphere.npz rather than cameras_large.npz
         yield (file,)
     for place in (folder, folder / "txt"):
-        texts = tuple(file for file in sorted(place.glob("*.txt")) if _may_be_projection(file))
+        texts = tuple(recognized(place.glob("*.txt"), _holds_projection))
         if len(texts) > 1:
             yield texts
 
@@ -297,11 +293,8 @@ def _words(file: Path) -> list[str]:
     return words[words[:1] == ["CONTOUR"] :]
 
 
-def _may_be_projection(file: Path) -> bool:
-    try:
-        return file.stat().st_size < LARGEST_TEXT and np.isfinite([number(word) for word in _words(file)]).sum() == 12
-    except (OSError, Unreadable):
-        return False
+def _holds_projection(file: Path) -> bool:
+    return file.stat().st_size < LARGEST_TEXT and np.isfinite([number(word) for word in _words(file)]).sum() == 12
 
 
 def _projection_camera(name: str, matrix: ArrayLike) -> PosedCamera:
