@@ -18,9 +18,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from structgstream.data import bundled_clip, open_capture
 from structgstream.data.calibration import rotation_matrix
+from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.data.lenses import LensCamera, Pinhole
+from structgstream.data.open import open_capture
 from structgstream.preparation.calibration.structure import refine, solve_structure
 from tests.support.calibration_errors import CameraError, calibration_errors
 

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.cameras import CameraRig
-from structgstream.data import bundled_clip, open_capture
+from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.data.lenses import LensCamera, Pinhole
+from structgstream.data.open import open_capture
 from structgstream.data.source import FrameSource
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame

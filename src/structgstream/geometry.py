@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cross products, rotations, and the type of float64 arrays."""
+"""Cross products, rotations, and the types of arrays of float64 and of indices."""
 
 import numpy as np
 import torch
@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Floats = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 
 def cross_matrices(vectors: Floats) -> Floats:

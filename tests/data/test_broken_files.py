@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 
 from structgstream.data.colmap import read_model
-from structgstream.data.found_calibrations import read_calibration
 from structgstream.data.images import picture_size, read_exif, read_picture
 from structgstream.data.lenses import Fisheye, LensCamera, Pinhole, RadialTangential
-from structgstream.data.open import open_capture
+from structgstream.data.open import open_capture, read_calibration
 from structgstream.data.posed_capture import filmed_by
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
 from structgstream.data.timeline import Clock

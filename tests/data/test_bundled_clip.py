@@ -1,5 +1,70 @@
 # SPDX-License-Identifier: Apache-2.0
+"""The bundled clip as package data: its files are there, small, and say what ``cameras.json`` says."""
+
+import json
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+import structgstream
 from structgstream.data.dataset_layouts import bundled_clip, bundled_clip_path
+
+# the package may be one of several folders (an editable install), so look where its data lies
+CLIP = next(folder for root in structgstream.__path__ if (folder := Path(root) / "data" / "clip").is_dir())
+RIG = json.loads((CLIP / "cameras.json").read_text())
+CAMERAS = sorted(RIG["cameras"])
+
+
+def pictures(name: str) -> tuple[np.ndarray, list[float], str]:
+    """Frames ``[T, H, W, 3]``, their times in seconds and the stream's pixel format."""
+    with av.open(str(CLIP / f"{name}.mp4")) as container:
+        frames = list(container.decode(video=0))
+    times = [float(frame.time) for frame in frames if frame.time is not None]
+    return np.stack([frame.to_ndarray(format="rgb24") for frame in frames]), times, frames[0].format.name
+
+
+def test_every_camera_has_one_video_and_there_are_no_others() -> None:
+    assert sorted(path.stem for path in CLIP.glob("*.mp4")) == CAMERAS
+    assert len(CAMERAS) == 10
+    assert set(RIG["held_out"]) < set(CAMERAS)
+
+
+def test_files_stay_small() -> None:
+    sizes = [path.stat().st_size for path in CLIP.iterdir() if path.is_file()]
+    assert sum(sizes) <= 2_500_000
+    assert max(sizes) <= 400_000
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_video_has_the_stated_frames_size_and_times(name: str) -> None:
+    frames, times, pixel_format = pictures(name)
+    assert frames.shape == (RIG["frames"], RIG["height"], RIG["width"], 3)
+    np.testing.assert_allclose(times, np.arange(RIG["frames"]) / RIG["fps"], atol=1e-4)
+    assert pixel_format == "yuv444p"
+    assert frames.std() > 20  # a picture, not a blank
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_cameras_are_rigid_and_look_at_the_table(name: str) -> None:
+    K, viewmat = (np.array(RIG["cameras"][name][key]) for key in ("K", "viewmat"))
+    rotation = viewmat[:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    table = viewmat[:3, :3] @ [0.0, 0.1, 0.0] + viewmat[:3, 3]
+    assert table[2] > RIG["near"]
+    x, y = (K @ table)[:2] / table[2]
+    assert 0 < x < RIG["width"]
+    assert 0 < y < RIG["height"]
+
+
+def test_something_appears_and_something_moves_in_the_held_out_view() -> None:
+    frames, _, _ = pictures(RIG["held_out"][0])
+    changed = np.abs(frames[-1].astype(int) - frames[0]).max(axis=-1) > 40
+    assert 0.02 < changed.mean() < 0.25
+    between = np.abs(frames[1:].astype(int) - frames[:-1]).max(axis=-1) > 25
+    assert (between.mean(axis=(1, 2)) > 0.004).all()
 
 
 def test_the_bundled_clip_is_a_capture() -> None:

@@ -1,13 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whole captures are opened in ``test_found_calibrations`` and ``tests/preparation/test_footage``."""
+"""Whole captures are opened in ``test_found_calibrations`` and ``tests/preparation/test_footage``.
+
+Which files of a folder are a capture's: not those that systems and the check leave beside them.
+"""
 
 from pathlib import Path
 
 import pytest
 
-from structgstream.data.camera_files import other_roots, pictures_in, videos_in
+from structgstream.data.camera_files import REPORT, by_stem, files_of, other_roots, pictures_in, videos_in
+from structgstream.data.open import open_capture
 from structgstream.errors import CaptureError
-from tests.support.captures import picture, write_picture, write_videos
+from tests.support.captures import (
+    numbers,
+    picture,
+    write_clip,
+    write_n3dv,
+    write_picture,
+    write_text_model,
+    write_videos,
+)
 
 
 def test_videos_in_folders_of_cameras(tmp_path: Path) -> None:
@@ -33,3 +45,53 @@ def test_one_take_is_found_and_several_are_asked_about(tmp_path: Path) -> None:
     write_videos(tmp_path / "run", ["a", "b"], frames=2)
     with pytest.raises(CaptureError, match=r"in several folders \(run, recordings/walk\); .*Give the folder"):
         list(other_roots(tmp_path))
+
+
+APPLE_DOUBLE = b"\0\5\x16\7"
+
+
+def test_files_of_a_kind_are_sorted_and_hidden_ones_are_none(tmp_path: Path) -> None:
+    for name in ("b.JPG", "a.jpg", "._a.jpg", "c.txt"):
+        (tmp_path / name).write_bytes(b"")
+    assert [file.name for file in files_of(tmp_path, (".jpg",))] == ["a.jpg", "b.JPG"]
+
+
+def test_two_files_of_one_name_are_reported(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match=r"a\.jpg and a\.png in .* are of one name, 'a'; expected one file of each"):
+        by_stem([tmp_path / "a.jpg", tmp_path / "a.png"])
+
+
+def colmap(where: Path) -> None:
+    rig = write_n3dv(where / "poses")
+    write_text_model(where / "sparse", rig, [(f"{name}.png", name) for name in rig])
+    for number, name in enumerate(rig):
+        write_picture(where / name / "0.png", picture(number, 0))
+        (where / name / "._0.png").write_bytes(APPLE_DOUBLE)
+
+
+def test_what_a_mac_leaves_beside_files_is_no_camera_and_no_frame(tmp_path: Path) -> None:
+    write_clip(tmp_path / "json")
+    write_n3dv(tmp_path / "n3dv")
+    for layout, name in (("json", "cam00"), ("n3dv", "cam00")):
+        before = list(open_capture(tmp_path / layout).rig)
+        (tmp_path / layout / f"._{name}.mp4").write_bytes(APPLE_DOUBLE)
+        assert list(open_capture(tmp_path / layout).rig) == before
+    colmap(tmp_path / "colmap")
+    assert len(open_capture(tmp_path / "colmap")) == 1
+
+
+def test_the_report_of_a_check_is_no_camera(tmp_path: Path) -> None:
+    """``prepare --check`` leaves it in the capture, with a picture of each camera."""
+    colmap(tmp_path)
+    before = list(open_capture(tmp_path).rig)
+    write_picture(tmp_path / REPORT / "camera_cam00.png", picture(0, 0))
+    source = open_capture(tmp_path)
+    assert list(source.rig) == before
+    assert numbers(next(source.frames()).images["cam01"])[0] == 1
+
+
+def test_a_picture_twice_is_not_chosen_by_chance(tmp_path: Path) -> None:
+    colmap(tmp_path)
+    write_picture(tmp_path / "cam01" / "0.jpg", picture(0, 0))
+    with pytest.raises(CaptureError, match=r"0\.jpg and 0\.png in .*cam01 are of one name"):
+        open_capture(tmp_path)

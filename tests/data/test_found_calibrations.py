@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from structgstream.data.found_calibrations import read_calibrated
 from structgstream.data.lenses import from_integer_centers
-from structgstream.data.open import open_capture
+from structgstream.data.open import open_capture, read_calibrated
 from structgstream.errors import CalibrationError, CaptureError
 from tests.support.calibrations import (
     NAMES,

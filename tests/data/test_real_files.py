@@ -250,11 +250,11 @@ def test_numbers_are_instants_whatever_their_padding_and_prefix(stem: Callable[[
     slots = picture_slots(pictures)
     assert slots["00_00"].tolist() == [0, 1, 2, 3]
     assert slots["00_02"].tolist() == [1, 2, 3, 4]
-    common = common_pictures(
+    common, _ = common_pictures(
         {name: {file.stem: file for file in files} for name, files in pictures.items()}, where=Path("take")
     )
-    assert len(common.files["00_00"]) == 4 or len(common.files["00_00"]) == 3
-    assert common.files["00_00"][0] == pictures["00_00"][1]
+    assert len(common["00_00"]) == 4 or len(common["00_00"]) == 3
+    assert common["00_00"][0] == pictures["00_00"][1]
 
 
 def test_numbers_of_other_names_are_reported_and_names_that_share_nothing_refused(

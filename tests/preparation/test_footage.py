@@ -6,8 +6,9 @@ import av
 import numpy as np
 import pytest
 
+from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
-from structgstream.preparation.footage import find_footage
+from structgstream.preparation.footage import find_footage, shared_seconds, shots_of, spread_moments
 from tests.support.captures import numbers, picture, write_picture, write_video, write_videos
 
 
@@ -192,3 +193,25 @@ def test_links_beside_what_they_lead_to(tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / f"{name}.mp4").symlink_to(tmp_path / "store" / f"{name}.mp4")
     assert find_footage(tmp_path).cameras == ("a", "b")
+
+
+def test_pictures_of_one_moment_by_the_clocks(tmp_path: Path) -> None:
+    write_videos(tmp_path, ["a", "b"], frames=10)
+    footage = find_footage(tmp_path)
+    clocks = {"b": Clock(-3 / 30)}
+    first, last = shared_seconds(footage, clocks)
+    assert (first, last) == pytest.approx((0.0, 6 / 30))
+    shots = shots_of(footage, clocks, spread_moments(first, last, 3))
+    assert [numbers(image)[1] for image in shots["a"]] == [0, 3, 6]
+    assert [numbers(image)[1] for image in shots["b"]] == [3, 6, 9]
+    assert numbers(shots["b"][1])[1] == 6
+    assert len(shots["b"][1:]) == 2
+
+
+def test_videos_shorter_than_the_offset_are_reported(tmp_path: Path) -> None:
+    write_videos(tmp_path, ["a", "b"], frames=10)
+    footage = find_footage(tmp_path)
+    with pytest.raises(
+        CaptureError, match=r"a\.mp4 of camera 'a' ends .* before b\.mp4 of camera 'b' begins.*--without"
+    ):
+        shared_seconds(footage, {"b": Clock(2.0)})

@@ -10,7 +10,6 @@ import logging
 import re
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -34,15 +33,6 @@ MODEL_NAMES = (
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
     "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE",
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class ColmapCamera:
-    """Intrinsics shared by images: ``K [3, 3]`` in pixels, the size they are for, and the lens."""
-
-    K: NDArray[np.float64]
-    size: tuple[int, int]
-    lens: Lens
 
 
 def find_model(path: Path) -> Path | None:
@@ -102,6 +92,11 @@ def read_model(folder: Path) -> Calibration:
     return Calibration(folder, ordered, points if len(points) else None, turned_by_exif=False)
 
 
+ColmapCamera = tuple[
+    NDArray[np.float64], tuple[int, int], Lens
+]  # ``K`` ``[3, 3]`` in pixels, the size it is for, the lens
+
+
 def _camera(model: str, width: int, height: int, params: tuple[float, ...], where: Path) -> ColmapCamera:
     params = tuple(map(number, params))
     if len(params) != _parameters(model, where):
@@ -112,7 +107,7 @@ def _camera(model: str, width: int, height: int, params: tuple[float, ...], wher
         lens = Fisheye(*coefficients)
     elif "PINHOLE" not in model:
         lens = RadialTangential(*coefficients)
-    return ColmapCamera(intrinsics(fx, fy, cx, cy), pixels((width, height)), lens)
+    return intrinsics(fx, fy, cx, cy), pixels((width, height)), lens
 
 
 def _parameters(model: str, where: Path) -> int:
@@ -125,8 +120,10 @@ def _parameters(model: str, where: Path) -> int:
     return PARAMETERS[model]
 
 
-def _image(name: str, pose: tuple[float, ...], camera: ColmapCamera) -> PosedCamera:
-    """From a quaternion (w, x, y, z) and a translation."""
+def _image(name: str, pose: tuple[float, ...], cameras: dict[int, ColmapCamera], own: int) -> PosedCamera:
+    """A picture of camera ``own``, from a quaternion (w, x, y, z) and a translation."""
+    if own not in cameras:
+        raise Unreadable(f"no camera {own} for a picture")
     if not 0 < (length := float(np.linalg.norm(pose[:4]))) < np.inf:
         raise Unreadable("a rotation that is no quaternion")
     w, x, y, z = np.array(pose[:4]) / length
@@ -137,7 +134,7 @@ def _image(name: str, pose: tuple[float, ...], camera: ColmapCamera) -> PosedCam
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     viewmat[:3, 3] = pose[4:]
-    return PosedCamera(name, viewmat, camera.K, camera.size, camera.lens)
+    return PosedCamera(name, viewmat, *cameras[own])
 
 
 def _lines(file: Path) -> Iterator[str]:
@@ -178,16 +175,10 @@ def _text_images(file: Path, cameras: dict[int, ColmapCamera]) -> list[PosedCame
         name = words[9].strip()
         try:
             pose = tuple(number(word) for word in words[1:8])
-            images.append(_image(name, pose, _of_image(cameras, whole(words[8]))))
+            images.append(_image(name, pose, cameras, whole(words[8])))
         except Unreadable as error:
             raise Unreadable(f"picture {name!r}: {error}") from None
     return images
-
-
-def _of_image(cameras: dict[int, ColmapCamera], own: int) -> ColmapCamera:
-    if own not in cameras:
-        raise Unreadable(f"no camera {own} for a picture")
-    return cameras[own]
 
 
 def _binary_cameras(file: Path) -> dict[int, ColmapCamera]:
@@ -210,7 +201,7 @@ def _binary_images(file: Path, cameras: dict[int, ColmapCamera]) -> list[PosedCa
     for _ in range(count):
         _, *pose, camera = struct.unpack_from("<i7di", data, offset)
         end = data.index(b"\0", offset + 64)
-        images.append(_image(data[offset + 64 : end].decode(), tuple(pose), _of_image(cameras, camera)))
+        images.append(_image(data[offset + 64 : end].decode(), tuple(pose), cameras, camera))
         (observations,) = struct.unpack_from("<Q", data, end + 1)
         offset = end + 9 + 24 * observations
     _check_end(data, offset)

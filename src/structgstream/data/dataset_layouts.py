@@ -102,8 +102,8 @@ def open_panoptic(path: Path) -> ImageSource:
             held_out += found
     names = sorted(cameras, key=natural)
     rig = calibrated_rig({name: cameras[name] for name in names}, held_out, where=path)
-    common = common_pictures({name: files[name] for name in names}, where=path, training=rig.training)
-    return ImageSource(path.name, rig, PANOPTIC_FPS, common.files, instants=common.instants)
+    common, instants = common_pictures({name: files[name] for name in names}, where=path, training=rig.training)
+    return ImageSource(path.name, rig, PANOPTIC_FPS, common, instants=instants)
 
 
 def _read_meta(meta: Path) -> tuple[dict[str, Camera], dict[str, dict[str, Path]]]:
@@ -349,7 +349,11 @@ def aligned_points(model: Calibration, rig: CameraRig) -> NDArray[np.float64] | 
     """
     if model.points is None:
         return None
-    found = _common(model, rig)
+    found: dict[str, PosedCamera] = {}  # whose camera's name is a part of a picture's
+    for posed in model.cameras:
+        parts = PurePosixPath(posed.name).with_suffix("").parts
+        if (name := next((part for part in parts if part in rig.cameras), None)) is not None:
+            found.setdefault(name, posed)
     if len(found) < MIN_COMMON:
         log.warning(
             "%s has %d cameras of the rig by name; its points are not used. Its pictures need the cameras' names.",
@@ -369,13 +373,3 @@ def aligned_points(model: Calibration, rig: CameraRig) -> NDArray[np.float64] | 
         )  # fmt: skip
         return None
     return fitted.points(model.points)
-
-
-def _common(model: Calibration, rig: CameraRig) -> dict[str, PosedCamera]:
-    """A pose of the model for each camera of the rig whose name is a part of a picture's."""
-    found: dict[str, PosedCamera] = {}
-    for posed in model.cameras:
-        parts = PurePosixPath(posed.name).with_suffix("").parts
-        if (name := next((part for part in parts if part in rig.cameras), None)) is not None:
-            found.setdefault(name, posed)
-    return found

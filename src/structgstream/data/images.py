@@ -20,7 +20,7 @@ from functools import cached_property
 from itertools import repeat
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,17 +99,11 @@ def opencv() -> ModuleType:
     return cv2
 
 
-class CommonPictures(NamedTuple):
-    """The pictures of a capture's frames by camera, None where it has none in one, and the name of each frame."""
-
-    files: dict[str, tuple[Path | None, ...]]
-    instants: tuple[str, ...]
-
-
 def common_pictures(
     files: Mapping[str, Mapping[str, Path]], *, where: Path, training: Collection[str] | None = None
-) -> CommonPictures:
-    """The pictures of the time steps of a capture, of which cameras may lack some.
+) -> tuple[dict[str, tuple[Path | None, ...]], tuple[str, ...]]:
+    """The pictures of the time steps of a capture, of which cameras may lack some: by camera that of each step, None
+    where it has none; and the names of the steps.
 
     Args:
         files: camera name to its pictures, by the name of the instant.
@@ -137,10 +131,8 @@ def common_pictures(
     slot_of = {instant: slot for slot, instant in enumerate(instants)}
     slots = {camera: sorted(slot_of[instant] for instant in pictures) for camera, pictures in files.items()}
     common = common_slots(slots, where=str(where), label=lambda slot: f"frame {instants[slot]!r}", training=training)
-    return CommonPictures(
-        {camera: tuple(pictures.get(instants[slot]) for slot in common) for camera, pictures in files.items()},
-        tuple(instants[slot] for slot in common),
-    )
+    shown = tuple(instants[slot] for slot in common)
+    return {camera: tuple(map(pictures.get, shown)) for camera, pictures in files.items()}, shown
 
 
 def read_picture(path: Path, *, bits: int = 16) -> NDArray[np.uint8]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, enlargement
 from structgstream.data.images import opencv, reduced_mask, reduced_picture
-from structgstream.geometry import Floats, cross_matrices
+from structgstream.geometry import Floats, Indices, cross_matrices
 
 Pair = tuple[str, str]
 """Names of two cameras."""
@@ -216,7 +216,7 @@ def guided_matches(
     line_pixels: float,
     depth_range: tuple[float, float],
     ratio: float,
-) -> NDArray[np.intp]:
+) -> Indices:
     """Mutually best matches ``[S, 2]`` (indices into the two sets) among keypoints near the epipolar line.
 
     A match survives if no other candidate, further than :data:`DISTINCT_PIXELS` from it, comes within ``ratio`` of its
@@ -237,12 +237,12 @@ def guided_matches(
 def mutually_best(
     first: Features,
     second: Features,
-    row: NDArray[np.intp],
-    column: NDArray[np.intp],
+    row: Indices,
+    column: Indices,
     *,
     ratio: float,
     distance: float = np.inf,
-) -> NDArray[np.intp]:
+) -> Indices:
     """Matches ``[S, 2]`` among candidates that are each other's best and pass the ratio test both ways.
 
     Args:
@@ -263,8 +263,8 @@ DISTINCT_PIXELS = 4.0  # what lies nearer to the best candidate is no rival of i
 
 
 def distinct_best(
-    query: NDArray[np.intp], candidate: NDArray[np.intp], cost: NDArray[np.float32], pixels: Floats, *, ratio: float
-) -> NDArray[np.intp]:
+    query: Indices, candidate: Indices, cost: NDArray[np.float32], pixels: Floats, *, ratio: float
+) -> Indices:
     """Positions, in a list of candidates, of each query's best one if it passes the ratio test.
 
     Args:
@@ -318,7 +318,7 @@ def mutual_matches(
     ratio: float,
     distance: float = math.inf,
     seen: tuple[NDArray[np.bool_], NDArray[np.bool_]] | None = None,
-) -> NDArray[np.intp]:
+) -> Indices:
     """Matches ``[S, 2]`` of unit descriptors ``[N, D]`` and ``[M, D]``, as rows of both, ascending in the first.
 
     Args:
@@ -358,7 +358,7 @@ def _never_together(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDAr
 
 def _distinct_nearest(
     similarity: NDArray[np.float32], ratio: float, distance: float
-) -> tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.bool_]]:
+) -> tuple[Indices, NDArray[np.float32], NDArray[np.bool_]]:
     """For each row the column of the largest value, this, and whether it stands out. Changes ``similarity``."""
     lines = np.arange(len(similarity))
     nearest = similarity.argmax(1)
@@ -387,7 +387,7 @@ class PairMatcher:
         self._images = images
         self._masks = masks or {}
         self._features: dict[str, Features] = {}
-        self._found: dict[Pair, NDArray[np.intp]] = {}
+        self._found: dict[Pair, Indices] = {}
 
     def matches(self, pairs: Sequence[Pair]) -> dict[Pair, tuple[Floats, Floats]]:
         """Pixels ``[S, 2]`` in the first and in the second picture of each pair; none where too few agree."""
@@ -396,7 +396,7 @@ class PairMatcher:
             for (first, second), rows in self.indices(pairs).items()
         }
 
-    def indices(self, pairs: Sequence[Pair]) -> dict[Pair, NDArray[np.intp]]:
+    def indices(self, pairs: Sequence[Pair]) -> dict[Pair, Indices]:
         """As :meth:`matches`, numbers ``[S, 2]`` of keypoints."""
         names = sorted({name for pair in pairs for name in pair} - set(self._features))
         missing = [pair for pair in pairs if pair not in self._found]
@@ -413,7 +413,7 @@ class PairMatcher:
         mask = self._masks.get(name)
         return sift_features(self._images[name], count=FEATURES, mask=mask, longest_side=KEYPOINT_SIDE)
 
-    def _match(self, pair: Pair) -> NDArray[np.intp]:
+    def _match(self, pair: Pair) -> Indices:
         empty = np.empty((0, 2), np.intp)
         first, second = (self._features[name] for name in pair)
         if min(len(first.pixels), len(second.pixels)) < MIN_INLIERS:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera
 from structgstream.data.images import opencv, reduced_mask
 from structgstream.data.matching import back_project, inside, project
-from structgstream.geometry import Floats
+from structgstream.geometry import Floats, Indices
 from structgstream.kernels.backend import processor_backend
 
 
@@ -217,7 +217,7 @@ def sweep_points(
 
 def _agreement(
     points: Floats, own: DepthMap, pixels: Floats, other: DepthMap, config: SweepConfig
-) -> tuple[NDArray[np.intp], Floats]:
+) -> tuple[Indices, Floats]:
     """Indices of the ``points`` that the other map confirms, and its estimates of them."""
     projected, depths = project(other.camera, points)
     seen = np.flatnonzero(inside(other.camera, projected, depths, near=0.0))

@@ -33,7 +33,7 @@ from structgstream.data.matching import (
 )
 from structgstream.data.plane_sweep import DEFAULT_LEVELS, SweepBounds, SweepConfig, sweep_points
 from structgstream.frames import MultiViewFrame
-from structgstream.geometry import Floats
+from structgstream.geometry import Floats, Indices
 
 _log = logging.getLogger(__name__)
 
@@ -163,7 +163,7 @@ def _sift_points(
         found = pool.map(lambda name: sift_features(images[name], count=config.FEATURES, mask=masks.get(name)), cameras)
         features = dict(zip(cameras, found, strict=True))
 
-        def match(pair: Pair) -> NDArray[np.intp]:
+        def match(pair: Pair) -> Indices:
             first, second = pair
             return guided_matches(
                 features[first],
@@ -187,10 +187,10 @@ def _sift_points(
 def _confirm_points(
     cameras: Mapping[str, Camera],
     features: Mapping[str, Features],
-    matches: Mapping[Pair, NDArray[np.intp]],
+    matches: Mapping[Pair, Indices],
     *,
     tolerance: float,
-) -> tuple[Floats, NDArray[np.intp], Floats]:
+) -> tuple[Floats, Indices, Floats]:
     """Points of keypoints whose matches in two other views agree.
 
     Returns the points ``[P, 3]``, and the camera (index) and pixel ``[P, 2]`` of their keypoint.
@@ -266,7 +266,7 @@ def _has_neighbors(points: Floats, *, cell: float) -> NDArray[np.bool_]:
     return total > 3
 
 
-def _thin_out(points: Floats, *, cell: float, count: int) -> NDArray[np.intp]:
+def _thin_out(points: Floats, *, cell: float, count: int) -> Indices:
     """Indices of one point per cell, of cells grown until at most ``count`` points remain.
 
     Unlike a random subset, cells keep points in sparse, textureless regions. The first point of a cell is kept, so

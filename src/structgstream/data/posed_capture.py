@@ -178,10 +178,10 @@ def of_pictures(
     names = sorted(poses, key=natural)
     for name in names:
         check_one_series(name, files[name].values())
-    common = common_pictures(
+    common, instants = common_pictures(
         {name: files[name] for name in names}, where=path, training=[name for name in names if name not in held_out]
     )
-    firsts = {name: next(filter(None, pictures)) for name, pictures in common.files.items()}
+    firsts = {name: next(filter(None, pictures)) for name, pictures in common.items()}
     turns = {name: _orientation(file, poses[name], calibration) for name, file in firsts.items()}
     sizes = {name: _shown_size(file, turns[name]) for name, file in firsts.items()}
     filmed = _filmed(poses, sizes, calibration)
@@ -190,9 +190,9 @@ def of_pictures(
         path.name,
         rig,
         PICTURE_FPS if fps is None else fps,
-        common.files,
+        common,
         calibration.points,
-        common.instants,
+        instants,
         turns=turns,
     )
     return source, filmed

@@ -61,17 +61,6 @@ class FrameSource(FrameStream, Protocol):
 
 
 @runtime_checkable
-class TimedPictures(Protocol):
-    """A recording that knows when its pictures were taken."""
-
-    @property
-    def apart_seconds(self) -> Mapping[str, NDArray[np.float64]]:
-        """Camera name to how long after its instant its picture of each frame was taken, ``[N]``; NaN where it has
-        none; empty where that is not known."""
-        ...
-
-
-@runtime_checkable
 class RetainsFrames(Protocol):
     """A live stream that stores earlier frames, so that a resumed run can read them again."""
 
@@ -192,8 +181,7 @@ def innermost(source: FrameSource) -> FrameSource:
 def apart_seconds(source: FrameSource) -> Mapping[str, NDArray[np.float64]]:
     """Camera name to how long after its instant its picture of each frame was taken, ``[N]`` by its own time stamps;
     NaN where it has none; empty where that is not known, as for pictures without times."""
-    inner = unwrapped(source)
-    return inner.apart_seconds if isinstance(inner, TimedPictures) else {}
+    return getattr(unwrapped(source), "apart_seconds", {})
 
 
 @runtime_checkable
@@ -460,9 +448,7 @@ class _RecordingReader(_Reader):
     """One of several readers of a recording."""
 
     def __len__(self) -> int:
-        count = frame_count(self.source)
-        assert count is not None, "a recording"
-        return count
+        return len(self.source)  # type: ignore[arg-type]
 
 
 def _close(frames: Iterator[MultiViewFrame]) -> None:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from structgstream.errors import CaptureError, ConfigError
 from structgstream.frames import MIN_CAMERAS
-from structgstream.geometry import Floats
+from structgstream.geometry import Floats, Indices
 
 log = logging.getLogger(__name__)
 
@@ -104,7 +104,7 @@ def _running_numbers(stems: Sequence[str]) -> dict[str, str]:
     return numbers if len(set(numbers.values())) == len(stems) else {}
 
 
-def picture_slots(pictures: Mapping[str, Sequence[Path]]) -> dict[str, NDArray[np.intp]]:
+def picture_slots(pictures: Mapping[str, Sequence[Path]]) -> dict[str, Indices]:
     """Which instant each picture of each camera is of, ``[N]`` from 0 on, ascending; pictures are in :func:`natural`
     order.
 

@@ -89,7 +89,7 @@ class VideoSource:
             # Entered last, so that no thread is inside a decoder when the decoders close.
             pool = stack.enter_context(ThreadPoolExecutor(min(len(self.rig), os.cpu_count() or 1), "videos"))
             for index in range(start, len(self)):
-                pictures = zip(self.rig, pool.map(next, decoders), strict=True)
+                pictures = zip(self.rig, pool.map(lambda decoder: next(decoder), decoders), strict=True)
                 present = {name: shown for name, shown in pictures if shown is not None}
                 images = {name: picture for name, (picture, _) in present.items()}
                 masks = {name: mask for name, (_, mask) in present.items() if mask is not None}

@@ -21,7 +21,7 @@ from structgstream.data.matching import (
     rays,
 )
 from structgstream.frames import MultiViewFrame
-from structgstream.geometry import Floats
+from structgstream.geometry import Floats, Indices
 
 ALL_PAIRS = 32  # cameras; with more, only neighbours by the given poses are matched
 NEIGHBOURS = 8
@@ -33,7 +33,7 @@ class Evidence:
 
     images: Mapping[str, NDArray[np.uint8]]  # name of a camera to its picture ``[H, W, 3]``
     keypoints: Mapping[str, Floats]  # name of a camera to pixels ``[S, 2]``
-    matches: Mapping[Pair, NDArray[np.intp]]
+    matches: Mapping[Pair, Indices]
     """Pair of cameras to numbers of keypoints ``[M, 2]``; empty where they see too little in common."""
 
     def pixels(self, pair: Pair) -> tuple[Floats, Floats]:
@@ -91,8 +91,8 @@ class Tracks:
 
     names: tuple[str, ...]  # of the cameras; observations number them in this order
     points: Floats  # ``[P, 3]``, triangulated from cameras that are not off
-    point: NDArray[np.intp]  # ``[M]`` number of the point of each observation
-    camera: NDArray[np.intp]  # ``[M]`` number of its camera
+    point: Indices  # ``[M]`` number of the point of each observation
+    camera: Indices  # ``[M]`` number of its camera
     pixels: Floats  # ``[M, 2]`` its keypoint
     residuals: Floats  # ``[M]`` its distance to the projected point, pixels
 
@@ -101,7 +101,7 @@ class Tracks:
         return self.camera == self.names.index(name)
 
     @property
-    def views(self) -> NDArray[np.intp]:
+    def views(self) -> Indices:
         """Number ``[P]`` of cameras that observed each point."""
         return np.bincount(self.point, minlength=len(self.points))
 
@@ -110,8 +110,8 @@ class Tracks:
 class _Table:
     """Observations, and which of them points are made of."""
 
-    point: NDArray[np.intp]
-    camera: NDArray[np.intp]
+    point: Indices
+    camera: Indices
     pixels: Floats
     used: NDArray[np.bool_]
 
@@ -154,7 +154,7 @@ def build_tracks(evidence: Evidence, cameras: Mapping[str, Camera], *, off: Coll
 
 def _edges(
     evidence: Evidence, cameras: Mapping[str, Camera], names: tuple[str, ...], *, off: Collection[str], limit: float
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+) -> tuple[Indices, Indices]:
     """First number of each camera's keypoints, and matches ``[E, 2]`` of keypoints by such numbers.
 
     Matches of cameras that are not off must agree with their poses.
@@ -175,8 +175,8 @@ def _edges(
 
 
 def _components(
-    first: NDArray[np.intp], edges: NDArray[np.intp], names: tuple[str, ...], evidence: Evidence
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    first: Indices, edges: Indices, names: tuple[str, ...], evidence: Evidence
+) -> tuple[Indices, Indices, Indices]:
     """Point, camera and keypoint of each observation; points have one keypoint in a picture, and two pictures."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components

@@ -40,6 +40,7 @@ from structgstream.data.timeline import Clock, natural, picture_slots
 from structgstream.data.video import measured_fps, pictures_at
 from structgstream.data.video_index import VIDEO_SUFFIXES, VideoTrack, load_av, open_video, scan_videos, video_stream
 from structgstream.errors import CaptureError
+from structgstream.geometry import Indices
 
 _log = logging.getLogger(__name__)
 
@@ -97,11 +98,11 @@ class Footage:
         return significant_bits(self.stills)
 
     @cached_property
-    def _slots(self) -> Mapping[str, NDArray[np.intp]]:
+    def _slots(self) -> Mapping[str, Indices]:
         """Which instant each picture is of, from 0 on."""
         return picture_slots(self.stills)
 
-    def pictures(self, name: str, indices: Sequence[int] | NDArray[np.intp]) -> Iterator[NDArray[np.uint8]]:
+    def pictures(self, name: str, indices: Sequence[int] | Indices) -> Iterator[NDArray[np.uint8]]:
         """Pictures ``[H, W, 3]`` sRGB of frames of one camera, whose numbers ascend, at their stored size."""
         if (track := self.tracks.get(name)) is not None:
             for run in _runs([int(index) for index in indices]):

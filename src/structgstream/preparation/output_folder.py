@@ -29,7 +29,7 @@ from structgstream.errors import CaptureError, StorageError
 from structgstream.preparation.options import Link
 
 FOLDER = "work"
-VERSION = 4  # of the steps' results; a new one does all steps again
+VERSION = 5  # of the steps' results; a new one does all steps again
 Value = TypeVar("Value")
 
 
@@ -195,7 +195,8 @@ def mark_output(capture: Path, videos: Path) -> None:
 
 @contextmanager
 def lock_output(capture: Path) -> Iterator[None]:
-    """No other process prepares the same marked capture within the block, or a ``StorageError`` says that one does."""
+    """No other process prepares the same marked capture within the block; where one does, a ``StorageError`` says
+    so."""
     try:
         file = open_lockable(capture / FOLDER / LOCK)
     except OSError as error:

@@ -7,6 +7,7 @@
 import json
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -77,8 +78,6 @@ from structgstream.preparation.solvers import (
 )
 
 MIN_SOLVED = 3  # cameras, for poses that can be checked
-
-
 POINTS = "points.npy"
 NEAR_SHARE = 0.5  # of the depth of the nearest points: what comes closer later is still drawn
 
@@ -146,7 +145,7 @@ class Job:
         """By motion again when the calibration is known, which makes it exact."""
         if clocks.method != "motion" or not isinstance(method, str):
             return clocks
-        again = lambda: synchronized(footage, self.options, cameras=solved.cameras)  # noqa: E731
+        again = partial(synchronized, footage, self.options, cameras=solved.cameras)
         return self._clocks("clocks", {}, again, after=("scale",))
 
     def _clocks(
@@ -173,58 +172,42 @@ class Job:
         if focals:
             inputs["focals"] = focals
 
-        def solve() -> tuple[SolvedCalibration, str]:
+        detail = describe_focals(focals, footage)
+
+        def solve() -> SolvedCalibration:
             if not isinstance(method, str):
-                return given_cameras(method, footage), ""
-            found = check_complete(solve_cameras(method, footage, clocks, options, focals=focals), footage)
-            return found, describe_focals(focals, footage)
+                return given_cameras(method, footage)
+            return check_complete(solve_cameras(method, footage, clocks, options, focals=focals), footage)
 
-        def describe(found: SolvedCalibration, detail: str) -> str:
-            return f"{name}: {summary(found)}" + (f"; {detail}" if detail else "")
-
-        solved = self._solved("calibrate", inputs, solve, describe=describe, after="synchronize")
+        calibrated = self.steps.run(
+            "calibrate", inputs, solve, pack=packed, unpack=unpacked, after=("synchronize",),
+            summary=lambda found: f"{name}: {summary(found)}" + (f"; {detail}" if detail else ""),
+        )  # fmt: skip
         if options.refine:
-            refine = lambda: refined(solved, footage, clocks, options)  # noqa: E731
-            refined_ = self._solved("refine", {}, refine, describe=lambda found, detail: detail, after="calibrate")
-        else:
-            refined_ = solved
+            calibrated, _ = self.steps.run(
+                "refine",
+                {},
+                partial(refined, calibrated, footage, clocks, options),
+                pack=lambda found: Stored({**packed(found[0]).values, "detail": found[1]}, packed(found[0]).arrays),
+                unpack=lambda stored: (unpacked(stored), str(stored.values["detail"])),
+                summary=lambda found: found[1],
+                after=("calibrate",),
+            )
 
-        def scale() -> tuple[SolvedCalibration, str]:
+        def scale() -> SolvedCalibration:
             if distance is None:
-                return refined_, ""
-            return with_distance(refined_, distance.first, distance.second, metres=distance.metres), ""
+                return calibrated
+            return with_distance(calibrated, distance.first, distance.second, metres=distance.metres)
 
-        return self._solved(
+        return self.steps.run(
             "scale",
             {"distance": None if distance is None else asdict(distance)},
             scale,
-            describe=lambda found, _: "metres" if found.metres else "arbitrary units; --distance A B 3.2m gives metres",
-            after="refine" if options.refine else "calibrate",
+            pack=packed,
+            unpack=unpacked,
+            summary=lambda found: "metres" if found.metres else "arbitrary units; --distance A B 3.2m gives metres",
+            after=("refine" if options.refine else "calibrate",),
         )
-
-    def _solved(
-        self,
-        step: str,
-        inputs: Mapping[str, object],
-        solve: Callable[[], tuple[SolvedCalibration, str]],
-        *,
-        describe: Callable[[SolvedCalibration, str], str],
-        after: str,
-    ) -> SolvedCalibration:
-        def pack(found: tuple[SolvedCalibration, str]) -> Stored:
-            stored = packed(found[0])
-            return Stored({**stored.values, "detail": found[1]}, stored.arrays)
-
-        found = self.steps.run(
-            step,
-            inputs,
-            solve,
-            pack=pack,
-            unpack=lambda stored: (unpacked(stored), str(stored.values.get("detail", stored.values.get("told", "")))),
-            summary=lambda found: describe(*found),
-            after=(after,),
-        )
-        return found[0]
 
     def link(self, footage: Footage, content: PreparedCapture) -> None:
         self.steps.begin("link")

@@ -13,9 +13,9 @@ import numpy as np
 
 from structgstream.data.calibration import Calibration, PosedCamera, listed
 from structgstream.data.dataset_layouts import CAMERAS_FILE, MODELS_FILE, read_cameras, read_models
-from structgstream.data.found_calibrations import calibration_below, read_calibration
 from structgstream.data.images import read_exif
 from structgstream.data.lenses import LensCamera, Pinhole
+from structgstream.data.open import calibration_below, read_calibration
 from structgstream.data.posed_capture import filmed_by, orientations
 from structgstream.data.prepared import FILE as PREPARED
 from structgstream.data.prepared import LENSES, camera_of, filmed_entry, read_prepared
@@ -98,10 +98,8 @@ def packed_clocks(found: Clocks) -> Stored:
 
 def unpacked_clocks(stored: Stored) -> Clocks:
     """The reverse of :func:`packed_clocks`."""
-    values = stored.values
-    clocks = {name: Clock(**clock) for name, clock in values["clocks"].items()}
-    summary = values["summary"] if "summary" in values else values["told"]  # the former name
-    return Clocks(clocks, values["method"], summary, values["sure"])
+    clocks = {name: Clock(**clock) for name, clock in stored.values["clocks"].items()}
+    return Clocks(**{**stored.values, "clocks": clocks})
 
 
 BOARD_SECONDS = 0.4

@@ -1,26 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motion of made takes under a known geometry, from changed pictures to clocks."""
+"""Motion of made takes under a known geometry, from changed pictures to clocks.
+
+Changes of pictures.
+
+Epipolar geometry from calibrations and from static features.
+"""
 
 from collections.abc import Mapping
 from functools import cache
 from itertools import combinations
 
+import cv2
 import numpy as np
 import pytest
 
+from structgstream.cameras import Camera
+from structgstream.data.lenses import LensCamera, Pinhole, RadialTangential
+from structgstream.data.matching import epipolar_errors, fundamental_matrix
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
 from structgstream.preparation.synchronization.correlation import Signal
 from structgstream.preparation.synchronization.motion import (
+    BUNDLES,
     CalibratedGeometry,
     Changes,
+    PairGeometry,
     PairSignals,
+    StaticGeometry,
     agreeing_cameras,
+    line_signals,
     pair_signals,
     picture_changes,
     solve_by_motion,
+    static_features,
 )
-from tests.support.takes import MadeStreams, lenses, ring
+from tests.support.takes import HEIGHT, WIDTH, MadeStreams, lenses, ring
 
 VIEWS = ring(4)
 OFFSETS = {"cam0": 0.0, "cam1": 0.35, "cam2": -0.2333, "cam3": 0.5167}
@@ -128,3 +142,150 @@ def sudden(seed: int) -> float:
     solution = solve_by_motion(dict.fromkeys(late, (0.0, 2.5)), pairs, slack_seconds=1 / 60, drift=False)
     errors = np.array([solution.offsets[name] - half / 60 for name, half in late.items()])
     return float((np.abs(errors - errors.mean()) / np.array(list(solution.sigmas.values()))).max())
+
+
+STAMPS = np.array([0.0, 0.1, 0.25, 0.3])
+
+
+def pictures(*, square: bool = True, noise: float = 2.0) -> list[np.ndarray]:
+    """Grey with noise, and a bright square that jumps to the right at the third picture."""
+    generator = np.random.default_rng(0)
+    made = []
+    for index in range(4):
+        picture = generator.normal(100, noise, (120, 200, 3))
+        if square:
+            left = 40 if index < 2 else 120
+            picture[50:80, left : left + 30] += 80
+        made.append(np.clip(picture, 0, 255).astype(np.uint8))
+    return made
+
+
+def test_changes_are_where_and_when_something_moves() -> None:
+    changes = picture_changes(pictures(), STAMPS)
+    assert changes.amounts.shape == (3, 96, 160)
+    assert np.allclose(changes.times, [0.05, 0.175, 0.275])
+    assert changes.activity.argmax() == 1
+    assert changes.moving
+    jump = changes.amounts[1]
+    assert jump[52, 44] > 40  # the middle of where it was, in reduced pixels
+    assert jump[52, 108] > 40
+    assert jump[:30].max() < 10
+
+
+def test_noise_is_no_motion() -> None:
+    for noise in (0.0, 2.0, 8.0):
+        assert not picture_changes(pictures(square=False, noise=noise), STAMPS).moving
+
+
+def test_one_picture_has_no_changes() -> None:
+    changes = picture_changes(pictures()[:1], STAMPS)
+    assert len(changes.times) == 0
+    assert not changes.moving
+
+
+CAMERAS = lenses(ring(3))
+
+
+def spots(name: str, points: np.ndarray) -> Changes:
+    """Changes of one pixel a frame: where each point ``[T, 3]`` is seen."""
+    amounts = np.zeros((len(points), HEIGHT, WIDTH), np.uint8)
+    pixels = CAMERAS[name].pixels(points)
+    for frame, (x, y) in enumerate(pixels):
+        amounts[frame, int(y), int(x)] = 100
+    return Changes(amounts, np.arange(len(points)) / 30, (WIDTH, HEIGHT))
+
+
+@pytest.mark.parametrize("pair", [("cam0", "cam1"), ("cam1", "cam2"), ("cam0", "cam2")])
+def test_a_point_is_in_the_same_bundle_of_both_views(pair: tuple[str, str]) -> None:
+    """Up to the next one, because a pixel has a size; whatever the depth."""
+    points = np.random.default_rng(0).uniform(-0.6, 0.6, (200, 3))
+    geometry = CalibratedGeometry(CAMERAS).pair(*pair)
+    assert geometry is not None
+    signals = line_signals(spots(pair[0], points), spots(pair[1], points), geometry)
+    assert signals is not None
+    seen = (signals[0].sum(1) > 0) & (signals[1].sum(1) > 0)
+    assert seen.mean() > 0.9
+    apart = np.abs(signals[0].argmax(1) - signals[1].argmax(1))[seen]
+    assert np.minimum(apart, BUNDLES - apart).max() <= 1
+
+
+def test_a_scaled_fundamental_matrix_is_the_same() -> None:
+    points = np.random.default_rng(1).uniform(-0.5, 0.5, (20, 3))
+    geometry = CalibratedGeometry(CAMERAS).pair("cam0", "cam1")
+    assert geometry is not None
+    scaled = PairGeometry(-7.5 * geometry.F, geometry.straighten)
+    views = spots("cam0", points), spots("cam1", points)
+    first, second = line_signals(*views, geometry), line_signals(*views, scaled)
+    assert first is not None
+    assert second is not None
+    assert np.allclose(first[0], second[0])
+    assert np.allclose(first[1], second[1])
+
+
+def test_views_that_share_few_lines_have_no_signals() -> None:
+    """The second picture is far above the first one, on rows that no line of the first meets."""
+    F = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # the same rows
+    views = spots("cam0", np.zeros((3, 3))), spots("cam1", np.zeros((3, 3)))
+    geometry = PairGeometry(F, (lambda pixels: pixels, lambda pixels: pixels + np.array([0.0, 0.9 * HEIGHT])))
+    assert line_signals(*views, PairGeometry(F, (lambda pixels: pixels, lambda pixels: pixels))) is not None
+    assert line_signals(*views, geometry) is None
+
+
+POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
+
+
+def worst(geometry: CalibratedGeometry, cameras: Mapping[str, LensCamera]) -> float:
+    """Largest distance of points from their lines, in normalised coordinates."""
+    pair = geometry.pair("cam0", "cam1")
+    assert pair is not None
+    first, second = (
+        straight(cameras[name].pixels(POINTS)) for name, straight in zip(("cam0", "cam1"), pair.straighten)
+    )
+    return float(epipolar_errors(pair.F, first, second).max())
+
+
+def test_points_lie_on_their_lines() -> None:
+    cameras = lenses(ring(2))
+    assert worst(CalibratedGeometry(cameras), cameras) < 1e-9
+    bent = {name: LensCamera(own.camera, RadialTangential(k1=-0.1, p1=0.01)) for name, own in cameras.items()}
+    assert worst(CalibratedGeometry(bent), bent) < 1e-6
+
+
+def test_cameras_without_calibration_or_at_one_place_have_no_geometry() -> None:
+    cameras = lenses(ring(2))
+    assert CalibratedGeometry(cameras).pair("cam0", "other") is None
+    assert CalibratedGeometry({**cameras, "cam1": cameras["cam0"]}).pair("cam0", "cam1") is None
+
+
+def textured(camera: Camera) -> np.ndarray:
+    """Two textured planes at different depths, as the camera sees them."""
+    generator = np.random.default_rng(3)
+    picture = np.zeros((camera.height, camera.width, 3), np.uint8)
+    for depth, side in ((1.5, 5.0), (0.0, 1.6)):
+        texture = cv2.resize(generator.integers(0, 255, (60, 60), np.uint8), (480, 480), interpolation=cv2.INTER_CUBIC)
+        corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * side / 2 + [0, 0, depth]
+        pixels = LensCamera(camera, Pinhole()).pixels(corners)
+        square = np.array([[0, 0], [480, 0], [480, 480], [0, 480]], np.float32)
+        H = cv2.getPerspectiveTransform(square, pixels.astype(np.float32))
+        warped = cv2.warpPerspective(texture, H, (camera.width, camera.height))
+        inside = cv2.warpPerspective(np.ones_like(texture), H, (camera.width, camera.height)) > 0
+        picture[inside] = warped[inside][:, None]
+    return picture
+
+
+def test_static_features_give_the_geometry() -> None:
+    cameras = {name: camera.resized(640, 480) for name, camera in ring(2, degrees=12).items()}
+    features = {name: static_features([textured(camera)] * 3) for name, camera in cameras.items()}
+    geometry = StaticGeometry(features, dict.fromkeys(cameras, (640, 480)))
+    pair = geometry.pair("cam0", "cam1")
+    assert pair is not None
+    assert pair.estimated
+    first, second = (LensCamera(camera, Pinhole()).pixels(POINTS) for camera in cameras.values())
+    assert np.median(epipolar_errors(pair.F, first, second)) < 2
+    assert np.median(epipolar_errors(fundamental_matrix(*cameras.values()), first, second)) < 1e-6
+
+
+def test_views_without_texture_have_no_geometry() -> None:
+    blank = np.full((60, 80, 3), 90, np.uint8)
+    geometry = StaticGeometry({name: static_features([blank]) for name in "ab"}, dict.fromkeys("ab", (80, 60)))
+    assert geometry.pair("a", "b") is None

@@ -14,7 +14,8 @@ that make an empty array, a type of numbers, or text, and nothing else. Any othe
 import pickle
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +27,17 @@ from structgstream.errors import CalibrationError, MissingExtraError
 LARGEST_BYTES = 50_000_000  # of a file that is searched to recognise it
 
 
+def recognized(files: Iterable[Path], test: Callable[[Path], object]) -> Iterator[Path]:
+    """The files that pass a test, sorted; not those that are large, or that it cannot read."""
+    for file in sorted(files):
+        with suppress(OSError, Unreadable):
+            if file.is_file() and file.stat().st_size < LARGEST_BYTES and test(file):
+                yield file
+
+
 def json_files_with(folder: Path, key: str) -> Iterator[tuple[Path]]:
     """The JSON files of ``folder`` that contain the quoted ``key``, each alone."""
-    for file in sorted(folder.glob("*.json")):
-        try:
-            if file.stat().st_size < LARGEST_BYTES and f'"{key}"' in read_text(file):
-                yield (file,)
-        except (OSError, Unreadable):
-            continue  # no file of these
+    return ((file,) for file in recognized(folder.glob("*.json"), lambda file: f'"{key}"' in read_text(file)))
 
 
 MAX_ENTRIES = 1_000_000  # of a matrix

@@ -17,11 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from structgstream.data.calibration import CalibrationFormat, NoPose, PosedCamera, common_folder, intrinsics, rigid
 from structgstream.data.calibration_files.reading import (
-    LARGEST_BYTES,
     json_files_with,
     load_plain,
     parsed_yaml,
     read_storage,
+    recognized,
 )
 from structgstream.data.lenses import Lens, Pinhole, fisheye_lens, from_integer_centers, opencv_lens
 from structgstream.data.text_files import Unreadable, mapping, number, pixels, read_json, read_text, read_toml, readable
@@ -157,13 +157,9 @@ KALIBR_LENSES: Mapping[str, Any] = {"radtan": opencv_lens, "equidistant": fishey
 
 
 def _find_kalibr(folder: Path) -> Iterator[tuple[Path, ...]]:
-    for file in sorted(folder.iterdir()):
-        if file.suffix.lower() in (".yaml", ".yml") and file.is_file() and file.stat().st_size < LARGEST_BYTES:
-            try:
-                if "camchain" in file.stem or KALIBR_CHAIN.search(read_text(file)):
-                    yield (file,)
-            except (OSError, Unreadable):
-                continue  # no file of Kalibr
+    files = (file for file in folder.iterdir() if file.suffix.lower() in (".yaml", ".yml"))
+    found = recognized(files, lambda file: "camchain" in file.stem or KALIBR_CHAIN.search(read_text(file)))
+    return ((file,) for file in found)
 
 
 def _kalibr_entries(files: tuple[Path, ...]) -> Entries:
@@ -196,10 +192,6 @@ def _kalibr_lens(name: str, camera: dict[str, Any], file: Path) -> Lens:
 
 # CMU Panoptic Studio: calibration_SEQUENCE.json, in centimetres. ``name`` is panel_node, ``type`` hd, vga or
 # kinect-color. Videos are hdVideos/hd_00_00.mp4, pictures hdImgs/00_00/00_00_00000000.jpg.
-
-
-def _cmu_entries(files: tuple[Path, ...]) -> Entries:
-    return ((str(entry["name"]), entry) for entry in read_json(files[0])["cameras"])
 
 
 def _cmu_camera(name: str, entry: dict[str, Any]) -> PosedCamera:
@@ -283,7 +275,7 @@ def _find_projections(folder: Path) -> Iterator[tuple[Path, ...]]:
     for file in sorted(folder.glob("cameras*.npz"))[-1:]:  # cameras_sphere.npz rather than cameras_large.npz
         yield (file,)
     for place in (folder, folder / "txt"):
-        texts = tuple(file for file in sorted(place.glob("*.txt")) if _may_be_projection(file))
+        texts = tuple(recognized(place.glob("*.txt"), _holds_projection))
         if len(texts) > 1:
             yield texts
 
@@ -301,11 +293,8 @@ def _words(file: Path) -> list[str]:
     return words[words[:1] == ["CONTOUR"] :]
 
 
-def _may_be_projection(file: Path) -> bool:
-    try:
-        return file.stat().st_size < LARGEST_TEXT and np.isfinite([number(word) for word in _words(file)]).sum() == 12
-    except (OSError, Unreadable):
-        return False
+def _holds_projection(file: Path) -> bool:
+    return file.stat().st_size < LARGEST_TEXT and np.isfinite([number(word) for word in _words(file)]).sum() == 12
 
 
 def _projection_camera(name: str, matrix: ArrayLike) -> PosedCamera:
@@ -365,7 +354,7 @@ KALIBR = CalibrationFormat(
 )
 CMU_PANOPTIC = CalibrationFormat(
     partial(json_files_with, key="distCoef"),
-    _cmu_entries,
+    lambda files: ((str(entry["name"]), entry) for entry in read_json(files[0])["cameras"]),
     _cmu_camera,
     "a list of cameras with name, type, resolution, K, distCoef, R and t, as the Panoptic Studio has it",
 )

@@ -17,7 +17,7 @@ by two running sums, and halves the compressed size.
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -130,8 +130,9 @@ def write_pictures(path: Path, frame: MultiViewFrame, *, origin_seconds: float) 
     compressor = zstandard.ZstdCompressor(level=LEVEL, write_checksum=True)
     entries: dict[str, dict[str, Any]] = {"images": {}, "masks": {}}
     packed = []
-    for kind, arrays in (("images", frame.images), ("masks", frame.masks)):
-        for name, array in arrays.items():
+    arrays: dict[str, Mapping[str, NDArray[Any]]] = {"images": frame.images, "masks": frame.masks}
+    for kind, own in arrays.items():
+        for name, array in own.items():
             packed.append(compressor.compress((residuals(array) if kind == "images" else array).tobytes()))
             entries[kind][name] = [list(array.shape), len(packed[-1])]
     header = {"format": FORMAT, "index": frame.index, "pts_seconds": frame.pts_seconds,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from structgstream.atomic_files import atomic_write
 from structgstream.data.images import opencv
 from structgstream.errors import CalibrationError, ConfigError, MissingExtraError
-from structgstream.geometry import Floats
+from structgstream.geometry import Floats, Indices
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Sighting:
     """The board in one picture."""
 
     instant: int  # index of the picture
-    corners: NDArray[np.intp]  # ``[S]`` indices into the board's corners
+    corners: Indices  # ``[S]`` indices into the board's corners
     pixels: NDArray[np.float64]  # ``[S, 2]``, the top-left pixel's centre at (0.5, 0.5)
 
 
@@ -135,29 +135,22 @@ def board_sightings(
         )
     _check_markers(pictures, board, markers, found)
     _check_layout(board, found)
-    few = [name for name in pictures if len(found[name]) < MIN_SIGHTINGS]
-    if few:
-        raise CalibrationError(_too_few(board, {name: (len(found[name]), len(pictures[name])) for name in few}, found))
+    if not any(found.values()):
+        raise CalibrationError(
+            f"No camera shows the board ({board.text}) in any of its {max(map(len, pictures.values()))} pictures that "
+            f"were looked at; show it whole, closer and sharper ({MIN_CORNERS} corners are needed), name the board "
+            "that was filmed with --board, or the folder in which it was with --board-videos."
+        )
+    if few := [name for name in pictures if len(found[name]) < MIN_SIGHTINGS]:
+        counts = ", ".join(f"{name!r} in {len(found[name])} of {len(pictures[name])} pictures" for name in few)
+        raise CalibrationError(
+            f"The board ({board.text}) is seen too rarely: by {counts}, where {MIN_SIGHTINGS} with {MIN_CORNERS} "
+            "corners each are needed; show it whole, closer and sharper to each camera, tilted in several directions."
+        )
     return {name: tuple(own_sightings) for name, own_sightings in found.items()}
 
 
-def _too_few(board: Board, seen: Mapping[str, tuple[int, int]], found: Mapping[str, Sequence[Sighting]]) -> str:
-    """The sentence for cameras with too few of their pictures that show the board."""
-    if not any(found.values()):
-        largest = max(total for _, total in seen.values())
-        return (
-            f"No camera shows the board ({board.text}) in any of its {largest} pictures that were looked at; show it "
-            f"whole, closer and sharper ({MIN_CORNERS} corners are needed), name the board that was "
-            "filmed with --board, or the folder in which it was with --board-videos."
-        )
-    counts = ", ".join(f"{name!r} in {count} of {total} pictures" for name, (count, total) in seen.items())
-    return (
-        f"The board ({board.text}) is seen too rarely: by {counts}, where {MIN_SIGHTINGS} with {MIN_CORNERS} corners "
-        "each are needed; show it whole, closer and sharper to each camera, tilted in several directions."
-    )
-
-
-def _sighted(picture: NDArray[np.uint8], board: Board) -> tuple[NDArray[np.intp], NDArray[np.float64], set[int]]:
+def _sighted(picture: NDArray[np.uint8], board: Board) -> tuple[Indices, NDArray[np.float64], set[int]]:
     """Corners, their pixels, and the markers that were read."""
     cv2 = opencv()
     grey = cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2GRAY)

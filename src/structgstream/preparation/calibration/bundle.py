@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from structgstream.data.calibration import rotation_matrix
 from structgstream.data.lenses import Fisheye, LensCamera
-from structgstream.geometry import Floats, cross_matrices
+from structgstream.geometry import Floats, Indices, cross_matrices
 from structgstream.preparation.calibration.lens_terms import (
     LensPrior,
     derivatives,
@@ -26,8 +26,6 @@ from structgstream.preparation.calibration.lens_terms import (
     with_row,
 )
 from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
-
-Indices = NDArray[np.intp]
 
 HUBER = 1.345  # standard deviations of the noise: 95 % as exact as least squares if there are no outliers
 RIDGE = 1e-10  # of the diagonal: the equations do not fix where the world's axes are
@@ -287,7 +285,7 @@ def chosen(found: SolvedCalibration, good: NDArray[np.bool_]) -> SolvedCalibrati
     return replace(found, points=found.points[inliers], observations=observations)
 
 
-def _problem(found: SolvedCalibration, lens: NDArray[np.intp], free: tuple[int, ...]) -> tuple[Bundle, Parameters]:
+def _problem(found: SolvedCalibration, lens: Indices, free: tuple[int, ...]) -> tuple[Bundle, Parameters]:
     cameras, seen = list(found.cameras.values()), found.observations
     observations = BodyObservations(seen.camera, seen.point, np.zeros((len(seen), 3)), seen.pixels)
     rotations = np.broadcast_to(np.eye(3), (len(found.points), 3, 3))
@@ -299,7 +297,7 @@ def posed_problem(
     observations: BodyObservations,
     bodies: tuple[Floats, Floats],
     *,
-    lens: NDArray[np.intp],
+    lens: Indices,
     free: tuple[int, ...],
     rotating: bool,
 ) -> tuple[Bundle, Parameters]:
@@ -338,9 +336,7 @@ def _with_noise(bundle: Bundle, parameters: Parameters) -> Bundle:
     return replace(bundle, noise=max(float(np.median(residuals)) / NORMAL_MEDIAN / np.sqrt(left), 1e-3))
 
 
-def cameras_in(
-    parameters: Parameters, cameras: Mapping[str, LensCamera], lens: NDArray[np.intp]
-) -> dict[str, LensCamera]:
+def cameras_in(parameters: Parameters, cameras: Mapping[str, LensCamera], lens: Indices) -> dict[str, LensCamera]:
     """``cameras`` with the poses and lenses of the parameters."""
     adjusted = {}
     for index, (name, filmed) in enumerate(cameras.items()):

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from structgstream.data.images import opencv, reduced_picture
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Features, Pair, mutual_matches, mutually_best
-from structgstream.geometry import Floats
+from structgstream.geometry import Floats, Indices
 from structgstream.preparation.calibration.colmap import pycolmap_module
 
 MAX_KEYPOINTS = 6000  # of one picture, the largest first
@@ -156,7 +156,7 @@ def _extracted(extractor: Any, picture: NDArray[np.uint8]) -> tuple[Floats, NDAr
     return places * (width / grey.shape[1], height / grey.shape[0]), descriptors / np.maximum(norms, 1e-9)
 
 
-def _repeated(known: Keypoints, pixels: Floats, descriptors: NDArray[np.float32]) -> NDArray[np.intp]:
+def _repeated(known: Keypoints, pixels: Floats, descriptors: NDArray[np.float32]) -> Indices:
     """For each of the new keypoints the known one that it repeats, or -1."""
     from scipy.spatial import KDTree
 
@@ -172,7 +172,6 @@ def _repeated(known: Keypoints, pixels: Floats, descriptors: NDArray[np.float32]
     return which
 
 
-Indices = NDArray[np.intp]
 MIN_SINE = 0.02  # rays along the baseline belong to every epipolar plane
 
 

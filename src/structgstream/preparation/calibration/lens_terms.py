@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.data.lenses import Fisheye, Lens, LensCamera, Pinhole, RadialTangential
-from structgstream.geometry import Floats
+from structgstream.geometry import Floats, Indices
 
 LensModel = Literal["pinhole", "radial", "opencv", "brown", "fisheye"]
 """What is estimated of a lens: nothing; k1, k2; k1, k2, p1, p2; the same and k3; k1 to k4 of a fisheye."""
@@ -177,7 +177,7 @@ MIN_DIFFERENCE = 0.01  # of the usual differences
 class LensPrior:
     """A normal prior of terms of lenses about means that groups share."""
 
-    group: NDArray[np.intp]  # ``[L]``, of each lens
+    group: Indices  # ``[L]``, of each lens
     terms: tuple[int, ...]  # which terms of the rows have one
     means: Floats  # ``[G, T]``, standard deviations of the means
     differences: Floats  # ``[G, T]``, of lenses of a group from its mean
@@ -229,7 +229,7 @@ class LensPrior:
         mean, own = self.means[group, column] ** 2, self.differences[group, column] ** 2
         return mean / (own + mean * int((self.group == group).sum()))
 
-    def _precisions(self) -> list[tuple[NDArray[np.intp], int, Floats]]:
+    def _precisions(self) -> list[tuple[Indices, int, Floats]]:
         """Of each group and term: the lenses, and the inverse of their covariance once the mean is integrated out."""
         found = []
         for group, column in np.ndindex(self.differences.shape):
@@ -239,7 +239,7 @@ class LensPrior:
         return found
 
 
-def usual_prior(group: NDArray[np.intp], free: Sequence[int], *, fisheye: bool) -> LensPrior:
+def usual_prior(group: Indices, free: Sequence[int], *, fisheye: bool) -> LensPrior:
     """The prior before any picture is looked at, of the free terms that have one."""
     usual = USUAL_FISHEYE if fisheye else USUAL
     terms = tuple(term for term in free if term in usual)

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Pair
+from structgstream.geometry import Indices
 from structgstream.preparation.calibration.bundle import Limits, chosen
 from structgstream.preparation.calibration.colmap import colmap_camera, colmap_pose, filmed_camera, pycolmap_module
 from structgstream.preparation.calibration.keypoints import (
@@ -335,7 +336,7 @@ def rematched(
     return again
 
 
-def _counts(found: SolvedCalibration) -> NDArray[np.intp]:
+def _counts(found: SolvedCalibration) -> Indices:
     """Observations ``[C]`` of each camera."""
     return np.bincount(found.observations.camera, minlength=len(found.cameras))
 

@@ -5,14 +5,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from structgstream.data.calibration import Alignment, alignment
 from structgstream.data.lenses import LensCamera
 from structgstream.errors import CalibrationError
-from structgstream.geometry import Floats
-
-Indices = NDArray[np.intp]
+from structgstream.geometry import Floats, Indices
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.images import opencv
-from structgstream.geometry import Floats
+from structgstream.geometry import Floats, Indices
 from structgstream.pose_check.check import Finding
 from structgstream.pose_check.tracks import Evidence
 
@@ -102,7 +102,7 @@ def _linear(values: Floats) -> Floats:
     return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4).astype(np.float64)
 
 
-def _fitted(one: NDArray[np.intp], other: NDArray[np.intp], values: Floats, count: int) -> Floats:
+def _fitted(one: Indices, other: Indices, values: Floats, count: int) -> Floats:
     """Gains ``[count]`` whose differences explain ``values``, by iteratively reweighted least squares."""
     weights = np.ones(len(values))
     gains: Floats = np.zeros(count)

@@ -5,12 +5,11 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from structgstream.cameras import Camera
 from structgstream.data.calibration import listed
 from structgstream.data.matching import Pair, connected_groups, inside, project
-from structgstream.geometry import Floats
+from structgstream.geometry import Floats, Indices
 from structgstream.pose_check.check import Finding
 from structgstream.pose_check.tracks import MIN_VIEWS, Tracks
 
@@ -26,7 +25,7 @@ class Coverage:
     median_cameras: float  # median number of cameras that see a point
 
 
-def cameras_per_point(points: Floats, cameras: Mapping[str, Camera]) -> NDArray[np.intp]:
+def cameras_per_point(points: Floats, cameras: Mapping[str, Camera]) -> Indices:
     """Number ``[P]`` of cameras whose picture contains each point, occluded or not."""
     count = np.zeros(len(points), np.intp)
     for camera in cameras.values():

@@ -11,6 +11,7 @@ from structgstream.data.images import ImageSource
 from structgstream.data.source import FrameSource, unwrapped
 from structgstream.data.video import VideoSource
 from structgstream.frames import MultiViewFrame
+from structgstream.geometry import Indices
 from structgstream.pose_check.check import Finding
 
 Presence = dict[str, NDArray[np.bool_]]
@@ -36,7 +37,7 @@ def stated_presence(source: FrameSource) -> Presence:
     }
 
 
-def passed_frames(source: FrameSource) -> dict[str, NDArray[np.intp]]:
+def passed_frames(source: FrameSource) -> dict[str, Indices]:
     """By camera of videos, the frames that it lacks although it dropped no picture.
 
     A clock that runs slow makes pictures later and later against the frames, so that now and then none is nearest to a
@@ -77,9 +78,7 @@ def note(frame: MultiViewFrame, presence: Presence) -> None:
         present[frame.index] = name in frame.images
 
 
-def presence_findings(
-    presence: Presence, fps: float, *, passed: Mapping[str, NDArray[np.intp]] | None = None
-) -> list[Finding]:
+def presence_findings(presence: Presence, fps: float, *, passed: Mapping[str, Indices] | None = None) -> list[Finding]:
     """A warning for each camera that ends early or has nothing, and for those that drop frames or lack frame 0.
 
     Where many drop frames, as phones do, one warning has them all. Cameras are never stopped in the same instant: those
@@ -145,7 +144,7 @@ def presence_findings(
     return findings
 
 
-def _passed(own: Sequence[int | None], stamps: Sequence[int]) -> NDArray[np.intp]:
+def _passed(own: Sequence[int | None], stamps: Sequence[int]) -> Indices:
     """Of the ``own`` stamps of frames the gaps in which the file, with all ``stamps``, lacks no picture."""
     frames = np.flatnonzero([stamp is not None for stamp in own])
     if len(frames) < 2:

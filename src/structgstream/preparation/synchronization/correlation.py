@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from structgstream.errors import MissingExtraError
-from structgstream.geometry import Floats
+from structgstream.geometry import Floats, Indices
 
 GROUPS = 8  # of channels, left out one by one to see how the peak moves
 
@@ -57,7 +57,7 @@ class Lag:
 
 
 def require_scipy() -> None:
-    """A ``MissingExtraError`` where scipy is not installed."""
+    """Refuses to go on without scipy, by a ``MissingExtraError``."""
     try:
         import scipy  # noqa: F401
     except ImportError:
@@ -152,9 +152,7 @@ def chance_deviation(first: Signal, second: Signal) -> float:
     return float(np.sqrt(max(2 * products.sum() - 1, 1.0) / count))
 
 
-def _scores(
-    first: Signal, second: Signal, min_overlap: int
-) -> tuple[Floats, Floats, Floats, NDArray[np.intp], NDArray[np.intp]]:
+def _scores(first: Signal, second: Signal, min_overlap: int) -> tuple[Floats, Floats, Floats, Indices, Indices]:
     """For each lag: correlation, its numerator by channel, energy, number of samples; and the lags."""
     from scipy.fft import irfft, next_fast_len, rfft
 
@@ -181,7 +179,7 @@ def _scores(
     return score, numerators, energy, counts, lags
 
 
-def _sums(values: Floats, starts: NDArray[np.intp], ends: NDArray[np.intp]) -> tuple[Floats, Floats]:
+def _sums(values: Floats, starts: Indices, ends: Indices) -> tuple[Floats, Floats]:
     """Sums of values and of squares over ranges of rows."""
     zero = np.zeros((1, values.shape[1]))
     totals = np.concatenate([zero, np.cumsum(values, axis=0)])
@@ -262,7 +260,7 @@ class _Blocks:
     cross: Floats
     own: Floats
     times: Floats
-    numbers: NDArray[np.intp]
+    numbers: Indices
     lag_seconds: float
 
 
@@ -369,7 +367,7 @@ def _gains(blocks: _Blocks, times: Floats, rates: Floats, lags: Floats, reach: i
     return sums
 
 
-def _best(gains: Floats, blocks: NDArray[np.intp], rates: Floats, lags: Floats) -> tuple[float, float]:
+def _best(gains: Floats, blocks: Indices, rates: Floats, lags: Floats) -> tuple[float, float]:
     """Lag in samples and rate of the least squares' minimum over all gains, refined by parabolas."""
     explained = _explained(gains[:, blocks].sum(1))
     q, lag = np.unravel_index(int(explained.argmax()), explained.shape)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from structgstream.data.matching import Pair
-from structgstream.geometry import Floats
+from structgstream.geometry import Floats, Indices
 
 TREES = 200
 ITERATIONS = 30
@@ -57,8 +57,8 @@ class _Graph:
     """Correspondences as arrays; ``times`` are relative to the middle of each camera's take, ``changes`` ``[K, M]`` are
     those of the differences without each block."""
 
-    first: NDArray[np.intp]
-    second: NDArray[np.intp]
+    first: Indices
+    second: Indices
     first_times: Floats
     second_times: Floats
     differences: Floats
@@ -160,7 +160,7 @@ def _consensus(graph: _Graph, confidences: Sequence[float], slack_seconds: float
     return best
 
 
-def _along_tree(graph: _Graph, order: NDArray[np.intp]) -> Floats:
+def _along_tree(graph: _Graph, order: Indices) -> Floats:
     """Offsets that satisfy the correspondences of a spanning tree, taken greedily in ``order`` (Kruskal)."""
     group = np.arange(graph.cameras)
     offsets = np.zeros(graph.cameras)
@@ -262,7 +262,7 @@ def _inflation(graph: _Graph, off: Floats, weights: Floats, scale: Floats) -> fl
     return factor
 
 
-def _pair_numbers(graph: _Graph) -> NDArray[np.intp]:
+def _pair_numbers(graph: _Graph) -> Indices:
     low, high = np.minimum(graph.first, graph.second), np.maximum(graph.first, graph.second)
     return low * graph.cameras + high
 

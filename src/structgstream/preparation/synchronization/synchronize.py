@@ -146,7 +146,7 @@ def synchronize(
         method: ``csv`` (``timestamps``), ``stamps`` (of the files, which share a clock), ``audio``, ``motion``,
             ``none`` (the cameras were started by one signal: stamps hold as they are), or ``auto``: csv if given,
             else audio if all cameras have sound in which something is common, else motion.
-        timestamps: a table of times (``timestamps.py``).
+        timestamps: a table of times (``stated_clocks.py``).
         cameras: the calibration, if it is known; motion is exact with it and coarse without.
 
     Raises:
