@@ -73,18 +73,6 @@ def test_every_number_of_the_table_is_whole_on_80_characters(
     assert means == {"key": round(sum(keys) / len(keys)), "delta": round(sum(deltas) / len(deltas))}
 
 
-def test_the_header_by_field(streams: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
-    reader = open_stream(streams["compact"])
-    lines = [" ".join(line) for line in shown([str(streams["compact"])], capsys)]
-    size = reader.header_field_bytes["anchor_features"]
-    share, bits = size / reader.header_bytes, 8 * size / (40 * 32)
-    assert f"anchor features 40 x 32 {size:,} {share:.1%} {bits:.2f}" in lines
-    rest = reader.header_bytes - sum(reader.header_field_bytes.values())
-    assert f"the rest {rest:,} {rest / reader.header_bytes:.1%}" in lines
-    mean = sum(info.bytes for info in reader.packets) / FRAMES
-    assert f"rate {mean * 8 * 30 / 1e6:.2f} Mbit/s without the header" in lines
-
-
 def test_a_long_stream_is_listed_in_even_steps(streams: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
     lines = shown([str(streams["raw"])], capsys)
     listed = [int(line[0]) for line in lines if len(line) > 2 and line[1] in ("key", "delta") and line[0] != "mean"]
@@ -177,13 +165,6 @@ def test_inspect_prints_the_resolved_configuration(stream: Path, capsys: pytest.
     capsys.readouterr()
     assert main(["inspect", str(stream), "--config"]) == 0
     assert json.loads(capsys.readouterr().out)["online"]["iterations"] == 2
-
-
-def test_inspect_of_a_cut_file_says_so(stream: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cut, last = tmp_path / "cut.sgs", open_stream(stream).packets[-1]
-    cut.write_bytes(stream.read_bytes()[: last.offset + last.bytes // 2])
-    assert main(["inspect", str(cut)]) == 0
-    assert "not finished" in capsys.readouterr().out
 
 
 def test_a_capture_is_described_without_training(tmp_path: Path) -> None:

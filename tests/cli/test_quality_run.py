@@ -11,7 +11,7 @@ import pytest
 from structgstream.cli import main
 from structgstream.cli.progress import Lines
 from structgstream.codec.reader import open_stream
-from structgstream.codec.segments.quality_list import QUALITIES, read_list
+from structgstream.codec.segments.quality_list import QUALITIES
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest
 from structgstream.session.frame_report import FrameReport
@@ -41,26 +41,11 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_each_quality_is_what_a_run_with_it_writes(made: Path, tmp_path: Path) -> None:
-    alone = tmp_path / "high.sgs"
-    assert main(["reconstruct", CLIP, "-o", str(alone), "--frames", "3", *QUARTER, "--quality", "1.5"]) == 0
-    assert archived(made / "high", tmp_path / "a.sgs") == alone.read_bytes()
-
-
-def test_the_list_and_the_numbers_lie_where_they_belong(made: Path) -> None:
-    listed = read_list(made)
-    assert listed is not None
-    assert [(one.name, one.manifest) for one in listed] == [(name, f"{name}/manifest.json") for name in NAMES]
-    low, high = (one.bits_per_second for one in listed)
-    assert low < high
+def test_the_list_the_logs_and_the_numbers_lie_beside_the_streams(made: Path) -> None:
+    """What is in them: qualities/test_recording.py."""
     values = json.loads(made.with_suffix(".metrics.json").read_text())
-    assert (values["state"], values["frames"], values["frames_total"]) == ("finished", 3, 3)
-    assert [values["qualities"][name]["frames"] for name in NAMES] == [3, 3]
-    log = [json.loads(line) for line in made.with_suffix(".log.jsonl").read_text().splitlines()]
-    for name in NAMES:
-        own = [json.loads(line) for line in (made / f"{name}.log.jsonl").read_text().splitlines()]
-        assert [entry["qualities"][name]["bytes"] for entry in log] == [entry["bytes"] for entry in own]
-        assert values["qualities"][name]["bytes"] == sum(entry["bytes"] for entry in own)
+    assert (values["state"], [values["qualities"][name]["frames"] for name in NAMES]) == ("finished", [3, 3])
+    assert made.with_suffix(".log.jsonl").is_file()
     assert {path.name for path in made.iterdir()} == {QUALITIES, *NAMES, *(f"{name}.log.jsonl" for name in NAMES)}
 
 

@@ -19,7 +19,6 @@ from structgstream.codec.segments.stored_bytes import read_manifest, write_archi
 from structgstream.session.frame_report import FrameReport
 from tests.support.backends import QUICKEST
 from tests.support.quick_streams import CLIP, QUARTER, error_of
-from tests.support.s3_emulator import BUCKET, emulator
 
 pytestmark = pytest.mark.usefixtures("quick_tiny")
 
@@ -104,29 +103,20 @@ def test_sigterm_finishes_the_frame_and_closes_the_stream_which_is_continued_wit
     assert (tmp_path / "out.log.jsonl").is_file()
 
 
-def test_publishing_to_s3(
+def test_publishing(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What is missing after a run is copied by the next, also if there is nothing to fit."""
-    out = tmp_path / "out"
+    """What is missing after a run is copied by the next, also if there is nothing to fit; S3: test_cloud_store.py."""
+    out, url = tmp_path / "out", f"file://{tmp_path}/published"
     shutil.copytree(made / "segments", out)
-    with emulator() as server:
-        options = server.options
-        monkeypatch.setenv("AWS_ENDPOINT_URL", options["endpoint_url"])
-        monkeypatch.setenv("AWS_ACCESS_KEY_ID", options["key"])
-        monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", options["secret"])
-        monkeypatch.setattr(cli_options, "FINISH_SECONDS", 0.0)
-        url = f"s3://{BUCKET}/out"
-        command = ["reconstruct", CLIP, "-o", str(out), "--frames", "3", *QUARTER]
-        command += ["--sink", "segments", "--publish", url]
+    command = ["reconstruct", CLIP, "-o", str(out), "--frames", "3", *QUARTER, "--sink", "segments", "--publish", url]
+    for seconds in (0.0, 120.0):
+        monkeypatch.setattr(cli_options, "FINISH_SECONDS", seconds)
         assert main([*command, "--resume"]) == 0
-        monkeypatch.setattr(cli_options, "FINISH_SECONDS", 120.0)
-        assert main([*command, "--resume"]) == 0
-        remote = CloudStore(url, **options)
-        here = FolderStore(out)
-        replaced = stale_files(read_manifest(here), here.names())
-        assert here.names() - replaced <= remote.names() <= here.names()
-        write_archive(remote, tmp_path / "a.sgs")
+    remote, here = CloudStore(url), FolderStore(out)
+    replaced = stale_files(read_manifest(here), here.names())
+    assert here.names() - replaced <= remote.names() <= here.names()
+    write_archive(remote, tmp_path / "a.sgs")
     assert (tmp_path / "a.sgs").read_bytes() == (made / "file.sgs").read_bytes()
     assert main(["reconstruct", CLIP, "-o", str(tmp_path / "x.sgs"), "--publish", url]) == 2
     assert "--publish is for --sink segments" in capsys.readouterr().err

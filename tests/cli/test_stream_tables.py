@@ -9,7 +9,6 @@ from rich.console import Console
 from rich.table import Table
 
 from structgstream.cli.inspect import bit_rate_text, facts_table, header_table, packet_table, period_table
-from structgstream.cli.progress import SHOWN_FRAMES
 from structgstream.evaluation.byte_count import Row
 
 HEADER: dict[str, Any] = {
@@ -83,15 +82,6 @@ def test_the_rate_by_hand() -> None:
 def test_the_header_by_field_the_largest_first() -> None:
     lines = shown(header_table(HEADER))
     assert lines[-3:] == ["offset scales 20 x 3 240 24.0% 32.00", "free 0 x 14 0 0.0% -", "the rest 760 76.0%"]
-
-
-def test_a_long_stream_is_listed_in_part_unless_every_packet_is_asked_for() -> None:
-    many = rows(2 * SHOWN_FRAMES)
-    part, every = packet_table(many, every=False), packet_table(many, every=True)
-    assert "1 in 2 is listed" in str(part.title)
-    assert "listed" not in str(every.title)
-    assert every.row_count - part.row_count == SHOWN_FRAMES
-    assert packet_table([], every=False).row_count == 0
 
 
 def test_large_packets_are_reported_in_kilobytes() -> None:

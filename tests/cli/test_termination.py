@@ -24,14 +24,6 @@ def test_the_first_signal_is_remembered_and_the_second_ends() -> None:
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_a_live_run_that_waits_is_woken_by_sigterm() -> None:
-    woken = []
-    with Termination(on_ask=lambda: woken.append(True)) as ending:
-        os.kill(os.getpid(), signal.SIGTERM)
-        assert ending.asked
-    assert woken == [True]
-
-
 def test_what_was_there_before_comes_back_however_the_block_ends() -> None:
     heard: list[int] = []
     before = signal.signal(signal.SIGTERM, lambda number, frame: heard.append(number))

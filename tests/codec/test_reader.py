@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from structgstream.codec.container.records import PREFIX, RecordType, packed, prefix, scan_records
-from structgstream.codec.contents import readable_part
 from structgstream.codec.packets import PacketKind, pack_header
 from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.scene_coder import SceneEncoder
@@ -97,14 +96,6 @@ def test_what_comes_before_damage_plays(damaged: int) -> None:
     )
 
 
-def test_damage_after_opening_is_noticed() -> None:
-    data = bytearray(small_stream())
-    reader = StreamReader(memoryview(data))
-    data[reader.packets[1].offset + 20] ^= 1
-    with pytest.raises(StreamError, match="Packet 1 .* damaged"):
-        reader.scene(1)
-
-
 def test_unknown_records_are_skipped() -> None:
     data = small_stream()
     second = list(scan_records(data))[2]
@@ -173,15 +164,6 @@ def test_files_that_are_no_streams(tmp_path: Path) -> None:
     ]:
         with pytest.raises(StreamError, match=message):
             open_stream(path)
-
-
-def test_the_readable_part_leaves_out_the_index() -> None:
-    data = small_stream()
-    records = list(scan_records(data))
-    assert readable_part(data, name="x") == records[-1].offset
-    assert readable_part(data[: records[3].end + 5], name="x") == records[3].end
-    assert readable_part(data[:40], name="x") is None
-    assert readable_part(b"", name="x") is None
 
 
 def test_a_file_is_read_when_it_is_asked_for(tmp_path: Path) -> None:

@@ -86,21 +86,6 @@ def test_a_name_may_be_a_word_of_the_files(tmp_path: Path) -> None:
         np.testing.assert_allclose(source.rig[name].center.numpy(), expected[name[-5:]], atol=1e-6)
 
 
-@pytest.mark.parametrize("names", [("a1", "a2", "a3"), ("left", "middle", "right"), ("cam0", "cam0b", "cam1")])
-def test_names_that_do_not_belong_together(tmp_path: Path, names: tuple[str, ...]) -> None:
-    write_anipose(tmp_path, truths(names=names))
-    write_videos(tmp_path, NAMES, frames=2)
-    with pytest.raises(CalibrationError, match=r"No camera of .*calibration\.toml belongs to the pictures in .*'cam0"):
-        open_capture(tmp_path)
-
-
-def test_a_video_without_calibration(tmp_path: Path) -> None:
-    write_anipose(tmp_path, truths(names=("cam00", "cam01", "spare")))
-    write_videos(tmp_path, NAMES, frames=2)
-    with pytest.raises(CalibrationError, match=r"pictures of camera 'cam02', for which .*calibration\.toml has no cal"):
-        open_capture(tmp_path)
-
-
 def test_a_calibrated_camera_that_did_not_film_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_anipose(tmp_path, truths(names=(*NAMES, "cam03")))
     write_videos(tmp_path, NAMES, frames=2)

@@ -62,28 +62,6 @@ def test_videos_beside_a_model(tmp_path: Path, folder: str) -> None:
     assert source.fps == 30.0
 
 
-def test_a_camera_without_calibration(tmp_path: Path) -> None:
-    write_pictures(tmp_path, "images/CAM/FRAME.png")
-    write_text_model(tmp_path / "sparse", RIG, [(f"{name}.png", name) for name in list(RIG)[1:]])
-    with pytest.raises(CalibrationError, match=r"pictures of camera 'cam00', for which .*sparse has no calibration"):
-        open_capture(tmp_path)
-
-
-def test_a_calibration_that_belongs_to_nothing(tmp_path: Path) -> None:
-    write_pictures(tmp_path, "images/CAM/FRAME.png")
-    write_text_model(tmp_path / "sparse", RIG, [(f"other{name[-1]}.png", name) for name in RIG])
-    with pytest.raises(CalibrationError, match=r"No camera of .*sparse belongs to .*'other0\.png'.*'cam0\d'"):
-        open_capture(tmp_path)
-
-
-def test_a_camera_that_moves(tmp_path: Path) -> None:
-    write_pictures(tmp_path, "images/CAM/FRAME.png")
-    images = [(f"{name}/000000.png", name) for name in RIG] + [("cam01/000001.png", "cam02")]
-    write_text_model(tmp_path / "sparse", RIG, images)
-    with pytest.raises(CalibrationError, match=r"'cam01' moves in .*'cam01/000000.png' and 'cam01/000001.png'"):
-        open_capture(tmp_path)
-
-
 def test_a_missing_picture_is_an_absent_camera(tmp_path: Path) -> None:
     write_pictures(tmp_path, "frames/FRAME/CAM.png")
     write_text_model(tmp_path / "sparse", RIG, [(f"{name}.png", name) for name in RIG])
@@ -120,14 +98,6 @@ def test_full_pictures_are_preferred_to_reduced_ones(tmp_path: Path) -> None:
             )
     write_text_model(tmp_path / "sparse", RIG, [(f"{name}.png", name) for name in RIG])
     assert open_capture(tmp_path).rig["cam00"].width == 64
-
-
-def test_pictures_of_other_proportions_than_the_model(tmp_path: Path) -> None:
-    write_pictures(tmp_path, "images/CAM/FRAME.png")
-    large = RIG.mapped({name: RIG[name].resized(128, 90) for name in RIG})
-    write_text_model(tmp_path / "sparse", large, [(f"{name}.png", name) for name in RIG])
-    with pytest.raises(CalibrationError, match=r"'cam00' have 64x48 pixels, .*sparse is for 128x90: other proportions"):
-        open_capture(tmp_path)
 
 
 @pytest.mark.parametrize("folder", ["images", "images_4", ""])

@@ -48,18 +48,6 @@ def test_a_camera_that_moves_is_refused(tmp_path: Path, key: str) -> None:
         open_panoptic(tmp_path)
 
 
-def test_nan_names_the_camera(tmp_path: Path) -> None:
-    write_panoptic(tmp_path)
-
-    def break_everywhere(content: dict[str, Any]) -> None:
-        for frame in content["k"]:
-            frame[0][0][0] = float("nan")
-
-    edit(tmp_path / TRAIN, break_everywhere)
-    with pytest.raises(CalibrationError, match=r"'1' .*not finite"):
-        open_panoptic(tmp_path)
-
-
 def test_a_missing_picture_is_an_absent_camera(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_panoptic(tmp_path)
     (tmp_path / "ims" / "2" / "000092.jpg").unlink()

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from structgstream.api import reconstruct
-from structgstream.atomic_files import GrowingFile, partial_path
-from structgstream.errors import CaptureError, ConfigError, OutOfMemoryError, StorageError, StreamError
-from structgstream.groups import unit as method
+from structgstream.atomic_files import partial_path
+from structgstream.errors import CaptureError, ConfigError, StreamError
 from structgstream.groups.base import GroupBase
 from structgstream.groups.segment_file import GroupSoFar, open_segment
 from structgstream.scene.state import state_of
@@ -46,17 +45,6 @@ def test_stopped_between_frames_and_within_one_it_goes_on_to_the_same_bytes(tmp_
     assert path.read_bytes() == whole
 
 
-def test_a_flipped_byte_or_a_cut_end_is_repaired(tmp_path: Path) -> None:
-    whole, path = made().segments[1].read_bytes(), tmp_path / "g.sgs"
-    second = open_segment(made().segments[1]).entries[1][2]
-    flipped = whole[: second + 20] + bytes([whole[second + 20] ^ 1]) + whole[second + 21 :]
-    for damaged in (whole[:-1] + b"?", whole + b"more", whole[:-3], flipped):
-        path.write_bytes(damaged)
-        assert not open_segment(path).complete
-    fit(path, task(made(), LENGTH))
-    assert path.read_bytes() == whole
-
-
 def test_the_group_of_frame_0_is_that_of_any_stream(tmp_path: Path) -> None:
     path = tmp_path / "a.sgs"
     reconstruct(CAPTURE, path, preset=QUICK, scale=0.25, frames=LENGTH, backend=quickest_backend())
@@ -88,13 +76,6 @@ def test_another_group_is_not_written_over(tmp_path: Path) -> None:
     assert open_segment(partial_path(path)).entries[0][0] == 2 * LENGTH
 
 
-def test_one_process_writes_a_segment(tmp_path: Path) -> None:
-    other = GrowingFile(tmp_path / "g.sgs")
-    with pytest.raises(StorageError, match="Another process writes"):
-        fit(tmp_path / "g.sgs", task(made(), LENGTH))
-    other.close()
-
-
 def test_ranges_that_are_none_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "g.sgs"
     with pytest.raises(ConfigError, match="from 0 to before the end"):
@@ -105,27 +86,3 @@ def test_ranges_that_are_none_are_refused(tmp_path: Path) -> None:
         fit(path, task(made(), 3))
     with pytest.raises(CaptureError, match="has 12 frames"):
         fit(path, task(made(), 2, end=13))
-
-
-def test_short_memory_lowers_the_budget_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    group = task(made(), LENGTH)  # Made before memory is short.
-    asked, real = [], method.fit_group_start
-
-    def short(*arguments, **options):
-        asked.append((options["start"].births, options["config"].scene_flow.views))
-        if len(asked) == 1:
-            raise OutOfMemoryError("to test")
-        return real(*arguments, **options)
-
-    monkeypatch.setattr(method, "fit_group_start", short)
-    assert fit(tmp_path / "g.sgs", group, stop_after=1) == 1
-    assert [births for births, _ in asked] == [50, 12]
-    assert asked[1][1] == asked[0][1] // 2
-    assert '"lowered budgets": 1' in (tmp_path / "g.log.jsonl").read_text().splitlines()[0]
-
-    def none(*arguments, **options):
-        raise OutOfMemoryError("to test")
-
-    monkeypatch.setattr(method, "fit_group_start", none)
-    with pytest.raises(OutOfMemoryError):
-        fit(tmp_path / "h.sgs", group)

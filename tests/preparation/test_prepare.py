@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """From videos with a calibration to a capture: steps, resuming, and what is refused."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,10 +9,9 @@ import torch
 
 from structgstream.data.open import open_capture
 from structgstream.data.prepared import read_prepared
-from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.options import Distance, PrepareOptions
 from structgstream.preparation.prepare import Job, prepare_capture
-from tests.support.captures import write_picture, write_videos
+from tests.support.captures import write_picture
 from tests.support.planes import room_frame
 from tests.support.rooms import write_room
 
@@ -94,42 +92,3 @@ def test_an_interrupted_preparation_goes_on(tmp_path: Path, monkeypatch: pytest.
     made = prepare_capture(tmp_path / "videos", tmp_path / "out", options=OPTIONS)
     assert "near" in made.skipped
     assert "points" not in made.skipped
-
-
-def test_a_folder_of_something_else_is_not_written_into(tmp_path: Path) -> None:
-    write_room(tmp_path / "videos")
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "thesis.txt").write_text("years of work")
-    with pytest.raises(CaptureError, match="not empty and was not made by prepare"):
-        prepare_capture(tmp_path / "videos", tmp_path / "out", options=OPTIONS)
-    assert [file.name for file in (tmp_path / "out").iterdir()] == ["thesis.txt"]
-    (tmp_path / "other" / "work").mkdir(parents=True)
-    (tmp_path / "other" / "work" / "source.json").write_text(json.dumps({"videos": "/elsewhere"}))
-    with pytest.raises(CaptureError, match="was prepared from /elsewhere, not from"):
-        prepare_capture(tmp_path / "videos", tmp_path / "other", options=OPTIONS)
-    with pytest.raises(CaptureError, match="folder of the videos itself"):
-        prepare_capture(tmp_path / "videos", tmp_path / "videos", options=OPTIONS)
-
-
-def test_two_cameras_are_refused(tmp_path: Path) -> None:
-    write_videos(tmp_path / "videos", ["left", "right"], frames=2)
-    with pytest.raises(CalibrationError, match="cameras 'left', 'right' alone; a capture needs 3 or more"):
-        prepare_capture(tmp_path / "videos", tmp_path / "out", options=OPTIONS)
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_calibration_of_another_size_is_refused(tmp_path: Path) -> None:
-    write_room(tmp_path / "videos")
-    file = tmp_path / "videos" / "cameras.json"
-    content = json.loads(file.read_text())
-    file.write_text(json.dumps(content | {"width": 200, "height": 100}))
-    with pytest.raises(CalibrationError, match=r"camera 'cam00' have 160x120 pixels, .*cameras\.json is for 200x100"):
-        prepare_capture(tmp_path / "videos", tmp_path / "out", options=OPTIONS)
-
-
-def test_a_calibration_that_is_not_there(tmp_path: Path) -> None:
-    write_room(tmp_path / "videos", cameras=4)
-    with pytest.raises(CalibrationError, match="does not exist"):
-        prepare_capture(
-            tmp_path / "videos", tmp_path / "out", options=replace(OPTIONS, calibration=tmp_path / "nowhere.toml")
-        )

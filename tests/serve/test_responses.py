@@ -63,6 +63,11 @@ def test_an_empty_file_has_no_range(header: str) -> None:
         "bytes=--5",
         "bytes=" + "9" * 400 + "-",
         "bytes=0-1\nbytes=2-3",
+        "bytes=0x10-0x20",
+        "bytes=0-0," * 400,
+        "bytes=0-18446744073709551616",
+        "bytes=-99999999999999999999999",
+        "=",
     ],
 )
 def test_what_counts_as_no_range(header: str | None) -> None:

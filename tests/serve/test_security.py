@@ -151,52 +151,10 @@ def test_a_pipe_is_no_file_and_nobody_waits_for_it(own_server: Served, folder: P
 
 
 @pytest.mark.parametrize(
-    "asked",
-    [
-        "bytes=0-18446744073709551616",
-        "bytes=99999999999999999999999-",
-        "bytes=-99999999999999999999999",
-        "bytes=5-1",
-        "bytes=--1",
-        "bytes=0x10-0x20",
-        "bytes=\u0661-\u0662",
-        "bytes=" + ",".join(["0-1"] * 500),
-        "bytes=" + ",".join(f"{i}-" for i in range(500)),
-        "bytes=0-0," * 400,
-        "lines=1-2",
-        "=",
-    ],
-)
-def test_huge_and_many_ranges_get_the_whole_once(server: Served, asked: str) -> None:
-    for address in ("/streams/ball.sgs/stream.sgs", "/streams/ball.sgs/stream.sgs?x=1"):
-        answer = server.ask(address, Range=asked.encode().decode("latin-1"))
-        assert (answer.status, answer.body) == (200, STREAM)
-
-
-def test_a_range_that_is_larger_than_the_file_is_cut(server: Served) -> None:
-    answer = server.ask("/streams/ball.sgs/stream.sgs", Range="bytes=100-99999999999999999")
-    assert (answer.status, answer.body) == (206, STREAM[100:])
-    assert server.ask("/streams/ball.sgs/stream.sgs", Range="bytes=99999999999999999-").status == 416
-
-
-@pytest.mark.parametrize(
-    ("query", "status"),
-    [
-        ("after=-1", 400),
-        ("after=1e3", 400),
-        ("after=\u0663", 400),
-        ("after=%D9%A3", 400),
-        ("after=99999999999999999999999999", 400),
-        ("after=1&after=2", 400),
-        ("after=", 400),
-        ("token=a&token=b", 400),
-        ("&".join(f"a{i}=1" for i in range(17)), 400),
-        ("%ff%fe=%80", 400),
-        ("<script>alert(1)</script>", 200),
-        ("after=0&x=%00", 200),
-    ],
+    ("query", "status"), [("after=\u0663", 400), ("<script>alert(1)</script>", 200), ("after=0&x=%00", 200)]
 )
 def test_queries_are_bounded(server: Served, query: str, status: int) -> None:
+    """What else is refused in them: test_access.py."""
     answer = get(server, f"/streams/studio/manifest.json?{query}")
     assert status_of(answer) == status
     assert b"<script>" not in answer
@@ -218,17 +176,13 @@ def test_what_is_no_http_is_refused(server: Served, sent: bytes) -> None:
     assert server.ask("/health").status == 200
 
 
-@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "TRACE", "CONNECT", "PROPFIND"])
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "TRACE", "CONNECT", "PROPFIND", "OPTIONS"])
 def test_nothing_can_be_changed(server: Served, method: str) -> None:
-    assert server.ask("/streams/studio/manifest.json", method=method).status == 405
-
-
-def test_what_is_allowed_is_named(server: Served) -> None:
-    answer = server.ask("/streams/studio/manifest.json", method="OPTIONS")
+    answer = server.ask("/streams/studio/manifest.json", method=method)
     assert (answer.status, {*answer.headers["allow"].split(", ")}) == (405, {"GET", "HEAD"})
 
 
-@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", "localhost.evil", "["])
+@pytest.mark.parametrize("host", ["evil.example:80", "127.0.0.1.evil.example", "localhost.evil", "["])
 def test_another_name_for_this_machine_is_refused(server: Served, host: str) -> None:
     for path in ("/", "/streams/studio/manifest.json", "/streams/ball.sgs/stream.sgs", "/metrics"):
         answer = server.ask(path, Host=host)

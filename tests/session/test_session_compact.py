@@ -12,7 +12,6 @@ import torch
 from structgstream.codec.container.records import scan_records
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.sinks import FileSink, MemorySink
-from structgstream.errors import ConfigError
 from structgstream.scene.order import morton_order
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, parameters_of, state_of
@@ -147,17 +146,6 @@ def test_what_stands_still_keeps_its_bins() -> None:
         assert int(changed.sum()) <= report.moving < report.anchors
 
 
-def test_interrupted_and_resumed_it_is_the_same_file(tmp_path: Path) -> None:
-    data, path = whole()[0], tmp_path / "a.sgs"
-    init, *packets = [*scan_records(data)][:-1]
-    for cut in (init.end, packets[2].end - 1, packets[-1].end):
-        path.write_bytes(data[:cut])
-        sink, resumed = FileSink.resume(path)
-        done = 0 if resumed is None else len(resumed)
-        assert len(run(sink, resumed=resumed)) == FRAMES - done
-        assert path.read_bytes() == data, cut
-
-
 def test_a_target_rate_is_kept_to_and_resumes_as_it_was(tmp_path: Path) -> None:
     """The target is half of what frame 2 takes without one; the pressure after it is a matter of record."""
     free = whole()[1]
@@ -174,20 +162,6 @@ def test_a_target_rate_is_kept_to_and_resumes_as_it_was(tmp_path: Path) -> None:
     file, resumed = FileSink.resume(path)
     run(file, resumed=resumed, config=config)
     assert path.read_bytes() == sink.data
-
-
-def test_a_target_rate_for_raw_packets_is_refused() -> None:
-    with pytest.raises(ConfigError, match="codec 'raw', which has no rate control"):
-        run(MemorySink(), config=replace(CONFIG, codec="raw", rate=RateConfig(1.0)))
-
-
-def test_another_codec_does_not_continue_it(tmp_path: Path) -> None:
-    path = tmp_path / "a.sgs"
-    path.write_bytes(whole()[0])
-    sink, resumed = FileSink.resume(path)
-    with pytest.raises(ConfigError, match="another method or codec, .compact. instead of .raw."):
-        run(sink, resumed=resumed, config=replace(CONFIG, codec="raw"))
-    sink.close()
 
 
 def delta_bytes(rate_weight: float) -> int:

@@ -138,22 +138,6 @@ def test_a_group_stands_alone() -> None:
         assert same(decoder.decode(packets[index]), seen[index])
 
 
-def test_damage_costs_its_group_and_no_more() -> None:
-    """Opened by the index, a flipped bit shows where its record is read: the frames after it in its group are lost."""
-    _, data, seen, _ = small()
-    packet = StreamReader(data).packets[1]
-    for at in range(packet.offset + 20, packet.offset + packet.bytes, 7):
-        mangled = bytearray(data)
-        mangled[at] ^= 16
-        reader = StreamReader(bytes(mangled), by_index=True)
-        for index in (2, 0, 1, 3, 2, 4):
-            if index in (1, 2):
-                with pytest.raises(StreamError, match=f"Packet 1 of The stream, at byte {packet.offset}, is damaged"):
-                    reader.scene(index)
-            else:
-                assert same(reader.scene(index), seen[index])
-
-
 def test_a_packet_out_of_order() -> None:
     header, _, seen, packets = small()
     decoder = SceneDecoder(header)

@@ -2,7 +2,6 @@
 """Segments are the bytes of the file sink in pieces, a reader of late finds everything, and a kill loses nothing."""
 
 import os
-import shutil
 from contextlib import suppress
 from pathlib import Path
 
@@ -156,70 +155,6 @@ def test_an_orderly_stop_in_the_middle_of_a_group_goes_on_to_the_same_segments(t
         written(store, SENT, options=options)
         assert archived(store) == as_file(SENT)
         assert {entry.file for entry in read_manifest(store).segments} == files
-
-
-def test_a_torn_or_damaged_last_part_is_as_one_that_was_never_written(tmp_path: Path) -> None:
-    sink = SegmentsSink(folder(tmp_path / "out"))
-    sink.open(header())
-    for packet in SENT[:5]:
-        sink.write(packet)
-    for number, left in ((4, 4), (3, 3)):
-        shutil.copytree(tmp_path / "out", tmp_path / f"{number}")
-        store = folder(tmp_path / f"{number}")
-        manifest = read_manifest(store)
-        if number == 3:
-            _flip(store, manifest.parts[0].file)
-            with pytest.raises(StreamError, match="Continuing would lose the frames after it"):
-                find(store)
-            continue
-        _flip(store, manifest.parts[-1].file)
-        found = find(store)
-        assert found is not None
-        assert found.manifest.edge.frame == left - 1
-        written(store, SENT)
-        assert archived(store) == as_file(SENT)
-
-
-def _flip(store: FolderStore, name: str) -> None:
-    data = bytearray(store.get(name))
-    data[-5] ^= 1
-    store.put(name, bytes(data))
-
-
-def test_what_cannot_be_continued_is_refused_in_words(tmp_path: Path) -> None:
-    store = folder(tmp_path)
-    written(store, SENT)
-    manifest = read_manifest(store)
-    content = store.get(MANIFEST)
-    store.delete(MANIFEST)
-    with pytest.raises(StreamError, match="it has frames of a stream, but no manifest.json. Put it back"):
-        resume_segments(store)
-    with pytest.raises(StreamError, match=r"has no manifest\.json; expected a folder written with --sink segments"):
-        open_stream(tmp_path)
-    store.put(MANIFEST, content[:-9])
-    with pytest.raises(StreamError, match="is not JSON"):
-        resume_segments(store)
-    store.put(MANIFEST, content)
-    store.delete(manifest.segments[1].file)
-    with pytest.raises(StreamError, match="names segment-00000001-.*, which is missing"):
-        resume_segments(store)
-    with pytest.raises(StreamError, match="has no segment-00000001-.*, which its manifest names"):
-        open_stream(tmp_path)
-
-
-def test_archiving_verifies_hashes(tmp_path: Path) -> None:
-    store = folder(tmp_path / "out")
-    written(store, SENT)
-    name = read_manifest(store).segments[1].file
-    _flip(store, name)
-    with pytest.raises(StreamError, match=f"{name} in .* is damaged: it has .* bytes with the SHA-256"):
-        archived(store)
-    assert os.listdir(tmp_path) == ["out"]
-    reader = open_stream(store.folder)  # As a file with the same damage: what else is whole is shown.
-    assert reader.runs == [range(5), range(6, 8)]
-    store.put(name, b"short")
-    with pytest.raises(StreamError, match="has 5 bytes; the manifest states"):
-        open_stream(store.folder)
 
 
 def test_an_existing_stream_stays_unless_it_may_be_replaced(tmp_path: Path) -> None:

@@ -10,13 +10,12 @@ from hypothesis import strategies as st
 
 from structgstream.codec.container.records import PacketKind
 from structgstream.codec.segments.manifest import MANIFEST, manifest_to_json
-from structgstream.codec.segments.sink import SegmentsOptions
 from structgstream.codec.segments.store import FolderStore
-from structgstream.codec.segments.stored_bytes import StoredBytes, is_segments, open_segments, read_manifest
+from structgstream.codec.segments.stored_bytes import StoredBytes, is_segments, open_segments
 from structgstream.errors import StreamError
 from tests.support.properties import examples
 from tests.support.segment_folders import GrowingFolder
-from tests.support.segment_streams import folder, packets, written
+from tests.support.segment_streams import folder
 from tests.support.streams import small_stream
 
 STREAM = small_stream(7)
@@ -75,14 +74,6 @@ def test_a_segment_of_the_window_must_be_there(tmp_path: Path) -> None:
     assert stored.gone == [range(3, 6)]
     assert (len(stored.sizes), len(stored.kinds)) == (7, 7)
     assert len(stored) < len(STREAM)
-
-
-def test_gaps_next_to_each_other_are_one(tmp_path: Path) -> None:
-    store = folder(tmp_path)
-    written(store, packets(30), options=SegmentsOptions(window_seconds=0.25, grace_seconds=0.0))
-    stored = StoredBytes(store, read_manifest(store))
-    assert stored.gone == [range(3, 21)]
-    assert len(stored.sizes) == 30
 
 
 def test_a_damaged_file_is_seen_by_its_length_or_with_check_by_its_hash(tmp_path: Path) -> None:
