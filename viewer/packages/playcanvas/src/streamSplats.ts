@@ -10,7 +10,10 @@ import {
   type StreamReader,
 } from "@structgstream/core";
 import {
+  center,
   fetchStream,
+  focusPoint,
+  rigCameras,
   type Shape,
   sameShape,
   shapeOf,
@@ -87,10 +90,10 @@ export class StreamSplats {
   ) {
     if (!app.graphicsDevice.isWebGL2)
       throw new StreamError("Streams need PlayCanvas' WebGL2 device; this one is another.");
-    const { center, scale } = header.similarity;
+    const { center: middle, scale } = header.similarity;
     this.entity.setLocalScale(1 / scale, 1 / scale, 1 / scale);
     this.entity.setLocalEulerAngles(180, 0, 0); // from y down, z forward
-    this.entity.setLocalPosition(center[0], -center[1], -center[2]);
+    this.entity.setLocalPosition(middle[0], -middle[1], -middle[2]);
     this.component = this.entity.addComponent("gsplat") as GSplatComponent;
     this.handles.push(app.on("prerender", () => this.look()));
     this.entity.once("destroy", () => this.release());
@@ -117,6 +120,16 @@ export class StreamSplats {
     if (this.component.resource !== container) this.component.resource = container;
     for (const [name, texture] of this.textures!.textures) this.component.setParameter(name, texture);
     this.component.setParameter("structuredCount", anchors * offsetsPerAnchor);
+  }
+
+  /** Where the rig's first camera is and what the rig looks at, in the world. */
+  view(): { eye: Vec3; target: Vec3 } {
+    const toWorld = this.entity.getWorldTransform();
+    const cameras = rigCameras(this.header);
+    const [eye, target] = [center(cameras[0]!), focusPoint(cameras)].map((point) =>
+      toWorld.transformPoint(new Vec3(...point)),
+    );
+    return { eye: eye!, target: target! };
   }
 
   /** Removes the entity and releases what it has on the GPU. */

@@ -10,7 +10,17 @@ import {
   type StreamHeader,
   type StreamReader,
 } from "@structgstream/core";
-import { fetchStream, type Shape, sameShape, shapeOf, sizesOf, trainingCamerasOf } from "@structgstream/gl/shading";
+import {
+  center,
+  fetchStream,
+  focusPoint,
+  rigCameras,
+  type Shape,
+  sameShape,
+  shapeOf,
+  sizesOf,
+  trainingCamerasOf,
+} from "@structgstream/gl/shading";
 import { type IUniform, Matrix4, Vector3 } from "three";
 import { FieldTextures } from "./fieldTextures.js";
 import { splatOfNumber } from "./generator.js";
@@ -48,10 +58,10 @@ export class StreamSplats extends SplatGenerator {
 
   constructor(private readonly header: StreamHeader) {
     super({});
-    const { center, scale } = header.similarity;
+    const { center: middle, scale } = header.similarity;
     this.scale.setScalar(1 / scale);
     this.rotation.x = Math.PI; // from y down, z forward
-    this.position.set(center[0], -center[1], -center[2]);
+    this.position.set(middle[0], -middle[1], -middle[2]);
     this.frameUpdate = (context) => this.advance(context);
   }
 
@@ -78,6 +88,16 @@ export class StreamSplats extends SplatGenerator {
     this.updateVersion();
   }
 
+  /** Where the rig's first camera is and what the rig looks at, in the world. */
+  view(): { eye: Vector3; target: Vector3 } {
+    this.updateWorldMatrix(true, false);
+    const cameras = rigCameras(this.header);
+    const [eye, target] = [center(cameras[0]!), focusPoint(cameras)].map((point) =>
+      this.localToWorld(new Vector3(...point)),
+    );
+    return { eye: eye!, target: target! };
+  }
+
   /** Releases the textures; the object shows nothing any more. */
   dispose(): void {
     this.disposed = true;
@@ -85,7 +105,7 @@ export class StreamSplats extends SplatGenerator {
     this.numSplats = 0;
   }
 
-  /** Called before each picture of Spark, with its clock and the present camera. */
+  /** Called before each picture of Spark, with the present camera. */
   protected advance(context: FrameUpdateContext): void {
     if (this.textures) this.look(context);
   }
@@ -125,7 +145,7 @@ export class StreamSplats extends SplatGenerator {
   }
 }
 
-/** A whole stream that plays by the clock of Spark's renderer. */
+/** A whole stream, which plays while it is drawn. */
 export class StreamClip extends StreamSplats {
   readonly playback: Playback;
 
@@ -148,7 +168,8 @@ export class StreamClip extends StreamSplats {
   }
 
   protected override advance(context: FrameUpdateContext): void {
-    if (!this.disposed) this.playback.update(context.time);
+    // Spark 2.2 does not advance the time of its context.
+    if (!this.disposed) this.playback.update(performance.now() / 1000);
     super.advance(context);
   }
 }
