@@ -145,11 +145,18 @@ function rowsOf(capacity: number): Rows {
   return { means: rows(3), scales: rows(3), rotations: rows(4), colors: rows(3), opacities: rows(1) };
 }
 
-/** One MLP. Its hidden layer's sums over an anchor's features are stored until features or weights change. */
+/**
+ * One MLP. Its hidden layer's sums over an anchor's features are stored until features or weights change. The appearance of
+ * an anchor changes its features by `basis^T a`; because this is linear, it is an input of its own.
+ */
 class Head {
   private weights: Float32Array = new Float32Array(0);
   private sums: Float32Array = new Float32Array(0);
-  private sources: (Tensor | undefined)[] = [];
+  private given: Fields = new Map();
+  private appearance: Float32Array = new Float32Array(0);
+  /** [hidden, rank]: weights of the appearance. */
+  private mixed: Float32Array = new Float32Array(0);
+  private rank = 0;
   private inputs = 0;
   private features = 0;
   private hidden = 0;
@@ -164,10 +171,11 @@ class Head {
   constructor(private readonly field: "opacity_mlp" | "color_mlp" | "covariance_mlp") {}
 
   prepare(fields: Fields, distanceInput: boolean): void {
-    const names = [this.field, "anchor_features", "appearance", "appearance_basis"] as const;
-    const sources = names.map((name) => fields.get(name));
-    if (sources.every((source, i) => source === this.sources[i]) && this.sources.length) return;
-    this.sources = sources;
+    const basis = fields.get("appearance_basis");
+    this.appearance = basis ? floats(fields.get("appearance")!) : new Float32Array(0);
+    const names = [this.field, "anchor_features", "appearance_basis"] as const;
+    if (names.every((name) => fields.get(name) === this.given.get(name)) && this.given.size) return;
+    this.given = fields;
     const [anchors, features] = fields.get("anchor_features")!.shape as [number, number];
     const splats = fields.get("anchor_offsets")!.shape[1]!;
     const outputs = { opacity_mlp: 1, color_mlp: 3, covariance_mlp: 7 }[this.field] * splats;
@@ -180,18 +188,24 @@ class Head {
     this.biasesAt = this.outputsAt + outputs * this.hidden;
     this.active = new Int32Array(this.hidden);
     this.values = new Float32Array(this.hidden);
+    this.rank = basis?.shape[0] ?? 0;
+    this.mixed = new Float32Array(this.hidden * this.rank);
+    const first = this.weights.subarray(0, this.hidden * this.inputs);
+    if (basis) multiply(this.mixed, first, this.inputs, floats(basis), features, features);
     if (this.sums.length !== anchors * this.hidden) this.sums = new Float32Array(anchors * this.hidden);
-    this.sum(floats(fields.get("anchor_features")!), anchors, fields.get("appearance"), fields.get("appearance_basis"));
+    multiply(this.sums, floats(fields.get("anchor_features")!), features, first, this.inputs, features);
   }
 
   /** Evaluates the hidden layer of an anchor, seen along a unit vector from a distance in scene units. */
   look(anchor: number, ux: number, uy: number, uz: number, distance: number): void {
-    const { weights, inputs, features, hidden, sums, active, values, distanceInput } = this;
+    const { weights, inputs, features, hidden, sums, active, values, distanceInput, appearance, mixed, rank } = this;
     let count = 0;
     for (let unit = 0; unit < hidden; unit++) {
       const at = unit * inputs + features;
-      let sum = sums[anchor * hidden + unit]! + weights[at]! * ux + weights[at + 1]! * uy + weights[at + 2]! * uz;
+      let sum = weights[hidden * inputs + unit]! + sums[anchor * hidden + unit]!;
+      sum += weights[at]! * ux + weights[at + 1]! * uy + weights[at + 2]! * uz;
       if (distanceInput) sum += weights[at + 3]! * distance;
+      for (let r = 0; r < rank; r++) sum += mixed[unit * rank + r]! * appearance[anchor * rank + r]!;
       if (!(sum > 0)) continue;
       active[count] = unit;
       values[count++] = sum;
@@ -206,30 +220,24 @@ class Head {
     for (let i = 0; i < activeCount; i++) sum += weights[row + active[i]!]! * values[i]!;
     return sum;
   }
-
-  private sum(features: Float32Array, anchors: number, appearance?: Tensor, basis?: Tensor): void {
-    const { weights, inputs, hidden, sums } = this;
-    const columns = this.features;
-    const given = new Float32Array(columns);
-    for (let m = 0; m < anchors; m++) {
-      given.set(features.subarray(m * columns, (m + 1) * columns));
-      if (appearance && basis) addAppearance(given, appearance, basis, m);
-      for (let unit = 0; unit < hidden; unit++) {
-        let sum = weights[hidden * inputs + unit]!;
-        const row = unit * inputs;
-        for (let i = 0; i < columns; i++) sum += weights[row + i]! * given[i]!;
-        sums[m * hidden + unit] = sum;
-      }
-    }
-  }
 }
 
-function addAppearance(features: Float32Array, appearance: Tensor, basis: Tensor, anchor: number): void {
-  const rank = appearance.shape[1]!;
-  const [shares, rows] = [floats(appearance), floats(basis)];
-  for (let r = 0; r < rank; r++) {
-    const share = shares[anchor * rank + r]!;
-    for (let i = 0; i < features.length; i++) features[i]! += share * rows[r * features.length + i]!;
+/** `to = a b^T`: the first `columns` of rows that are `aStride` and `bStride` numbers apart. */
+function multiply(
+  to: Float32Array,
+  a: Float32Array,
+  aStride: number,
+  b: Float32Array,
+  bStride: number,
+  columns: number,
+): void {
+  let at = 0;
+  for (let i = 0; i < a.length; i += aStride) {
+    for (let j = 0; j < b.length; j += bStride) {
+      let sum = 0;
+      for (let column = 0; column < columns; column++) sum += a[i + column]! * b[j + column]!;
+      to[at++] = sum;
+    }
   }
 }
 
