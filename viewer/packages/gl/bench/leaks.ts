@@ -6,7 +6,7 @@
  */
 
 import type { ExampleStage } from "../test/support/examplePage.ts";
-import { openExample, playToEnd, settledCounts } from "../test/support/exampleRun.ts";
+import { grown, openExample, playToEnd, settledCounts } from "../test/support/exampleRun.ts";
 
 /** Growth of the heap after a forced collection, in bytes, that counts as a leak. */
 const MAX_GROWTH = 1 << 20;
@@ -18,11 +18,11 @@ const opened = await openExample(new URL(`../../${name}/test/example.ts`, import
 const session = await opened.page.context().newCDPSession(opened.page);
 await session.send("HeapProfiler.enable");
 
-async function measured(): Promise<{ heap: number; gpu: string }> {
-  const counts = await settledCounts(opened);
+async function measured(): Promise<{ heap: number; gpu: Record<string, number> }> {
+  const gpu = await settledCounts(opened);
   await session.send("HeapProfiler.collectGarbage");
   const { usedSize } = await session.send("Runtime.getHeapUsage");
-  return { heap: usedSize, gpu: JSON.stringify(counts) };
+  return { heap: usedSize, gpu };
 }
 
 await opened.page.evaluate(() => {
@@ -30,17 +30,16 @@ await opened.page.evaluate(() => {
 });
 let first: Awaited<ReturnType<typeof measured>> | undefined;
 let last = first;
-let leaks = false;
 for (let shown = 0; shown < Number(frames); ) {
   shown += await playToEnd(opened);
   last = await measured();
-  console.log(`${shown} frames: heap ${(last.heap / 1e6).toFixed(2)} MB, GPU ${last.gpu}`);
+  console.log(`${shown} frames: heap ${(last.heap / 1e6).toFixed(2)} MB, GPU ${JSON.stringify(last.gpu)}`);
   first ??= last;
 }
-leaks = last!.gpu !== first!.gpu || last!.heap - first!.heap > MAX_GROWTH;
+const leaks = grown(first!.gpu, last!.gpu).length > 0 || last!.heap - first!.heap > MAX_GROWTH;
 await opened.page.evaluate(() => stage.removeStreams());
 const removed = await measured();
-console.log(`removed: heap ${(removed.heap / 1e6).toFixed(2)} MB, GPU ${removed.gpu}`);
+console.log(`removed: heap ${(removed.heap / 1e6).toFixed(2)} MB, GPU ${JSON.stringify(removed.gpu)}`);
 console.log(`messages: ${JSON.stringify(opened.complaints)}`);
 await opened.close();
 process.exitCode = leaks || opened.complaints.length ? 1 : 0;

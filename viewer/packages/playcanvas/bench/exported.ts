@@ -16,6 +16,7 @@ import {
   Mat4,
   RESOLUTION_FIXED,
   RenderComponentSystem,
+  TextureHandler,
 } from "playcanvas";
 import { exportedStage } from "../../gl/test/support/exportedPage.ts";
 import type { EngineCamera } from "../../gl/test/support/ownPictures.ts";
@@ -45,7 +46,7 @@ async function picture(url: string, yDown: boolean, view: EngineCamera, settings
   const options = new AppOptions();
   options.graphicsDevice = await createGraphicsDevice(canvas, { deviceTypes: ["webgl2"], antialias: false });
   options.componentSystems = [CameraComponentSystem, GSplatComponentSystem, RenderComponentSystem];
-  options.resourceHandlers = [GSplatHandler, ContainerHandler];
+  options.resourceHandlers = [GSplatHandler, ContainerHandler, TextureHandler];
   const app = new AppBase(canvas);
   app.init(options);
   app.setCanvasResolution(RESOLUTION_FIXED, view.own.width, view.own.height);

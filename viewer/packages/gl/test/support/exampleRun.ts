@@ -8,6 +8,9 @@ import type { ExampleStage } from "./examplePage.ts";
 /** Pixels; software GL takes its time. */
 const VIEWPORT = { width: 80, height: 100 };
 
+/** An engine that reads back has a buffer more for a moment. */
+const TRANSIENT = 1;
+
 declare const stage: ExampleStage;
 
 /** @param files streams by the names under which the example loads them */
@@ -30,4 +33,9 @@ export async function settledCounts({ page }: Stage): Promise<Record<string, num
     for (let i = 0; i < 5; i++) await new Promise(requestAnimationFrame);
   });
   return page.evaluate(() => stage.glCounts());
+}
+
+/** What there is more of than before, transient objects aside. */
+export function grown(before: Readonly<Record<string, number>>, after: Readonly<Record<string, number>>): string[] {
+  return Object.keys(after).filter((kind) => after[kind]! > before[kind]! + TRANSIENT);
 }
