@@ -6,8 +6,10 @@ export { checkFollows, type Frame, fieldBytes, type Packet, packetOf, SceneDecod
 export { StreamError } from "./errors.js";
 export { FIELD_NAMES, type FieldName, type Fields, type Tensor } from "./fields.js";
 export { FOOTER_BYTES, type IndexEntry, indexEntries, indexOffset } from "./fileIndex.js";
+export { GaussianEvaluator, type GaussianOptions, type Gaussians, type Point } from "./gaussians.js";
 export { type Camera, difference, type Period, type Similarity, type StreamHeader } from "./header.js";
 export { unpackedHeader } from "./initRecord.js";
+export { Playback, type PlaybackOptions } from "./playback.js";
 export { type PacketInfo, type ReaderState, readStream, StreamReader } from "./reader.js";
 export {
   CHECKSUM_BYTES,

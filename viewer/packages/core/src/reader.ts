@@ -150,16 +150,17 @@ export class StreamReader {
   }
 
   /**
-   * The scene of one frame. The frame after the last one is decoded from it; any other from its key packet on.
+   * The scene of one frame, decoded from the last one if that is in the same group and earlier, else from its key packet on.
    *
    * @throws StreamError there is no such frame, or it was removed, lost or damaged
    */
   frame(index: number): Frame {
     if (!this.shown[index]) throw this.missing(index);
     const scenes = this.decoderOf(index);
-    const first = this.decoded === index - 1 ? index : this.groupStart(index);
+    const [start, after] = [this.groupStart(index), (this.decoded ?? index) + 1];
+    const first = start < after && after <= index ? after : start;
     this.decoded = undefined; // until a packet has been decoded
-    for (let i = first; i < index; i++) scenes.decode(this.packet(i));
+    for (let i = first; i < index; i++) scenes.advance(this.packet(i));
     const frame = scenes.decode(this.packet(index));
     this.decoded = index;
     return frame;

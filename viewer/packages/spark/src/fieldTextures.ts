@@ -1,63 +1,41 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The fields of a scene and its training cameras as three.js textures: four numbers per texel, in the shader's order. */
+/** The fields of a scene and its training cameras as three.js textures. */
 
-import type { FieldName, Fields, Tensor } from "@structgstream/core";
+import type { Fields } from "@structgstream/core";
 import {
-  packedWeights,
-  paddedRows,
+  FieldTables,
   type Shape,
+  TABLE_NAMES,
   TABLE_WIDTH_BITS,
+  type TableName,
   type TrainingCameras,
 } from "@structgstream/gl/shading";
 import { DataTexture, FloatType, type IUniform, RGBAFormat } from "three";
 
 const WIDTH = 1 << TABLE_WIDTH_BITS;
 
-/** Names in the shader, and their fields. */
-const TABLES: Readonly<Record<string, readonly FieldName[]>> = {
-  positions: ["anchor_positions"],
-  offsetScales: ["offset_scales"],
-  baseScales: ["base_scales"],
-  offsets: ["anchor_offsets"],
-  features: ["anchor_features"],
-  appearance: ["appearance"],
-  free: ["free"],
-  weights: ["opacity_mlp", "color_mlp", "covariance_mlp", "appearance_basis"],
-};
-
 export class FieldTextures {
   /** By names in the shader; three.js uploads changes. */
-  readonly uniforms: Readonly<Record<string, IUniform<DataTexture>>>;
-  private written = new Map<FieldName, Tensor | undefined>();
+  readonly uniforms: Readonly<Record<TableName | "cameras", IUniform<DataTexture>>>;
+  private readonly tables: FieldTables;
 
-  constructor(
-    private readonly shape: Shape,
-    training: TrainingCameras,
-  ) {
-    const empty = Object.keys(TABLES).map((name) => [name, { value: table(new Float32Array(4)) }] as const);
-    this.uniforms = { ...Object.fromEntries(empty), cameras: { value: table(training.rows) } };
+  constructor(shape: Shape, training: TrainingCameras) {
+    this.tables = new FieldTables(shape);
+    const empty = TABLE_NAMES.map((name) => [name, { value: table(new Float32Array(4)) }] as const);
+    const cameras = ["cameras", { value: table(training.rows) }] as const;
+    this.uniforms = Object.fromEntries([...empty, cameras]) as FieldTextures["uniforms"];
   }
 
-  /** Sets a scene of the same shape; fields that are the same objects as before are not uploaded again. */
+  /** Sets a scene of the same shape. */
   write(fields: Fields): void {
-    for (const [name, sources] of Object.entries(TABLES)) {
-      if (sources.every((source) => fields.get(source) === this.written.get(source))) continue;
-      const uniform = this.uniforms[name]!;
-      uniform.value = written(uniform.value, this.numbers(name, fields));
+    for (const [name, numbers] of this.tables.changed(fields)) {
+      const uniform = this.uniforms[name];
+      uniform.value = written(uniform.value, numbers);
     }
-    this.written = new Map(fields);
   }
 
   dispose(): void {
     for (const { value } of Object.values(this.uniforms)) value.dispose();
-  }
-
-  private numbers(name: string, fields: Fields): Float32Array {
-    if (name === "weights") return packedWeights(fields, this.shape);
-    const tensor = fields.get(TABLES[name]![0]!)!;
-    const data = tensor.data as Float32Array;
-    // Offsets have three numbers for each Gaussian, all others one row for each anchor or free Gaussian.
-    return paddedRows(data, name === "offsets" ? 3 : tensor.shape[1]!);
   }
 }
 

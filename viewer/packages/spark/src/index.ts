@@ -1,3 +1,3 @@
 // SPDX-License-Identifier: Apache-2.0
 
-export { StreamSplats } from "./streamSplats.js";
+export { blurAmount, RENDERING, StreamClip, StreamSplats } from "./streamSplats.js";

@@ -3,10 +3,10 @@
 
 import { SparkRenderer } from "@sparkjsdev/spark";
 import { readStream, type StreamReader } from "@structgstream/core";
-import { type Camera, resized, rigCamera, SplatRenderer } from "@structgstream/gl";
-import { Matrix4, PerspectiveCamera, Scene, WebGLRenderer } from "three";
+import { PerspectiveCamera, Scene, WebGLRenderer } from "three";
+import { type EngineCamera, engineCamera, OwnPictures } from "../../gl/test/support/ownPictures.ts";
 import { base64, pixelsOf } from "../../gl/test/support/pixels.ts";
-import { StreamSplats } from "../src/index.ts";
+import { blurAmount, RENDERING, StreamSplats } from "../src/index.ts";
 
 /** Spark sorts in a worker; a picture is in order once sorting has been idle for so many pictures in a row. */
 const PICTURES = 4;
@@ -17,17 +17,12 @@ export class Pair {
   private readonly renderer = new WebGLRenderer({ preserveDrawingBuffer: true });
   private readonly scene = new Scene();
   private readonly spark: SparkRenderer;
-  private readonly own: SplatRenderer;
+  private readonly own: OwnPictures;
 
   constructor(private readonly reader: StreamReader) {
     this.splats = new StreamSplats(reader.header!);
-    this.own = new SplatRenderer(document.createElement("canvas"), { sorter: new URL("/sorter.js", location.href) });
-    // The package draws no environment.
-    const known = [...reader.header!.static].filter(([name]) => name !== "environment");
-    this.own.load({ ...reader.header!, static: new Map(known) });
-    // The low-pass of the training pictures is in the scales; the order is that of depth.
-    const rules = { preBlurAmount: 0, blurAmount: 0, sortRadial: false, maxStdDev: 3, clipXY: 4 };
-    this.spark = new SparkRenderer({ renderer: this.renderer, ...rules });
+    this.own = new OwnPictures(reader);
+    this.spark = new SparkRenderer({ renderer: this.renderer, ...RENDERING });
     this.scene.add(this.spark, this.splats);
   }
 
@@ -40,19 +35,13 @@ export class Pair {
     name: string,
     size = 1,
   ): Promise<{ spark: string; own: string; width: number; height: number }> {
-    const { fields, ptsSeconds } = this.reader.frame(index);
-    const filmed = rigCamera(this.reader.header!, name);
-    const [width, height] = [Math.round(size * filmed.width), Math.round(size * filmed.height)];
-    const camera = resized(filmed, width, height);
-    const changed = [...fields].filter(([name]) => this.reader.header!.dynamic.has(name));
-    this.own.update({ index, ptsSeconds, fields: new Map(changed) });
-    await this.own.renderSettled(camera);
-    const own = await pixelsOf(await this.own.screenshot());
-    this.splats.show(fields);
-    // What smaller pictures lack against aliasing.
-    this.spark.blurAmount = Math.max(0.15 - 0.3 * size * size, 0);
+    const camera = engineCamera(this.reader, name, size);
+    const { width, height } = camera.own;
+    const own = await this.own.picture(index, camera.own);
+    this.splats.show(this.reader.frame(index).fields);
+    this.spark.blurAmount = blurAmount(size);
     this.renderer.setSize(width, height, false);
-    const eye = this.threeCamera(name, camera);
+    const eye = threeCamera(camera);
     for (let atRest = 0; atRest < PICTURES; ) {
       this.renderer.render(this.scene, eye);
       await new Promise((resolve) => setTimeout(resolve, PAUSE_MILLISECONDS));
@@ -74,23 +63,14 @@ export class Pair {
     this.splats.dispose();
     this.renderer.dispose();
   }
+}
 
-  /** The same camera in three's axes, in units of the capture. */
-  private threeCamera(name: string, { K, width, height }: Camera): PerspectiveCamera {
-    const { viewmat, near } = this.reader.header!.cameras.find((camera) => camera.name === name)!;
-    const camera = new PerspectiveCamera();
-    const flip = new Matrix4().makeScale(1, -1, -1);
-    const toWorld = new Matrix4()
-      .fromArray([...viewmat])
-      .transpose()
-      .invert();
-    flip.clone().multiply(toWorld).multiply(flip).decompose(camera.position, camera.quaternion, camera.scale);
-    const [x, y] = [near / K.fx, near / K.fy];
-    const far = 1000 * near;
-    camera.projectionMatrix.makePerspective(-K.cx * x, (width - K.cx) * x, K.cy * y, (K.cy - height) * y, near, far);
-    camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
-    return camera;
-  }
+function threeCamera({ toWorld, left, right, top, bottom, near, far }: EngineCamera): PerspectiveCamera {
+  const camera = new PerspectiveCamera();
+  camera.matrix.fromArray([...toWorld]).decompose(camera.position, camera.quaternion, camera.scale);
+  camera.projectionMatrix.makePerspective(left, right, top, bottom, near, far);
+  camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
+  return camera;
 }
 
 async function open(url: string): Promise<Pair> {

@@ -17,6 +17,12 @@ export interface Stage {
   close(): Promise<void>;
 }
 
+export interface PageOptions {
+  readonly viewport?: { readonly width: number; readonly height: number };
+  /** Of the page's address. */
+  readonly query?: string;
+}
+
 /**
  * @param files what the server gives in addition to the page, by name: paths on this machine
  * @param script what runs in the page; it sets `globalThis.stage`
@@ -25,6 +31,7 @@ export async function openStage(
   executablePath: string,
   files: Readonly<Record<string, string>>,
   script = new URL("page.ts", import.meta.url),
+  { viewport, query = "" }: PageOptions = {},
 ): Promise<Stage> {
   const sorterScript = new URL("../../src/sorter.worker.ts", import.meta.url);
   const [page, sorter] = await Promise.all([script, sorterScript].map((url) => bundled(fileURLToPath(url))));
@@ -46,7 +53,7 @@ export async function openStage(
   let browser: Browser | undefined;
   try {
     browser = await launched(executablePath);
-    const opened = await browser.newPage();
+    const opened = await browser.newPage(viewport ? { viewport } : {});
     const complaints: string[] = [];
     opened.on("pageerror", (error) => complaints.push(error.message));
     opened.on("console", (message) => {
@@ -55,7 +62,7 @@ export async function openStage(
       const usual = text.includes("favicon") || text.includes("GPU stall due to ReadPixels");
       if (["error", "warning"].includes(message.type()) && !usual) complaints.push(text);
     });
-    await opened.goto(`http://127.0.0.1:${(server.address() as AddressInfo).port}/`);
+    await opened.goto(`http://127.0.0.1:${(server.address() as AddressInfo).port}/${query}`);
     await opened.waitForFunction("globalThis.stage !== undefined");
     const running = browser;
     return { page: opened, complaints, close: () => closed(running, server) };

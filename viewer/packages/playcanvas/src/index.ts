@@ -1,0 +1,3 @@
+// SPDX-License-Identifier: Apache-2.0
+
+export { RENDERING, StreamClip, StreamSplats } from "./streamSplats.js";
