@@ -28,6 +28,7 @@ from structgstream.codec.container.records import (
 )
 from structgstream.codec.header import unpack_header
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet
+from structgstream.codec.sound import FrameSound, unpack_sound
 from structgstream.errors import StreamError
 
 LOST = 2**64 - 1
@@ -36,7 +37,8 @@ LOST = 2**64 - 1
 
 @dataclass(frozen=True)
 class PacketInfo:
-    """Facts of one packet: ``bytes`` is the length of its record, ``field_bytes`` that of each field's part."""
+    """Facts of one packet: ``bytes`` is the length of its record and of its sound's, ``field_bytes`` that of each field's
+    part, and of the record of the sound as ``sound``."""
 
     kind: PacketKind
     index: int
@@ -104,7 +106,13 @@ class Packets(PacketInfos):
                 raise self.damaged(index) from error
             raise
         field_bytes: dict[str, int] = {block.name: block.end - block.start for block in blocks}
-        return PacketInfo(PACKET_KINDS[head.type], index, pts_seconds, offset, head.bytes, field_bytes)
+        sound = read_head(self._data, offset + head.bytes)
+        if sound is None or sound.type != RecordType.SOUND:
+            return PacketInfo(PACKET_KINDS[head.type], index, pts_seconds, offset, head.bytes, field_bytes)
+        size = head.bytes + sound.bytes
+        return PacketInfo(
+            PACKET_KINDS[head.type], index, pts_seconds, offset, size, field_bytes | {"sound": sound.bytes}
+        )
 
     def packet(self, index: int) -> Packet:
         """The packet of a frame that is not lost; its checksum is verified."""
@@ -115,6 +123,15 @@ class Packets(PacketInfos):
         if packet.index != index:
             raise self.damaged(index)
         return packet
+
+    def sound(self, index: int) -> FrameSound | None:
+        """The sound that is stored with a frame that is not lost; None if there is none, or it is damaged."""
+        head = read_head(self._data, self.offsets[index])
+        record = None if head is None else read_record(self._data, self.offsets[index] + head.bytes)
+        if record is None or record.type != RecordType.SOUND:
+            return None
+        sound = unpack_sound(record.payload)
+        return sound if sound.index == index else None
 
     def damaged(self, index: int) -> StreamError:
         """The error for a packet that was damaged after opening."""
@@ -195,6 +212,7 @@ def differences(first: StreamHeader, later: StreamHeader) -> Sequence[str]:
         "similarity": first.similarity != later.similarity,
         "frames a second": first.fps != later.fps,
         "codec": first.codec != later.codec,
+        "sound": first.sound != later.sound,
     }
     return [name for name, differs in found.items() if differs]
 

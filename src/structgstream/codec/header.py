@@ -20,6 +20,7 @@ from structgstream.codec.container.blocks import (
 )
 from structgstream.codec.fields.static_fields import UNCODED_FIELDS, decode_fields, encode_fields
 from structgstream.codec.packets import StreamHeader
+from structgstream.codec.sound import sound_format
 from structgstream.errors import CalibrationError, StreamError
 from structgstream.scene.state import FIELDS, STATE_TABLE, FieldName
 from structgstream.similarity import Similarity
@@ -112,6 +113,7 @@ def pack_header(header: StreamHeader) -> bytes:
         **({"steps": dict(header.steps)} if header.steps else {}),
         **({"init_steps": dict(header.init_steps)} if header.init_steps else {}),
         **({"periods": True} if header.periods else {}),
+        **({"sound": header.sound.plain()} if header.sound else {}),
     }
     fields: dict[FieldName, Tensor] = {**header.static, **header.reference}
     coded = encode_fields(fields, header.init_steps) if header.codec == "compact" else {}
@@ -211,6 +213,7 @@ def _header(description: dict[str, Any], static: Mapping[FieldName, Tensor]) -> 
         init_steps=_steps(description.get("init_steps", {})),
         reference={name: value for name, value in static.items() if name in dynamic},
         periods=flags[1],
+        sound=sound_format(description.get("sound")),
     )
 
 

@@ -10,12 +10,13 @@ from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.codec.container.blocks import iterate_blocks
-from structgstream.codec.container.records import FRAME, PacketKind
+from structgstream.codec.container.records import FRAME, PacketKind, RecordType, packed
+from structgstream.codec.sound import SoundFormat
 from structgstream.errors import ConfigError, StreamError
 from structgstream.scene.state import FieldName
 from structgstream.similarity import Similarity
 
-__all__ = ["Packet", "PacketKind", "PacketSink", "StreamHeader", "packet_from_blocks", "parse_packet"]
+__all__ = ["Packet", "PacketKind", "PacketSink", "StreamHeader", "packet_from_blocks", "parse_packet", "sound_record"]
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,7 @@ class StreamHeader:
         init_steps: ``compact`` only: quantization steps by field of ``static`` and ``reference``
             (``static_fields.py``), each a float32 number.
         periods: whether other periods, with init records of their own, may follow.
+        sound: what is stored beside the frames; None for no sound.
     """
 
     rig: CameraRig
@@ -52,6 +54,7 @@ class StreamHeader:
     reference: Mapping[FieldName, Tensor] = field(default_factory=dict)
     init_steps: Mapping[FieldName, float] = field(default_factory=dict)
     periods: bool = False
+    sound: SoundFormat | None = None
 
     def camera(self, camera: Camera | str) -> Camera:
         """A camera in the normalised units of the decoded scenes; it shows the same picture.
@@ -79,6 +82,7 @@ class Packet:
         pts_seconds: presentation time.
         payload: the coded fields.
         field_bytes: length of each field's part of the payload.
+        sound: payload of the sound record that follows; None in a stream without sound.
     """
 
     kind: PacketKind
@@ -86,9 +90,15 @@ class Packet:
     pts_seconds: float
     payload: bytes
     field_bytes: Mapping[str, int]
+    sound: bytes | None = None
 
     def __repr__(self) -> str:
         return f"Packet({self.kind.name}, index={self.index}, {len(self.payload)} bytes)"
+
+
+def sound_record(packet: Packet) -> bytes:
+    """The record of a packet's sound; nothing in a stream without sound."""
+    return b"" if packet.sound is None else packed(RecordType.SOUND, packet.sound)
 
 
 class PacketSink(Protocol):

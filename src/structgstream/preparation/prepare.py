@@ -28,6 +28,7 @@ from structgstream.data.prepared import (
     recognizes_prepared,
     write_prepared,
 )
+from structgstream.data.sound import read_audio
 from structgstream.data.source import FrameSource
 from structgstream.data.timeline import Clock
 from structgstream.data.undistortion import rectilinear
@@ -66,6 +67,7 @@ from structgstream.preparation.solvers import (
     summary,
     unpacked,
 )
+from structgstream.preparation.sound import best_microphone
 from structgstream.preparation.steps import FOLDER, Job, Listener, Silent, Steps, Stored, fingerprint
 from structgstream.similarity import rig_radius
 
@@ -383,6 +385,21 @@ class CaptureSteps:
         write_prepared(self.capture, content)
         return content
 
+    def sound(self, footage: Footage, content: PreparedCapture) -> None:
+        """Chooses the camera whose sound streams get."""
+        if not footage.tracks:
+            return
+        found = self.steps.run(
+            "sound",
+            {"files": fingerprint(footage.files)},
+            lambda: best_microphone((name, read_audio(footage.files[name])) for name in footage.cameras),
+            pack=lambda camera: Stored({"camera": camera}),
+            unpack=lambda stored: stored.values["camera"],
+            summary=lambda camera: "no camera has any" if camera is None else f"the microphone of {camera} is the best",
+        )
+        if found is not None:
+            write_prepared(self.capture, replace(content, sound=found))
+
     def check(self, content: PreparedCapture) -> tuple[Finding, ...]:
         from structgstream.preparation.report import write_report
 
@@ -524,6 +541,7 @@ def _made(job: Job, find: CameraSteps, footage: Footage, method: str | Calibrati
     make.link(footage, content)
     content = make.points(make.near(content))
     findings = make.check(content)
+    make.sound(footage, content)
     return Preparation(
         job.capture, findings, job.steps.summaries, tuple(job.steps.skipped), job.capture / REPORT / "index.html"
     )

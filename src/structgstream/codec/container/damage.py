@@ -4,9 +4,10 @@
 import math
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
-from structgstream.codec.container.blocks import LENGTH
+from structgstream.codec.container.blocks import LENGTH, read_description
 from structgstream.codec.container.byte_source import ByteSource
 from structgstream.codec.container.records import (
     CHECKSUM,
@@ -128,8 +129,17 @@ def _fits(record: Record, standing: Standing) -> bool:
     return standing.frames <= indexed_frames(record.payload) <= standing.last_frame_at(record.offset)
 
 
+def _states_sound(payload: bytes) -> bool:
+    """Whether the description of an init record states sound; what is no description is reported by who reads it."""
+    with suppress(StreamError, ValueError):
+        return "sound" in read_description(payload)
+    return False
+
+
 def readable_part(data: ByteSource, *, name: str) -> int | None:
     """End of the last whole packet, before the index; None if the file is truncated within the init record.
+
+    In a stream with sound, a packet counts when the sound record after it is whole: both are written at once.
 
     Raises:
         StreamError: not a stream, another major version, or a damaged init record, after which restarting would
@@ -139,6 +149,7 @@ def readable_part(data: ByteSource, *, name: str) -> int | None:
         return None  # Cut within the prefix, or empty.
     check_prefix(data, name)
     end, standing, complete = PREFIX.size, Standing(PREFIX.size, 0, -math.inf), False
+    has_sound = False
     for record in scan_records(data):
         if complete := record.type == RecordType.INDEX:
             break
@@ -146,10 +157,13 @@ def readable_part(data: ByteSource, *, name: str) -> int | None:
         if record.type == RecordType.INIT and record.offset > PREFIX.size:
             standing = replace(standing, period=record.period)
             continue  # What a period begins with is written with its first packet, and again when that is cut.
-        end = record.end
+        is_packet = record.type in (RecordType.KEY, RecordType.DELTA)
+        if not (is_packet and has_sound):
+            end = record.end
         if record.type == RecordType.INIT:
             standing = replace(standing, period=record.period)
-        elif record.type in (RecordType.KEY, RecordType.DELTA):
+            has_sound = _states_sound(record.payload)
+        elif is_packet:
             standing = replace(standing, frames=standing.frames + 1)
     # A crash cannot leave whole frames after a damaged one; a failing disk can.
     lost = not complete and PacketSearch(data).next(standing.offset, standing) is not None
