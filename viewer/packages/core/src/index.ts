@@ -8,7 +8,7 @@ export { FIELD_NAMES, type FieldName, type Fields, type Tensor } from "./fields.
 export { FOOTER_BYTES, type IndexEntry, indexEntries, indexOffset } from "./fileIndex.js";
 export { type Camera, difference, type Period, type Similarity, type StreamHeader } from "./header.js";
 export { unpackedHeader } from "./initRecord.js";
-export { type PacketInfo, type ReaderState, readStream, StreamReader } from "./reader.js";
+export { type PacketInfo, type ReaderState, readStream, type StoredSound, StreamReader } from "./reader.js";
 export {
   CHECKSUM_BYTES,
   checkPrefix,
@@ -19,3 +19,4 @@ export {
   recordIn,
   type StreamRecord,
 } from "./records.js";
+export { type FrameSound, PACKET_SAMPLES, SOUND_RATE, type SoundFormat, soundOf } from "./sound.js";
