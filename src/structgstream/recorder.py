@@ -18,8 +18,8 @@ from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsS
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.codec.segments.stored_bytes import read_manifest
 from structgstream.codec.sinks import StoredSegments, resume_segments
-from structgstream.codec.sound import SoundFormat
-from structgstream.data.sound import SoundSource, frame_sound
+from structgstream.codec.sound import SoundFormat, frame_sound
+from structgstream.data.sound import SoundSource
 from structgstream.data.source import FrameStream, frame_count
 from structgstream.data.wrappers import read_ahead
 from structgstream.errors import StorageError, StreamError

@@ -25,8 +25,9 @@ from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.segments.sink import Clocks, SegmentsSink
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.sinks import MemorySink
-from structgstream.codec.sound import SAMPLE_RATE, FrameSound, SoundFormat
-from structgstream.data.sound import SoundEncoder, frame_sound
+from structgstream.codec.sound import FrameSound, SoundFormat, frame_sound
+from structgstream.data.sound import SoundEncoder
+from structgstream.opus import SAMPLE_RATE
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, scene_of, state_of
 from structgstream.similarity import Similarity

@@ -37,8 +37,8 @@ LOST = 2**64 - 1
 
 @dataclass(frozen=True)
 class PacketInfo:
-    """Facts of one packet: ``bytes`` is the length of its record and of its sound's, ``field_bytes`` that of each field's
-    part, and of the record of the sound as ``sound``."""
+    """Facts of one packet: ``bytes`` is the length of its record and of its sound's, ``field_bytes`` that of each
+    field's part, and of the record of the sound as ``sound``."""
 
     kind: PacketKind
     index: int

@@ -3,19 +3,13 @@
 
 import math
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from structgstream.errors import StreamError
+from structgstream.opus import PACKET_SECONDS, OpusPacket, is_packet
 
-SAMPLE_RATE = 48_000
-"""Of what decoding gives, in hertz."""
-PACKET_SAMPLES = 960
-"""Of each packet and channel: 20 ms."""
-PACKET_SECONDS = PACKET_SAMPLES / SAMPLE_RATE
-PREROLL_PACKETS = 8
-"""Decoded before the first packet that is heard, where decoding begins within the sound; RFC 7845 asks for four."""
-MAX_PACKET_BYTES = 1275
 _HEAD = struct.Struct("<IdH")  # frame, seconds, number of packets
 _CODEC = "opus"
 
@@ -89,17 +83,19 @@ def unpack_sound(payload: bytes) -> FrameSound:
     return FrameSound(index, seconds, tuple(packets))
 
 
-def is_packet(packet: bytes) -> bool:
-    """Whether this may be an Opus packet of 20 ms, by its first bytes (RFC 6716, section 3.1)."""
-    if not 1 <= len(packet) <= MAX_PACKET_BYTES:
-        return False
-    config, code = packet[0] >> 3, packet[0] & 3
-    if config < 12:
-        frame = (10.0, 20.0, 40.0, 60.0)[config & 3]
-    elif config < 16:
-        frame = (10.0, 20.0)[config & 1]
-    else:
-        frame = (2.5, 5.0, 10.0, 20.0)[config & 3]
-    if code < 3:
-        return frame * (1 if code == 0 else 2) == 20.0
-    return len(packet) > 1 and frame * (packet[1] & 63) == 20.0
+MAX_FRAME_PACKETS = 2**16 - 1
+"""Packets of one record: 21 minutes."""
+
+
+def frame_sound(index: int, pts_seconds: float, packets: Sequence[OpusPacket]) -> FrameSound:
+    """The packets as a frame's sound. Before a gap, after which live sound begins again, nothing is stored.
+
+    Args:
+        pts_seconds: of the frame, for one without sound.
+    """
+    start = max(len(packets) - MAX_FRAME_PACKETS, 0)
+    for place in range(start + 1, len(packets)):
+        if abs(packets[place].seconds - packets[place - 1].seconds - PACKET_SECONDS) > PACKET_SECONDS / 2:
+            start = place
+    first = packets[start].seconds if packets else pts_seconds
+    return FrameSound(index, first, tuple(packet.data for packet in packets[start:]))

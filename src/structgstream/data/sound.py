@@ -20,13 +20,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.codec.sound import PACKET_SAMPLES, PACKET_SECONDS, SAMPLE_RATE, FrameSound
 from structgstream.data.source import FrameSource
 from structgstream.data.timeline import Clock
 from structgstream.data.video import VideoSource
 from structgstream.data.video_index import load_av
 from structgstream.data.wrappers import EveryNthFrame, Section, SourceWrapper
 from structgstream.errors import CaptureError, ConfigError
+from structgstream.opus import PACKET_SAMPLES, PACKET_SECONDS, SAMPLE_RATE, OpusPacket
 
 if TYPE_CHECKING:
     from av.audio.frame import AudioFrame
@@ -41,17 +41,7 @@ GAP_SECONDS = 0.03
 """Difference of a time stamp from the samples before it above which something is missing, or comes twice."""
 SAME_RATE = 1e-7
 """Rates of clocks that differ from 1 by less count as 1: 0.4 ms in an hour."""
-MAX_FRAME_PACKETS = 2**16 - 1
-"""Packets that are stored with one frame: 21 minutes."""
 RATE_FACTOR = 1000  # Rates in hertz are whole numbers; those of clocks differ from 1 by millionths.
-
-
-@dataclass(frozen=True)
-class OpusPacket:
-    """20 ms of sound."""
-
-    seconds: float  # presentation time of the first sample that decoding gives
-    data: bytes
 
 
 class SoundFeed(Protocol):
@@ -324,18 +314,25 @@ def camera_videos(source: FrameSource) -> dict[str, Path]:
     return {name: track.path for name, track in source.tracks.items()} if isinstance(source, VideoSource) else {}
 
 
-def frame_sound(index: int, pts_seconds: float, packets: Sequence[OpusPacket]) -> FrameSound:
-    """The packets as a frame's sound. Before a gap, after which live sound begins again, nothing is stored.
+class SoundDecoder:
+    """Decodes the sound of frames in order."""
 
-    Args:
-        pts_seconds: of the frame, for one without sound.
-    """
-    start = max(len(packets) - MAX_FRAME_PACKETS, 0)
-    for place in range(start + 1, len(packets)):
-        if abs(packets[place].seconds - packets[place - 1].seconds - PACKET_SECONDS) > PACKET_SECONDS / 2:
-            start = place
-    first = packets[start].seconds if packets else pts_seconds
-    return FrameSound(index, first, tuple(packet.data for packet in packets[start:]))
+    def __init__(self, channels: int) -> None:
+        self._channels = channels
+        self._codec: Any = None
+        self._end = 0.0
+
+    def decode(self, packets: Sequence[bytes], seconds: float) -> NDArray[np.float32]:
+        """Samples ``[N, channels]`` in [-1, 1] at 48 kHz of packets whose first sample sounds at ``seconds``."""
+        av = load_av()
+        parts = [np.zeros((0, self._channels), np.float32)]
+        if self._codec is None or (packets and abs(seconds - self._end) > PACKET_SECONDS / 2):
+            self._codec = av.CodecContext.create("opus", "r")
+            self._codec.sample_rate, self._codec.layout = SAMPLE_RATE, "mono" if self._channels == 1 else "stereo"
+        for packet in packets:
+            parts += [frame.to_ndarray().T for frame in self._codec.decode(av.Packet(packet))]
+        self._end = seconds + len(packets) * PACKET_SECONDS
+        return np.concatenate(parts)
 
 
 @contextmanager

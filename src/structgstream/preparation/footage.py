@@ -33,12 +33,13 @@ from structgstream.data.camera_files import (
 from structgstream.data.images import PICTURE_SUFFIXES, check_one_series, picture_size, read_picture, significant_bits
 from structgstream.data.posed_capture import filmed_roots
 from structgstream.data.prepared import pictures_of
-from structgstream.data.sound import SAMPLE_RATE, read_audio
+from structgstream.data.sound import read_audio
 from structgstream.data.timeline import natural, picture_slots
 from structgstream.data.video import measured_fps
 from structgstream.data.video_index import VIDEO_SUFFIXES, VideoTrack, open_video, scan_videos, video_stream
 from structgstream.data.video_pictures import pictures_at
 from structgstream.errors import CaptureError
+from structgstream.opus import SAMPLE_RATE
 
 _log = logging.getLogger(__name__)
 

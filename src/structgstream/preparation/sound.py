@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from structgstream.data.prepared import read_prepared, recognizes_prepared
 from structgstream.data.sound import (
-    SAMPLE_RATE,
     SoundFile,
     camera_clock,
     camera_videos,
@@ -23,6 +22,7 @@ from structgstream.data.sound import (
 from structgstream.data.source import FrameSource
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError, ConfigError
+from structgstream.opus import SAMPLE_RATE
 from structgstream.preparation.synchronization.audio import PairLag, UnusableSoundError, audio_lags, sound_of
 
 log = logging.getLogger(__name__)

@@ -7,7 +7,8 @@ import threading
 from collections import deque
 from typing import TYPE_CHECKING
 
-from structgstream.data.sound import MAX_FRAME_PACKETS, OpusPacket, SoundEncoder
+from structgstream.data.sound import SoundEncoder
+from structgstream.opus import OpusPacket
 
 if TYPE_CHECKING:
     from av.audio.frame import AudioFrame
@@ -16,6 +17,8 @@ log = logging.getLogger(__name__)
 
 MAX_EARLY = 4096
 """Frames of sound that wait for the first set of pictures, which states when presentation begins; 87 s of AAC."""
+MAX_WAITING = 2**16 - 1
+"""Packets that wait for the next frame: 21 minutes, as many as it can have."""
 MAX_SILENCE_SECONDS = 10.0
 """After a longer gap sound begins again instead of being silent that long."""
 
@@ -80,7 +83,7 @@ class LiveFeed:
     channels = LiveSound.channels
 
     def __init__(self) -> None:
-        self._packets: deque[OpusPacket] = deque(maxlen=MAX_FRAME_PACKETS)
+        self._packets: deque[OpusPacket] = deque(maxlen=MAX_WAITING)
 
     def add(self, packets: list[OpusPacket]) -> None:
         """Further packets."""
