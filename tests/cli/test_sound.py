@@ -2,6 +2,7 @@
 """Sound through the commands: reconstructed, continued, in segments, rendered; and what cannot be."""
 
 import shutil
+from itertools import pairwise
 from pathlib import Path
 
 import av
@@ -158,7 +159,7 @@ def in_video(path: Path) -> tuple[list[float], list[float]]:
             heard.append(at)
     with av.open(str(path)) as container:
         light = [(frame.time, float(frame.to_ndarray(format="gray").mean())) for frame in container.decode(video=0)]
-    return heard, [at for (_, before), (at, now) in zip(light, light[1:], strict=False) if now > 100 >= before]
+    return heard, [at for (_, before), (at, now) in pairwise(light) if now > 100 >= before]
 
 
 def test_a_rendered_video_has_the_clap_with_its_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

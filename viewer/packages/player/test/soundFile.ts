@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 /** The golden stream with sound, of a second with a clap and a white picture in its middle, as often as a test wants. */
 
-import { bytesOf, joined, piecesOf, record, VECTORS } from "../../core/test/streams.ts";
 import { HEAD_BYTES, RecordType, viewOf } from "../../core/src/records.ts";
+import { bytesOf, joined, piecesOf, record, VECTORS } from "../../core/test/streams.ts";
 
 export const FPS = 12;
 /** In each second, of the clap and of the white picture. */

@@ -83,7 +83,9 @@ async function differences(page: Page, count: number): Promise<number[]> {
 
 function expectInStep(found: readonly number[], where: string): void {
   const middle = found[found.length >> 1];
-  console.info(`${where}: sound is ${middle?.toFixed(1)} ms after the picture, each ${found.map((ms) => ms.toFixed(0))}`);
+  console.info(
+    `${where}: sound is ${middle?.toFixed(1)} ms after the picture, each ${found.map((ms) => ms.toFixed(0))}`,
+  );
   expect(Math.abs(middle ?? Number.NaN)).toBeLessThan(MOST_MILLISECONDS);
 }
 
