@@ -53,8 +53,10 @@ class FakeContext {
         gain.value = value;
       },
     };
-    const node = { gain, connect: (to: unknown) => to === this.destination && (this.volume = gain), disconnect() {} };
-    return node;
+    const connect = (to: unknown) => {
+      if (to === this.destination) this.volume = gain;
+    };
+    return { gain, connect, disconnect() {} };
   }
 
   createBufferSource() {

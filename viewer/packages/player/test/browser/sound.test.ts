@@ -4,7 +4,8 @@
 import type { Page } from "playwright-core";
 import { afterAll, beforeAll, describe, expect, test, vi } from "vitest";
 import { chromiumPath, launched } from "../../../gl/test/support/chromium.ts";
-import { clappingFile } from "../soundFile.ts";
+import { LiveRun } from "../liveRun.ts";
+import { clappingFile, FPS } from "../soundFile.ts";
 import { TestServer } from "./server.ts";
 import { builtPlayer, pageWith } from "./stage.ts";
 
@@ -120,6 +121,58 @@ describe.skipIf(!chromiumPath())("sound in a browser", () => {
     expectInStep(await differences(page, 4), "after a seek");
     await page.evaluate((seconds) => document.querySelector("structgstream-player")!.seek(seconds), 60 * MINUTES - 1);
     expectInStep(await differences(page, 4), "after ten minutes");
+    await page.close();
+  });
+
+  test("is in step at the edge of a live stream", async () => {
+    const live = new LiveRun(clappingFile(60), { fps: FPS }).write(4 * FPS);
+    server.publish("/live/", live.files);
+    const writing = setInterval(() => {
+      live.write(1);
+      server.publish("/live/", live.files);
+    }, 1000 / FPS);
+    try {
+      const page = await opened('src="live/manifest.json" autoplay');
+      expect(await page.evaluate(() => document.querySelector("structgstream-player")!.live)).toBe(true);
+      expectInStep(await differences(page, 5), "live");
+      await page.close();
+    } finally {
+      clearInterval(writing);
+    }
+  });
+
+  test("is muted by attribute, property, button and key, and loud as its volume says", async () => {
+    const page = await opened('src="claps.sgs" muted');
+    await page.evaluate(() => {
+      const changes: string[] = [];
+      Object.assign(globalThis, { changes });
+      const player = document.querySelector("structgstream-player")!;
+      player.on("volumechange", () => changes.push(`${player.muted} ${player.volume}`));
+      return player.play();
+    });
+    await page.waitForFunction(() => document.querySelector("structgstream-player")!.currentTime > 1.2);
+    expect(await page.evaluate("[times.claps.length, changes.length]")).toEqual([0, 0]);
+    await page.getByRole("button", { name: "Unmute" }).click();
+    await differences(page, 1);
+    await page.keyboard.press("m");
+    const changes = await page.evaluate(() => {
+      const player = document.querySelector("structgstream-player")!;
+      player.volume = 0.5;
+      player.muted = false;
+      player.defaultMuted = false;
+      let refused = "";
+      try {
+        player.volume = 2;
+      } catch (error) {
+        refused = (error as DOMException).name;
+      }
+      return [...(globalThis as unknown as { changes: string[] }).changes, refused, player.outerHTML.includes("muted")];
+    });
+    expect(changes).toEqual(["false 1", "true 1", "true 0.5", "false 0.5", "IndexSizeError", false]);
+    await page.evaluate(() => {
+      document.querySelector("structgstream-player")!.playbackRate = 2;
+    });
+    await page.getByRole("button", { name: "Mute (off at other speeds)" }).waitFor();
     await page.close();
   });
 });
