@@ -15,6 +15,7 @@ from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.sink import SegmentsOptions
 from structgstream.data.dataset_layouts import bundled_clip_path
 from structgstream.data.open import open_capture
+from structgstream.data.sound import SoundSource
 from structgstream.data.source import FrameSource, FrameStream
 from structgstream.errors import ConfigError
 from structgstream.evaluation.evaluate import evaluate as evaluate_recording
@@ -29,6 +30,7 @@ from structgstream.preparation.checking.check import CheckReport
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.output_folder import Listener
 from structgstream.preparation.prepare import Preparation, check_folder, prepare_capture
+from structgstream.preparation.sound import chosen_sound
 from structgstream.recorder import check_output, record, segments_at, segments_folder
 from structgstream.serve.pages import StreamFile, write_page, write_site
 from structgstream.session.frame_report import FrameReport
@@ -107,6 +109,8 @@ def reconstruct(
     overwrite: bool = False,
     sink: Literal["file", "segments"] = "file",
     window_seconds: float | None = None,
+    sound: str | SoundSource | None = None,
+    sound_offset: float | None = None,
     on_frame: Callable[[FrameReport], object] | None = None,
 ) -> list[FrameReport]:
     """Reconstructs a capture to a stream file, frame by frame; returns after the last frame is stored.
@@ -134,6 +138,10 @@ def reconstruct(
         overwrite: replace ``path`` if it exists.
         sink: ``segments`` writes a folder of immutable files and a manifest (docs/segments.md).
         window_seconds: for segments, how far viewers can seek back; None stores everything.
+        sound: name of a camera or a file whose sound is stored; ``auto`` for the best microphone, ``none``; None for
+            the one that ``prepare`` chose. Of an opened capture, a :class:`SoundSource`.
+        sound_offset: when the file of ``sound`` begins, in seconds after the first frame of the capture; None to find
+            it out by what cameras hear.
         on_frame: called with the report of each frame.
 
     Returns:
@@ -160,11 +168,15 @@ def reconstruct(
             capture, held_out=held_out, scale=scale, start=start, frames=frames, near=near, every=every
         )
         metadata |= part_metadata(start=start, scale=scale, every=every)
+        if sound is None or isinstance(sound, str):
+            sound = chosen_sound(source, Path(capture), sound, offset_seconds=sound_offset)
     elif (held_out, scale, start, frames, near, every) != (None, 1.0, 0, None, None, 1):
         raise ConfigError(
             "held_out, scale, start, frames, near and every choose from a folder; an opened capture was given, for "
             "which open_capture takes them."
         )
+    elif isinstance(sound, str) or sound_offset is not None:
+        raise ConfigError("sound and sound_offset choose from a folder; an opened capture takes a SoundSource.")
     else:
         source = capture
     pipeline, chosen = stream_pipeline(config), select_backend(backend)
@@ -176,7 +188,7 @@ def reconstruct(
         storage = segments_at(store, options=SegmentsOptions(window_seconds))
     else:
         check_output(path, may_exist=resume or overwrite)
-    run = record(path, source, pipeline, chosen, resume=resume, storage=storage, metadata=metadata)
+    run = record(path, source, pipeline, chosen, resume=resume, storage=storage, metadata=metadata, sound=sound)
     reports = []
     with closing(run.reports) as recording:
         for report in recording:

@@ -38,12 +38,13 @@ from structgstream.codec.segments.quality_list import (
     write_list,
 )
 from structgstream.data.denoising import DenoisingConfig, denoised
+from structgstream.data.sound import SoundSource
 from structgstream.data.source import FrameStream, SharedFrames, read_ahead
 from structgstream.errors import ConfigError, StorageError, StreamError
 from structgstream.evaluation.run_log import append_log, begin_log, log_entry, read_log
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import Backend
-from structgstream.recorder import Run, RunMetrics, Storage, log_reports
+from structgstream.recorder import Run, RunMetrics, Storage, log_reports, with_sound
 from structgstream.scene.scene import Scene
 from structgstream.session.frame_report import FrameReport
 from structgstream.session.loop import Session
@@ -323,6 +324,7 @@ def record_qualities(
     metadata: Mapping[str, object] | None = None,
     on_step: StepListener | None = None,
     metrics: RunMetrics | None = None,
+    sound: SoundSource | None = None,
 ) -> Run:
     """Reconstructs a capture in several qualities (Note [In step]), with a log of each quality and of the run.
 
@@ -332,6 +334,7 @@ def record_qualities(
     Args:
         folder: contains ``qualities.json`` and a folder for each quality; logs are next to these.
         qualities: at least one, the coarsest first.
+        sound: what each stores beside the frames; None for nothing.
 
     Raises:
         ConfigError: a stream to resume was made with another configuration or from another capture.
@@ -339,9 +342,11 @@ def record_qualities(
         StorageError: a stream, a log or the list cannot be written; complete frames are not affected.
     """
     work = SharedWork()
-    opened = []
+    opened, stated = [], metadata
     for quality in qualities:
         sink, stored = storages[quality.name](resume)
+        if sound is not None:
+            sink, stated = with_sound(sink, metadata, sound, source=source, resumed=stored)
         own = configured(config, quality)
         # Frames are denoised below, once for all qualities.
         pipeline = replace(stream_pipeline(own), method=SharedMethod(own, shared=work), denoising=DenoisingConfig())
@@ -351,9 +356,7 @@ def record_qualities(
     frames = SharedFrames(shown, starts=starts, first=firsts)
     reports = {}
     for one, reader in zip(opened, frames.readers, strict=True):
-        session = Session(
-            reader, one.sink, one.pipeline, backend, resumed=one.stored, metadata=metadata, on_step=on_step
-        )
+        session = Session(reader, one.sink, one.pipeline, backend, resumed=one.stored, metadata=stated, on_step=on_step)
         reports[one.name] = log_reports(session.run(), folder / one.name, done=one.done)
     done = {one.name: one.done for one in opened}
     rates, least = BitRates(folder, qualities), min(done.values())

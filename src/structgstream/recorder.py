@@ -13,7 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, Final
@@ -30,7 +30,9 @@ from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsS
 from structgstream.codec.segments.store import FolderStore, Store
 from structgstream.codec.segments.stored_bytes import read_manifest
 from structgstream.codec.sinks import StoredSegments, resume_segments
+from structgstream.codec.sound import SoundFormat, frame_sound
 from structgstream.data.live.status import LiveStatus
+from structgstream.data.sound import SoundSource
 from structgstream.data.source import FrameStream, frame_count, read_ahead
 from structgstream.errors import StorageError, StreamError
 from structgstream.evaluation.pictures import png_bytes
@@ -70,6 +72,7 @@ def record(
     metadata: Mapping[str, object] | None = None,
     on_step: StepListener | None = None,
     remarks: LogExtras | None = None,
+    sound: SoundSource | None = None,
 ) -> Run:
     """Reconstructs a capture into a file or other storage, with a log next to it.
 
@@ -80,6 +83,7 @@ def record(
         source: the capture; frames of a recording are read ahead.
         storage: opens another sink than a file at ``path``, such as :func:`segments_at`.
         metadata: plain JSON values for the header, equal in all runs of a stream.
+        sound: what to store beside the frames; None for nothing.
 
     Raises:
         ConfigError: the file to resume was made with another configuration or from another capture.
@@ -90,6 +94,8 @@ def record(
         sink, resumed = pipeline.codec.file(path, frames=frame_count(source), resume=resume)
     else:
         sink, resumed = storage(resume)
+    if sound is not None:
+        sink, metadata = with_sound(sink, metadata, sound, source=source, resumed=resumed)
     session = Session(read_ahead(source), sink, pipeline, backend, resumed=resumed, metadata=metadata, on_step=on_step)
     done = 0 if resumed is None else len(resumed)
     return Run(done, log_reports(session.run(), path, done=done, remarks=remarks))
@@ -211,6 +217,59 @@ class PreviewSink:
 
     def close(self) -> None:
         self._sink.close()
+
+
+class SoundSink:
+    """Forwards a stream to ``sink``, with the sound of each frame.
+
+    A frame has the packets that begin before it ends, so that a player that has a frame can play on until the next.
+
+    Args:
+        sound: of the run.
+        fps: frames a second.
+        after: presentation time of the last frame that is there already; None for a new stream.
+    """
+
+    def __init__(self, sink: PacketSink, sound: SoundSource, *, fps: float, after: float | None) -> None:
+        self._sink = sink
+        self._feed = sound.open()
+        self._frame_seconds = 1.0 / fps
+        if after is not None:
+            self._feed.until(after + self._frame_seconds)
+
+    def open(self, header: StreamHeader) -> int:
+        return self._sink.open(self._stated(header))
+
+    def begin(self, header: StreamHeader) -> int:
+        return self._sink.begin(self._stated(header))
+
+    def write(self, packet: Packet) -> int:
+        heard = self._feed.until(packet.pts_seconds + self._frame_seconds)
+        sound = frame_sound(packet.index, packet.pts_seconds, heard)
+        return self._sink.write(replace(packet, sound=sound.pack()))
+
+    def close(self) -> None:
+        self._sink.close()
+
+    def _stated(self, header: StreamHeader) -> StreamHeader:
+        return replace(header, sound=SoundFormat(self._feed.channels))
+
+
+def with_sound(
+    sink: PacketSink,
+    metadata: Mapping[str, object] | None,
+    sound: SoundSource,
+    *,
+    source: FrameStream,
+    resumed: StoredStream[State] | None,
+) -> tuple[SoundSink, Mapping[str, object]]:
+    """The sink of a run with sound, and its metadata, by which a stream is resumed with the same sound alone.
+
+    Raises:
+        CaptureError: the sound cannot be read.
+    """
+    after = resumed.packets[-1].pts_seconds if resumed is not None and len(resumed) else None
+    return SoundSink(sink, sound, fps=source.fps, after=after), {**(metadata or {}), "sound": sound.name}
 
 
 def preview(header: StreamHeader, packet: Packet) -> NDArray[np.uint8]:

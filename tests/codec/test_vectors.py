@@ -20,7 +20,9 @@ from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.segments.manifest import manifest_from_json, manifest_to_json
 from structgstream.codec.segments.stored_bytes import open_segments
 from structgstream.scene.state import state_of
+from tests.support.sounds import stream_heard
 from tests.vectors.generate import (
+    CLAP_SECONDS,
     COMPACT_EXPECTED,
     COMPACT_STEPS,
     COMPACT_STREAM,
@@ -29,6 +31,8 @@ from tests.vectors.generate import (
     PERIODS_EXPECTED,
     PERIODS_STREAM,
     SEGMENTS,
+    SOUND_EXPECTED,
+    SOUND_STREAM,
     STREAM,
     SUMS,
     compact_header,
@@ -61,7 +65,8 @@ def test_the_files_are_those_that_were_published() -> None:
     assert COMPACT_STREAM.stat().st_size < 20_000
     assert PERIODS_STREAM.stat().st_size < 20_000
     lines = SUMS.read_text().splitlines()
-    assert len(lines) == 6 + len(list(SEGMENTS.iterdir()))
+    assert SOUND_STREAM.stat().st_size < 20_000
+    assert len(lines) == 8 + len(list(SEGMENTS.iterdir()))
     for line in lines:
         digest, name = line.split()
         assert hashlib.sha256((STREAM.parent / name).read_bytes()).hexdigest() == digest, name
@@ -75,7 +80,12 @@ def test_today_s_encoder_writes_the_golden_stream() -> None:
 
 @pytest.mark.parametrize(
     ("stream", "wanted", "count"),
-    [(STREAM, EXPECTED, 3), (COMPACT_STREAM, COMPACT_EXPECTED, 6), (PERIODS_STREAM, PERIODS_EXPECTED, 8)],
+    [
+        (STREAM, EXPECTED, 3),
+        (COMPACT_STREAM, COMPACT_EXPECTED, 6),
+        (PERIODS_STREAM, PERIODS_EXPECTED, 8),
+        (SOUND_STREAM, SOUND_EXPECTED, 12),
+    ],
 )
 def test_today_s_decoder_reads_a_golden_stream(stream: Path, wanted: Path, count: int) -> None:
     reader = open_stream(stream)
@@ -89,6 +99,21 @@ def test_the_second_period_has_a_header_of_its_own() -> None:
     notes = [reader.header_of(frame).metadata["note"] for frame in (LATER - 1, LATER)]
     assert notes == ["ä", "later"]
     assert "covariance_mlp" in reader.header.dynamic - reader.header_of(LATER).dynamic
+
+
+def test_the_golden_sound_is_beside_its_frames() -> None:
+    """A decoder makes a clap of it at half a second, in the white frame."""
+    expected = json.loads(SOUND_EXPECTED.read_text())
+    for by_index in (False, True):
+        with open_stream(SOUND_STREAM, by_index=by_index) as reader:
+            assert reader.header.sound is not None
+            assert reader.header.sound.plain() == expected["sound"]
+            for frame in expected["frames"]:
+                sound = reader.sound(frame["index"])
+                assert sound is not None
+                found = {"seconds": sound.seconds, "packets": [packet.hex() for packet in sound.packets]}
+                assert found == frame["sound"]
+            assert stream_heard(reader) == pytest.approx([CLAP_SECONDS], abs=1e-3)
 
 
 def check(reader: StreamReader, frames: list[dict[str, Any]], count: int) -> None:

@@ -7,9 +7,9 @@ import av
 import numpy as np
 import pytest
 
+from structgstream.data import sound as audio
+from structgstream.data.sound import read_audio
 from structgstream.errors import CaptureError
-from structgstream.preparation import footage as audio
-from structgstream.preparation.footage import read_audio
 from tests.support.captures import write_video
 
 RATE = 48_000
@@ -65,5 +65,5 @@ def test_a_very_long_one_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_what_is_no_video(tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_text("no video")
-    with pytest.raises(CaptureError, match=r"a\.mp4 cannot be opened"):
+    with pytest.raises(CaptureError, match=r"sound of .*a\.mp4 cannot be read"):
         read_audio(tmp_path / "a.mp4")

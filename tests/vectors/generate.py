@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes the golden streams of format version 2, one of each codec and one of two periods, and what a decoder must find.
+"""Makes the golden streams of format version 2: one of each codec, one of two periods and one with sound, and what a
+decoder must find.
 
 With ``raw`` every number is a small multiple of a power of two; with ``compact`` it is the product of a whole number
 and a float32, which need not be one: exact in JSON and on any machine. Run from the repository's root, only when a new
@@ -19,11 +20,14 @@ from torch import Tensor
 
 from structgstream.cameras import Camera, CameraRig, Similarity
 from structgstream.codec.packets import PacketKind, StreamHeader
-from structgstream.codec.reader import open_stream
+from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.scene_coder import SceneEncoder
 from structgstream.codec.segments.sink import Clocks, SegmentsSink
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.sinks import MemorySink
+from structgstream.codec.sound import FrameSound, SoundFormat, frame_sound
+from structgstream.data.sound import SoundEncoder
+from structgstream.opus import SAMPLE_RATE
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import PAPER_DYNAMIC, FieldName, scene_of, state_of
 
@@ -31,6 +35,7 @@ FOLDER = Path(__file__).parent
 STREAM, EXPECTED, SUMS = (FOLDER / name for name in ("version-2.sgs", "version-2.json", "SHA256SUMS"))
 COMPACT_STREAM, COMPACT_EXPECTED = (FOLDER / f"version-2-compact.{suffix}" for suffix in ("sgs", "json"))
 PERIODS_STREAM, PERIODS_EXPECTED = (FOLDER / f"version-2-periods.{suffix}" for suffix in ("sgs", "json"))
+SOUND_STREAM, SOUND_EXPECTED = (FOLDER / f"version-2-sound.{suffix}" for suffix in ("sgs", "json"))
 SEGMENTS = FOLDER / "segments-1"
 ANCHORS, K, FEATURES, HIDDEN = 3, 2, 2, 3
 KINDS = (PacketKind.KEY, PacketKind.DELTA, PacketKind.KEY)
@@ -267,6 +272,84 @@ def compact_stream() -> bytes:
     return streamed(compact_header(), [compact_scene(i) for i in range(len(COMPACT_KINDS))], COMPACT_KINDS)
 
 
+CLAP_SECONDS, SOUND_FRAMES, SOUND_FPS = 0.5, 12, 12
+"""A second with a clap in its middle: the frame of that time is white, the others are black."""
+
+
+def clapping_scene(frame: int) -> Scene:
+    """One free Gaussian that fills the pictures, and no anchor."""
+    seen = [1.0] * 3 if frame == round(CLAP_SECONDS * SOUND_FPS) else [0.0] * 3
+    state: dict[FieldName, Tensor] = {
+        "anchor_positions": torch.zeros(0, 3),
+        "offset_scales": torch.zeros(0, 3),
+        "base_scales": torch.zeros(0, 3),
+        "anchor_offsets": torch.zeros(0, K, 3),
+        "anchor_features": torch.zeros(0, FEATURES),
+        "opacity_mlp": numbers(mlp_size(1), salt=6),
+        "color_mlp": numbers(mlp_size(3), salt=7),
+        "covariance_mlp": numbers(mlp_size(7), salt=8),
+        "free": torch.tensor([[-0.1875, 0.375, -2.25, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 8.0, *seen]]),
+        "free_births": torch.tensor([0]),
+        "camera_color": torch.zeros(2, 6),
+    }
+    return scene_of(state, distance_input=True)
+
+
+def clapping_sounds() -> list[FrameSound]:
+    """The sound of each frame, as the encoder of the day makes it."""
+    import av
+
+    samples = np.zeros((1, SAMPLE_RATE), np.float32)
+    burst = np.random.default_rng(0).uniform(-0.9, 0.9, 480) * np.exp(-np.arange(480) / 96)
+    first = round(CLAP_SECONDS * SAMPLE_RATE)
+    samples[0, first : first + len(burst)] = burst
+    frame = av.AudioFrame.from_ndarray(samples, format="flt", layout="mono")
+    frame.sample_rate = SAMPLE_RATE
+    encoder = SoundEncoder(1)
+    packets = [*encoder.add(frame, 0.0), *encoder.finish()]
+    sounds = []
+    for index in range(SOUND_FRAMES):
+        end = (index + 1) / SOUND_FPS
+        heard = [packet for packet in packets if end - 1 / SOUND_FPS <= max(packet.seconds, 0.0) < end]
+        sounds.append(frame_sound(index, index / SOUND_FPS, heard))
+    return sounds
+
+
+def sound_stream() -> bytes:
+    """That with sound: of codec ``raw``, in which only free Gaussians are dynamic."""
+    dynamic: frozenset[FieldName] = frozenset({"free", "free_births"})
+    state = state_of(clapping_scene(0))
+    header = replace(
+        golden_header(),
+        fps=float(SOUND_FPS),
+        dynamic=dynamic,
+        static={name: value for name, value in state.items() if name not in dynamic},
+        sound=SoundFormat(1),
+    )
+    encoder, sink = SceneEncoder(header), MemorySink()
+    sink.open(header)
+    for sound in clapping_sounds():
+        kind = PacketKind.DELTA if sound.index % 4 else PacketKind.KEY
+        seconds = sound.index / SOUND_FPS
+        packet = encoder.encode(clapping_scene(sound.index), index=sound.index, pts_seconds=seconds, kind=kind).packet
+        sink.write(replace(packet, sound=sound.pack()))
+    sink.close()
+    return sink.data
+
+
+def sound_report(data: bytes) -> dict[str, Any]:
+    """What is in the stream with sound; the packets of Opus are those that it was written with."""
+    kinds = [PacketKind.DELTA if index % 4 else PacketKind.KEY for index in range(SOUND_FRAMES)]
+    report = reported([clapping_scene(index) for index in range(SOUND_FRAMES)], kinds)
+    with StreamReader(data) as reader:
+        for frame in report["frames"]:
+            sound = reader.sound(frame["index"])
+            assert sound is not None, "written with each frame"
+            frame["pts_seconds"] = frame["index"] / SOUND_FPS
+            frame["sound"] = {"seconds": sound.seconds, "packets": [packet.hex() for packet in sound.packets]}
+    return {"sound": {"codec": "opus", "channels": 1}, **report}
+
+
 def write_segments(folder: Path) -> None:
     """The stream of codec ``compact`` while it is made: a segment of the first group, parts of the second."""
     store = FolderStore(folder)
@@ -286,6 +369,7 @@ def write_segments(folder: Path) -> None:
 def main() -> None:
     """Write what is missing, and the sums of all."""
     raw, compact = [golden_scene(i) for i in range(3)], [compact_scene(i) for i in range(6)]
+    sound = SOUND_STREAM.read_bytes() if SOUND_STREAM.exists() else sound_stream()
     files = {
         STREAM: golden_stream(),
         EXPECTED: (json.dumps(reported(raw, KINDS)) + "\n").encode(),
@@ -293,6 +377,8 @@ def main() -> None:
         COMPACT_EXPECTED: (json.dumps(reported(compact, COMPACT_KINDS)) + "\n").encode(),
         PERIODS_STREAM: periods_stream(),
         PERIODS_EXPECTED: (json.dumps(reported(periods_scenes(), PERIODS_KINDS)) + "\n").encode(),
+        SOUND_STREAM: sound,
+        SOUND_EXPECTED: (json.dumps(sound_report(sound)) + "\n").encode(),
     }
     for path, data in files.items():
         if not path.exists():

@@ -152,6 +152,7 @@ def describe_stream(
             "cameras": header.rig.plain(),
             "config": dict(header.config),
             "metadata": dict(header.metadata),
+            **({"sound": header.sound.plain()} if header.sound else {}),
         },
         "packets": [_packet(row, log.get(row.index, {})) for row in rows],
     }
@@ -217,6 +218,8 @@ def facts_table(header: Mapping[str, Any], rows: "Sequence[Row]", *, packets: Se
     )
     headers = "header" if len(header["periods"]) < 2 else f"{len(header['periods'])} headers"
     table.add_row("size", f"{human_bytes(header['total_bytes'])}, {headers} {human_bytes(header['header_bytes'])}")
+    if sound := header.get("sound"):
+        table.add_row("sound", f"{sound['codec']}, {sound['channels']} channel{'s' * (sound['channels'] > 1)}")
     if rows:
         table.add_row("rate", bit_rate_text(rows, header["fps"]))
     table.add_row("dynamic", ", ".join(header["dynamic"]) or "-")

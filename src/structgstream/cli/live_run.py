@@ -52,7 +52,14 @@ class LiveChoice:
 
 
 def open_live(
-    scene: Path, capture: CaptureOptions, live: LiveChoice, *, stream: Path, resume: bool, denoising: "DenoisingConfig"
+    scene: Path,
+    capture: CaptureOptions,
+    live: LiveChoice,
+    *,
+    stream: Path,
+    resume: bool,
+    denoising: "DenoisingConfig",
+    sound: str | None = None,
 ) -> "LiveSource":
     """The cameras of a rig file; they are not opened yet."""
     from structgstream.data.live.source import LiveOptions, LiveSource
@@ -71,6 +78,7 @@ def open_live(
         record=live.record,
         resume=resume,
         denoising=denoising,
+        sound=None if sound == "none" else sound,
     )
     with usage_errors():
         return LiveSource(scene, stream, options)

@@ -32,6 +32,7 @@ from structgstream.cli.progress import human_bytes, print_lines
 
 if TYPE_CHECKING:
     from structgstream.cli.options import Captured
+    from structgstream.data.sound import SoundSource
     from structgstream.data.source import FrameStream
     from structgstream.kernels.backend import Backend
     from structgstream.recorder import RunMetrics, Storage
@@ -90,6 +91,12 @@ class Reconstruct:
     """Compute back-end; auto takes the first available of cuda, cpu and reference (plain PyTorch, slow)."""
     seed: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
     """Random seed. Default: the preset's."""
+    sound: Annotated[str | None, tyro.conf.arg(metavar="CAMERA|FILE|auto|none", help_behavior_hint="")] = None
+    """Sound to store with the frames: that of a camera, in step by its clock; a file, in step by what cameras hear of
+    it; auto for the best microphone. Default: the microphone that prepare chose, otherwise none. Live: a camera."""
+    sound_offset: Annotated[float | None, tyro.conf.arg(metavar="SECONDS", help_behavior_hint="")] = None
+    """When the file of --sound begins, in seconds after the first frame of the capture. Default: found by what cameras
+    hear."""
     resume: Flag = False
     """Continue after the last whole frame of OUT. The same options give the bytes of an uninterrupted run."""
     overwrite: Flag = False
@@ -108,6 +115,10 @@ def main(arguments: list[str]) -> None:
         return
     options, rest = parse_known_options(Reconstruct, "reconstruct", arguments=arguments)
     check_ending(options.output, ".sgs", command="reconstruct", folder=True)
+    if options.sound_offset is not None and options.sound is None:
+        raise UsageError("--sound-offset says when the file of --sound begins; give that, too.")
+    if options.sound_offset is not None and options.live.live:
+        raise UsageError("--sound-offset is for files; the sound of a live camera is in step by its clock.")
     if options.resume and options.overwrite:
         raise UsageError("--resume keeps the file and --overwrite replaces it: choose one.")
     config, preset = resolve_config(options.preset, rest, command="reconstruct", seed=options.seed)
@@ -129,6 +140,7 @@ def main(arguments: list[str]) -> None:
             output=options.output,
             backend=opened.backend,
             metadata=opened.metadata,
+            sound=opened.sound,
             resume=options.resume,
             storage=None if storage is None else storage(opened.captured),
             metrics=run_metrics(opened.source, options.output),
@@ -147,12 +159,14 @@ class OpenedScene:
     captured: "Captured | None"  # when a frame was filmed, Unix time, by its number; None for a recording
     backend: "Backend"
     metadata: Mapping[str, object]  # of the run, for headers
+    sound: "SoundSource | None"  # to store beside the frames
 
 
 def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, console: Console) -> OpenedScene:
     """The capture, or the live cameras, that the options name; says what it is."""
     from structgstream.evaluation.recording import part_metadata
     from structgstream.kernels.backend import select_backend
+    from structgstream.preparation.sound import chosen_sound
     from structgstream.session.presets import departures
     from structgstream.training.online.select import unrecognized_faults
 
@@ -164,12 +178,14 @@ def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, con
             stream=options.output,
             resume=options.resume,
             denoising=config.denoising,
+            sound=options.sound,
         )
-        length, captured = "live", source.captured
+        length, captured, sound = "live", source.captured, source.sound
     else:
         options.live.check(options.scene)
         source = open_selected_capture(options.scene, options.capture)
         length, captured = f"{len(source)} frames", None
+        sound = chosen_sound(source, options.scene, options.sound, offset_seconds=options.sound_offset)
     backend = select_backend(options.device)
     print_lines(
         console,
@@ -183,7 +199,9 @@ def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, con
         console.print(blind, highlight=False)
     part = part_metadata(start=options.capture.start, scale=options.capture.scale, every=options.capture.every)
     metadata = {"preset": preset, **part}
-    return OpenedScene(source, captured, backend, metadata)
+    if sound is not None:
+        print_lines(console, f"Sound: {sound.name}.")
+    return OpenedScene(source, captured, backend, metadata, sound)
 
 
 def run_reconstruction(
@@ -196,11 +214,13 @@ def run_reconstruction(
     resume: bool = False,
     storage: "Storage[Scene] | None" = None,
     metrics: "RunMetrics | None" = None,
+    sound: "SoundSource | None" = None,
 ) -> dict[str, int]:
     """Reconstructs ``source`` into the file ``output`` or other storage, replacing what is there unless it is resumed.
 
     Args:
         metrics: the metrics of the run, written next to ``output``.
+        sound: what to store beside the frames.
 
     Returns:
         the largest peak memory in bytes over all frames, by stage; a GPU's under the stage's name and "on the GPU".
@@ -219,6 +239,7 @@ def run_reconstruction(
             metadata=metadata,
             on_step=on_step,
             remarks=None if metrics is None else metrics.frame,
+            sound=sound,
         )
         return run.done, run.reports, lambda report: (report, None, True)
 
@@ -316,6 +337,7 @@ def _reconstruct_qualities(options: Reconstruct, config: "StreamConfig", *, pres
             metadata=opened.metadata,
             on_step=on_step,
             metrics=metrics,
+            sound=opened.sound,
         )
         return run.done, run.reports, lambda one: (one.report, one.quality, one.whole)
 

@@ -95,21 +95,42 @@ def main(arguments: list[str]) -> None:
         pictures = compared_pictures(reader, options.scene, backend=backend, options=options)
     else:
         pictures = camera_pictures(reader, backend, camera=choose_camera(reader, options.camera), frame=options.frame)
-    single = output.suffix.lower() == ".png"
-    write_pictures(output, islice(pictures, 1) if single else pictures, fps=reader.header.fps)
+    if output.suffix.lower() == ".png":
+        pictures = islice(pictures, 1)
+    has_sound = output.suffix.lower() == ".mp4" and reader.header.sound is not None
+    in_step = options.frame is None and (options.path is None or path_length(reader, options.seconds) <= len(reader))
+    if has_sound and not in_step:
+        print_lines(Console(stderr=True), "The video has no sound, because it does not show the stream as it is.")
+    write_pictures(output, pictures, fps=reader.header.fps, heard=reader if has_sound and in_step else None)
     print_lines(Console(), f"Wrote {output}")
 
 
-def write_pictures(output: Path, pictures: "Iterable[NDArray[np.uint8]]", *, fps: float) -> None:
-    """Writes pictures as a video, one PNG or a folder of PNGs, by the suffix of ``output``."""
+def write_pictures(
+    output: Path, pictures: "Iterable[NDArray[np.uint8]]", *, fps: float, heard: "StreamReader | None" = None
+) -> None:
+    """Writes pictures as a video, one PNG or a folder of PNGs, by the suffix of ``output``.
+
+    Args:
+        heard: the stream whose frames the pictures show, one after the other; a video gets its sound and its times.
+    """
+    from structgstream.data.sound import SoundDecoder
     from structgstream.data.video_writer import VideoWriter
     from structgstream.evaluation.pictures import write_png
 
     with Console(stderr=True).status("rendering") as status:
         if output.suffix.lower() == ".mp4":
-            with VideoWriter(output, fps=fps) as video:
+            format = None if heard is None else heard.header.sound
+            decoder = None if format is None else SoundDecoder(format.channels)
+            with VideoWriter(output, fps=fps, channels=None if format is None else format.channels) as video:
                 for number, picture in enumerate(pictures):
-                    video.write(picture)
+                    if heard is None or decoder is None:
+                        video.write(picture)
+                    else:
+                        start = heard.packets[0].pts_seconds
+                        video.write(picture, seconds=heard.packets[number].pts_seconds - start)
+                        if (sound := heard.sound(number)) is not None:
+                            samples = decoder.decode(sound.packets, sound.seconds)
+                            video.write_sound(samples, seconds=sound.seconds - start)
                     status.update(f"rendering picture {number + 1}")
             return
         for number, picture in enumerate(pictures):
@@ -145,12 +166,17 @@ def path_pictures(
     from structgstream.scene.state import on_device
 
     header = reader.header
-    length = max(len(reader.packets) / header.fps, MIN_PATH_SECONDS) if seconds is None else seconds
-    count = max(round(length * header.fps), 1)
+    count = path_length(reader, seconds)
     rig = header.rig
     views: list[Camera] = orbit(rig, count, around=camera) if path == "orbit" else arc(rig, count, between=between)
     for view, scene in zip(views, _ping_pong(reader, frame, count=count), strict=True):
         yield rendered(on_device(scene, backend.device), header.camera(view), backend)[0]
+
+
+def path_length(reader: "StreamReader", seconds: float | None) -> int:
+    """The pictures of a camera path of this duration; None: the stream's, or a little longer."""
+    length = max(len(reader.packets) / reader.header.fps, MIN_PATH_SECONDS) if seconds is None else seconds
+    return max(round(length * reader.header.fps), 1)
 
 
 def compared_pictures(

@@ -7,10 +7,11 @@ import re
 from array import array
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import overload
 
-from structgstream.codec.container.blocks import LENGTH, field_sizes, iterate_blocks
+from structgstream.codec.container.blocks import LENGTH, field_sizes, iterate_blocks, read_description
 from structgstream.codec.container.byte_source import ByteSlice, ByteSource
 from structgstream.codec.container.records import (
     CHECKSUM,
@@ -34,6 +35,7 @@ from structgstream.codec.container.records import (
     scan_records,
 )
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader, parse_packet, unpack_header
+from structgstream.codec.sound import FrameSound, unpack_sound
 from structgstream.errors import StreamError
 
 MIN_PACKET_BYTES = RECORD.size + FRAME.size + CHECKSUM.size
@@ -127,8 +129,17 @@ def _fits(record: Record, standing: Standing) -> bool:
     return standing.frames <= indexed_frames(record.payload) <= standing.last_frame_at(record.offset)
 
 
+def _states_sound(payload: bytes) -> bool:
+    """Whether the description of an init record states sound; what is no description is reported by who reads it."""
+    with suppress(StreamError, ValueError):
+        return "sound" in read_description(payload)
+    return False
+
+
 def readable_part(data: ByteSource, *, name: str) -> int | None:
     """End of the last whole packet, before the index; None if the file is truncated within the init record.
+
+    In a stream with sound, a packet counts when the sound record after it is whole: both are written at once.
 
     Raises:
         StreamError: not a stream, another major version, or a damaged init record, after which restarting would
@@ -138,6 +149,7 @@ def readable_part(data: ByteSource, *, name: str) -> int | None:
         return None  # Cut within the prefix, or empty.
     check_prefix(data, name)
     end, standing, complete = PREFIX.size, Standing(PREFIX.size, 0, -math.inf), False
+    has_sound = False
     for record in scan_records(data):
         if complete := record.type == RecordType.INDEX:
             break
@@ -145,10 +157,13 @@ def readable_part(data: ByteSource, *, name: str) -> int | None:
         if record.type == RecordType.INIT and record.offset > PREFIX.size:
             standing = replace(standing, period=record.period)
             continue  # What a period begins with is written with its first packet, and again when that is cut.
-        end = record.end
+        is_packet = record.type in (RecordType.KEY, RecordType.DELTA)
+        if not (is_packet and has_sound):
+            end = record.end
         if record.type == RecordType.INIT:
             standing = replace(standing, period=record.period)
-        elif record.type in (RecordType.KEY, RecordType.DELTA):
+            has_sound = _states_sound(record.payload)
+        elif is_packet:
             standing = replace(standing, frames=standing.frames + 1)
     # A crash cannot leave whole frames after a damaged one; a failing disk can.
     lost = not complete and PacketSearch(data).next(standing.offset, standing) is not None
@@ -172,7 +187,8 @@ LOST = 2**64 - 1
 
 @dataclass(frozen=True)
 class PacketInfo:
-    """Facts of one packet: ``bytes`` is the length of its record, ``field_bytes`` that of each field's part."""
+    """Facts of one packet: ``bytes`` is the length of its record and of its sound's, ``field_bytes`` that of each
+    field's part, and of the record of the sound as ``sound``."""
 
     kind: PacketKind
     index: int
@@ -232,7 +248,13 @@ class Packets(Sequence[PacketInfo]):
                 raise self.damaged(index) from error
             raise
         field_bytes: dict[str, int] = {block.name: block.end - block.start for block in blocks}
-        return PacketInfo(PACKET_KINDS[head.type], index, pts_seconds, offset, head.bytes, field_bytes)
+        sound = read_head(self._data, offset + head.bytes)
+        if sound is None or sound.type != RecordType.SOUND:
+            return PacketInfo(PACKET_KINDS[head.type], index, pts_seconds, offset, head.bytes, field_bytes)
+        size = head.bytes + sound.bytes
+        return PacketInfo(
+            PACKET_KINDS[head.type], index, pts_seconds, offset, size, field_bytes | {"sound": sound.bytes}
+        )
 
     def packet(self, index: int) -> Packet:
         """The packet of a frame that is not lost; its checksum is verified."""
@@ -243,6 +265,15 @@ class Packets(Sequence[PacketInfo]):
         if packet.index != index:
             raise self.damaged(index)
         return packet
+
+    def sound(self, index: int) -> FrameSound | None:
+        """The sound that is stored with a frame that is not lost; None if there is none, or it is damaged."""
+        head = read_head(self._data, self.offsets[index])
+        record = None if head is None else read_record(self._data, self.offsets[index] + head.bytes)
+        if record is None or record.type != RecordType.SOUND:
+            return None
+        sound = unpack_sound(record.payload)
+        return sound if sound.index == index else None
 
     def damaged(self, index: int) -> StreamError:
         """The error for a packet that was damaged after opening."""
@@ -311,6 +342,7 @@ def differences(first: StreamHeader, later: StreamHeader) -> Sequence[str]:
         "similarity": first.similarity != later.similarity,
         "frames a second": first.fps != later.fps,
         "codec": first.codec != later.codec,
+        "sound": first.sound != later.sound,
     }
     return [name for name, differs in found.items() if differs]
 

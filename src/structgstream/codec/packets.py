@@ -21,8 +21,9 @@ from structgstream.codec.container.blocks import (
     read_description,
     unpack_blocks,
 )
-from structgstream.codec.container.records import FRAME, PacketKind
+from structgstream.codec.container.records import FRAME, PacketKind, RecordType, packed
 from structgstream.codec.fields.static_fields import UNCODED_FIELDS, decode_fields, encode_fields
+from structgstream.codec.sound import SoundFormat, sound_format
 from structgstream.errors import CalibrationError, ConfigError, StreamError
 from structgstream.scene.state import FIELDS, STATE_TABLE, FieldName
 
@@ -46,6 +47,7 @@ class StreamHeader:
         init_steps: ``compact`` only: quantization steps by field of ``static`` and ``reference``
             (``static_fields.py``), each a float32 number.
         periods: whether other periods, with init records of their own, may follow.
+        sound: what is stored beside the frames; None for no sound.
     """
 
     rig: CameraRig
@@ -61,6 +63,7 @@ class StreamHeader:
     reference: Mapping[FieldName, Tensor] = field(default_factory=dict)
     init_steps: Mapping[FieldName, float] = field(default_factory=dict)
     periods: bool = False
+    sound: SoundFormat | None = None
 
     def camera(self, camera: Camera | str) -> Camera:
         """A camera in the normalised units of the decoded scenes; it shows the same picture.
@@ -88,6 +91,7 @@ class Packet:
         pts_seconds: presentation time.
         payload: the coded fields.
         field_bytes: length of each field's part of the payload.
+        sound: payload of the sound record that follows; None in a stream without sound.
     """
 
     kind: PacketKind
@@ -95,9 +99,15 @@ class Packet:
     pts_seconds: float
     payload: bytes
     field_bytes: Mapping[str, int]
+    sound: bytes | None = None
 
     def __repr__(self) -> str:
         return f"Packet({self.kind.name}, index={self.index}, {len(self.payload)} bytes)"
+
+
+def sound_record(packet: Packet) -> bytes:
+    """The record of a packet's sound; nothing in a stream without sound."""
+    return b"" if packet.sound is None else packed(RecordType.SOUND, packet.sound)
 
 
 class PacketSink(Protocol):
@@ -229,6 +239,7 @@ def pack_header(header: StreamHeader) -> bytes:
         **({"steps": dict(header.steps)} if header.steps else {}),
         **({"init_steps": dict(header.init_steps)} if header.init_steps else {}),
         **({"periods": True} if header.periods else {}),
+        **({"sound": header.sound.plain()} if header.sound else {}),
     }
     fields: dict[FieldName, Tensor] = {**header.static, **header.reference}
     coded = encode_fields(fields, header.init_steps) if header.codec == "compact" else {}
@@ -321,6 +332,7 @@ def _header(description: dict[str, Any], static: Mapping[FieldName, Tensor]) -> 
         init_steps=_steps(description.get("init_steps", {})),
         reference={name: value for name, value in static.items() if name in dynamic},
         periods=flags[1],
+        sound=sound_format(description.get("sound")),
     )
 
 

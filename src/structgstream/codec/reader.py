@@ -30,6 +30,7 @@ from structgstream.codec.contents import Damage, PacketInfo, Packets, PeriodTabl
 from structgstream.codec.packets import Packet, PacketKind, StreamHeader
 from structgstream.codec.scene_coder import SceneDecoder
 from structgstream.codec.segments.stored_bytes import is_segments, open_segments
+from structgstream.codec.sound import FrameSound
 from structgstream.errors import StreamError
 from structgstream.kernels.backend import Backend, BackendName, select_backend
 from structgstream.scene.render import render, to_8bit_image
@@ -243,6 +244,15 @@ class StreamReader:
             first -= 1
         for number in range(first, index + 1):
             yield self.packets.packet(number)
+
+    def sound(self, index: int) -> FrameSound | None:
+        """The sound that is stored with one frame; None if there is none, or it or the frame is damaged.
+
+        Raises:
+            StreamError: its record is whole and violates the format.
+        """
+        place = first_run(self.runs, index)
+        return self.packets.sound(index) if place < len(self.runs) and index in self.runs[place] else None
 
     def scenes(self, start: int = 0) -> Iterator[tuple[PacketInfo, Scene]]:
         """Every frame from ``start`` on, one at a time, up to the first lost one."""

@@ -22,7 +22,7 @@ from structgstream.codec.container.records import (
     prefix,
 )
 from structgstream.codec.contents import LOST, PacketInfo, Packets, readable_part
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader, pack_header
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader, pack_header, sound_record
 from structgstream.codec.reader import StreamReader
 from structgstream.codec.segments.recovery import find
 from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsSink
@@ -63,7 +63,9 @@ class _Writer:
         self._file.truncate(end)
 
     def open(self, header: StreamHeader) -> int:
-        data = prefix(periods=header.periods) + packed(RecordType.INIT, pack_header(header))
+        data = prefix(periods=header.periods, sound=header.sound is not None) + packed(
+            RecordType.INIT, pack_header(header)
+        )
         self._header_bytes = self._append(data)
         return self._header_bytes
 
@@ -74,7 +76,7 @@ class _Writer:
     def write(self, packet: Packet) -> int:
         assert packet.kind is PacketKind.KEY or not self._init, "a period begins with a key packet"
         kind, period = RECORD_TYPES[packet.kind], self._period + bool(self._init)
-        record = packed(kind, packet.payload, period=period)
+        record = packed(kind, packet.payload, period=period) + sound_record(packet)
         self._largest = max(self._largest, len(record))
         check_room(
             self._free(),

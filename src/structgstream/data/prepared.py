@@ -60,6 +60,7 @@ class PreparedCapture:
     unit: Unit = "arbitrary"  # of poses and points; ``arbitrary`` where no length was given
     held_out: frozenset[str] = field(default_factory=frozenset)  # names of the held-out cameras
     points: str | None = None  # file of points ``[P, 3]`` (``.npy``) relative to the capture, or None
+    sound: str | None = None  # camera of the best microphone; None where none has sound
 
     def only(self, names: Collection[str]) -> "PreparedCapture":
         """These cameras, in the order of the capture, without points."""
@@ -94,6 +95,7 @@ def prepared_entries(capture: PreparedCapture) -> dict[str, Any]:
         "near": capture.near,
         "held_out": sorted(capture.held_out, key=natural),
         "points": capture.points,
+        **({"sound": capture.sound} if capture.sound is not None else {}),
         "cameras": cameras,
     }
 
@@ -122,6 +124,7 @@ def read_prepared(path: Path) -> PreparedCapture:
             unit=cast(Unit, content["unit"]),
             held_out=frozenset(content["held_out"]),
             points=None if content["points"] is None else str(content["points"]),
+            sound=str(content["sound"]) if content.get("sound") in entries else None,
         )
 
 

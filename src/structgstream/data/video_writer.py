@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes pictures as a widely playable video: H.264 in mp4, 4:2:0, BT.709, constant quality."""
+"""Writes pictures as a widely playable video: H.264 in mp4, 4:2:0, BT.709, constant quality; sound as AAC."""
 
 from contextlib import AbstractContextManager
 from fractions import Fraction
@@ -13,8 +13,11 @@ from numpy.typing import NDArray
 from structgstream.atomic_files import give_name, partial_path
 from structgstream.data.video_index import load_av
 from structgstream.errors import StorageError
+from structgstream.opus import SAMPLE_RATE
 
 BT709, LIMITED_RANGE, FULL_RANGE = 1, 1, 2  # values of ISO/IEC 23091-2 and of libavutil
+SOUND_BITS_PER_SECOND = 128_000
+TICKS = 90_000  # a second, of pictures with times
 BICUBIC, ACCURATE_ROUNDING = 0x4, 0x40000
 
 
@@ -24,11 +27,14 @@ class VideoWriter(AbstractContextManager["VideoWriter"]):
     The file gets its name when the ``with`` block ends without an error, so it is never incomplete. Odd sizes are
     padded by one pixel, because 4:2:0 needs even ones.
 
+    Args:
+        channels: of sound, 1 or 2; None for no sound.
+
     Raises:
         StorageError: the file cannot be written, or this PyAV has no H.264 encoder.
     """
 
-    def __init__(self, path: Path, *, fps: float) -> None:
+    def __init__(self, path: Path, *, fps: float, channels: int | None = None) -> None:
         av = load_av()
         self.path = path
         self._part = partial_path(path)
@@ -47,17 +53,49 @@ class VideoWriter(AbstractContextManager["VideoWriter"]):
         context = self._stream.codec_context
         context.bit_rate = 0  # a rate left at its default would win over the constant quality
         state_bt709(context)
+        self._sound, self._heard = None, 0
+        if channels is not None:
+            context.time_base = Fraction(1, TICKS)
+            self._sound = self._container.add_stream("aac", rate=SAMPLE_RATE)
+            self._sound.layout = "mono" if channels == 1 else "stereo"
+            self._sound.codec_context.bit_rate = SOUND_BITS_PER_SECOND
 
-    def write(self, picture: NDArray[np.uint8]) -> None:
-        """Adds a picture ``[H, W, 3]`` sRGB."""
+    def write(self, picture: NDArray[np.uint8], *, seconds: float | None = None) -> None:
+        """Adds a picture ``[H, W, 3]`` sRGB, in a video with sound shown at ``seconds``; None: at the next multiple of
+        the frames' distance."""
         height, width = picture.shape[:2]
         even = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         if self._count == 0:
             self._stream.height, self._stream.width = even.shape[:2]
         frame = bt709_frame(even)
-        frame.pts, frame.time_base = self._count, 1 / self._fps
+        if self._sound is None:
+            frame.pts, frame.time_base = self._count, 1 / self._fps
+        else:
+            at = self._count / self._fps if seconds is None else seconds
+            frame.pts, frame.time_base = round(at * TICKS), Fraction(1, TICKS)
         self._count += 1
         self._mux(frame)
+
+    def write_sound(self, samples: NDArray[np.float32], *, seconds: float) -> None:
+        """Adds sound ``[N, channels]`` in [-1, 1] at 48 kHz, later than all before; what lies before 0 is left out.
+
+        Args:
+            seconds: when its first sample sounds.
+
+        Raises:
+            StorageError: the disk is full.
+        """
+        assert self._sound is not None, "made with channels"
+        missing = round(seconds * SAMPLE_RATE) - self._heard
+        silence = np.zeros((max(missing, 0), samples.shape[1]), np.float32)
+        samples = np.concatenate([silence, samples[max(-missing, 0) :]])
+        if not len(samples):
+            return
+        layout = self._sound.layout.name
+        frame = self._av.AudioFrame.from_ndarray(np.ascontiguousarray(samples.T), format="fltp", layout=layout)
+        frame.sample_rate, frame.pts, frame.time_base = SAMPLE_RATE, self._heard, Fraction(1, SAMPLE_RATE)
+        self._heard += len(samples)
+        self._mux(frame, self._sound)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -65,6 +103,8 @@ class VideoWriter(AbstractContextManager["VideoWriter"]):
         try:
             if kind is None and self._count:
                 self._mux(None)
+                if self._heard:
+                    self._mux(None, self._sound)
             self._container.close()
             if kind is None and self._count:
                 give_name(self._part, self.path)
@@ -73,9 +113,9 @@ class VideoWriter(AbstractContextManager["VideoWriter"]):
         finally:
             self._part.unlink(missing_ok=True)
 
-    def _mux(self, frame: object) -> None:
+    def _mux(self, frame: object, stream: Any = None) -> None:
         try:
-            self._container.mux(self._stream.encode(frame))  # pyright: ignore[reportArgumentType]
+            self._container.mux((stream or self._stream).encode(frame))  # pyright: ignore[reportArgumentType]
         except (OSError, self._av.error.FFmpegError) as error:
             raise StorageError(f"The video {self.path} cannot be written ({error.strerror}).") from None
 

@@ -36,11 +36,13 @@ from structgstream.data.camera_files import (
 from structgstream.data.images import PICTURE_SUFFIXES, check_one_series, picture_size, read_picture, significant_bits
 from structgstream.data.posed_capture import filmed_roots
 from structgstream.data.prepared import pictures_of
+from structgstream.data.sound import read_audio
 from structgstream.data.timeline import Clock, natural, picture_slots
 from structgstream.data.video import measured_fps, pictures_at
-from structgstream.data.video_index import VIDEO_SUFFIXES, VideoTrack, load_av, open_video, scan_videos, video_stream
+from structgstream.data.video_index import VIDEO_SUFFIXES, VideoTrack, open_video, scan_videos, video_stream
 from structgstream.errors import CaptureError
 from structgstream.geometry import Indices
+from structgstream.opus import SAMPLE_RATE
 
 _log = logging.getLogger(__name__)
 
@@ -135,8 +137,8 @@ class Footage:
         """Mono samples ``[N]`` and their rate in hertz; sample 0 is at time 0 of the stamps. None without sound."""
         if name not in self.tracks:
             return None
-        samples = read_audio(self.files[name], rate=(rate := 48_000))
-        return None if samples is None else (samples, float(rate))
+        samples = read_audio(self.files[name])
+        return None if samples is None else (samples, float(SAMPLE_RATE))
 
     def metadata(self, name: str) -> dict[str, str]:
         """What a camera's file states as text, by lower-case key; nothing for pictures."""
@@ -271,42 +273,6 @@ def _check_left(root: Path, found: Mapping[str, Path]) -> None:
             "The folder %s is left out: it holds no %s, as %s does. If it is a camera, give all of one kind.",
             entry, "video" if taken.suffix.lower() in VIDEO_SUFFIXES else "picture", taken,
         )  # fmt: skip
-
-
-LONGEST_SECONDS = 7200.0
-
-
-def read_audio(path: Path, *, rate: int = 48_000) -> NDArray[np.float32] | None:
-    """Mono samples ``[N]`` in [-1, 1]; sample ``k`` sounds at ``k / rate`` seconds of the video's time stamps.
-
-    Where the sound starts later than time 0, silence precedes it. None when the file has no sound.
-    """
-    av = load_av()
-    with open_video(path) as container:
-        if not container.streams.audio:
-            return None
-        stream = container.streams.audio[0]
-        resampler = av.AudioResampler(format="flt", layout="mono", rate=rate)
-        parts: list[NDArray[np.float32]] = []
-        start_seconds: float | None = None
-        try:
-            for frame in container.decode(stream):
-                if start_seconds is None:
-                    start_seconds = 0.0 if frame.time is None else float(frame.time)
-                parts += [resampled.to_ndarray()[0] for resampled in resampler.resample(frame)]
-            parts += [resampled.to_ndarray()[0] for resampled in resampler.resample(None)]
-        except av.error.FFmpegError as error:
-            raise CaptureError(
-                f"The sound of {path} cannot be decoded ({error.strerror}); copy the file again, or synchronise by "
-                "another method."
-            ) from None
-    if not parts or start_seconds is None:
-        return None
-    samples = np.concatenate(parts).astype(np.float32)
-    first = round(start_seconds * rate)
-    if len(samples) + first > LONGEST_SECONDS * rate:
-        raise CaptureError(f"{path} is longer than two hours; cut it to the take.")
-    return np.concatenate([np.zeros(first, np.float32), samples]) if first > 0 else samples[-first:]
 
 
 Picture = NDArray[np.uint8]

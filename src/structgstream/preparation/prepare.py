@@ -29,6 +29,7 @@ from structgstream.data.prepared import (
     recognizes_prepared,
     write_prepared,
 )
+from structgstream.data.sound import read_audio
 from structgstream.data.source import FrameSource, WithRig
 from structgstream.data.timeline import Clock
 from structgstream.data.undistortion import rectilinear
@@ -76,6 +77,7 @@ from structgstream.preparation.solvers import (
     unpacked,
     unpacked_clocks,
 )
+from structgstream.preparation.sound import best_microphone
 
 MIN_SOLVED = 3  # cameras, for poses that can be checked
 POINTS = "points.npy"
@@ -278,6 +280,21 @@ class Job:
         write_prepared(self.capture, content)
         return content
 
+    def sound(self, footage: Footage, content: PreparedCapture) -> None:
+        """Chooses the camera whose sound streams get."""
+        if not footage.tracks:
+            return
+        found = self.steps.run(
+            "sound",
+            {"files": fingerprint(footage.files)},
+            lambda: best_microphone((name, read_audio(footage.files[name])) for name in footage.cameras),
+            pack=lambda camera: Stored({"camera": camera}),
+            unpack=lambda stored: stored.values["camera"],
+            summary=lambda camera: "no camera has any" if camera is None else f"the microphone of {camera} is the best",
+        )
+        if found is not None:
+            write_prepared(self.capture, replace(content, sound=found))
+
     def check(self, content: PreparedCapture) -> tuple[Finding, ...]:
         def look() -> tuple[Finding, ...]:
             source = self._source(content)
@@ -452,6 +469,7 @@ def prepare_capture(
         job.link(footage, content)
         content = job.points(job.near(content))
         findings = job.check(content)
+        job.sound(footage, content)
     report = capture / REPORT / "index.html"
     return Preparation(capture, findings, job.steps.summaries, tuple(job.steps.skipped), report)
 

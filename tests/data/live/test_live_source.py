@@ -4,6 +4,7 @@
 import io
 import logging
 import threading
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from itertools import islice, pairwise
@@ -26,8 +27,10 @@ from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_p
 from structgstream.data.source import frame_count, is_recording
 from structgstream.data.video import srgb
 from structgstream.errors import CaptureError, ConfigError, StorageError
+from structgstream.opus import PACKET_SECONDS
 from tests.support.rigs import arc_rig
 from tests.support.sender_modules import moving_pictures, sender, sent_loops, sent_stream
+from tests.support.sounds import add_sound, claps, packets_heard
 from tests.support.varied import varied
 
 NAMES = ("a", "b", "c")
@@ -420,3 +423,40 @@ def test_options_that_make_no_sense_are_refused(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace("[cameras.c]", "[cameras.d]"))
     with pytest.raises(CaptureError, match="names camera 'd'"):
         LiveSource(path, tmp_path / "x.sgs")
+
+
+@pytest.mark.parametrize("clock", ["stream", "arrival"])
+def test_the_sound_of_a_camera_is_in_step_with_the_pictures(tmp_path: Path, clock: str) -> None:
+    """A clap is filmed half a second after the film's first picture; sets that are skipped leave no gap."""
+    path = files(tmp_path)
+    path.write_text(path.read_text().replace('"stream"', f'"{clock}"'))
+    with av.open(str(tmp_path / "b.ts")) as container:
+        first = next(frame.time for frame in container.decode(video=0))
+    assert first is not None
+    add_sound(tmp_path / "b.ts", tmp_path / "heard.ts", claps(1.0, 0.5), start=first)
+    (tmp_path / "heard.ts").replace(tmp_path / "b.ts")
+    source = LiveSource(path, tmp_path / "x.sgs", LiveOptions(sound="b", denoising=DenoisingConfig(frames=1)))
+    assert source.sound is not None
+    feed, packets, expected = source.sound.open(), [], []
+    for frame in source.frames():
+        packets += feed.until(frame.pts_seconds + 1 / FPS)
+        expected.append(frame.pts_seconds + 0.5 - shown(frame.images["b"]) / FPS)
+        time.sleep(0.1)
+    packets += feed.until(10.0)
+    times = [packet.seconds for packet in packets]
+    assert np.diff(times) == pytest.approx(PACKET_SECONDS)
+    (heard,) = packets_heard(packets)
+    loop = len(moving_pictures()) / FPS
+    apart = [(one - heard + loop / 2) % loop - loop / 2 for one in expected]
+    assert np.abs(apart).max() < 0.5 / FPS + 0.003, "a set has pictures of up to half a frame from its instant"
+
+
+def test_a_camera_that_sends_no_sound_is_said_and_one_that_is_not_there_refused(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = files(tmp_path, frames=5)
+    with pytest.raises(ConfigError, match="has no camera 'z' whose sound could be stored; it has a, b, c"):
+        LiveSource(path, tmp_path / "x.sgs", LiveOptions(sound="z"))
+    source = LiveSource(path, tmp_path / "x.sgs", LiveOptions(sound="b"))
+    assert len(list(source.frames())) > 0
+    assert sum("sends no sound, which --sound asks for" in record.message for record in caplog.records) == 1

@@ -17,8 +17,8 @@ from structgstream.errors import StreamError
 
 MAGIC = b"\x89SGS\r\n\x1a\n"
 MAJOR = 2
-MINOR, MINOR_WITH_PERIODS = 0, 1
-"""Minor versions: of a stream of one period, and of one that may have several."""
+MINOR, MINOR_WITH_PERIODS, MINOR_WITH_SOUND = 0, 1, 2
+"""Minor versions: of a stream of one period, of one that may have several, and of one with sound."""
 PREFIX = struct.Struct("<8sHH")
 RECORD = struct.Struct("<BBHI")
 CHECKSUM = struct.Struct("<I")
@@ -35,6 +35,7 @@ class RecordType(IntEnum):
     KEY = 2
     DELTA = 3
     INDEX = 4
+    SOUND = 32
 
 
 class PacketKind(IntEnum):
@@ -79,14 +80,14 @@ class Record:
         return self.offset + RECORD.size + len(self.payload) + CHECKSUM.size
 
 
-def prefix(*, periods: bool = False) -> bytes:
-    """The first bytes of a file, which may have several ``periods``."""
-    return PREFIX.pack(MAGIC, MAJOR, MINOR_WITH_PERIODS if periods else MINOR)
+def prefix(*, periods: bool = False, sound: bool = False) -> bytes:
+    """The first bytes of a file, which may have several ``periods``, or ``sound``."""
+    return PREFIX.pack(MAGIC, MAJOR, MINOR_WITH_SOUND if sound else MINOR_WITH_PERIODS if periods else MINOR)
 
 
 def may_be_prefix(data: bytes | memoryview) -> bool:
     """Whether ``data`` is the beginning of some prefix, perhaps all of it."""
-    return any(prefix(periods=periods).startswith(bytes(data)) for periods in (False, True))
+    return any(one.startswith(bytes(data)) for one in (prefix(), prefix(periods=True), prefix(sound=True)))
 
 
 def packed(kind: int, payload: bytes, *, period: int = 0) -> bytes:

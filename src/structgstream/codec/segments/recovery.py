@@ -91,7 +91,8 @@ class Draft:
 
 def init_file(header: StreamHeader, number: int) -> bytes:
     """The file of a period: prefix and init record."""
-    return prefix(periods=header.periods or number > 0) + packed(RecordType.INIT, pack_header(header), period=number)
+    start = prefix(periods=header.periods or number > 0, sound=header.sound is not None)
+    return start + packed(RecordType.INIT, pack_header(header), period=number)
 
 
 def period_entry(data: bytes, number: int, *, first_frame: int, first_segment: int) -> PeriodEntry:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 from structgstream.codec.container.byte_source import check_room
 from structgstream.codec.container.records import RECORD_TYPES, packed
-from structgstream.codec.packets import Packet, PacketKind, StreamHeader
+from structgstream.codec.packets import Packet, PacketKind, StreamHeader, sound_record
 from structgstream.codec.segments.manifest import (
     MANIFEST,
     MAX_MANIFEST_BYTES,
@@ -198,14 +198,14 @@ class SegmentsSink:
         return size
 
     def write(self, packet: Packet) -> int:
-        """Write one packet; returns the bytes of its record. Raises StorageError if it cannot be written; earlier
+        """Write one packet; returns the bytes of its records. Raises StorageError if it cannot be written; earlier
         packets stay."""
         draft = self._opened()
         assert packet.index == draft.manifest.edge.frame + 1, "frames have no gaps"
         period = draft.manifest.periods[-1]
         begins = packet.index == period.first_frame
         assert packet.kind is PacketKind.KEY or not begins, "a period begins with a key packet"
-        record = packed(RECORD_TYPES[packet.kind], packet.payload, period=period.period)
+        record = packed(RECORD_TYPES[packet.kind], packet.payload, period=period.period) + sound_record(packet)
         self._check_room(draft, len(record))
         part = part_of(record)
         self._put([(part.file, record)])

@@ -17,10 +17,11 @@ delay allows. Pictures that a network delayed come late, never early, so they do
 """
 
 import logging
+import math
 import threading
 import zlib
 from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager, closing
+from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
@@ -28,12 +29,14 @@ import numpy as np
 
 from structgstream.data.live.recorder import CameraRecorder
 from structgstream.data.live.rig_file import LiveCamera, TimeBase
+from structgstream.data.live.sound import LiveSound
 from structgstream.data.live.status import Fault, FaultLog
 from structgstream.data.live.synchronizer import LivePicture
 from structgstream.data.video_index import load_av, video_stream
 from structgstream.remote_folders import without_secrets
 
 if TYPE_CHECKING:
+    from av.audio.frame import AudioFrame
     from av.packet import Packet
     from av.video.frame import VideoFrame
 
@@ -206,6 +209,7 @@ class CameraFeed:
         stuck_seconds: a picture that does not change for this time is not used if others change.
         open_camera: opens a camera with a timeout in seconds; None for PyAV.
         wait: waits some seconds before reconnecting; None for a wait that :meth:`stop` ends.
+        sound: receives the camera's sound; None where that is not wanted.
     """
 
     def __init__(
@@ -225,12 +229,13 @@ class CameraFeed:
         recorder: CameraRecorder | None = None,
         open_camera: OpenCamera | None = None,
         wait: Callable[[float], object] | None = None,
+        sound: LiveSound | None = None,
     ) -> None:
         self.name, self._camera, self._size = name, camera, size
         self._receiver, self._clock, self._faults, self._base = receiver, clock, faults, base
         self._now, self._unix_offset = now, unix_offset
         self._silent, self._stuck = silent_seconds, stuck_seconds
-        self._recorder = recorder
+        self._recorder, self._sound = recorder, sound
         self._open_camera = open_with_pyav if open_camera is None else open_camera
         self._stop = threading.Event()
         self._wait = self._stop.wait if wait is None else wait
@@ -300,9 +305,12 @@ class CameraFeed:
         ticks = MPEGTS_STAMPS if container.format.name == "mpegts" else None
         self._damaged, self._decodes = True, False  # until the first key frame, before which damage is no fault
         self._before = None
-        for packet in container.demux(stream):
+        for packet in container.demux(stream, *self._sound_streams(container)):
             if self._stop.is_set():
                 return
+            if packet.stream.type == "audio":
+                self._hear(packet)
+                continue
             if self._is_duplicate(packet):
                 continue
             shift = None
@@ -312,6 +320,22 @@ class CameraFeed:
             usable = self._usable and not self._damaged and not packet.is_corrupt
             if self._recorder is not None and packet.size and usable:
                 self._recorder.record(packet, shift_seconds=self._clock.shift if shift is None else shift)
+
+    def _sound_streams(self, container: Any) -> list[Any]:
+        """The stream of sound to read; none where sound is not wanted, or not sent."""
+        if self._sound is None:
+            return []
+        if not container.streams.audio:
+            self._faults.warn(self.name, "sound", "sends no sound, which --sound asks for; the stream is silent")
+        return list(container.streams.audio[:1])
+
+    def _hear(self, packet: "Packet") -> None:
+        """Passes sound on; what cannot be decoded, or comes before the first picture, is left out."""
+        assert self._sound is not None
+        with suppress(load_av().error.FFmpegError):
+            for frame in cast("list[AudioFrame]", packet.decode()):
+                if frame.time is not None and self._decodes and math.isfinite(self._clock.shift):
+                    self._sound.add(frame, frame.time + self._clock.shift)
 
     def _is_duplicate(self, packet: "Packet") -> bool:
         """Whether the packet repeats the last one: decoded twice, its differences would be added twice."""

@@ -8,6 +8,7 @@ from typing import Any
 from structgstream.data.live.camera import CameraFeed, ClockMapper, ClockResets, OpenCamera
 from structgstream.data.live.recorder import Recording
 from structgstream.data.live.rig_file import LiveRig
+from structgstream.data.live.sound import LiveSound
 from structgstream.data.live.status import Fault, FaultLog
 from structgstream.data.live.synchronizer import FrameSynchronizer, LivePicture, PictureSet
 from structgstream.frames import MultiViewFrame
@@ -65,6 +66,7 @@ class Ingest:
         now: monotonic seconds.
         unix_offset: Unix time minus ``now``, seconds.
         open_camera: opens a camera with a timeout; None for PyAV.
+        sound: receives the sound of the camera that it names; None for none.
     """
 
     def __init__(
@@ -79,6 +81,7 @@ class Ingest:
         now: Callable[[], float],
         unix_offset: float,
         open_camera: OpenCamera | None = None,
+        sound: LiveSound | None = None,
     ) -> None:
         self._rig, self._faults, self.buffer, self._now = rig, faults, buffer, now
         self._synchronizer = FrameSynchronizer(
@@ -108,6 +111,7 @@ class Ingest:
                 size=sizes[name],
                 clock=ClockMapper(rig.clock, offset_seconds=camera.offset_seconds, resets=resets),
                 recorder=None if recording is None else recording.camera(name, faults),
+                sound=sound if sound is not None and sound.name == name else None,
                 **common,
             )
             for name, camera in rig.cameras.items()

@@ -20,6 +20,7 @@ from structgstream.data.live.ingest import FrameBuffer, Ingest
 from structgstream.data.live.recorder import Recording
 from structgstream.data.live.resume_cache import ResumeCache, resume_folder
 from structgstream.data.live.rig_file import LiveRig, TimeBase, check_cameras, read_rig
+from structgstream.data.live.sound import LiveSound
 from structgstream.data.live.status import CameraStatus, Fault, FaultLog, LiveStatus
 from structgstream.data.live.synchronizer import PictureSet
 from structgstream.data.masks import FOLDER, with_masks
@@ -36,7 +37,7 @@ from structgstream.data.source import FrameSource
 from structgstream.data.undistortion import lenses_of
 from structgstream.data.video import srgb
 from structgstream.data.video_index import load_av
-from structgstream.errors import CaptureError, StorageError
+from structgstream.errors import CaptureError, ConfigError, StorageError
 from structgstream.frames import MIN_CAMERAS, MultiViewFrame
 
 
@@ -111,6 +112,7 @@ class LiveOptions:
     near: float | None = None  # see ``open_capture``
     record: Path | None = None  # folder for the cameras' packets; None for none
     resume: bool = False  # whether the stream is continued
+    sound: str | None = None  # the camera whose sound is stored; None for none
     denoising: DenoisingConfig = field(default_factory=DenoisingConfig)  # over how many sets frame 0 is averaged
 
 
@@ -142,6 +144,11 @@ class LiveSource:
         calibration = read_calibration(rig.calibration)
         check_cameras(rig, list(calibration.cameras), path)
         self._calibration = calibration.only(rig.cameras)
+        if options.sound is not None and options.sound not in rig.cameras:
+            raise ConfigError(
+                f"{path} has no camera {options.sound!r} whose sound could be stored; it has {', '.join(rig.cameras)}."
+            )
+        self.sound = None if options.sound is None else LiveSound(options.sound)
         self._live: LiveRig = rig
         self._options, self._now = options, now
         self._unix_offset = unix() - now()
@@ -219,6 +226,8 @@ class LiveSource:
                 times, seconds = ingest.buffer.times, frame.pts_seconds
                 origin = self._origin(origin, seconds, pts)
                 pts = seconds - origin
+                if self.sound is not None:
+                    self.sound.synchronize(origin)
                 frame = replace(frame, index=index, pts_seconds=pts)
                 if index == 0:
                     frame = self._denoised(frame, ingest)
@@ -334,6 +343,7 @@ class LiveSource:
             recording=recording,
             now=self._now,
             unix_offset=self._unix_offset,
+            sound=self.sound,
         )
         try:
             ingest.start()

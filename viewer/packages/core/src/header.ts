@@ -2,6 +2,7 @@
 /** The header of a stream, which a receiver needs before the first frame. */
 
 import type { FieldName, Fields } from "./fields.js";
+import type { SoundFormat } from "./sound.js";
 
 /** A camera of the capture, in the capture's own units. */
 export interface Camera {
@@ -35,6 +36,8 @@ export interface StreamHeader {
   readonly distanceInput: boolean;
   readonly config: Readonly<Record<string, unknown>>;
   readonly metadata: Readonly<Record<string, unknown>>;
+  /** Undefined for a stream without sound. */
+  readonly sound: SoundFormat | undefined;
 }
 
 /** A part of a stream with its own init record, at byte `offset`; `first` is its first frame. */
@@ -47,11 +50,11 @@ export interface Period {
 
 /** A sentence on the difference of two headers in what all periods must have in common; undefined if there is none. */
 export function difference(first: StreamHeader, later: StreamHeader): string | undefined {
-  const shared = ({ cameras, similarity, fps, codec }: StreamHeader) =>
-    JSON.stringify([cameras, similarity, fps, codec]);
+  const shared = ({ cameras, similarity, fps, codec, sound }: StreamHeader) =>
+    JSON.stringify([cameras, similarity, fps, codec, sound]);
   return shared(first) === shared(later)
     ? undefined
-    : "its cameras, similarity, fps or codec are not those of the first";
+    : "its cameras, similarity, fps, codec or sound are not those of the first";
 }
 
 export function trainingCameras(header: StreamHeader): number {

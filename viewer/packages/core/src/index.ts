@@ -10,7 +10,7 @@ export { GaussianEvaluator, type GaussianOptions, type Gaussians, type Point } f
 export { type Camera, difference, type Period, type Similarity, type StreamHeader } from "./header.js";
 export { unpackedHeader } from "./initRecord.js";
 export { Playback, type PlaybackOptions } from "./playback.js";
-export { type PacketInfo, type ReaderState, readStream, StreamReader } from "./reader.js";
+export { type PacketInfo, type ReaderState, readStream, type StoredSound, StreamReader } from "./reader.js";
 export {
   CHECKSUM_BYTES,
   checkPrefix,
@@ -21,3 +21,4 @@ export {
   recordIn,
   type StreamRecord,
 } from "./records.js";
+export { type FrameSound, PACKET_SAMPLES, SOUND_RATE, type SoundFormat, soundOf } from "./sound.js";

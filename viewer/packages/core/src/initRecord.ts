@@ -8,6 +8,7 @@ import { checkShapes, type FieldName, type Fields, isFieldName, isScene, mergedF
 import { type Camera, type StreamHeader, trainingCameras } from "./header.js";
 import { unpackedJson } from "./json.js";
 import { viewOf } from "./records.js";
+import type { SoundFormat } from "./sound.js";
 import { AS_THEY_ARE, decodedFields } from "./staticFields.js";
 
 const LENGTH_BYTES = 4;
@@ -74,7 +75,13 @@ function headerOf(description: Record<string, unknown>, fields: Fields): StreamH
     distanceInput: flag(description.distance_input, "distance_input"),
     config: object(description.config, "config"),
     metadata: object(description.metadata, "metadata"),
+    sound: description.sound === undefined ? undefined : soundFormat(object(description.sound, "sound")),
   };
+}
+
+function soundFormat({ codec, channels }: Record<string, unknown>): SoundFormat {
+  if (codec === "opus" && channels !== 1 && channels !== 2) throw wrong("sound.channels", "1 or 2");
+  return { codec: text(codec, "sound.codec"), channels: Number(channels) };
 }
 
 function selected(fields: Fields, wanted: (name: FieldName) => boolean): Map<FieldName, Tensor> {

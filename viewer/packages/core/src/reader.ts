@@ -23,6 +23,7 @@ import {
   recordIn,
   type StreamRecord,
 } from "./records.js";
+import { type FrameSound, soundOf } from "./sound.js";
 
 /** One packet's position in the stream: `bytes` is the length of the record at byte `offset`. */
 export interface PacketInfo {
@@ -44,12 +45,18 @@ interface Begun extends Period {
   header: StreamHeader | undefined;
 }
 
+/** The sound of a frame; its record ends at byte `end` of the stream. */
+export interface StoredSound extends FrameSound {
+  readonly end: number;
+}
+
 export class StreamReader {
   private readonly queue = new ByteQueue();
   private readonly search = new Search();
   // By frame, as `infos` is: undefined for lost packets, and payloads also for removed ones.
   private readonly payloads: (Uint8Array | undefined)[] = [];
   private readonly infos: (PacketInfo | undefined)[] = [];
+  private sounds: StoredSound[] = [];
   private readonly shown: boolean[] = [];
   private readonly whole: PacketInfo[] = [];
   private readonly damaged: Standing[] = [];
@@ -177,6 +184,7 @@ export class StreamReader {
   forget(index: number): void {
     const end = this.groupStart(Math.min(index, this.infos.length - 1));
     for (; this.kept < end; this.kept++) this.payloads[this.kept] = undefined;
+    this.sounds = this.sounds.filter((sound) => sound.index >= end);
   }
 
   /**
@@ -188,6 +196,13 @@ export class StreamReader {
     const packet = this.packet(index);
     this.payloads[index] = undefined;
     return packet;
+  }
+
+  /** Removes and returns the sound that has been read since the last call, in order. */
+  takeSounds(): StoredSound[] {
+    const { sounds } = this;
+    this.sounds = [];
+    return sounds;
   }
 
   private decoderOf(index: number): SceneDecoder {
@@ -306,6 +321,11 @@ export class StreamReader {
         );
       }
       this.addPacket(packetOf(record.payload, record.type === RecordType.key), record.offset, bytes);
+    } else if (record.type === RecordType.sound && this.header?.sound?.codec === "opus") {
+      const sound = soundOf(record.payload);
+      if (!this.open && sound?.index === this.infos.length - 1) {
+        this.sounds.push({ ...sound, end: record.offset + bytes });
+      }
     }
   }
 

@@ -3,7 +3,7 @@
 
 import { StreamError } from "./errors.js";
 
-export const RecordType = { init: 1, key: 2, delta: 3, index: 4 } as const;
+export const RecordType = { init: 1, key: 2, delta: 3, index: 4, sound: 32 } as const;
 export const MAJOR = 2;
 export const PREFIX_BYTES = 12;
 export const HEAD_BYTES = 8;

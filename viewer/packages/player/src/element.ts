@@ -5,7 +5,7 @@
  * | attribute | meaning |
  * |---|---|
  * | `src` | address of a stream, of a manifest of segments (`.json`), or `#id` of an element of the page that holds one as base64 |
- * | `autoplay`, `loop`, `poster` | as for a video |
+ * | `autoplay`, `loop`, `poster`, `muted` | as for a video; without a gesture, browsers play pictures alone until there is one |
  * | `controls="off"` | no controls; the picture can still be turned |
  * | `embed` | few controls |
  * | `theme` | `dark` or `light`; default: that of the system |
@@ -16,6 +16,7 @@
  * `detail` has the event's data. Children are shown over the picture; those with `slot="controls"` in the bar.
  */
 
+import { SOUND_RATE } from "@structgstream/core";
 import { type Camera, type RenderStats, type ResourceCounts, SplatRenderer } from "@structgstream/gl";
 import type { Engine } from "./engine/engine.js";
 import { type MediaEvents, MediaState, Ranges } from "./mediaEvents.js";
@@ -31,6 +32,8 @@ import { QualityControl } from "./view/quality.js";
 
 /** As `MediaError.code` has it: the stream cannot be fetched or decoded. */
 const MEDIA_ERR_SRC_NOT_SUPPORTED = 4;
+/** In a page that is hidden the player goes on at this interval. */
+const HIDDEN_MILLISECONDS = 500;
 
 interface Running {
   readonly player: Player;
@@ -46,16 +49,21 @@ export class StructgstreamPlayer extends HTMLElement {
   static readonly observedAttributes = ["src", "loop", "controls", "embed", "poster"];
   private running: Running | undefined;
   private ticking: number | undefined;
+  private listening: ReturnType<typeof setInterval> | undefined;
   private link: Link | undefined;
   /** The stream's address, if a link can contain it. */
   private linked: string | undefined;
   private source = "";
+  /** Whether it is muted; undefined: as the attribute says. */
+  private silenced: boolean | undefined;
+  private loudness = 1;
 
   connectedCallback(): void {
     this.link ??= this.hasAttribute("isolated") ? undefined : linkOf(new URL(location.href));
     if (!this.running) this.start();
     if (!this.running) return;
     this.ticking ??= requestAnimationFrame(this.tick);
+    this.listening ??= setInterval(this.listen, HIDDEN_MILLISECONDS);
   }
 
   disconnectedCallback(): void {
@@ -130,6 +138,37 @@ export class StructgstreamPlayer extends HTMLElement {
   set loop(loop: boolean) {
     this.toggleAttribute("loop", loop);
     this.running?.player.setLoop(loop);
+  }
+
+  get muted(): boolean {
+    return this.running?.player.sound.muted ?? this.silenced ?? this.defaultMuted;
+  }
+
+  set muted(muted: boolean) {
+    this.silenced = muted;
+    this.running?.player.setMuted(muted);
+  }
+
+  /** Whether it begins muted: the attribute, as of a video. */
+  get defaultMuted(): boolean {
+    return this.hasAttribute("muted");
+  }
+
+  set defaultMuted(muted: boolean) {
+    this.toggleAttribute("muted", muted);
+  }
+
+  get volume(): number {
+    return this.running?.player.sound.volume ?? this.loudness;
+  }
+
+  /** @throws DOMException it is not from 0 to 1 */
+  set volume(volume: number) {
+    if (!(volume >= 0 && volume <= 1)) {
+      throw new DOMException(`The volume is ${volume}; expected a number from 0 to 1.`, "IndexSizeError");
+    }
+    this.loudness = volume;
+    this.running?.player.setVolume(volume);
   }
 
   get currentTime(): number {
@@ -310,11 +349,14 @@ export class StructgstreamPlayer extends HTMLElement {
         quality,
         startPipeline: startedPipeline,
         now: () => performance.now() / 1000,
+        startAudio: () => new AudioContext({ sampleRate: SOUND_RATE }),
       });
     } catch (error) {
       this.startWithout(root, style, error);
       return;
     }
+    player.sound.muted = this.silenced ?? this.defaultMuted;
+    player.sound.volume = this.loudness;
     const ui = new PlayerUi({
       host: this,
       canvas,
@@ -367,6 +409,8 @@ export class StructgstreamPlayer extends HTMLElement {
   private stop(): void {
     if (this.ticking !== undefined) cancelAnimationFrame(this.ticking);
     this.ticking = undefined;
+    clearInterval(this.listening);
+    this.listening = undefined;
     const { running } = this;
     this.running = undefined;
     running?.observer.disconnect();
@@ -378,6 +422,11 @@ export class StructgstreamPlayer extends HTMLElement {
     this.ticking = requestAnimationFrame(this.tick);
     this.running?.player.tick();
     this.running?.ui.tick();
+  };
+
+  /** No pictures are asked for in a page that is hidden; its sound goes on, as that of a video. */
+  private readonly listen = (): void => {
+    if (document.hidden && this.running?.player.sound.wanted) this.running.player.tick();
   };
 
   private applyAttributes(ui: PlayerUi): void {

@@ -28,6 +28,8 @@ export interface MediaEvents {
   /** The time has changed: at most four times a second, and after each seek. */
   timeupdate: Empty;
   ratechange: Empty;
+  /** `muted` or `volume` has changed. */
+  volumechange: Empty;
 }
 
 /** Values of `readyState`. */
@@ -45,6 +47,8 @@ export class MediaState {
   private running = false;
   private stalled = false;
   private rate = 1;
+  private muted: boolean;
+  private volume: number;
   private updatedAt = Number.NEGATIVE_INFINITY;
 
   /** @param now seconds of a monotonic clock */
@@ -52,7 +56,10 @@ export class MediaState {
     private readonly player: Player,
     private readonly now: () => number,
     private readonly emit: (name: keyof MediaEvents) => void,
-  ) {}
+  ) {
+    this.muted = player.sound.muted;
+    this.volume = player.sound.volume;
+  }
 
   get readyState(): number {
     if (Number.isNaN(this.duration)) return HAVE.nothing;
@@ -112,8 +119,11 @@ export class MediaState {
   }
 
   private compare(): void {
-    const { engine, playbackRate } = this.player;
-    const { rate, paused, seeking, running } = this;
+    const { engine, playbackRate, sound } = this.player;
+    const { rate, paused, seeking, running, muted, volume } = this;
+    this.muted = sound.muted;
+    this.volume = sound.volume;
+    if (muted !== this.muted || volume !== this.volume) this.emit("volumechange");
     this.rate = playbackRate;
     this.paused = engine?.paused ?? true;
     this.seeking = engine?.seeking ?? false;

@@ -7,6 +7,7 @@ import { Emitter } from "./engine/emitter.js";
 import { Engine } from "./engine/engine.js";
 import type { EngineEvents } from "./engine/events.js";
 import type { Pipeline } from "./engine/pipeline.js";
+import { Sound } from "./sound/sound.js";
 import type { SourceDescription } from "./source/description.js";
 import { Flight } from "./view/flight.js";
 import { carried, type View, viewOf } from "./view/navigator.js";
@@ -28,10 +29,16 @@ export interface PlayerOptions {
   readonly startPipeline: () => Pipeline;
   /** Seconds of a monotonic clock. */
   readonly now: () => number;
+  /** @throws when the browser has no sound */
+  readonly startAudio: () => AudioContext;
 }
 
 /** Longest interval between consecutive pictures; after a longer one the page was hidden, or nothing changed. */
 const PAUSE_SECONDS = 1;
+/** A picture that takes longer was held up by something else. */
+const MAX_DRAW_SECONDS = 0.1;
+/** Frames over which the time of drawing is measured. */
+const DRAWN = 9;
 const FLIGHT_SECONDS = 0.9;
 
 export class Player extends Emitter<PlayerEvents> {
@@ -52,6 +59,8 @@ export class Player extends Emitter<PlayerEvents> {
   /** Smoothed time between the last pictures; undefined if they are not consecutive. */
   pictureSeconds: number | undefined;
   loop = false;
+  /** The sound of all streams, one after the other; its clock is that of the pictures. */
+  readonly sound: Sound;
   private rate = 1;
   private size: readonly [width: number, height: number] = [1, 1];
   private flight: Flight | undefined;
@@ -63,16 +72,27 @@ export class Player extends Emitter<PlayerEvents> {
   /** The first frame that the renderer has received and not drawn yet. */
   private given: { readonly index: number; readonly at: number } | undefined;
   private hasScene = false;
+  private tickedAt: number | undefined;
+  /** Smoothed time between ticks. */
+  private tickSeconds = 0;
+  /** Times from the last frames' ticks to those that drew them: they are sorted in between. */
+  private readonly drawSeconds: number[] = [];
 
   constructor(private readonly options: PlayerOptions) {
     super();
+    this.sound = new Sound({
+      startContext: options.startAudio,
+      wall: options.now,
+      gestures: globalThis.document,
+      notice: (message) => this.emit("notice", { message }),
+    });
     options.renderer.onError = (error) => this.emit("error", { message: error.message, fatal: false });
   }
 
   /** Opens a stream and closes the last one. `view` is set once the rig is known. */
   load(source: SourceDescription, startSeconds?: number, view?: (rig: Rig) => View): Engine {
     this.engine?.destroy();
-    const engine = new Engine(this.options.startPipeline(), this.options.now);
+    const engine = new Engine(this.options.startPipeline(), this.sound.now, { sound: this.sound });
     this.engine = engine;
     this.rig = undefined;
     this.flight = undefined;
@@ -113,6 +133,22 @@ export class Player extends Emitter<PlayerEvents> {
   setLoop(loop: boolean): void {
     this.loop = loop;
     if (this.engine) this.engine.loop = loop;
+    this.emit("state", {});
+  }
+
+  setMuted(muted: boolean): void {
+    this.sound.muted = muted;
+    this.emit("state", {});
+  }
+
+  /** Mutes or unmutes; where the browser waits for a gesture, this was one. */
+  toggleSound(): void {
+    if (!this.sound.waits && !this.sound.woke) this.setMuted(!this.sound.muted);
+  }
+
+  /** @param volume from 0 to 1 */
+  setVolume(volume: number): void {
+    this.sound.volume = volume;
     this.emit("state", {});
   }
 
@@ -170,6 +206,9 @@ export class Player extends Emitter<PlayerEvents> {
   tick(): void {
     const { renderer, quality, now } = this.options;
     const time = now();
+    const since = time - (this.tickedAt ?? time);
+    this.tickedAt = time;
+    if (since < PAUSE_SECONDS) this.tickSeconds = 0.9 * this.tickSeconds + 0.1 * since;
     if (this.flight) {
       const { view, over } = this.flight.at(time);
       if (over) this.flight = undefined;
@@ -219,6 +258,7 @@ export class Player extends Emitter<PlayerEvents> {
   destroy(): void {
     this.engine?.destroy();
     this.engine = undefined;
+    this.sound.destroy();
     this.options.renderer.destroy();
     this.clear();
   }
@@ -278,7 +318,14 @@ export class Player extends Emitter<PlayerEvents> {
     else if (this.given && (stats.frameIndex ?? -1) >= this.given.index) {
       this.options.quality.picture(Math.max(time - this.given.at - stats.sortMilliseconds / 1000, 0));
     }
-    if (this.given && (stats.frameIndex ?? -1) >= this.given.index) this.given = undefined;
+    if (this.given && (stats.frameIndex ?? -1) >= this.given.index) {
+      this.drawSeconds.push(Math.min(time - this.given.at, MAX_DRAW_SECONDS));
+      if (this.drawSeconds.length > DRAWN) this.drawSeconds.shift();
+      const middle = [...this.drawSeconds].sort((a, b) => a - b)[this.drawSeconds.length >> 1]!;
+      // A frame is due half a tick before its own on average, and seen half a tick after it was drawn.
+      this.sound.lagSeconds = middle + this.tickSeconds;
+      this.given = undefined;
+    }
     this.drawnView = this.view;
     this.drawnStats = stats;
     this.emit("drawn", { stats });

@@ -2,7 +2,7 @@
 /** A made-up live run: packets of stored streams as a segments folder that grows (docs/segments.md). */
 
 import { createHash } from "node:crypto";
-import { HEAD_BYTES, RecordType } from "@structgstream/core";
+import { HEAD_BYTES, RecordType, recordBytes } from "@structgstream/core";
 import { joined, piecesOf, record } from "../../core/test/streams.ts";
 
 interface Made {
@@ -28,20 +28,25 @@ export interface RunOptions {
   readonly pageSegments?: number;
 }
 
-/** The init record of a period, with the prefix, and the packets of a stream. */
+/** The init record of a period, with the prefix, and the packets of a stream, each with its sound behind it. */
 export function partsOf(stream: Uint8Array, period: number) {
   const [prefix, init, ...rest] = piecesOf(stream);
-  const packets = rest.filter((piece) => piece[0] === RecordType.key || piece[0] === RecordType.delta);
+  const packets: Uint8Array[] = [];
+  for (const piece of rest) {
+    if (piece[0] === RecordType.sound) packets.push(joined(packets.pop()!, piece));
+    else if (piece[0] !== RecordType.index) packets.push(piece);
+  }
   return { init: joined(prefix!, record(RecordType.init, init!.slice(HEAD_BYTES, -4), period)), packets };
 }
 
 /** A packet with another number, time and period. */
 export function renumbered(piece: Uint8Array, frame: number, seconds: number, period: number): Uint8Array {
-  const payload = piece.slice(HEAD_BYTES, -4);
+  const bytes = recordBytes(piece);
+  const payload = piece.slice(HEAD_BYTES, bytes - 4);
   const view = new DataView(payload.buffer);
   view.setUint32(0, frame, true);
   view.setFloat64(4, seconds, true);
-  return record(piece[0]!, payload, period);
+  return joined(record(piece[0]!, payload, period), piece.subarray(bytes));
 }
 
 export class LiveRun {

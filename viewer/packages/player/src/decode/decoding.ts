@@ -5,7 +5,7 @@
  * One packet is decoded at a time, and messages are handled in between, so a seek waits for at most one packet.
  */
 
-import { type Frame, fieldBytes, type Packet, StreamError } from "@structgstream/core";
+import { type Frame, type FrameSound, fieldBytes, type Packet, StreamError } from "@structgstream/core";
 import type { ReadReply, ReadRequest } from "../source/description.js";
 import type { Port } from "../source/port.js";
 import { ByteClient } from "./byteClient.js";
@@ -19,6 +19,8 @@ import { Throttle } from "./throttle.js";
 const LATE_PICTURE_MILLISECONDS = 250;
 /** Shortest interval between messages about values that change with every packet. */
 const POST_MILLISECONDS = 100;
+/** Sound begins so many frames before the clock. */
+const SOUND_LEAD_FRAMES = 8;
 
 export class Decoding {
   private readonly client: ByteClient;
@@ -41,6 +43,8 @@ export class Decoding {
   private readonly storedPosts = new Throttle(POST_MILLISECONDS, () => this.postStored());
   private readonly catalogPosts = new Throttle(POST_MILLISECONDS, () => this.postCatalog());
   private wake: (() => void) | undefined;
+  /** The next frame whose sound is sent, for the demand of this serial. */
+  private sound: { readonly serial: number; next: number } | undefined;
 
   constructor(
     private readonly port: Port<FromDecoder, ToDecoder>,
@@ -54,8 +58,10 @@ export class Decoding {
 
   private obey(message: ToDecoder): void {
     if (message.type === "open") this.open(message);
-    else if (message.type === "demand") this.demand = message.demand;
-    else if (message.type === "quality") this.segmented?.choose(message.quality);
+    else if (message.type === "demand") {
+      this.demand = message.demand;
+      this.sendSound();
+    } else if (message.type === "quality") this.segmented?.choose(message.quality);
     else this.announced?.changed.forget();
     this.wake?.();
   }
@@ -218,12 +224,33 @@ export class Decoding {
     this.wake?.();
   }
 
+  /** Sends the sound that is there and was not sent yet. */
+  private sendSound(): void {
+    const { stream, demand } = this;
+    if (!stream || !demand?.sound) return;
+    const { serial, until } = demand.sound;
+    const from = Math.max(demand.at - SOUND_LEAD_FRAMES, stream.catalog.first);
+    if (this.sound?.serial !== serial) this.sound = { serial, next: from };
+    this.sound.next = Math.max(this.sound.next, from);
+    const sounds: FrameSound[] = [];
+    for (; this.sound.next < Math.min(until, stream.catalog.count); this.sound.next++) {
+      const { next } = this.sound;
+      const sound = stream.store.sound(next);
+      // Sound comes with the packet; of a lost frame there is none.
+      const comes = next >= demand.at && !stream.store.has(next) && !stream.catalog.isDamaged(next);
+      if (!sound && comes) break;
+      if (sound) sounds.push(sound);
+    }
+    if (sounds.length) this.post({ type: "sound", serial, sounds });
+  }
+
   private catalogChanged(): void {
     this.catalogPosts.call();
     this.wake?.();
   }
 
   private storeChanged(): void {
+    this.sendSound();
     this.storedPosts.call();
     this.wake?.();
   }

@@ -9,7 +9,7 @@ interface Entry {
   readonly isKey: boolean;
   readonly offset: number;
   /** Start of the next known record; records of unknown types may precede it. */
-  readonly end: number;
+  end: number;
   ptsSeconds: number | undefined;
 }
 
@@ -74,6 +74,12 @@ export class FileCatalog extends Catalog {
   append({ index, isKey, offset, bytes, ptsSeconds }: PacketInfo): void {
     while (this.entries.length < index) this.markDamaged(this.entries.push(undefined) - 1);
     this.entries.push({ isKey, offset, end: offset + bytes, ptsSeconds });
+  }
+
+  /** The sound of a frame that was found during reading ends at byte `end`. */
+  extend(index: number, end: number): void {
+    const entry = this.entries[index];
+    if (entry) entry.end = Math.max(entry.end, end);
   }
 
   place(index: number): Place | undefined {

@@ -147,8 +147,11 @@ export class FileStream implements Stream {
   private take(reader: StreamReader, ended: boolean): void {
     const { catalog, store, indexed, events } = this;
     const keepFrom = events.wanted();
+    const sounds = reader.takeSounds();
     const found = reader.packets.slice(this.taken);
-    this.taken = reader.packets.length;
+    // A packet waits for the sound after it.
+    if (this.header.sound && !ended && found.length && sounds.at(-1)?.index !== found.at(-1)!.index) found.pop();
+    this.taken += found.length;
     for (const info of found) {
       const before = catalog.count;
       for (; !indexed && (reader.periods[this.begun]?.first ?? Number.POSITIVE_INFINITY) <= info.index; this.begun++) {
@@ -161,6 +164,10 @@ export class FileStream implements Stream {
       else catalog.append(info);
       if (!indexed && info.index > before) events.lost(before, info.index, "the record there is damaged");
       store.put(reader.take(info.index), keepFrom);
+    }
+    for (const sound of sounds) {
+      if (!indexed) catalog.extend(sound.index, sound.end);
+      store.putSound(sound);
     }
     reader.forgetHeaders();
     if (ended && !indexed) catalog.complete = true;

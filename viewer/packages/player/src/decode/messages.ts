@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 /** Messages between the engine and the decode worker. */
 
-import type { FieldName, StreamHeader } from "@structgstream/core";
+import type { FieldName, FrameSound, StreamHeader } from "@structgstream/core";
 import type { SceneUpdate } from "@structgstream/gl";
 import type { SourceDescription } from "../source/description.js";
 
@@ -18,6 +18,8 @@ export interface Demand {
   readonly until: number;
   /** Packets are fetched up to before this one. */
   readonly ahead: number;
+  /** Sound is sent up to before frame `until`, and from the start again with a new serial; undefined if none is wanted. */
+  readonly sound?: { readonly serial: number; readonly until: number } | undefined;
 }
 
 export type ToDecoder =
@@ -99,6 +101,8 @@ export type FromDecoder =
       readonly packets: readonly PacketFacts[];
       readonly decodeMilliseconds: number;
     }
+  /** The sound of frames in order. It begins before the clock, because decoding it needs that. */
+  | { readonly type: "sound"; readonly serial: number; readonly sounds: readonly FrameSound[] }
   /** Frames up to before `end` cannot be shown. */
   | { readonly type: "gap"; readonly serial: number; readonly end: number }
   | { readonly type: "damage"; readonly message: string; readonly lost: FrameRange }

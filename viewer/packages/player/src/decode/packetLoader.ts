@@ -1,7 +1,17 @@
 // SPDX-License-Identifier: Apache-2.0
 /** Fetches missing packets by position, one run of neighbouring packets per request. */
 
-import { ByteQueue, HEAD_BYTES, type Packet, packetOf, RecordType, recordBytes, recordIn } from "@structgstream/core";
+import {
+  ByteQueue,
+  type FrameSound,
+  HEAD_BYTES,
+  type Packet,
+  packetOf,
+  RecordType,
+  recordBytes,
+  recordIn,
+  soundOf,
+} from "@structgstream/core";
 import type { ByteClient } from "./byteClient.js";
 import type { Catalog, Place } from "./catalog.js";
 import type { PacketStore } from "./packetStore.js";
@@ -174,15 +184,19 @@ export class PacketLoader {
       at += gap;
       const head = queue.peek(HEAD_BYTES);
       const bytes = head.length === HEAD_BYTES ? recordBytes(head) : Number.POSITIVE_INFINITY;
-      const isThere = at === start && queue.length >= bytes;
+      // What follows the packet up to the next one comes with it: its sound, and records that this version does not know.
+      const isThere = at === start && queue.length >= (ended ? bytes : end - start);
       const cannotCome = head.length === HEAD_BYTES && bytes > end - start;
       if (!isThere && !cannotCome && !ended) return at;
       const packet = isThere && !cannotCome ? packetIn(queue.peek(bytes), start) : undefined;
       if (packet?.index === run.next && packet.isKey === place.isKey) {
         this.catalog.learn(packet.index, packet.ptsSeconds);
+        const all = Math.min(queue.length, end - start);
+        const sound = soundIn(queue.peek(all).subarray(bytes), start + bytes);
         this.store.put(packet, this.first);
-        queue.skip(bytes);
-        at += bytes;
+        if (sound?.index === packet.index) this.store.putSound(sound);
+        queue.skip(all);
+        at += all;
         this.events.changed();
       } else {
         this.catalog.markDamaged(run.next);
@@ -191,6 +205,13 @@ export class PacketLoader {
     }
     return at;
   }
+}
+
+/** The sound in the record at the start of `bytes`, with a copy of its payload; undefined if there is none. */
+function soundIn(bytes: Uint8Array, offset: number): FrameSound | undefined {
+  if (bytes.length < HEAD_BYTES || bytes[0] !== RecordType.sound) return undefined;
+  const record = recordIn(bytes.subarray(0, recordBytes(bytes)), offset);
+  return record && soundOf(record.payload.slice());
 }
 
 /** The packet of a complete record, with a copy of its payload; undefined if it is damaged or not a packet. */

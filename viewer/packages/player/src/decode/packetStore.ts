@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 /** A store of fetched packets with a limited number of bytes. */
 
-import type { Packet } from "@structgstream/core";
+import type { FrameSound, Packet } from "@structgstream/core";
 import type { FrameRange } from "./messages.js";
 
 /** Share of the store that is freed at once, so that not every packet starts a search. */
@@ -9,6 +9,7 @@ const LEFT = 0.9;
 
 export class PacketStore {
   private readonly packets = new Map<number, Packet>();
+  private readonly sounds = new Map<number, FrameSound>();
   private bytes = 0;
 
   /** @param budgetBytes limit of the payloads' size, except for the one packet that is needed at present */
@@ -35,6 +36,17 @@ export class PacketStore {
     return this.packets.has(packet.index);
   }
 
+  /** Stores the sound of a frame whose packet is there; it is removed with that. */
+  putSound(sound: FrameSound): void {
+    if (!this.packets.has(sound.index) || this.sounds.has(sound.index)) return;
+    this.sounds.set(sound.index, sound);
+    this.bytes += soundBytes(sound);
+  }
+
+  sound(index: number): FrameSound | undefined {
+    return this.sounds.get(index);
+  }
+
   /** Frames whose packets are available. */
   ranges(): FrameRange[] {
     const ranges: FrameRange[] = [];
@@ -53,6 +65,13 @@ export class PacketStore {
       if (this.bytes <= LEFT * this.budgetBytes || index === first) return;
       this.bytes -= this.packets.get(index)!.payload.length;
       this.packets.delete(index);
+      const sound = this.sounds.get(index);
+      if (sound) this.bytes -= soundBytes(sound);
+      this.sounds.delete(index);
     }
   }
+}
+
+function soundBytes({ packets }: FrameSound): number {
+  return packets.reduce((sum, { length }) => sum + length, 0);
 }

@@ -3,6 +3,7 @@
 
 import type { StreamHeader } from "@structgstream/core";
 import type { Demand, FromDecoder } from "../decode/messages.js";
+import { SOUND_AHEAD_SECONDS } from "../sound/sound.js";
 import type { SourceDescription } from "../source/description.js";
 import { demandOf } from "./ahead.js";
 import { MediaClock } from "./clock.js";
@@ -186,6 +187,9 @@ export class Engine extends Emitter<EngineEvents> {
     if (!this.opened || this.failed) return undefined;
     const now = this.now();
     if (this.wantsToPlay && !this.seeking) this.advance(now);
+    // Sound at another speed than the viewer's pictures would not be right.
+    const audible = this.clock.running && this.rate === 1;
+    this.options.sound?.update({ audible, seconds: this.clock.at(now), rate: this.clock.rate, now });
     this.ask();
     const update = this.queue.take(this.frames.frameAt(this.clock.at(now)));
     if (!update) return undefined;
@@ -198,6 +202,7 @@ export class Engine extends Emitter<EngineEvents> {
     this.failed = true;
     this.pipeline.onmessage = undefined;
     this.pipeline.close();
+    this.options.sound?.begin(undefined);
     this.clear();
   }
 
@@ -207,6 +212,7 @@ export class Engine extends Emitter<EngineEvents> {
     this.hasEnded = false;
     this.clock.stop(now);
     this.clock.set(seconds, now);
+    this.options.sound?.flush();
     this.queue.carryAll();
     this.ask();
     this.emit("state", {});
@@ -269,14 +275,25 @@ export class Engine extends Emitter<EngineEvents> {
     const { serial } = this.progress;
     const rate = this.wantsToPlay ? clock.rate : undefined;
     const { until, ahead } = demandOf(timeline, serial, at, rate, this.options.aheadSeconds);
+    const sound = this.soundDemand(at);
     const last = this.demanded;
-    if (last?.serial === serial && last.at === at && last.until === until && last.ahead === ahead) return;
-    this.demanded = { serial, at, until, ahead };
+    const isSame = last?.serial === serial && last.at === at && last.until === until && last.ahead === ahead;
+    if (isSame && last.sound?.serial === sound?.serial && last.sound?.until === sound?.until) return;
+    this.demanded = { serial, at, until, ahead, sound };
     this.pipeline.send({ type: "demand", demand: this.demanded });
+  }
+
+  /** The sound to send for a clock at frame `at`. */
+  private soundDemand(at: number): Demand["sound"] {
+    const { frames: timeline, rate } = this;
+    const { sound } = this.options;
+    if (!sound?.wanted || !this.wantsToPlay || rate !== 1) return undefined;
+    return { serial: sound.serial, until: timeline.frameAt(timeline.ptsOf(at) + SOUND_AHEAD_SECONDS) + 1 };
   }
 
   private hear(message: FromDecoder): void {
     if (message.type === "frame") this.hearFrame(message);
+    else if (message.type === "sound") this.options.sound?.take(message.serial, message.sounds);
     else if (message.type === "gap") this.hearGap(message.serial, message.end);
     else if (message.type === "opening") this.emit("opening", message);
     else if (message.type === "header") this.hearHeader(message.header, message.ranged);
@@ -297,6 +314,7 @@ export class Engine extends Emitter<EngineEvents> {
   private hearHeader(header: StreamHeader, ranged: boolean): void {
     this.header = header;
     this.frames.fps = header.fps;
+    this.options.sound?.begin(header.sound);
     this.emit("header", header);
     if (ranged) return;
     this.emit("notice", {
@@ -384,6 +402,7 @@ export class Engine extends Emitter<EngineEvents> {
   private fail(message: string, fatal: boolean): void {
     this.failed ||= fatal;
     this.pause();
+    this.options.sound?.flush();
     this.demanded = undefined; // the next demand tries again
     this.emit("error", { message, fatal });
   }

@@ -26,6 +26,9 @@ export class Bar {
   private readonly time = made("div", { class: "time" });
   private readonly rate: HTMLSelectElement;
   private readonly edge: HTMLButtonElement;
+  private readonly mute: HTMLButtonElement;
+  private readonly volume = made("input", { type: "range", min: "0", max: "1", step: "0.05", class: "wide" });
+  private hearing: string | undefined;
   private face: IconName = "play";
 
   constructor(
@@ -45,6 +48,12 @@ export class Bar {
     });
     this.edge = made("button", { type: "button", class: "edge", hidden: true });
     this.edge.addEventListener("click", () => player.goToNewest());
+    this.mute = button("sound", "Mute", () => player.toggleSound());
+    this.volume.setAttribute("aria-label", "Volume");
+    this.volume.addEventListener("input", () => {
+      player.setVolume(Number(this.volume.value));
+      player.setMuted(false);
+    });
     const panel = (name: Parameters<BarActions["toggle"]>[0], face: IconName, label: string, extra: string) => {
       const made_ = button(face, label, () => actions.toggle(name, made_), extra);
       made_.setAttribute("aria-expanded", "false");
@@ -63,6 +72,8 @@ export class Bar {
         this.time,
         this.edge,
         made("div", { class: "space" }),
+        this.mute,
+        this.volume,
         this.rate,
         this.loop,
         this.compare,
@@ -94,8 +105,24 @@ export class Bar {
       this.play.setAttribute("aria-label", label);
       this.play.title = label;
     }
+    this.updateSound();
     this.updateEdge();
     this.updateTime();
+  }
+
+  private updateSound(): void {
+    const { sound, playbackRate } = this.player;
+    this.mute.hidden = this.volume.hidden = !sound.present;
+    if (!sound.present) return;
+    const volume = String(sound.muted ? 0 : sound.volume);
+    if (this.volume.value !== volume) this.volume.value = volume;
+    const off = playbackRate === 1 ? "" : " (off at other speeds)";
+    const label = sound.waits ? "Play the sound" : `${sound.muted ? "Unmute" : "Mute"}${off}`;
+    if (label === this.hearing) return;
+    this.hearing = label;
+    this.mute.replaceChildren(icon(sound.muted || sound.waits || off ? "silent" : "sound"));
+    this.mute.setAttribute("aria-label", label);
+    this.mute.title = label;
   }
 
   private updateEdge(): void {

@@ -10,6 +10,8 @@ const PATHS = {
   back: "M17 6v12l-9-6zM6.5 6v12",
   forward: "M7 6v12l9-6zM17.5 6v12",
   loop: "M17 4l3 3-3 3M20 7H8a4 4 0 0 0-4 4v1M7 20l-3-3 3-3M4 17h12a4 4 0 0 0 4-4v-1",
+  sound: "M4 9.5v5h3.5L12 18.5v-13L7.5 9.5zM15.5 9a4.2 4.2 0 0 1 0 6M18 6.5a8 8 0 0 1 0 11",
+  silent: "M4 9.5v5h3.5L12 18.5v-13L7.5 9.5zM16 9.5l5 5M21 9.5l-5 5",
   cameras: "M4 8h10v8H4zM14 11l6-3v8l-6-3z",
   compare: "M12 3v18M4 6h16v12H4z",
   chart: "M5 19V11M10 19V5M15 19v-6M20 19V8",

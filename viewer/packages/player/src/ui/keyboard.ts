@@ -21,6 +21,7 @@ export const KEYS: readonly (readonly [keys: readonly string[], does: string])[]
   [["Home", "End"], "first, last frame, or live"],
   [["<", ">"], "slower, faster"],
   [["L"], "loop"],
+  [["M"], "mute, unmute"],
   [["W", "A", "S", "D", "Q", "E"], "fly"],
   [["Shift + arrows"], "turn around the scene"],
   [["+", "-"], "closer, farther"],
@@ -74,7 +75,7 @@ export class Keyboard {
   private down(event: KeyboardEvent): void {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     const from = event.composedPath()[0];
-    if (from instanceof HTMLSelectElement) return;
+    if (from instanceof HTMLSelectElement || (from instanceof HTMLInputElement && from.type === "range")) return;
     // Space and Enter activate the focused button.
     if (from instanceof HTMLButtonElement && (event.key === " " || event.key === "Enter")) return;
     if (FLY[event.code] && !event.shiftKey) this.held.add(event.code);
@@ -102,6 +103,7 @@ export class Keyboard {
       "<": () => faster(-1),
       ">": () => faster(1),
       l: () => player.setLoop(!player.loop),
+      m: () => player.toggleSound(),
     };
     if (event.shiftKey && event.key.startsWith("Arrow")) return false;
     return called(act, event.key);

@@ -54,6 +54,7 @@ button[aria-pressed="true"], button[aria-expanded="true"] { color: var(--accent)
   font-variant-numeric: tabular-nums; white-space: nowrap; pointer-events: none; }
 select { background: none; border: 1px solid transparent; border-radius: 7px; height: 32px; padding: 0 4px; cursor: pointer; }
 .bar select { width: 62px; }
+.bar input { width: 70px; accent-color: var(--accent); }
 option { background: Canvas; color: CanvasText; }
 .panel { position: absolute; right: 10px; top: 10px; bottom: 80px; width: min(290px, calc(100% - 20px)); overflow: auto; padding: 10px 12px;
   overscroll-behavior: contain; height: fit-content; max-height: calc(100% - 90px); }

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sound in presentation time: clocks, rates, channels, gaps, and what is missing. A clap is off by 1 ms at most."""
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from structgstream.data.live.sound import LiveSound
+from structgstream.data.open import open_capture
+from structgstream.data.sound import SoundEncoder, SoundFile, camera_clock, start_seconds
+from structgstream.data.timeline import Clock
+from structgstream.errors import CaptureError
+from structgstream.opus import PACKET_SECONDS, OpusPacket
+from tests.support.captures import write_video
+from tests.support.quick_streams import CLIP
+from tests.support.sounds import add_sound, claps, packets_heard, write_sound
+
+MILLISECOND = 1e-3
+
+
+def heard(path: Path, clock: Clock, seconds: float) -> tuple[list[OpusPacket], list[float]]:
+    feed = SoundFile("it", path, clock).open()
+    packets = feed.until(seconds)
+    return packets, packets_heard(packets, channels=feed.channels)
+
+
+@pytest.mark.parametrize("rate", [8_000, 16_000, 44_100, 48_000, 96_000])
+@pytest.mark.parametrize("channels", [1, 2, 6])
+def test_any_rate_and_number_of_channels(tmp_path: Path, rate: int, channels: int) -> None:
+    path = write_sound(tmp_path / "a.wav", claps(2.0, 0.5, 1.25, rate=rate, channels=channels), rate=rate)
+    feed = SoundFile("it", path, Clock()).open()
+    assert feed.channels == min(channels, 2)
+    found = packets_heard(feed.until(2.0), channels=feed.channels)
+    assert found == pytest.approx([0.5, 1.25], abs=MILLISECOND)
+
+
+@pytest.mark.parametrize("offset", [-0.3, 0.0, 0.0137, 2.5])
+def test_a_clock_s_offset_shifts_it(tmp_path: Path, offset: float) -> None:
+    path = write_sound(tmp_path / "a.wav", claps(2.0, 0.5, 1.25))
+    packets, found = heard(path, Clock(offset), 5.0)
+    assert packets[0].seconds == pytest.approx(-312 / 48_000)
+    assert np.diff([packet.seconds for packet in packets]) == pytest.approx(PACKET_SECONDS)
+    assert found == pytest.approx([0.5 + offset, 1.25 + offset], abs=MILLISECOND)
+
+
+@pytest.mark.parametrize(("rate", "seconds"), [(1 + 8e-5, 600.0), (1 - 2e-4, 60.0)])
+def test_it_is_in_step_after_minutes_whatever_the_clock_s_rate(tmp_path: Path, rate: float, seconds: float) -> None:
+    at = [0.5, seconds / 2, seconds - 1.0]
+    path = write_sound(tmp_path / "a.flac", claps(seconds, *at))
+    _, found = heard(path, Clock(0.1, rate), seconds + 1.0)
+    assert found == pytest.approx([0.1 + rate * one for one in at], abs=MILLISECOND)
+
+
+def test_packets_do_not_depend_on_how_they_are_asked_for(tmp_path: Path) -> None:
+    path = write_sound(tmp_path / "a.wav", claps(3.0, 0.5, 2.25))
+    whole, _ = heard(path, Clock(0.01), 3.0)
+    feed = SoundFile("it", path, Clock(0.01)).open()
+    parts = [feed.until(end / 30) for end in range(1, 91)]
+    assert [packet for part in parts for packet in part] == whole
+    assert all(packet.seconds < end / 30 for end, part in enumerate(parts, 1) for packet in part)
+
+
+def test_a_gap_in_the_time_stamps_is_silence_and_what_comes_twice_is_left_out() -> None:
+    encoder, packets = SoundEncoder(1), list[OpusPacket]()
+    samples = claps(0.1, 0.05)
+    for seconds in (0.0, 0.5, 0.55, 1.0):
+        frame = av.AudioFrame.from_ndarray(samples, format="fltp", layout="mono")
+        frame.sample_rate = 48_000
+        packets += encoder.add(frame, seconds)
+    packets += encoder.finish()
+    # The third begins with what the second ends with.
+    assert packets_heard(packets) == pytest.approx([0.05, 0.55, 1.05], abs=MILLISECOND)
+
+
+def test_a_shorter_sound_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    feed = SoundFile("cam", write_sound(tmp_path / "a.wav", claps(0.5, 0.2)), Clock()).open()
+    assert len(feed.until(1.0)) == 26
+    assert feed.until(2.0) == feed.until(3.0) == []
+    assert [record.message for record in caplog.records] == [
+        "The sound of cam ends at 0.5 s, before the pictures; what follows is silent"
+    ]
+
+
+def test_a_damaged_end_is_said_and_costs_nothing_else(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = write_sound(tmp_path / "a.flac", claps(3.0, *np.arange(0.25, 3.0, 0.25)))
+    path.write_bytes(path.read_bytes()[:-2000])
+    packets, found = heard(path, Clock(), 3.0)
+    assert packets[-1].seconds < 2.9
+    assert found[0] == pytest.approx(0.25, abs=MILLISECOND)
+    assert len(caplog.records) == 1
+
+
+def test_files_without_sound(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", [np.zeros((48, 64, 3), np.uint8)] * 2)
+    with pytest.raises(CaptureError, match=r"a\.mp4 has no sound; choose another"):
+        SoundFile("a", tmp_path / "a.mp4", Clock()).open()
+    with pytest.raises(CaptureError, match=r"missing\.wav cannot be read"):
+        SoundFile("a", tmp_path / "missing.wav", Clock()).open()
+
+
+def test_a_camera_s_clock_is_that_of_its_pictures(tmp_path: Path) -> None:
+    """The bundled clip with a camera that began a third of a second earlier, by its own time stamps."""
+    folder = tmp_path / "clip"
+    folder.mkdir()
+    for file in Path(CLIP).iterdir():
+        (folder / file.name).symlink_to(file)
+    (folder / "cam03.mp4").unlink()
+    add_sound(Path(CLIP) / "cam03.mp4", folder / "cam03.mp4", claps(0.4, 0.2))
+    source = open_capture(folder)
+    assert camera_clock(source, "cam03") == (folder / "cam03.mp4", Clock(0.0, 1.0))
+    later = open_capture(folder, start=3, frames=6, scale=0.5)
+    found = camera_clock(later, "cam03")
+    assert found is not None
+    assert found[1].offset_seconds == pytest.approx(-0.1)
+    assert start_seconds(later) == pytest.approx(-0.1)
+    _, at = heard(folder / "cam03.mp4", found[1], 0.4)
+    assert at == pytest.approx([0.1], abs=MILLISECOND)
+    assert camera_clock(open_capture(folder, every=2), "cam03") == (folder / "cam03.mp4", Clock(0.0, 1.0))
+
+
+def test_live_sound_is_in_step_with_the_pictures_and_begins_again_after_an_outage() -> None:
+    sound = LiveSound("cam")
+    feeds = [sound.open(), sound.open()]
+
+    def send(first: float, seconds: float) -> None:
+        samples = claps(seconds, seconds / 2)
+        frame = av.AudioFrame.from_ndarray(samples, format="fltp", layout="mono")
+        frame.sample_rate = 48_000
+        sound.add(frame, first)
+
+    send(99.0, 0.5)  # before the first picture
+    send(99.9, 0.4)
+    sound.synchronize(100.0)
+    send(100.3, 0.3)
+    early = feeds[0].until(0.3)
+    assert packets_heard(early) == pytest.approx([0.1], abs=MILLISECOND)
+    assert packets_heard(early + feeds[0].until(10.0)) == pytest.approx([0.1, 0.45], abs=MILLISECOND)
+    assert packets_heard(feeds[1].until(10.0)) == pytest.approx([0.1, 0.45], abs=MILLISECOND)
+    sound.synchronize(100.0)
+    send(200.0, 1.0)
+    after = feeds[0].until(200.0)
+    gap = [one.seconds for one in after if one.seconds > 90.0]
+    assert gap[0] == pytest.approx(100.0, abs=0.03)
+    assert packets_heard([one for one in after if one.seconds > 90.0]) == pytest.approx([100.5], abs=MILLISECOND)

@@ -1,0 +1,67 @@
+// SPDX-License-Identifier: Apache-2.0
+/** The golden stream with sound, of a second with a clap and a white picture in its middle, as often as a test wants. */
+
+import { HEAD_BYTES, RecordType, viewOf } from "../../core/src/records.ts";
+import { bytesOf, joined, piecesOf, record, VECTORS } from "../../core/test/streams.ts";
+
+export const FPS = 12;
+/** In each second, of the clap and of the white picture. */
+export const CLAP_SECONDS = 0.5;
+export const CLAP_FRAME = 6;
+const FOOTER_BYTES = 16;
+const ENTRY_BYTES = 13;
+
+export const SOUND_VECTOR = bytesOf(VECTORS, "version-2-sound.sgs");
+
+/** Prefix and init record, and each frame's packet and sound record, of so many seconds. */
+export function clapping(seconds: number): { head: Uint8Array; frames: (readonly [Uint8Array, Uint8Array])[] } {
+  const [prefix, init, ...pieces] = piecesOf(SOUND_VECTOR);
+  const frames: (readonly [Uint8Array, Uint8Array])[] = [];
+  for (let second = 0; second < seconds; second++) {
+    for (let frame = 0; frame < FPS; frame++) {
+      const index = second * FPS + frame;
+      const packet = payload(pieces[2 * frame]!);
+      viewOf(packet).setUint32(0, index, true);
+      viewOf(packet).setFloat64(4, index / FPS, true);
+      // A second has 50 packets; the one before its first is that of the last second.
+      const sound = second && !frame ? withoutFirst(payload(pieces[1]!)) : payload(pieces[2 * frame + 1]!);
+      viewOf(sound).setUint32(0, index, true);
+      viewOf(sound).setFloat64(4, viewOf(sound).getFloat64(4, true) + second, true);
+      frames.push([record(pieces[2 * frame]![0]!, packet), record(RecordType.sound, sound)]);
+    }
+  }
+  return { head: joined(prefix!, init!), frames };
+}
+
+/** A file of so many seconds, with its index. */
+export function clappingFile(seconds: number): Uint8Array {
+  const { head, frames } = clapping(seconds);
+  const entries = new Uint8Array(frames.length * ENTRY_BYTES);
+  const view = viewOf(entries);
+  let offset = head.length;
+  for (const [index, [packet, sound]] of frames.entries()) {
+    view.setUint32(index * ENTRY_BYTES, index, true);
+    view.setUint8(index * ENTRY_BYTES + 4, packet[0]!);
+    view.setBigUint64(index * ENTRY_BYTES + 5, BigInt(offset), true);
+    offset += packet.length + sound.length;
+  }
+  const footer = new Uint8Array(FOOTER_BYTES);
+  viewOf(footer).setBigUint64(0, BigInt(offset), true);
+  footer.set(new TextEncoder().encode("SGSINDEX"), 8);
+  return joined(head, ...frames.flat(), record(RecordType.index, entries), footer);
+}
+
+function payload(piece: Uint8Array): Uint8Array {
+  return piece.slice(HEAD_BYTES, -4);
+}
+
+/** A sound record's payload without its first packet. */
+function withoutFirst(given: Uint8Array): Uint8Array {
+  const view = viewOf(given);
+  const [count, first] = [view.getUint16(12, true), view.getUint16(14, true)];
+  const packets = given.subarray(14 + 2 * count + first);
+  const made = joined(given.subarray(0, 14), given.subarray(16, 14 + 2 * count), packets);
+  viewOf(made).setUint16(12, count - 1, true);
+  viewOf(made).setFloat64(4, view.getFloat64(4, true) + 0.02, true);
+  return made;
+}
