@@ -31,7 +31,7 @@ def test_a_capture_is_made_once_and_only_what_changed_again(tmp_path: Path) -> N
         assert torch.equal(source.rig[name].viewmat, rig[name].viewmat)
         assert 0.6 < source.rig[name].near < 1.4  # the board stands 2.5 in front of the cameras
     again = prepare_capture(tmp_path / "videos", tmp_path / "out", options=OPTIONS)
-    assert set(again.skipped) == {"synchronize", "calibrate", "scale", "near", "points", "check"}
+    assert set(again.skipped) == {"synchronize", "calibrate", "scale", "near", "points", "check", "sound"}
     assert again.findings == made.findings
     distance = Distance("cam00", "cam04", 2.0)
     metres = prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(OPTIONS, distance=distance))
