@@ -11,7 +11,6 @@ import {
   GSplatComponentSystem,
   Quat,
   RESOLUTION_FIXED,
-  Vec3,
 } from "playcanvas";
 import { controlsOf } from "../../gl/examples/controls.js";
 
@@ -34,18 +33,18 @@ app.root.addChild(camera);
 export const clips = await Promise.all(
   (sources.length ? sources : ["clip.sgs"]).map((source) => StreamClip.load(app, camera, source)),
 );
-const { eye, target } = clips[0]!.view();
+const { eye, target, up } = clips[0]!.view();
 for (const [i, { entity }] of clips.entries()) {
   entity.translate(i * eye.distance(target), 0, 0);
   app.root.addChild(entity);
 }
 camera.setPosition(eye);
-camera.lookAt(target);
+camera.lookAt(target, up);
 canvas.addEventListener("pointermove", ({ buttons, movementX }) => {
   if (!buttons) return;
-  const turn = new Quat().setFromAxisAngle(Vec3.UP, -movementX * DEGREES_PER_PIXEL);
+  const turn = new Quat().setFromAxisAngle(up, -movementX * DEGREES_PER_PIXEL);
   camera.setPosition(turn.transformVector(camera.getPosition().clone().sub(target)).add(target));
-  camera.lookAt(target);
+  camera.lookAt(target, up);
 });
 
 const bar = controlsOf(clips.map(({ playback }) => playback));

@@ -20,6 +20,8 @@ import {
   sizesOf,
   streamSplatGlsl,
   trainingCamerasOf,
+  upAxis,
+  type Vector,
 } from "@structgstream/gl/shading";
 import {
   type AppBase,
@@ -63,7 +65,8 @@ vec4 getColor() { return present.color; }
 }
 
 /**
- * Shows one frame at a time, as the entity `entity`, whose place is the capture's with y up; it can be moved as any entity.
+ * Shows one frame at a time, as the entity `entity`, whose axes and units are the capture's, turned from y down to
+ * y up; it can be moved as any entity.
  *
  * The MLPs are evaluated on the GPU for the position of `camera`, when that or the frame changes. Exposure of single cameras
  * and the environment are left out, because the surrounding scene has its own.
@@ -122,14 +125,13 @@ export class StreamSplats {
     this.component.setParameter("structuredCount", anchors * offsetsPerAnchor);
   }
 
-  /** Where the rig's first camera is and what the rig looks at, in the world. */
-  view(): { eye: Vec3; target: Vec3 } {
+  /** Where the rig's first camera is, what the rig looks at, and its up direction, in the world. */
+  view(): { eye: Vec3; target: Vec3; up: Vec3 } {
     const toWorld = this.entity.getWorldTransform();
     const cameras = rigCameras(this.header);
-    const [eye, target] = [center(cameras[0]!), focusPoint(cameras)].map((point) =>
-      toWorld.transformPoint(new Vec3(...point)),
-    );
-    return { eye: eye!, target: target! };
+    const point = (scene: Vector) => toWorld.transformPoint(new Vec3(...scene));
+    const up = toWorld.transformVector(new Vec3(...upAxis(cameras))).normalize();
+    return { eye: point(center(cameras[0]!)), target: point(focusPoint(cameras)), up };
   }
 
   /** Removes the entity and releases what it has on the GPU. */

@@ -18,12 +18,13 @@ scene.add(new SparkRenderer({ renderer, ...RENDERING }));
 export const clips = await Promise.all(
   (sources.length ? sources : ["clip.sgs"]).map((source) => StreamClip.load(source)),
 );
-const { eye, target } = clips[0]!.view();
+const { eye, target, up } = clips[0]!.view();
 for (const [i, clip] of clips.entries()) {
   clip.position.x += i * eye.distanceTo(target);
   scene.add(clip);
 }
 camera.position.copy(eye);
+camera.up.copy(up);
 const orbit = new OrbitControls(camera, renderer.domElement);
 orbit.target.copy(target);
 orbit.update();

@@ -20,6 +20,8 @@ import {
   shapeOf,
   sizesOf,
   trainingCamerasOf,
+  upAxis,
+  type Vector,
 } from "@structgstream/gl/shading";
 import { type IUniform, Matrix4, Vector3 } from "three";
 import { FieldTextures } from "./fieldTextures.js";
@@ -42,7 +44,7 @@ export function blurAmount(size: number): number {
 const STILL = 1e-4;
 
 /**
- * Shows one frame at a time. Its axes are those of three.js, y up, and its units those of the capture. It can be moved as any object.
+ * Shows one frame at a time. Its units are those of the capture, and its axes too, turned from y down to y up. It can be moved as any object.
  *
  * The MLPs are evaluated on the GPU when the camera or the frame changes. Exposure of single cameras and the
  * environment are left out, because the surrounding three.js scene has its own.
@@ -88,14 +90,13 @@ export class StreamSplats extends SplatGenerator {
     this.updateVersion();
   }
 
-  /** Where the rig's first camera is and what the rig looks at, in the world. */
-  view(): { eye: Vector3; target: Vector3 } {
+  /** Where the rig's first camera is, what the rig looks at, and its up direction, in the world. */
+  view(): { eye: Vector3; target: Vector3; up: Vector3 } {
     this.updateWorldMatrix(true, false);
     const cameras = rigCameras(this.header);
-    const [eye, target] = [center(cameras[0]!), focusPoint(cameras)].map((point) =>
-      this.localToWorld(new Vector3(...point)),
-    );
-    return { eye: eye!, target: target! };
+    const point = (scene: Vector) => this.localToWorld(new Vector3(...scene));
+    const up = new Vector3(...upAxis(cameras)).transformDirection(this.matrixWorld);
+    return { eye: point(center(cameras[0]!)), target: point(focusPoint(cameras)), up };
   }
 
   /** Releases the textures; the object shows nothing any more. */
