@@ -11,6 +11,7 @@ file of a killed process. The partial file is locked, because concurrent writers
 
 import errno
 import fcntl
+import io
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -205,6 +206,22 @@ def name_finished(path: Path) -> None:
     GrowingFile(path, keep=partial.stat().st_size if partial.exists() else 0).finish()
 
 
+def append_durably(file: BinaryIO, data: bytes, *, end: int) -> None:
+    """Writes ``data`` to an unbuffered file from byte ``end`` on, and syncs it. Raises OSError if that fails; what was
+    written of it is truncated."""
+    try:
+        file.seek(end)
+        rest = memoryview(data)
+        while rest:
+            rest = rest[file.write(rest) :]
+        with suppress(io.UnsupportedOperation):  # A file in memory has nothing to sync.
+            os.fsync(file.fileno())
+    except OSError:
+        with suppress(OSError):  # If this fails too, readers stop at the incomplete record.
+            file.truncate(end)
+        raise
+
+
 class GrowingFile:
     """A locked file that grows under the name ``PATH.partial``, after ``keep`` existing bytes, and is renamed at the
     end.
@@ -230,19 +247,12 @@ class GrowingFile:
         if self._file.seek(0, os.SEEK_END) < keep:
             raise StorageError(f"Another process has changed {self.partial}; run the same command again.")
         self._file.truncate(keep)
-        self._file.seek(keep)
 
     def append(self, data: bytes) -> int:
         """Adds ``data``; returns its length. Raises StorageError if it cannot be written; earlier data stays."""
         try:
-            rest = memoryview(data)
-            while rest:
-                rest = rest[self._file.write(rest) :]
-            os.fsync(self._file.fileno())
+            append_durably(self._file, data, end=self.size)
         except OSError as error:
-            with suppress(OSError):
-                self._file.truncate(self.size)
-                self._file.seek(self.size)
             raise self._failed(error) from error
         self.size += len(data)
         return len(data)

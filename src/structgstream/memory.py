@@ -10,6 +10,7 @@ the process started. It covers all threads: a prefetched frame counts in the sta
 readers of the mark, ``ru_maxrss`` included, see the reset value.
 """
 
+import resource
 from enum import StrEnum
 from pathlib import Path
 
@@ -25,7 +26,7 @@ class PeakKind(StrEnum):
 
     STAGE = "stage"  # the stage's own peak
     PROCESS = "process"  # the process's peak up to the end of the stage
-    NONE = "none"  # not available on this system
+    NONE = "none"  # nothing was measured
 
 
 class PeakMeter:
@@ -36,7 +37,7 @@ class PeakMeter:
 
     Attributes:
         kind: meaning of ``process_bytes``.
-        process_bytes: stage to largest resident size; empty where the system does not report it.
+        process_bytes: stage to largest resident size.
         device_bytes: stage to largest size of allocated tensors; empty without a CUDA device.
     """
 
@@ -48,9 +49,8 @@ class PeakMeter:
 
     def end(self, stage: str) -> None:
         """Records the peak of the stage that ends here and starts the next."""
-        peak = status_bytes("VmHWM") if self.kind is PeakKind.STAGE else process_peak_bytes()
-        if peak is not None:
-            self.process_bytes[stage] = peak
+        peak = status_bytes("VmHWM") if self.kind is PeakKind.STAGE else None
+        self.process_bytes[stage] = process_peak_bytes() if peak is None else peak
         if self._device is not None:
             self.device_bytes[stage] = torch.cuda.max_memory_allocated(self._device)
         restarted = self._restart()
@@ -59,13 +59,13 @@ class PeakMeter:
     def _restart(self) -> PeakKind:
         if self._device is not None:
             torch.cuda.reset_peak_memory_stats(self._device)
-        if status_bytes("VmHWM") is not None:
-            try:
-                _CLEAR.write_text(_RESET_PEAK)
-            except OSError:
-                return PeakKind.PROCESS
-            return PeakKind.STAGE
-        return PeakKind.NONE if process_peak_bytes() is None else PeakKind.PROCESS
+        if status_bytes("VmHWM") is None:
+            return PeakKind.PROCESS
+        try:
+            _CLEAR.write_text(_RESET_PEAK)
+        except OSError:
+            return PeakKind.PROCESS
+        return PeakKind.STAGE
 
 
 def resident_bytes() -> int | None:
@@ -84,10 +84,6 @@ def status_bytes(name: str) -> int | None:
     return None if size is None else int(size) * 1024
 
 
-def process_peak_bytes() -> int | None:
-    """Largest resident size of the process since the last reset; None where unknown."""
-    try:
-        import resource
-    except ImportError:
-        return None
+def process_peak_bytes() -> int:
+    """Largest resident size of the process since the last reset."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -343,14 +343,13 @@ class RunMetrics:
         *,
         fps: float,
         total: int | None = None,
-        done: int = 0,
         live: Callable[[], LiveStatus] | None = None,
         captured: Callable[[int], float | None] | None = None,
         qualities: Sequence[str] = (),
         now: Callable[[], float] = time.monotonic,
         unix: Callable[[], float] = time.time,
     ) -> None:
-        self._stream, self._fps, self._total, self._done = stream, fps, total, done
+        self._stream, self._fps, self._total, self._done = stream, fps, total, 0
         self._live, self._captured, self._now, self._unix = live, captured, now, unix
         self._age: float | None = None
         self._begun = now()

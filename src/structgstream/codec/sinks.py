@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
-from structgstream.atomic_files import lock_file, sync_folder
+from structgstream.atomic_files import append_durably, lock_file, sync_folder
 from structgstream.codec.container.byte_source import ByteSlice, ByteSource, FileBytes, check_room, free_bytes
 from structgstream.codec.container.records import (
     INDEX_ENTRY,
@@ -109,16 +109,9 @@ class _Writer:
 
     def _append(self, data: bytes) -> int:
         try:
-            self._file.seek(self._end)
-            rest = memoryview(data)
-            while rest:
-                rest = rest[self._file.write(rest) :]
-            with suppress(io.UnsupportedOperation):  # A file in memory has nothing to sync.
-                os.fsync(self._file.fileno())
+            append_durably(self._file, data, end=self._end)
         except OSError as error:
             self._failed = True
-            with suppress(OSError):  # If this fails too, readers stop at the incomplete record.
-                self._file.truncate(self._end)
             raise StorageError(
                 f"Cannot write {len(data)} bytes to {self._name} ({error.strerror or error}). "
                 f"The {self._frames()} frames "

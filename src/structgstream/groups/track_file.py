@@ -175,14 +175,20 @@ def open_track(path: Path) -> TrackFile:
     return TrackFile(FileBytes(found), str(found))
 
 
+def track_bytes(head: TrackHead, *starts: TrackStart) -> bytes:
+    """An unfinished track with these starts."""
+    records = [packed(TrackRecord.HEAD, json.dumps(vars(head), sort_keys=True).encode())]
+    records += [packed(TrackRecord.START, start.packed()) for start in starts]
+    return PREFIX.pack(SIGNATURE, MAJOR, MINOR) + b"".join(records)
+
+
 class TrackWriter:
     """Writes the track ``path``. Raises StorageError if it cannot be written."""
 
     def __init__(self, path: Path, head: TrackHead, *, keep: int = 0) -> None:
         self._file = GrowingFile(path, keep=keep)
         if not keep:
-            self._file.append(PREFIX.pack(SIGNATURE, MAJOR, MINOR))
-            self._file.append(packed(TrackRecord.HEAD, json.dumps(vars(head), sort_keys=True).encode()))
+            self._file.append(track_bytes(head))
 
     def write(self, start: TrackStart) -> int:
         """Appends a start; returns its size in bytes."""

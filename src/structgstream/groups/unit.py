@@ -26,7 +26,7 @@ from structgstream.groups.segment_file import GroupSoFar, SegmentIdentity, Segme
 from structgstream.groups.track_file import TrackStart, open_track
 from structgstream.groups.track_pass import dense
 from structgstream.kernels.backend import Backend
-from structgstream.recorder import LogExtras, Run, record
+from structgstream.recorder import Run, record
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import on_device
 from structgstream.session.pipeline import FrameTask, Past
@@ -203,7 +203,6 @@ def fit_segment(
     *,
     overwrite: bool = False,
     on_step: StepListener | None = None,
-    remarks: LogExtras | None = None,
 ) -> Run | None:
     """Fits a group into the segment ``path``; resumes an interrupted fit.
 
@@ -244,7 +243,6 @@ def fit_segment(
         storage=lambda _: (sink, so_far),
         metadata=base.header.metadata,
         on_step=on_step,
-        remarks=remarks,
     )
 
 

@@ -3,13 +3,12 @@
 start, and the join.
 """
 
-import tempfile
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 
-from structgstream.atomic_files import atomic_write, partial_path
+from structgstream.atomic_files import atomic_write
 from structgstream.errors import StorageError, StreamError, TaskError
 from structgstream.executors.tasks import (
     PYTHON,
@@ -20,7 +19,7 @@ from structgstream.executors.tasks import (
     WorkerSlot,
     thread_environment,
 )
-from structgstream.groups.track_file import Groups, TrackWriter, groups_path, open_track, read_groups
+from structgstream.groups.track_file import Groups, groups_path, open_track, read_groups, track_bytes
 from structgstream.parallel.exchange import SharedFolder
 from structgstream.parallel.parts import Parts, group_name, key_of, sha256_of
 
@@ -39,13 +38,7 @@ def starts_in(track: Path) -> Collection[int]:
 def cut_track(track: Path, first: int) -> bytes:
     """An unfinished track with the start that a group needs. Raises StreamError if it is missing or damaged."""
     found = open_track(track)
-    start = found.start(first)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "start"
-        writer = TrackWriter(path, found.head)
-        writer.write(start)
-        writer.close()
-        return partial_path(path).read_bytes()
+    return track_bytes(found.head, found.start(first))
 
 
 @dataclass(frozen=True)

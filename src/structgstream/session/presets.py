@@ -152,7 +152,6 @@ class StreamConfig:
 
 def to_json(config: StreamConfig) -> dict[str, Any]:
     """The resolved configuration as plain JSON values: what a stream's header stores."""
-
     found = plain_value(config)
     if found.get("period") == asdict(PeriodConfig()):
         del found["period"]

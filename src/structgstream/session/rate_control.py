@@ -154,9 +154,7 @@ class RateController:
     @property
     def _spacing(self) -> float:
         """Mean spacing of the packets of the last window, in frames of the media (Note [Media time])."""
-        return self._spacing_of(self._written())
-
-    def _spacing_of(self, packets: Sequence["_Written"]) -> float:
+        packets = self._written()
         if len(packets) < 2:
             return 1.0
         return max(packets[-1].place - packets[0].place, 1) / (len(packets) - 1)

@@ -25,7 +25,7 @@ def recorded(key: str = "full", **others: Any) -> Result:
 
 
 def grown(anchors: int) -> Result:
-    initial = round_floats(to_json(PRESETS[PAPER_METHOD_PRESET].initial))
+    initial = round_floats(to_json(PRESETS[PAPER_METHOD_PRESET]))["initial"]
     return recorded(initial=initial | {"growth": {**initial["growth"], "max_anchors": anchors}})
 
 

@@ -161,10 +161,8 @@ def incomplete_reason(data: ByteSource, offset: int) -> str:
     """Why :func:`read_record` found no whole record at ``offset``, as a clause of a message."""
     if offset == len(data):
         return f"it ends at byte {offset} without an index"
-    if offset + RECORD.size <= len(data):
-        length = RECORD.unpack(data[offset : offset + RECORD.size])[3]
-        if offset + RECORD.size + length + CHECKSUM.size <= len(data):
-            return f"the record at byte {offset} of {len(data)} is damaged"
+    if read_head(data, offset) is not None:
+        return f"the record at byte {offset} of {len(data)} is damaged"
     return f"it is cut at byte {len(data)}, within the record that begins at byte {offset}"
 
 
