@@ -438,7 +438,7 @@ class Sweep:
         drawn = [entry for entry, wanted in zip(entries, chosen, strict=True) if wanted and entry.picture is not None]
         found = in_groups(
             drawn,
-            lambda entry: entry.view.image.shape,
+            lambda entry: (entry.view.image.shape, entry.view.camera.near),
             lambda alike: self._draw(alike, again=again),
             device=self.backend.device,
         )
