@@ -3,7 +3,7 @@
 
 Each part prints its figures and what was predicted without a GPU, and writes all figures so far; a part that fails
 is reported and the next one begins. The kernels of iterations and pictures, which are measured here, are not the
-default yet (``cuda_backend(native=True)``). Frames need gsplat, which draws the tiles around what moves.
+default yet (``cuda_backend(native=True)``).
 """
 
 import argparse

@@ -5,4 +5,8 @@
 
 #include "../cpu/lift.h"
 
-extern "C" int sgs_cuda_lift(const structgstream::FlowLift* lift, void* stream);
+extern "C" {
+
+int sgs_cuda_lift(const structgstream::FlowLift* lift, void* stream);
+
+}  // extern "C"

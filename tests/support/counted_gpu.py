@@ -74,13 +74,19 @@ class Counts:
 
 
 class _Library(KernelLibrary):
-    """The emulated kernels on tensors of the pretended device; a call is as many operations as it has launches."""
+    """The emulated kernels on tensors of the pretended device; a call is as many operations as it has launches, each of
+    which has a copy of the views' arguments where it is for several views."""
 
     counts: Counts
 
     def call(self, name: str, *arguments: Any, device: torch.device) -> None:
-        launches = {"sgs_cuda_anchor_inputs": 2, "sgs_cuda_l1_ssim": 2, "sgs_cuda_views": 8}.get(name, 1)
-        self.counts.add(name, launches, waits=int(name == "sgs_cuda_views"))
+        several = {
+            "sgs_cuda_anchor_inputs": 2,
+            "sgs_cuda_l1_ssim": 2,
+            "sgs_cuda_reached_tiles": 2,
+            "sgs_cuda_views": 16,
+        }
+        self.counts.add(name, several.get(name, 1), waits=int(name == "sgs_cuda_views"))
         super().call(name, *(values_of(argument) for argument in arguments), device=device)
 
     def addresses(self, *tensors: Tensor | None) -> list[int | None]:

@@ -76,7 +76,8 @@ class Scene:
         if self.environment is None:
             return None
         axes = torch.stack([camera.viewport(self.environment).viewmat[2, :3] for camera in cameras])
-        return environment(self.environment, axes)
+        # Contiguous: a product of transposed tensors rounds by the number of its rows.
+        return environment(self.environment.contiguous(), axes)
 
     def structured(
         self, camera: Camera, backend: Backend, *, tiles: TileSelection | None = None

@@ -54,7 +54,10 @@ class ResidualFloor:
                 torch.stack([changed[index] for index in indices]), torch.fmin(floors, usual[:, None, None]), floors
             )
 
-        found = in_groups(list(changed), lambda index: self.maps[index].shape, eased)
+        if not changed:
+            return self
+        device = next(iter(self.maps.values())).device
+        found = in_groups(list(changed), lambda index: self.maps[index].shape, eased, device=device)
         return replace(self, maps={**self.maps, **dict(zip(changed, found, strict=True))})
 
 

@@ -27,6 +27,9 @@ from structgstream.frames import MultiViewFrame
 
 Item, Found = TypeVar("Item"), TypeVar("Found")
 
+PROCESSOR_VIEWS = 4
+"""On the processor so many views are computed together, or one for each thread if these are more: its caches hold few
+pictures. A GPU takes all at once, since its host queues every operation."""
 MAX_PHASES = 8
 """Ratios of sizes whose pattern repeats after more pixels than this are left to torch."""
 
@@ -77,7 +80,7 @@ def training_views(frame: MultiViewFrame, rig: CameraRig, device: torch.device) 
     rows, names = {name: i for i, name in enumerate(rig.training)}, frame.showing(rig.training)
     images = [torch.from_numpy(frame.images[name]) for name in names]
     if device.type != "cpu":
-        images = in_groups(images, lambda image: image.shape, lambda same: torch.stack(same).to(device))
+        images = in_groups(images, lambda image: image.shape, lambda same: torch.stack(same).to(device), device=device)
     return [_view(rows[n], rig[n], image, frame.masks.get(n)) for n, image in zip(names, images, strict=True)]
 
 
@@ -99,19 +102,29 @@ def mean_of_counting(values: Tensor, mask: Tensor | None) -> Tensor:
 
 
 def in_groups(
-    items: Sequence[Item], group: Callable[[Item], Hashable], compute: Callable[[list[Item]], Iterable[Found]]
+    items: Sequence[Item],
+    group: Callable[[Item], Hashable],
+    compute: Callable[[list[Item]], Iterable[Found]],
+    *,
+    device: torch.device,
 ) -> list[Found]:
-    """``compute`` of the items of each group together; its results are in the order of ``items``."""
+    """``compute`` of the items of each group together, on the processor of a few at a time; its results are in the
+    order of ``items``."""
     rows: dict[Hashable, list[int]] = {}
     for row, item in enumerate(items):
         rows.setdefault(group(item), []).append(row)
-    found = {row: one for of in rows.values() for row, one in zip(of, compute([items[row] for row in of]), strict=True)}
+    most = max(PROCESSOR_VIEWS, torch.get_num_threads()) if device.type == "cpu" else max(len(items), 1)
+    parts = [of_group[n : n + most] for of_group in rows.values() for n in range(0, len(of_group), most)]
+    found = {row: one for part in parts for row, one in zip(part, compute([items[row] for row in part]), strict=True)}
     return [found[row] for row in range(len(items))]
 
 
 def by_size(views: Sequence[View], compute: Callable[[list[View]], Iterable[Found]]) -> list[Found]:
     """``compute`` of the views of each picture size together, as arrays of pictures."""
-    return in_groups(views, lambda view: (view.image.shape, view.camera.near), compute)
+    if not views:
+        return []
+    device = views[0].image.device
+    return in_groups(views, lambda view: (view.image.shape, view.camera.near), compute, device=device)
 
 
 def stacked_colors(views: Sequence[View]) -> Tensor:

@@ -203,6 +203,7 @@ def measure(
             list(zip(views, changes, strict=True)),
             kind,
             lambda alike: _measure_views(folded, *zip(*alike), config=config, backend=backend, floor=floor),
+            device=backend.device,
         )
         shares = torch.stack([of_view for _, of_view in measured]).tolist()
     return [

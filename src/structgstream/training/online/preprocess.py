@@ -166,7 +166,12 @@ def detect_changes(
         return _detect_changes(alike, last, config=config, backend=backend, flow_from=flow_from, flow=flow)
 
     with torch.no_grad():
-        return in_groups(views, lambda view: (view.image.shape, view.camera.near, view.index in earlier), changes)
+        return in_groups(
+            views,
+            lambda view: (view.image.shape, view.camera.near, view.index in earlier),
+            changes,
+            device=backend.device,
+        )
 
 
 def _detect_changes(
@@ -185,15 +190,17 @@ def _detect_changes(
     reach = round(config.REACH_PIXELS * views[0].enlargement)
     changed = backend.changed_pixels(then, now, threshold=config.CHANGE_THRESHOLD, reach_pixels=reach)
     changed = changed if both is None else changed & both
-    repeated = _are_repeated(then, now, changed, both)
-    found = [PictureChange(*of_view) for of_view in zip(changed, repeated, strict=True)]
     rows = [row for row, view in enumerate(views) if view.index in flow_from]
+    everywhere = torch.ones_like(changed) if both is None else both
+    any_changed, *here = on_processor(  # Where flow is searched.
+        changed.flatten(1).any(1), *(given[rows] for given in (then, now, changed, everywhere))
+    )
+    repeated = _are_repeated(then, now, both, same=(~any_changed).nonzero()[:, 0].tolist())
+    found = [PictureChange(*of_view) for of_view in zip(changed, repeated, strict=True)]
     if not rows:
         return found
     small, last = (evidence_views([some[row] for row in rows], config.picture_scale) for some in (views, before))
     size = (small[0].camera.height, small[0].camera.width)
-    everywhere = torch.ones_like(changed) if both is None else both
-    here = on_processor(*(given[rows] for given in (then, now, changed, everywhere)))  # Where flow is searched.
     estimated = [
         flow_map(*of_view, size, mask=mask, config=flow, backend=backend) for *of_view, mask in zip(*here, strict=True)
     ]
@@ -204,16 +211,15 @@ def _detect_changes(
     return found
 
 
-def _are_repeated(then: Tensor, now: Tensor, changed: Tensor, masks: Tensor | None) -> list[bool]:
-    """Whether each of the pictures ``now`` is ``then`` once more; ``changed`` as in :class:`PictureChange`, ``masks``
-    the pixels of both."""
-    same = [row for row, any_changed in enumerate(changed.flatten(1).any(1).tolist()) if not any_changed]
+def _are_repeated(then: Tensor, now: Tensor, masks: Tensor | None, *, same: list[int]) -> list[bool]:
+    """Whether each of the pictures ``now`` is ``then`` once more: of those, ``same``, in which no pixel has changed.
+    ``masks`` are the pixels of both."""
     if not same:
-        return [False] * len(changed)
+        return [False] * len(now)
     levels = (now[same].int() - then[same].int()).abs().float().mean(-1)
     means = mean_of_counting(levels, None if masks is None else masks[same]).tolist()
     repeated = {row for row, mean in zip(same, means, strict=True) if mean < REPEATED_LEVELS}
-    return [row in repeated for row in range(len(changed))]
+    return [row in repeated for row in range(len(now))]
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,12 @@ def view_residuals(
         image, view, _ = of_view
         return view.image.shape, image is None, floor is not None and view.index not in floor.maps
 
-    return in_groups(given, kind, lambda alike: _view_residuals(*zip(*alike), color, floor, rules, backend))
+    return in_groups(
+        given,
+        kind,
+        lambda alike: _view_residuals(*zip(*alike), color, floor, rules, backend),
+        device=backend.device,
+    )
 
 
 def _view_residuals(
@@ -104,7 +109,7 @@ def _view_residuals(
         none = torch.zeros(pictures.shape[:3], device=pictures.device)
         nothing = torch.zeros_like(none, dtype=torch.bool)
         if images:
-            small = [replace(view, mask=mask) for view, mask in zip(small, nothing, strict=True)]
+            small = [View(v.index, v.camera, v.image, mask) for v, mask in zip(small, nothing, strict=True)]
         return [ViewResidual(*of_view) for of_view in zip(small, nothing, none, strict=True)]
     seen = color.of_cameras([view.index for view in views])
     off = backend.picture_residuals(
@@ -420,20 +425,25 @@ class Sweep:
             masks = changed_tiles(torch.stack([of_view.mask for of_view in tiles]), list(pixels), size)
             return [replace(of_view, mask=mask) for of_view, mask in zip(tiles, masks, strict=True)]
 
-        tiles = in_groups(range(len(views)), lambda row: (views[row].image.shape, pictures[row] is None), suspect_tiles)
+        tiles = in_groups(
+            range(len(views)),
+            lambda row: (views[row].image.shape, pictures[row] is None),
+            suspect_tiles,
+            device=self.backend.device,
+        )
         return list(map(Missing, views, residuals, tiles, pictures, drawn))
 
     def _drawn(self, entries: Sequence[Missing], *, chosen: Sequence[bool], again: bool = False) -> list[Missing]:
         """By renderings of the ``chosen`` ones in the suspect tiles; in those drawn before only ``again``."""
-        return in_groups(
-            list(zip(entries, chosen, strict=True)),
-            lambda given: (given[0].view.image.shape, given[0].picture is not None and given[1]),
-            lambda alike: (
-                self._draw([entry for entry, _ in alike], again=again)
-                if alike[0][1] and alike[0][0].picture is not None
-                else [entry for entry, _ in alike]
-            ),
+        drawn = [entry for entry, wanted in zip(entries, chosen, strict=True) if wanted and entry.picture is not None]
+        found = in_groups(
+            drawn,
+            lambda entry: (entry.view.image.shape, entry.view.camera.near),
+            lambda alike: self._draw(alike, again=again),
+            device=self.backend.device,
         )
+        by_view = {entry.view.index: entry for entry in found}
+        return [by_view.get(entry.view.index, entry) for entry in entries]
 
     def _draw(self, entries: Sequence[Missing], *, again: bool) -> list[Missing]:
         """:meth:`_drawn` of views of one size that all have active tiles."""
