@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from structgstream.atomic_files import atomic_write, side_path
 from structgstream.codec.container.byte_source import free_bytes
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader
+from structgstream.codec.reader import StreamReader
 from structgstream.codec.scene_coder import SceneDecoder
 from structgstream.codec.segments.manifest import MANIFEST
 from structgstream.codec.segments.sink import Clocks, SegmentsOptions, SegmentsSink
@@ -270,6 +271,35 @@ def with_sound(
     """
     after = resumed.packets[-1].pts_seconds if resumed is not None and len(resumed) else None
     return SoundSink(sink, sound, fps=source.fps, after=after), {**(metadata or {}), "sound": sound.name}
+
+
+def copy_with_sound(reader: StreamReader, sink: PacketSink, sound: SoundSource, *, name: str) -> None:
+    """Writes the frames of a stream without sound to ``sink``, with sound.
+
+    Args:
+        name: of the stream, for messages.
+
+    Raises:
+        StreamError: the stream has sound, or a frame is lost.
+        CaptureError: the sound cannot be read.
+        StorageError: the sink cannot be written.
+    """
+    if reader.header.sound is not None:
+        raise StreamError(f"{name} has sound; take a stream without it.")
+    if reader.damage or not len(reader):
+        raise StreamError(f"{name} is damaged or empty, so it is not copied; structgstream inspect says where.")
+
+    def stated(header: StreamHeader) -> StreamHeader:
+        return replace(header, metadata={**header.metadata, "sound": sound.name})
+
+    heard = SoundSink(sink, sound, fps=reader.header.fps, after=None)
+    begins = {period.first_frame for period in reader.periods[1:]}
+    heard.open(stated(reader.header))
+    with closing(heard):
+        for index in range(len(reader)):
+            if index in begins:
+                heard.begin(stated(reader.header_of(index)))
+            heard.write(reader.packets.packet(index))
 
 
 def preview(header: StreamHeader, packet: Packet) -> NDArray[np.uint8]:

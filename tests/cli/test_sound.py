@@ -70,6 +70,21 @@ def test_without_sound_there_is_no_byte_more(capture: Path, tmp_path: Path, stre
             assert [*reader.group(index)][-1] == [*heard.group(index)][-1], "pictures do not depend on sound"
 
 
+def test_sound_is_added_to_a_stream_that_has_none(
+    capture: Path, tmp_path: Path, stream: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    silent, heard = made(Path(CLIP), tmp_path / "silent.sgs"), tmp_path / "heard.sgs"
+    arguments = ["add-sound", str(silent), str(capture), "-o", str(heard)]
+    assert main([*arguments, "--sound", "cam03"]) == 0
+    assert heard.read_bytes() == stream.read_bytes()
+    assert "exists; replace it with --overwrite" in error_of(arguments, capsys, status=2)
+    again = ["add-sound", str(heard), str(capture), "-o", str(tmp_path / "x.sgs"), "--sound", "cam03"]
+    assert "heard.sgs has sound; take a stream without it" in error_of(again, capsys, status=1)
+    assert main([*arguments[:-1], str(tmp_path / "y.sgs"), "--sound", "cam04"]) == 0
+    with open_stream(tmp_path / "y.sgs") as reader:
+        assert stream_heard(reader) == pytest.approx([0.1], abs=MILLISECOND)
+
+
 def test_a_part_of_the_capture_is_in_step(capture: Path, tmp_path: Path) -> None:
     reconstruct(
         capture, tmp_path / "part.sgs", preset="tiny", backend=QUICKEST, scale=0.25, start=2, frames=2, sound="cam04"

@@ -30,12 +30,14 @@ def test_a_capture_is_made_once_and_only_what_changed_again(tmp_path: Path) -> N
     for name in rig:
         assert torch.equal(source.rig[name].viewmat, rig[name].viewmat)
         assert 0.6 < source.rig[name].near < 1.4  # the board stands 2.5 in front of the cameras
+    assert made.steps["sound"] == "no camera has any"
+    assert read_prepared(tmp_path / "out").sound is None
     again = prepare_capture(tmp_path / "videos", tmp_path / "out", options=OPTIONS)
     assert set(again.skipped) == {"synchronize", "calibrate", "scale", "near", "points", "check", "sound"}
     assert again.findings == made.findings
     distance = Distance("cam00", "cam04", 2.0)
     metres = prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(OPTIONS, distance=distance))
-    assert set(metres.skipped) == {"synchronize", "calibrate"}
+    assert set(metres.skipped) == {"synchronize", "calibrate", "sound"}
     found = read_prepared(tmp_path / "out")
     assert found.unit == "metres"
     one, other = (found.cameras[name].pinhole.center for name in ("cam00", "cam04"))

@@ -12,8 +12,11 @@ from numpy.typing import NDArray
 from structgstream.data.open import open_capture
 from structgstream.data.prepared import FILE, read_prepared
 from structgstream.data.timeline import Clock
+from structgstream.preparation.options import PrepareOptions
+from structgstream.preparation.prepare import prepare_capture
 from structgstream.preparation.sound import best_microphone, chosen_sound, file_sound
 from tests.support.quick_streams import CLIP
+from tests.support.rooms import write_room
 from tests.support.sounds import add_sound, claps, write_sound
 
 SECONDS, RATE = 12.0, 48_000
@@ -88,3 +91,18 @@ def test_a_prepared_capture_states_its_microphone(tmp_path: Path) -> None:
     for stated, expected in ({}, None), ({"sound": "a"}, "a"), ({"sound": "gone"}, None):
         (tmp_path / FILE).write_text(json.dumps(content | stated))
         assert read_prepared(tmp_path).sound == expected
+
+
+def test_prepare_chooses_the_microphone_that_reconstruct_takes(noises: NDArray[np.float32], tmp_path: Path) -> None:
+    videos, out = tmp_path / "videos", tmp_path / "out"
+    names = [*write_room(videos)]
+    worse = noises + 0.05 * np.random.default_rng(2).standard_normal(noises.shape).astype(np.float32)
+    for name, samples in ((names[1], worse), (names[2], noises)):
+        video = next(videos.glob(f"{name}.*"))
+        add_sound(video, tmp_path / video.name, samples).replace(video)
+    made = prepare_capture(videos, out, options=PrepareOptions(synchronize="none"))
+    assert made.steps["sound"] == f"the microphone of {names[2]} is the best"
+    sound = chosen_sound(open_capture(out), out, None)
+    assert sound is not None
+    assert sound.name == names[2]
+    assert chosen_sound(open_capture(out), out, "none") is None

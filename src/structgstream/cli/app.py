@@ -36,10 +36,12 @@ COMMANDS = {
     "export": "write a page with a player, or frames as plain 3D Gaussians: .ply, .spz, .sog, .glb, .usd ...",
     "import": "make a stream of a numbered .ply sequence of another trainer",
     "archive": "turn a folder of segments into one stream file",
+    "add-sound": "store sound with a stream that was made without it",
     "inspect": "show the content of a stream file",
     "doctor": "show available back-ends and packages, and how to install missing ones",
 }
 SHARED = {
+    "add-sound": "conversion.add_sound",
     "archive": "conversion.archive",
     "board": "prepare.board",
     "export": "conversion.export",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands between formats: ``export``, ``import`` and ``archive``."""
+"""Commands between formats: ``export``, ``import``, ``archive`` and ``add-sound``."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +10,16 @@ from rich.console import Console
 from rich.table import Table
 
 from structgstream.cli.app import UsageError, usage_errors
-from structgstream.cli.options import EXPORTS, Device, Flag, Folder, check_ending, check_new, parse_options
+from structgstream.cli.options import (
+    EXPORTS,
+    Device,
+    Flag,
+    Folder,
+    StreamFile,
+    check_ending,
+    check_new,
+    parse_options,
+)
 from structgstream.cli.progress import frame_bar, frames_text, human_bytes, print_lines
 from structgstream.exporters.formats import FORMATS, Format, FrameOptions, PageFormat, SpzVersion
 
@@ -143,9 +152,10 @@ def _list_formats(console: Console) -> None:
 
 
 def _export_page(path: Path, output: Path, format: PageFormat) -> None:
-    from structgstream.serve.pages import StreamFile, write_page, write_site
+    from structgstream.serve.pages import StreamFile as ServedStream
+    from structgstream.serve.pages import write_page, write_site
 
-    stream = StreamFile(path)
+    stream = ServedStream(path)
     if format == "html":
         size_bytes = write_page(output, stream)
         then = f"open it in a browser: {output.resolve().as_uri()}"
@@ -269,3 +279,47 @@ def archive(arguments: list[str]) -> None:
 
     frames = write_archive(FolderStore(options.segments), output)
     print_lines(Console(), f"Wrote {output}: {frames_text(frames)}, {human_bytes(output.stat().st_size)}")
+
+
+@dataclass(frozen=True)
+class AddSound:
+    """Stores sound with a stream that was made without it, such as one of parallel or join; frames are copied.
+
+    Example: structgstream add-sound ball.sgs basketball --sound cam03 -o heard.sgs
+    """
+
+    stream: tyro.conf.Positional[StreamFile]
+    """The stream."""
+    capture: tyro.conf.Positional[Folder]
+    """The capture that it was made from."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.sgs")]
+    """The stream file to write."""
+    sound: Annotated[str, tyro.conf.arg(metavar="CAMERA|FILE|auto")] = "auto"
+    """As of reconstruct: the sound of a camera, of a file, or of the best microphone."""
+    sound_offset: Annotated[float | None, tyro.conf.arg(metavar="SECONDS", help_behavior_hint="")] = None
+    """As of reconstruct: when the file begins, in seconds after the first frame of the capture."""
+    overwrite: Flag = False
+    """Replace OUT.sgs when it exists."""
+
+
+def add_sound(arguments: list[str]) -> None:
+    """Writes the file and prints where its sound is from."""
+    options = parse_options(AddSound, "add-sound", arguments=arguments)
+    output = options.output
+    check_ending(output, ".sgs", command="add-sound")
+    check_new(output, overwrite=options.overwrite)
+    from structgstream.codec.reader import open_stream
+    from structgstream.codec.sinks import FileSink
+    from structgstream.evaluation.recording import capture_of
+    from structgstream.preparation.sound import chosen_sound
+    from structgstream.recorder import copy_with_sound
+
+    with open_stream(options.stream) as reader:
+        if output.exists() and output.samefile(options.stream):
+            raise UsageError("add-sound reads the stream while it writes another; give another name with -o.")
+        source = capture_of(reader.header, options.capture, frames=len(reader))
+        sound = chosen_sound(source, options.capture, options.sound, offset_seconds=options.sound_offset)
+        if sound is None:
+            raise UsageError("--sound none adds nothing; name a camera or a file.")
+        copy_with_sound(reader, FileSink(output, overwrite=options.overwrite), sound, name=str(options.stream))
+    print_lines(Console(), f"Wrote {output}: {frames_text(len(reader))}, sound of {sound.name}")

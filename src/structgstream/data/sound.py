@@ -229,20 +229,15 @@ class FileFeed:
         av = load_av()
         with open_sound(source.path) as container:
             frames = container.decode(sound_stream(container, source.path))
-            while True:
-                try:
-                    frame = next(frames, None)
-                except av.error.FFmpegError as error:
-                    log.warning(
-                        "The sound of %s cannot be decoded any further (%s); what follows is silent",
-                        source.path, error.strerror,
-                    )  # fmt: skip
-                    self._reported = True
-                    frame = None
-                if frame is None:
-                    break
-                time = None if frame.time is None else source.clock.offset_seconds + source.clock.rate * frame.time
-                yield from encoder.add(frame, time)
+            try:
+                for frame in frames:
+                    time = None if frame.time is None else source.clock.offset_seconds + source.clock.rate * frame.time
+                    yield from encoder.add(frame, time)
+            except (av.error.FFmpegError, ValueError) as error:  # The pictures go on.
+                log.warning(
+                    "The sound of %s cannot be decoded any further (%s); what follows is silent", source.path, error
+                )  # fmt: skip
+                self._reported = True
         yield from encoder.finish()
 
 

@@ -21,7 +21,7 @@ import math
 import threading
 import zlib
 from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager, closing, suppress
+from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
@@ -332,10 +332,12 @@ class CameraFeed:
     def _hear(self, packet: "Packet") -> None:
         """Passes sound on; what cannot be decoded, or comes before the first picture, is left out."""
         assert self._sound is not None
-        with suppress(load_av().error.FFmpegError):
+        try:
             for frame in cast("list[AudioFrame]", packet.decode()):
                 if frame.time is not None and self._decodes and math.isfinite(self._clock.shift):
                     self._sound.add(frame, frame.time + self._clock.shift)
+        except (load_av().error.FFmpegError, ValueError) as error:  # The pictures go on.
+            self._faults.warn(self.name, "sound", f"sends sound that cannot be decoded ({error}); it is left out")
 
     def _is_duplicate(self, packet: "Packet") -> bool:
         """Whether the packet repeats the last one: decoded twice, its differences would be added twice."""

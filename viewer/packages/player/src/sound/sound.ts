@@ -205,6 +205,10 @@ export class Sound {
       this.fail(`This browser cannot play sound (${error instanceof Error ? error.message : error}).`);
       return undefined;
     }
+    // A telephone call, say, ends sound until the next gesture.
+    this.context.onstatechange = () => {
+      if (this.context && this.context.state !== "running") this.waitForGesture();
+    };
     this.wake();
     if (this.context.state !== "running") this.waitForGesture();
     return this.context;
@@ -310,7 +314,10 @@ export class Sound {
     source.playbackRate.value = rate;
     source.connect(fade);
     source.start(at + late, chunk.from + passed, chunk.length - passed);
-    source.onended = () => source.disconnect();
+    source.onended = () => {
+      source.disconnect();
+      sources.delete(chunk);
+    };
     sources.set(chunk, source);
   }
 
