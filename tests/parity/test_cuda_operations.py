@@ -20,7 +20,7 @@ from tests.support.worlds import moving_world
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
-MAX_OPERATIONS, MAX_WAITS, MAX_OF_A_VIEW = 1_170, 18, 20
+MAX_OPERATIONS, MAX_WAITS, MAX_OF_A_VIEW = 1_200, 18, 16
 """Of the frame below with four views, and operations of each further view: what it takes now, with little room. Whoever
 needs fewer lowers them."""
 

@@ -105,7 +105,7 @@ def rendering_residual(gaussians: Gaussians, view: View, scene: Scene, backend: 
 def residual(drawn: Tensor, view: View, color: CameraColor, backend: Backend) -> Tensor:
     """Mean absolute difference ``[H, W]`` of a rendering ``[H, W, 3]`` to the picture of ``view``, over channels and
     3 x 3 pixels, after the correction ``color`` of its camera; 0 where pixels do not count."""
-    return residuals(drawn[None], [view], color, backend)[0]
+    return residuals([drawn], [view], color, backend)[0]
 
 
 def residuals(drawn: Sequence[Tensor], views: Sequence[View], color: CameraColor, backend: Backend) -> Tensor:

@@ -25,7 +25,8 @@ from torch import Tensor
 from structgstream.cameras import Camera, CameraRig, enlargement
 from structgstream.frames import MultiViewFrame
 
-Item, Found = TypeVar("Item"), TypeVar("Found")
+Item = TypeVar("Item")
+Found = TypeVar("Found")
 
 PROCESSOR_VIEWS = 4
 """On the processor so many views are computed together, or one for each thread if these are more: its caches hold few
@@ -163,7 +164,7 @@ def _reduced(views: list[View], scale: float) -> Iterable[View]:
         return [View(view.index, camera, image) for view, camera, image in zip(views, cameras, images, strict=True)]
     masks = area_mean(masks[:, None].float(), size)[:, 0] > 1.0 - 1e-4
     pictures = zip(views, cameras, blackened(images, masks), masks, strict=True)
-    return [View(view.index, camera, *picture) for view, camera, *picture in pictures]
+    return [View(view.index, camera, image, mask) for view, camera, image, mask in pictures]
 
 
 def as_picture(image: Tensor) -> Tensor:

@@ -256,7 +256,7 @@ def _measure_views(
     wrong_shares = torch.zeros_like(changed_shares)
     if floor is not None and views[0].index in floor.maps and config.residual_threshold > 0.0:
         floors = torch.stack([floor.maps[view.index] for view in views])
-        wrong = residuals(drawn, small, scene.camera_color, backend) > config.residual_threshold + floors
+        wrong = residuals(list(drawn), small, scene.camera_color, backend) > config.residual_threshold + floors
         wrong = wrong.to(changed)
         wrong_shares = mean_of_counting(wrong, masks)
         around = torch.maximum(changed, max_pool2d(wrong, 3, stride=1, padding=1))

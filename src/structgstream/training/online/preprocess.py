@@ -202,7 +202,8 @@ def _detect_changes(
     small, last = (evidence_views([some[row] for row in rows], config.picture_scale) for some in (views, before))
     size = (small[0].camera.height, small[0].camera.width)
     estimated = [
-        flow_map(*of_view, size, mask=mask, config=flow, backend=backend) for *of_view, mask in zip(*here, strict=True)
+        flow_map(first, second, where, size, mask=mask, config=flow, backend=backend)
+        for first, second, where, mask in zip(*here, strict=True)
     ]
     maps = torch.stack([of_view.maps for of_view in estimated]).to(changed.device)
     maps = torch.cat([maps, stacked_colors(last)], dim=-1)

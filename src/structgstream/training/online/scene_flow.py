@@ -257,7 +257,9 @@ def residual_flow(
             lambda same: _weigh_residual_flow(folded, same, active_tiles, scale=scale, config=config, backend=backend),
         )
     evidence = flow_evidence([primitive_sums(of_view, folded) for of_view in found])
-    coverage = sum((of_view[:, 3] for of_view in found[1:]), start=found[0][:, 3])
+    coverage = found[0][:, 3]
+    for of_view in found[1:]:
+        coverage = coverage + of_view[:, 3]
     return lift_flow(evidence, primitive_centers(dynamic, coverage), nothing, seen, config=config.LIFT, backend=backend)
 
 

@@ -86,24 +86,24 @@ def view_residuals(
     return in_groups(
         given,
         kind,
-        lambda alike: _view_residuals(*zip(*alike), color, floor, rules, backend),
+        lambda alike: _view_residuals(alike, color, floor, rules, backend),
         device=backend.device,
     )
 
 
 def _view_residuals(
-    drawn: Sequence[Tensor | None],
-    views: Sequence[View],
-    tiles: Sequence[TileSelection | None],
+    given: Sequence[tuple[Tensor | None, View, TileSelection | None]],
     color: CameraColor,
     floor: ResidualFloor | None,
     rules: SpawnRules,
     backend: Backend,
 ) -> list[ViewResidual]:
     """Of views of one size, all or none of which were drawn and have a floor."""
+    views = [view for _, view, _ in given]
     small = reduced_views(views, min(1.0, rules.picture_width / views[0].camera.width))
     pictures, masks = torch.stack([view.image for view in small]), stacked_masks(small)
-    images, selected = ([one for one in every if one is not None] for every in (drawn, tiles))
+    images = [image for image, _, _ in given if image is not None]
+    selected = [of_view for _, _, of_view in given if of_view is not None]
     if not images or (floor is not None and views[0].index not in floor.maps):
         # Of a camera that was absent from frame 0 nothing is known to be new.
         none = torch.zeros(pictures.shape[:3], device=pictures.device)
