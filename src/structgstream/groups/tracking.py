@@ -235,8 +235,8 @@ def _rendered_flow(tracker: Tracker, scene: Scene, seen: _ViewEvidence, velociti
     picture = seen.tiles.choose(blackened(rendered, view.mask), view.image)
     small = view.evidence(tracker.config.picture_scale)
     size = (small.camera.height, small.camera.width)
-    here = on_processor(picture, view.image, counting)  # Where flow is searched.
-    found = flow_map(*here, size, mask=here[2], config=FLOW, backend=backend)
+    first, second, counted = on_processor(picture, view.image, counting)  # Where flow is searched.
+    found = flow_map(first, second, counted, size, mask=counted, config=FLOW, backend=backend)
     inside = area_mean(counting[None, None].float(), size)[0, 0]
     maps = torch.cat([found.maps.to(inside.device), inside[..., None], small.colors * inside[..., None]], dim=-1)
     sums = accumulate(moved, small.camera, maps, backend)
