@@ -4,15 +4,15 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check python-test viewer-test viewer-test-if-node player wheel wheel-test docs lab-test tables clean
+.PHONY: demo test check python-test viewer-test player wheel wheel-test docs lab-test tables clean
 
 demo: $(VENV)/.demo-ready
 	$(BIN)/structgstream demo --output demo
 
-# As many parts at a time as there are cores, so that none of them idles; what a part prints comes when the part has
-# ended, and one that fails ends all when those that run are done. The viewer's needs no environment.
-test:
-	@$(MAKE) --no-print-directory --jobs=$$(nproc 2> /dev/null || echo 1) --output-sync=target viewer-test-if-node check python-test
+# The first two parts run beside each other, and print when they end. The viewer's run alone: browsers play in real time.
+test: $(VENV)/.test-ready
+	@$(MAKE) --no-print-directory --jobs=$$(nproc 2> /dev/null || echo 1) --output-sync=target check python-test
+	scripts/viewer-test --if-node
 
 check: $(VENV)/.test-ready
 	scripts/check $(BIN)
@@ -22,9 +22,6 @@ python-test: $(VENV)/.test-ready
 
 viewer-test:
 	scripts/viewer-test
-
-viewer-test-if-node:
-	scripts/viewer-test --if-node
 
 # The player that comes with the package, from viewer/packages; commit what changes.
 player:
