@@ -35,6 +35,9 @@ def check() -> None:
     assert state_of(scene)[NAME].tolist() == [[0.0]] * 40
     trained = fitted(scene)
     assert changed_primitives(scene, trained)[:40].any()
+    camera, backend = arc_rig()["cam00"], reference_backend()
+    (of_views,) = trained.gaussians_of_views([camera], backend)
+    assert torch.equal(of_views.colors, trained.gaussians(camera, backend).colors), "measuring sees what render draws"
     frames = [scene, trained, fitted(trained)]
     for header in (header_for(scene, dynamic=DYNAMIC), compact_header(scene, dynamic=DYNAMIC)):
         sink = MemorySink()

@@ -60,8 +60,8 @@ class MotionConfig:
     residual_threshold: float = 0.0
     """A pixel has also changed if its residual exceeds frame 0's by this (full scale 1). 0: residuals are not used."""
     hysteresis: float = 1.0
-    """Factor (hysteresis) on the thresholds of pixels and shares for primitives that the last frame changed. 1:
-    none."""
+    """Factor on the thresholds of pixels and shares for primitives that the last frame changed: below 1, what moves
+    stays dynamic. 1: none."""
     occluded_share: float = 0.0
     """An anchor that fewer than ``MIN_VOTES`` views show is trained if at least this share of its nearest shown ones
     is: it lies in or behind what moves. 0: none."""
@@ -241,7 +241,7 @@ class SmoothnessConfig:
     """Weight in the loss of the mean difference of displacement from the neighbours, pixels (paper: 0, none)."""
 
     NEIGHBOURS: ClassVar[int] = 8
-    """Number of nearest moving anchors that an anchor is compared with."""
+    """Number of nearest dynamic anchors that an anchor is compared with."""
     BANDWIDTH: ClassVar[float] = 0.7
     """Standard deviation of the Gaussian weight of a neighbour by distance, relative to the farthest neighbour's."""
     FEATURE_BANDWIDTH: ClassVar[float] = 1.0
@@ -328,7 +328,7 @@ class OnlineConfig:
     """Configuration of the frames after the first."""
 
     iterations: int = 100
-    """Optimisation steps per frame (paper: 100)."""
+    """Optimisation steps per frame (paper: 100); fewer where the dynamic part is not in all views."""
     dynamic: frozenset[FieldName] = PAPER_DYNAMIC
     """Fields of the state table that are trained after frame 0 (paper: x_v, l_v, F_Sigma and free 3DGs)."""
     appearance_rank: int = 4

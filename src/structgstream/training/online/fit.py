@@ -64,7 +64,7 @@ def fit_next_frame(
         intervals: media time since the previous frame, in times of that between the two before, for the motion prior.
         floor: residuals of frame 0, for ``config.motion.residual_threshold`` and for spawning; None for none.
         light: frame 0's, for ``config.exposure``; None for none.
-        on_step: called after every iteration.
+        on_step: called after every iteration, or every tenth of native ones.
     """
     if pictures is None:
         pictures = preprocess(
@@ -76,19 +76,18 @@ def fit_next_frame(
     if config.patching.lifetime == "frame":
         scene = scene.without_free()
     scene = replace(scene, sampling=RigSampling.of(rig) if config.sampling_filter else None)
-    counts: dict[str, int] = {}
+    light_counts: dict[str, int] = {}
     if config.exposure.enabled and light is not None:
-        step = None if steps is None else steps.get("color_mlp")
-        lit = with_exposure_of(scene, views, light, config=config.exposure, step=step)
-        counts["light changed"] = int(lit is not scene)
-        scene = lit
+        before, step = scene, (steps or {}).get("color_mlp")
+        scene = with_exposure_of(before, views, light, config=config.exposure, step=step)
+        light_counts = {"light changed": int(scene is not before)}
 
     watch, generator = Stopwatch(), torch.Generator().manual_seed(seed)
     optimizer = FrameOptimizer(config, backend, frame.index, generator, watch, steps or {}, on_step)
     prior = prior_displacements(scene, older, intervals * config.motion_prior)
     if pictures.changes is None:
         result = optimizer.run(StartingPoint(scene, views, prior))
-        return replace(result, counts={**result.counts, **counts})
+        return replace(result, counts={**result.counts, **light_counts})
 
     with watch.stage("find motion"):
         measured = measure(scene, views, pictures.changes, config=config.motion, backend=backend, floor=floor)
@@ -99,10 +98,12 @@ def fit_next_frame(
         flow = apply_scene_flow(
             split, inliers, prior[selection.primitives], config=config.scene_flow, motion=config.motion, backend=backend
         )
+    # Where flow was looked for, what is missing is too (``SceneFlowConfig.views``).
+    swept = [view for view in inliers if view.index in selection.views_with_flow] or inliers
     with watch.stage("renew"):
         spawned = prune_and_spawn(
             flow.split,
-            [view for view in inliers if view.index in selection.views_with_flow] or inliers,
+            swept,
             flow.active_tiles,
             first_identity=frame.index * IDS_PER_FRAME,
             floor=floor,
@@ -132,7 +133,7 @@ def fit_next_frame(
             **pictures.flow_counts,
             "views left out": len(views) - len(inliers),
             "scene cuts": int(selection.scene_cut),
-            **counts,
+            **light_counts,
         },
     )
 

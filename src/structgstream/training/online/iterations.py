@@ -53,6 +53,8 @@ NATIVE_SETTINGS = frozenset(
     }
 )
 """Fields of :class:`OnlineConfig` that they know, or that do not concern them."""
+TERMS = ("l1", "ssim", "volume", "smoothness")
+"""Columns of ``FitPlan.terms``; the last one after them is their weighted sum."""
 REPORT_INTERVAL = 10
 """Iterations between reports of progress, where a back-end runs them."""
 
@@ -76,7 +78,7 @@ class StartingPoint:
         scene: the whole scene, or the dynamic part of ``split``.
         views: the pictures.
         displacements: ``[M + F, 3]`` initial displacements of its primitives (Note [Primitives]).
-        split: of which the scene is the moving part; None for a whole scene.
+        split: of which the scene is the dynamic part; None for a whole scene.
         active_tiles: by view index, the tiles that the scene reaches; None for whole pictures of all views.
         new_free: free Gaussians to add.
         reference: anchors as in ``scene``, from whose values the rate term and smoothness count; it has no free
@@ -202,7 +204,8 @@ class OnlineHooks(Hooks[View, SceneLoss]):
         if key not in self.recorded:
             # The other visits of a view follow each other; those of all tiles are ``rest_every`` visits apart.
             visits_left = (self.iterations - iteration) // len(self.start.seen)
-            if self._tracks_screen(iteration) or visits_left < (self.rest_every if alternates and not rests else 1):
+            visits_apart = self.rest_every if alternates and not rests else 1
+            if self._tracks_screen(iteration) or visits_left < visits_apart:
                 return None
             for tiles in () if active is None else (active.tiles, active.changed):
                 if tiles is not None:
@@ -255,20 +258,23 @@ def minimize_natively(
     patch_at = hooks.patch_at if hooks.patches and hooks.patch_at <= len(views) else 0
     interval = REPORT_INTERVAL if on_step is not None else max(len(views), 1)
     run = None
-    for first, last in pairwise(sorted({*range(0, len(views), interval), patch_at, len(views)})):
+    # The back-end runs from one stop to the next: reports, the patching, the end.
+    stops = sorted({*range(0, len(views), interval), patch_at, len(views)})
+    for first, last in pairwise(stops):
         with hooks.watch.stage("iterations"):
             run = run or begin(_frame(adam, plan, hooks, first))
             run(first, last)
         if hooks.average is not None:
             hooks.average.count(last - max(first, plan.mean_from))
         if last == patch_at and hooks.patch(views[last - 1]):
-            run = None
+            run = None  # rows have come or gone
         if on_step is not None:
-            on_step(Step(last, len(views), float(plan.terms[last - 1, 4]), *hooks.counts()))
-    terms = {"l1": 0, "ssim": 1, **({"volume": 2} if hooks.config.losses.volume else {})}
-    terms |= {} if hooks.smoothness is None else {"smoothness": 3}
+            on_step(Step(last, len(views), float(plan.terms[last - 1, len(TERMS)]), *hooks.counts()))
+    computed = {"l1", "ssim"}
+    computed |= {"volume"} if hooks.config.losses.volume else set()
+    computed |= {"smoothness"} if hooks.smoothness is not None else set()
     for i, (view, rests) in enumerate(zip(views, plan.rests.tolist(), strict=True)):
-        found = {name: plan.terms[i, column] for name, column in terms.items()}
+        found = {name: value for name, value in zip(TERMS, plan.terms[i], strict=False) if name in computed}
         hooks.last_pass.add_results(i + 1, view.index, found, plan.squared_errors[i], comparable=not rests)
     return len(views)
 

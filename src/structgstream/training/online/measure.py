@@ -8,9 +8,9 @@ first, then free Gaussians, ``M + F`` in all. A map is accumulated for a primiti
 with the blending weights of the primitive's Gaussians, so that occluded ones get nothing.
 """
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -205,15 +205,26 @@ def measure(
             lambda alike: _measure_views(folded, *zip(*alike), config=config, backend=backend, floor=floor),
             device=backend.device,
         )
-        shares = torch.stack([of_view for _, of_view in measured]).tolist()
+        shares = torch.stack([of_view.shares for of_view in measured]).tolist()
     return [
-        measurement(
-            change=ViewChange(None, wrong, repeated=False)
-            if change is None
-            else ViewChange(changed, wrong, repeated=change.repeated)
+        ViewMeasurement(
+            view,
+            *of_view[:5],
+            ViewChange(None if change is None else changed, wrong, repeated=change is not None and change.repeated),
         )
-        for (measurement, _), (changed, wrong), change in zip(measured, shares, changes, strict=True)
+        for view, of_view, (changed, wrong), change in zip(views, measured, shares, changes, strict=True)
     ]
+
+
+class _Measured(NamedTuple):
+    """Fields of :class:`ViewMeasurement`, and shares ``[2]`` of changed and of wrong pixels, still on the device."""
+
+    coverage: Tensor
+    covered: Tensor
+    covered_changed: Tensor | None
+    flow_sums: Tensor | None
+    changed: Tensor | None
+    shares: Tensor
 
 
 def _measure_views(
@@ -224,9 +235,8 @@ def _measure_views(
     config: MotionConfig,
     backend: Backend,
     floor: ResidualFloor | None,
-) -> list[tuple[Callable[..., ViewMeasurement], Tensor]]:
-    """Measurements without ``change``, and shares ``[2]`` of changed and of wrong pixels, of views of one size, all or
-    none of which have a change, flow and a floor."""
+) -> list[_Measured]:
+    """Of views of one size, all or none of which have a change, flow and a floor."""
     small = evidence_views(views, config.picture_scale)
     cameras, masks = [view.camera for view in small], stacked_masks(small)
     gaussians = scene.gaussians_of_views(cameras, backend)
@@ -238,10 +248,7 @@ def _measure_views(
     if not known:
         sums = pixel_area * backend.weigh_views(gaussians, viewports, valid[..., None], slots=slots)
         covered, none = primitive_sums(sums, scene)[..., 0], valid.new_zeros(2)
-        return [
-            (partial(ViewMeasurement, *of_view, None, None, None), none)
-            for of_view in zip(views, sums[..., 0], covered, strict=True)
-        ]
+        return [_Measured(*of_view, None, None, None, none) for of_view in zip(sums[..., 0], covered, strict=True)]
     everywhere = torch.stack([change.changed for change in known]).to(valid)
     changed = area_mean(everywhere[:, None], size)[:, 0]
     changed_shares = changed.mean((1, 2)) if masks is None else mean_of_counting(everywhere, stacked_masks(views))
@@ -266,10 +273,8 @@ def _measure_views(
         changed = around
     sums *= pixel_area
     of_primitives = primitive_sums(sums, scene)
+    # The maps are 1, changed, c, c flow_x, c flow_y, r, g and b; flow_evidence wants 1 after the flow.
     flow_sums = of_primitives[..., [2, 3, 4, 0, 5, 6, 7]] if flows else [None] * len(views)
     shares = torch.stack([changed_shares, wrong_shares], dim=1)
-    columns = sums[..., 0], of_primitives[..., 0], of_primitives[..., 1], flow_sums, changed > 0.0
-    return [
-        (partial(ViewMeasurement, *of_view), of_shares)
-        for *of_view, of_shares in zip(views, *columns, shares, strict=True)
-    ]
+    columns = sums[..., 0], of_primitives[..., 0], of_primitives[..., 1], flow_sums, changed > 0.0, shares
+    return [_Measured(*of_view) for of_view in zip(*columns, strict=True)]

@@ -55,7 +55,7 @@ class FrameOptimizer:
         generator: of all random numbers.
         watch: gets seconds by stage.
         steps: quantization steps (Note [Bins]).
-        on_step: called after every iteration; None for none.
+        on_step: called after every iteration, or every tenth of native ones; None for none.
     """
 
     config: OnlineConfig
@@ -167,10 +167,11 @@ class FrameOptimizer:
         steps: dict[ParameterName, float] = {name: self.steps[name] for name in trained if name in self.steps}
         parameters = Parameters.of(start.scene, trained=trained, steps=steps)
         rounding = config.rounding
-        known, free = parameters, rounding.free_priced
-        if start.reference is not None:
-            known, free = Parameters.of(start.reference, trained=trained, steps=steps), False
-        return parameters, RateTerm.of(known.values, steps, weight=rounding.resolved_rate_weight, free=free)
+        weight = rounding.resolved_rate_weight
+        if start.reference is None:
+            return parameters, RateTerm.of(parameters.values, steps, weight=weight, free=rounding.free_priced)
+        known = Parameters.of(start.reference, trained=trained, steps=steps)
+        return parameters, RateTerm.of(known.values, steps, weight=weight, free=False)
 
 
 def rest_every(most: int, *, views: int, iterations: int) -> int:

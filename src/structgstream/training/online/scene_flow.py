@@ -206,8 +206,9 @@ def apply_scene_flow(
             moved.dynamic, views_with_flow, active_tiles, scale=motion.picture_scale, config=config, backend=backend
         )
         displacements, corrected = displacements + second.displacements, second.lifted
-    counts = torch.stack([first.lifted, corrected, fast, fast & first.lifted]).sum(1).tolist()
-    return SceneFlow(split.displaced(displacements), displacements, active_tiles, *counts)
+    masks = {"lifted": first.lifted, "corrected": corrected, "fast": fast, "fast_lifted": fast & first.lifted}
+    counts = dict(zip(masks, torch.stack(list(masks.values())).sum(1).tolist(), strict=True))
+    return SceneFlow(split.displaced(displacements), displacements, active_tiles, **counts)
 
 
 def _is_fast(evidence: FlowEvidence, views: Sequence[View]) -> Tensor:

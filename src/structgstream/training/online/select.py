@@ -132,10 +132,11 @@ def select_dynamic(
         view_changes[number] = replace(view_changes[number], shift_pixels=shift)
     inliers = [number for number, good in enumerate(inlier_views(view_changes)) if good]
 
-    voters = [measured[number] for number in inliers if measured[number].covered_changed is not None]
-    none = ease.new_zeros(0, len(ease))
-    covered = torch.cat([none, *(of_view.covered[None] for of_view in voters)])
-    covered_changed = torch.cat([none, *(row[None] for m in voters if (row := m.covered_changed) is not None)])
+    used = [measured[number] for number in inliers]
+    # No rows come first, because every inlier may be a camera that was absent from the previous frame.
+    none = ease.new_zeros(0, 2, len(ease))
+    votes = [torch.stack([m.covered, m.covered_changed])[None] for m in used if m.covered_changed is not None]
+    covered, covered_changed = torch.cat([none, *votes]).unbind(1)
     moves = covered_changed > config.MIN_CHANGED_PIXELS * ease
     moves &= covered_changed > config.MIN_CHANGED_SHARE * ease * covered
     # From here on masks lie on the processor, where rows are counted without waiting for a GPU.
@@ -145,24 +146,25 @@ def select_dynamic(
         (covered > VISIBLE_PIXELS).sum(0) >= config.MIN_VOTES,
     )
     occluded = occluded_dynamic(positions, dynamic[:anchors], shown[:anchors], share=config.occluded_share)
-    coverage = torch.stack([measured[number].coverage for number in inliers])
+    coverage = torch.stack([m.coverage for m in used])
 
     found = DynamicSelection(
         anchors=dynamic[:anchors] | occluded,
         free=dynamic[anchors:],
-        visible=dict(zip((measured[n].view.index for n in inliers), coverage > VISIBLE_PIXELS, strict=True)),
+        visible=dict(zip((m.view.index for m in used), coverage > VISIBLE_PIXELS, strict=True)),
         inliers=tuple(inliers),
         scene_cut=is_scene_cut(view_changes),
-        changed={measured[n].view.index: changed for n in inliers if (changed := measured[n].changed) is not None},
+        changed={m.view.index: m.changed for m in used if m.changed is not None},
         occluded_count=int(occluded.sum()),
     )
-    with_flow = [n for n in inliers if measured[n].flow_sums is not None]
+    with_flow = [(m.view.index, m.flow_sums) for m in used if m.flow_sums is not None]
     if not with_flow or found.scene_cut:
         return found
+    views_with_flow, flow_sums = zip(*with_flow, strict=True)
     return replace(
         found,
-        evidence=flow_evidence([sums for n in with_flow if (sums := measured[n].flow_sums) is not None]),
-        views_with_flow=tuple(measured[n].view.index for n in with_flow),
+        evidence=flow_evidence(flow_sums),
+        views_with_flow=views_with_flow,
         centers=primitive_centers(scene, coverage.sum(0)),
     )
 
@@ -192,17 +194,16 @@ def outlier_candidates(changes: Sequence[ViewChange]) -> list[int]:
 def inlier_views(changes: Sequence[ViewChange]) -> list[bool]:
     """For each view whether it is no outlier. If fewer than two views are left, none counts as an outlier."""
     usual_change, usual_wrong = _usual_change(changes), median(c.wrong_share for c in changes)
-    few_same = 4 * sum(c.repeated for c in changes) <= len(changes)
-    found = [
-        not (
-            ((c.changed_share or 0.0) > WHOLE_PICTURE_SHARE and usual_change < MEDIAN_SHARE)
-            or (c.wrong_share > WHOLE_PICTURE_SHARE and usual_wrong < MEDIAN_SHARE)
-            or c.wrong_share > max(BUMPED_SHARE, BUMPED_TIMES * usual_wrong)
-            or c.shift_pixels > SHIFTED_PIXELS
-            or (c.repeated and few_same and usual_change > FROZEN_SHARE)
-        )
-        for c in changes
-    ]
+    few_repeated = 4 * sum(c.repeated for c in changes) <= len(changes)
+
+    def is_outlier(c: ViewChange) -> bool:
+        changed_everywhere = (c.changed_share or 0.0) > WHOLE_PICTURE_SHARE and usual_change < MEDIAN_SHARE
+        wrong_everywhere = c.wrong_share > WHOLE_PICTURE_SHARE and usual_wrong < MEDIAN_SHARE
+        bumped = c.wrong_share > max(BUMPED_SHARE, BUMPED_TIMES * usual_wrong) or c.shift_pixels > SHIFTED_PIXELS
+        frozen = c.repeated and few_repeated and usual_change > FROZEN_SHARE
+        return changed_everywhere or wrong_everywhere or bumped or frozen
+
+    found = [not is_outlier(c) for c in changes]
     return found if sum(found) >= 2 else [True] * len(found)
 
 

@@ -46,7 +46,7 @@ class MotionSmoothness:
         """The penalty on displacements of the anchors of ``scene``; None for none, or if no two are seen.
 
         Args:
-            scene: at the start, usually the moving part.
+            scene: at the start, usually the dynamic part.
             cameras: of the training views, in scene units.
             config: of the penalty.
 

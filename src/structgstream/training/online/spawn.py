@@ -173,7 +173,7 @@ def spawn_by_sweep(
     """New free Gaussians at points whose colour is missing in several views.
 
     Args:
-        missing: of every training view.
+        missing: of each view.
         depths: by view index, rendered depth ``[h, w]``, infinite where nothing is rendered.
         color: colour corrections of the cameras.
         first_identity: identity of the first.
@@ -350,7 +350,7 @@ class Sweep:
     Args:
         dynamic: the dynamic part after the scene flow, with folded appearance.
         static: the rest, with folded appearance.
-        views: of the frame.
+        views: inliers, those with flow if there are any.
         active_tiles: by view index, the tiles that the dynamic part reaches.
         floor: residuals of frame 0; None for none.
         rules: the rules.
@@ -404,14 +404,14 @@ class Sweep:
 
     def _before(self, *, wrong: bool) -> list[Missing]:
         """By the pictures that are drawn already; ``wrong`` pixels make their tiles suspect, too."""
-        found = []
-        for view in self.views:
-            active, known = self.active_tiles.get(view.index), self.known.get(view.index)
-            picture = (
-                None if active is None else active.picture if known is None or known.picture is None else known.picture
-            )
-            found.append((view, picture, None if known is None else known.drawn))
-        views, pictures, drawn = zip(*found, strict=True)
+        views = list(self.views)
+        known = [self.known.get(view.index) for view in views]  # by the other rules
+        actives = [self.active_tiles.get(view.index) for view in views]
+        pictures = [None if active is None else active.picture for active in actives]
+        for n, entry in enumerate(known):
+            if pictures[n] is not None and entry is not None and entry.picture is not None:
+                pictures[n] = entry.picture
+        drawn = [None if entry is None else entry.drawn for entry in known]
         residuals = self._residuals(views, pictures)
 
         def suspect_tiles(rows: list[int]) -> Sequence[TileSelection | None]:
@@ -570,7 +570,7 @@ def prune_and_spawn(
 
     Args:
         split: with its dynamic part after the scene flow.
-        views: of the frame.
+        views: inliers, those with flow if there are any.
         active_tiles: by view index, the tiles that the dynamic part reaches.
         first_identity: identity of the first new Gaussian.
         floor: residuals of frame 0; None for none.
