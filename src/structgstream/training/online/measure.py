@@ -268,7 +268,8 @@ def _measure_views(
     of_primitives = primitive_sums(sums, scene)
     flow_sums = of_primitives[..., [2, 3, 4, 0, 5, 6, 7]] if flows else [None] * len(views)
     shares = torch.stack([changed_shares, wrong_shares], dim=1)
-    columns = sums[..., 0], of_primitives[..., 0], of_primitives[..., 1], flow_sums, changed > 0.0
+    # Copied, as a column alone would keep those of flow, too.
+    columns = sums[..., 0].contiguous(), of_primitives[..., 0], of_primitives[..., 1], flow_sums, changed > 0.0
     return [
         (partial(ViewMeasurement, *of_view), of_shares)
         for *of_view, of_shares in zip(views, *columns, shares, strict=True)
