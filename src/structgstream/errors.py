@@ -77,8 +77,9 @@ class MissingExtraError(StructGStreamError):
 
 
 def import_extra(module: str, extra: str) -> typing.Any:
-    """An optional module. Raises MissingExtraError, which names the ``extra`` that installs it, if it is missing."""
+    """An optional module. Raises MissingExtraError, which names the ``extra`` that installs it, if it is missing; what is
+    installed but broken says so itself."""
     try:
         return importlib.import_module(module)
-    except ImportError:
+    except ModuleNotFoundError:
         raise MissingExtraError(module.partition(".")[0], extra) from None

@@ -16,7 +16,7 @@ from structgstream.codec.reader import StreamReader, open_stream
 from structgstream.codec.scene_coder import SceneEncoder
 from structgstream.codec.sinks import MemorySink
 from structgstream.errors import StreamError
-from structgstream.kernels.backend import reference_backend
+from structgstream.kernels.backend import Backend, reference_backend
 from structgstream.scene.render import render, to_8bit_image
 from structgstream.scene.scene import Scene
 from tests.support.properties import THOROUGH
@@ -222,3 +222,18 @@ def test_a_scene_is_decoded_when_frame_or_back_end_change_and_not_before(monkeyp
         expected = to_8bit_image(render(scene(index), reader.header.camera(name), backend).image)
         assert np.array_equal(picture, expected)
     assert decoded == [0, 1, 1]
+
+
+def test_a_back_end_is_selected_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Selecting a slow one warns, which whoever renders all frames of a stream need not read for each of them."""
+    backend, asked = reference_backend(), list[object]()
+
+    def selected(name: object) -> Backend:
+        asked.append(name)
+        return backend
+
+    monkeypatch.setattr("structgstream.codec.reader.select_backend", selected)
+    reader = StreamReader(small_stream())
+    for index in (0, 1, 0):
+        reader.render(index, reader.header.rig.training[0])
+    assert asked == ["auto"]

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from structgstream.frames import MultiViewFrame
 from structgstream.kernels.backend import reference_backend
@@ -63,6 +64,29 @@ def test_a_frozen_picture_that_is_encoded_again_is_repeated_and_a_noisy_one_is_n
     assert all(change.repeated for change in changes(disturbed(0.05, 3), before))
     noisy = changes(disturbed(0.5, 3), before)
     assert not any(change.repeated or change.changed.any() for change in noisy)
+
+
+class LargestNumbers(TorchDispatchMode):
+    """Notes the largest array of whole numbers that an operation gives."""
+
+    numbers = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        found = func(*args, **(kwargs or {}))
+        if isinstance(found, torch.Tensor) and found.dtype == torch.int32:
+            self.numbers = max(self.numbers, found.numel())
+        return found
+
+
+def test_still_pictures_are_compared_one_at_a_time_on_the_processor() -> None:
+    """Twenty of 1352 x 1014 pixels took a gigabyte together."""
+    backend = reference_backend().with_functions(
+        changed_pixels=lambda then, now, **rules: torch.zeros(now.shape[:-1], dtype=torch.bool)
+    )
+    with LargestNumbers() as largest:
+        found = detect_changes(views(), views(), config=MotionConfig(), backend=backend)
+    assert all(change is not None and change.repeated for change in found)
+    assert largest.numbers == 32 * 48 * 3
 
 
 def test_flow_is_looked_for_where_it_was_asked_for() -> None:

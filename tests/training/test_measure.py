@@ -3,17 +3,23 @@
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 
+from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians, concatenate
+from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.measure import (
     accumulate,
     flow_evidence,
+    measure,
     primitive_centers,
     primitive_of,
     slot_count,
     sum_by_primitive,
 )
+from structgstream.training.online.preprocess import detect_changes
+from structgstream.training.views import training_views
 from tests.support.backends import quickest_backend
 from tests.support.rigs import arc_rig, random_scene
 from tests.support.worlds import emerging_ball
@@ -21,6 +27,7 @@ from tests.support.worlds import emerging_ball
 RIG = arc_rig(4, width=48, height=32)
 CAMERA = RIG[RIG.training[0]]
 BACKEND = quickest_backend()
+CPU = torch.device("cpu")
 
 
 def gaussians_with_ids(ids: list[int]) -> Gaussians:
@@ -93,3 +100,16 @@ def test_a_mover_is_where_its_gaussians_are_seen() -> None:
     torch.testing.assert_close(found[0], fourth)
     torch.testing.assert_close(found[1], anchors.positions[1])
     torch.testing.assert_close(found[2], scene.free.means[0])
+
+
+def test_coverage_keeps_no_memory_of_other_sums() -> None:
+    """Sums by id have eight columns, of as many rows as the scene has Gaussians, for each view."""
+    now, before = (
+        training_views(MultiViewFrame(0, 0.0, {name: np.full((32, 48, 3), level, np.uint8) for name in RIG}), RIG, CPU)
+        for level in (0, 99)
+    )
+    scene, config = random_scene(30, free=3), MotionConfig(enabled=True)
+    changes = detect_changes(now, before, config=config, backend=BACKEND)
+    for measured in measure(scene, now, changes, config=config, backend=BACKEND):
+        assert measured.coverage.untyped_storage().nbytes() <= 4 * len(now) * slot_count(scene)
+        assert measured.coverage.shape == (slot_count(scene),)

@@ -100,7 +100,8 @@ class StreamReader:
         self.cut_reason = None if self.complete else self._reason(contents.end)
         self._decoder: tuple[int, SceneDecoder] = 0, SceneDecoder(self.header)
         self._decoded = NOTHING
-        self._drawn: tuple[tuple[int, BackendName | Backend], Scene, Backend] | None = None  # the scene rendered last
+        self._chosen: tuple[BackendName | Backend, Backend] | None = None  # as asked for, and what was selected
+        self._drawn: tuple[int, Scene] | None = None  # the scene rendered last
 
     @property
     def header(self) -> StreamHeader:
@@ -206,12 +207,13 @@ class StreamReader:
             BackendError: the back-end is not available.
         """
         view = self.header.camera(camera)
-        if self._drawn is None or self._drawn[0] != (index, backend):
+        if self._chosen is None or self._chosen[0] != backend:
+            self._chosen, self._drawn = (backend, select_backend(backend)), None
+        _, chosen = self._chosen
+        if self._drawn is None or self._drawn[0] != index:
             self._drawn = None  # So that two scenes are not in memory at once.
-            chosen = select_backend(backend)
-            self._drawn = (index, backend), on_device(self.scene(index), chosen.device), chosen
-        _, scene, chosen = self._drawn
-        return to_8bit_image(render(scene, view, chosen).image)
+            self._drawn = index, on_device(self.scene(index), chosen.device)
+        return to_8bit_image(render(self._drawn[1], view, chosen).image)
 
     def _decoder_of(self, index: int) -> SceneDecoder:
         """The decoder of the period of a frame; a new one unless that is the period of the last decoded frame."""

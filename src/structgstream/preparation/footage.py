@@ -110,8 +110,9 @@ class Footage:
             for run in _runs([int(index) for index in indices]):
                 yield from self._decoded(name, track, run)
         else:
+            size = self.size(name)
             for file in (self.stills[name][index] for index in indices):
-                picture, size = read_picture(file, bits=self._bits), self.size(name)
+                picture = read_picture(file, bits=self._bits)
                 if picture.shape[1::-1] != size:
                     raise CaptureError(
                         f"The picture {file} has {picture.shape[1]}x{picture.shape[0]} pixels, the first one of camera "

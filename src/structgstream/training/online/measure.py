@@ -276,5 +276,7 @@ def _measure_views(
     # The maps are 1, changed, c, c flow_x, c flow_y, r, g and b; flow_evidence wants 1 after the flow.
     flow_sums = of_primitives[..., [2, 3, 4, 0, 5, 6, 7]] if flows else [None] * len(views)
     shares = torch.stack([changed_shares, wrong_shares], dim=1)
-    columns = sums[..., 0], of_primitives[..., 0], of_primitives[..., 1], flow_sums, changed > 0.0, shares
+    # Copied, as a column alone would keep those of flow, too.
+    coverage = sums[..., 0].contiguous()
+    columns = coverage, of_primitives[..., 0], of_primitives[..., 1], flow_sums, changed > 0.0, shares
     return [_Measured(*of_view) for of_view in zip(*columns, strict=True)]

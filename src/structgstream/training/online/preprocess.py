@@ -217,8 +217,13 @@ def _are_repeated(then: Tensor, now: Tensor, masks: Tensor | None, *, same: list
     ``masks`` are the pixels of both."""
     if not same:
         return [False] * len(now)
-    levels = (now[same].int() - then[same].int()).abs().float().mean(-1)
-    means = mean_of_counting(levels, None if masks is None else masks[same]).tolist()
+
+    def means_of(rows: list[int]) -> list[float]:
+        levels = (now[rows].int() - then[rows].int()).abs().float().mean(-1)
+        return mean_of_counting(levels, None if masks is None else masks[rows]).tolist()
+
+    # Whole numbers of whole pictures: on the processor of one at a time.
+    means = means_of(same) if now.device.type != "cpu" else [mean for row in same for mean in means_of([row])]
     repeated = {row for row, mean in zip(same, means, strict=True) if mean < REPEATED_LEVELS}
     return [row in repeated for row in range(len(now))]
 
