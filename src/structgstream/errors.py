@@ -77,8 +77,7 @@ class MissingExtraError(StructGStreamError):
 
 
 def import_extra(module: str, extra: str) -> typing.Any:
-    """An optional module. Raises MissingExtraError, which names the ``extra`` that installs it, if it is missing; what is
-    installed but broken says so itself."""
+    """An optional module. Raises MissingExtraError, which names the ``extra`` that installs it, if it is missing."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError:
