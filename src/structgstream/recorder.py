@@ -235,8 +235,10 @@ class SoundSink:
         self._sink = sink
         self._feed = sound.open()
         self._frame_seconds = 1.0 / fps
+        self._from = -math.inf
         if after is not None:
-            self._feed.until(after + self._frame_seconds)
+            self._from = after + self._frame_seconds
+            self._feed.until(self._from)
 
     def open(self, header: StreamHeader) -> int:
         return self._sink.open(self._stated(header))
@@ -245,7 +247,9 @@ class SoundSink:
         return self._sink.begin(self._stated(header))
 
     def write(self, packet: Packet) -> int:
-        heard = self._feed.until(packet.pts_seconds + self._frame_seconds)
+        # A live camera is heard before its first frame, which may follow the last one that is there.
+        until = packet.pts_seconds + self._frame_seconds
+        heard = [one for one in self._feed.until(until) if one.seconds >= self._from]
         sound = frame_sound(packet.index, packet.pts_seconds, heard)
         return self._sink.write(replace(packet, sound=sound.pack()))
 

@@ -2,6 +2,7 @@
 """Sound through the commands: reconstructed, continued, in segments, rendered; and what cannot be."""
 
 import shutil
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import av
 import numpy as np
 import pytest
 
+from structgstream import recorder
 from structgstream.api import reconstruct
 from structgstream.cli import main, render
 from structgstream.cli.render import write_pictures
@@ -17,6 +19,7 @@ from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import write_archive
 from structgstream.codec.sinks import FileSink
+from structgstream.codec.sound import FrameSound, frame_sound
 from structgstream.data.sound import SoundFile
 from structgstream.data.timeline import Clock
 from structgstream.recorder import SoundSink
@@ -83,6 +86,25 @@ def test_sound_is_added_to_a_stream_that_has_none(
     assert main([*arguments[:-1], str(tmp_path / "y.sgs"), "--sound", "cam04"]) == 0
     with open_stream(tmp_path / "y.sgs") as reader:
         assert stream_heard(reader) == pytest.approx([0.1], abs=MILLISECOND)
+
+
+def test_sound_that_is_interrupted_leaves_no_half_stream(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    silent, heard = made(Path(CLIP), tmp_path / "silent.sgs"), tmp_path / "heard.sgs"
+    heard.write_bytes(b"another")
+    arguments = ["add-sound", str(silent), str(capture), "-o", str(heard), "--sound", "cam03", "--overwrite"]
+
+    def interrupted(index: int, *rest: object) -> FrameSound:
+        if index == 2:
+            raise KeyboardInterrupt
+        return frame_sound(index, *rest)  # pyright: ignore[reportArgumentType]
+
+    monkeypatch.setattr(recorder, "frame_sound", interrupted)
+    with suppress(KeyboardInterrupt):
+        assert main(arguments) != 0
+    assert heard.read_bytes() == b"another"
+    assert sorted(file.name for file in tmp_path.glob("heard*")) == ["heard.sgs"]
 
 
 def test_a_part_of_the_capture_is_in_step(capture: Path, tmp_path: Path) -> None:

@@ -2,17 +2,21 @@
 """Sound in presentation time: clocks, rates, channels, gaps, and what is missing. A clap is off by 1 ms at most."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import numpy as np
 import pytest
 
+from structgstream.codec.packets import Packet, PacketKind
+from structgstream.codec.sound import unpack_sound
 from structgstream.data.live.sound import LiveSound
 from structgstream.data.open import open_capture
 from structgstream.data.sound import SoundEncoder, SoundFile, camera_clock, start_seconds
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
 from structgstream.opus import PACKET_SECONDS, OpusPacket
+from structgstream.recorder import SoundSink
 from tests.support.captures import write_video
 from tests.support.quick_streams import CLIP
 from tests.support.sounds import add_sound, claps, packets_heard, write_sound
@@ -118,6 +122,23 @@ def test_a_camera_s_clock_is_that_of_its_pictures(tmp_path: Path) -> None:
     _, at = heard(folder / "cam03.mp4", found[1], 0.4)
     assert at == pytest.approx([0.1], abs=MILLISECOND)
     assert camera_clock(open_capture(folder, every=2), "cam03") == (folder / "cam03.mp4", Clock(0.0, 1.0))
+
+
+def test_a_live_stream_that_is_resumed_hears_nothing_twice() -> None:
+    """The camera is heard half a second before the first frame, which follows the last one that is there."""
+    written: list[Packet] = []
+    live = LiveSound("cam")
+    sink = SoundSink(SimpleNamespace(write=written.append), live, fps=25.0, after=2.0)  # pyright: ignore[reportArgumentType]
+    frame = av.AudioFrame.from_ndarray(claps(1.0), format="fltp", layout="mono")
+    frame.sample_rate = 48_000
+    live.add(frame, 101.54)
+    live.synchronize(100.0)
+    sink.write(Packet(PacketKind.KEY, 51, 2.04, b"", {}))
+    assert written[0].sound is not None
+    sound = unpack_sound(written[0].sound)
+    assert sound.seconds == pytest.approx(2.04, abs=PACKET_SECONDS)
+    assert sound.seconds >= 2.04
+    assert len(sound.packets) == 2
 
 
 def test_live_sound_is_in_step_with_the_pictures_and_begins_again_after_an_outage() -> None:

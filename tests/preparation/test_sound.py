@@ -3,8 +3,10 @@
 
 import json
 import shutil
+import tracemalloc
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -14,10 +16,10 @@ from structgstream.data.prepared import FILE, read_prepared
 from structgstream.data.timeline import Clock
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.prepare import prepare_capture
-from structgstream.preparation.sound import best_microphone, chosen_sound, file_sound
+from structgstream.preparation.sound import best_microphone, chosen_sound, file_sound, loudness, recording
 from tests.support.quick_streams import CLIP
 from tests.support.rooms import write_room
-from tests.support.sounds import add_sound, claps, write_sound
+from tests.support.sounds import add_sound, claps, packets_heard, write_sound
 
 SECONDS, RATE = 12.0, 48_000
 
@@ -53,6 +55,48 @@ def test_the_best_microphone(noises: NDArray[np.float32], capture: Path) -> None
     assert chosen_sound(open_capture(capture), capture, "none") is None
 
 
+def test_a_long_recording_takes_little_memory_besides_it() -> None:
+    samples = np.random.default_rng(3).uniform(-0.5, 0.5, 600 * RATE).astype(np.float32)
+    samples[: 120 * RATE] *= 0.01
+    tracemalloc.start()
+    try:
+        level = loudness(samples)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert level == pytest.approx(40.0, abs=1.0)
+    assert peak < samples.nbytes / 2
+
+
+def test_a_microphone_that_cannot_be_read_costs_no_other(
+    noises: NDArray[np.float32], capture: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """One of which the sound is damaged, and one that is longer than two hours."""
+    folder = tmp_path / "clip"
+    shutil.copytree(capture, folder)
+    damage_sound(folder / "cam02.mp4")
+    sound = chosen_sound(open_capture(folder), folder, "auto")
+    assert sound is not None
+    assert sound.name == "cam05"
+    (warning,) = [record.message for record in caplog.records]
+    assert "cam02.mp4 cannot be decoded" in warning
+    file = write_sound(tmp_path / "take.wav", noises)
+    assert file_sound(open_capture(folder), file).clock.offset_seconds == pytest.approx(0.0, abs=1e-3)
+    monkeypatch.setattr("structgstream.data.sound.LONGEST_SECONDS", 5.0)
+    assert recording(folder / "cam05.mp4") is None
+
+
+def damage_sound(video: Path) -> None:
+    """Overwrites the sound of a video."""
+    with av.open(str(video)) as container:
+        places = [(packet.pos, packet.size) for packet in container.demux(container.streams.audio[0]) if packet.size]
+    data = bytearray(video.read_bytes())
+    for place, size in places[20:]:
+        data[place : place + size] = b"\xff" * size
+    video.write_bytes(data)
+
+
 @pytest.mark.parametrize("early", [1.7, -2.4])
 def test_a_recorder_s_file_is_put_in_step_by_what_cameras_hear(
     capture: Path, noises: NDArray[np.float32], tmp_path: Path, early: float
@@ -75,6 +119,20 @@ def test_a_file_that_no_camera_hears_begins_with_the_capture_which_is_said(
     (warning,) = [record.message for record in caplog.records if "hears" in record.message]
     assert warning.endswith("--sound-offset SECONDS gives another time")
     assert file_sound(open_capture(capture, start=3), other, offset_seconds=2.0).clock == Clock(1.9)
+
+
+def test_a_file_whose_stamps_do_not_begin_with_0_begins_when_it_is_said_to(capture: Path, tmp_path: Path) -> None:
+    add_sound(Path(CLIP) / "cam00.mp4", tmp_path / "take.mp4", claps(2.0, 0.5))
+    with av.open(str(tmp_path / "take.mp4")) as given, av.open(str(tmp_path / "take.ts"), "w") as container:
+        streams = {stream: container.add_stream_from_template(stream) for stream in given.streams}
+        for packet in given.demux():
+            if packet.size and packet.pts is not None and packet.dts is not None and packet.time_base is not None:
+                later = round(3600 / packet.time_base)
+                packet.pts, packet.dts = packet.pts + later, packet.dts + later
+                packet.stream = streams[packet.stream]
+                container.mux(packet)
+    feed = file_sound(open_capture(capture), tmp_path / "take.ts", offset_seconds=0.25).open()
+    assert packets_heard(feed.until(9.0)) == pytest.approx([0.75], abs=0.03)
 
 
 def test_a_prepared_capture_states_its_microphone(tmp_path: Path) -> None:

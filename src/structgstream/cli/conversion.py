@@ -308,8 +308,10 @@ def add_sound(arguments: list[str]) -> None:
     output = options.output
     check_ending(output, ".sgs", command="add-sound")
     check_new(output, overwrite=options.overwrite)
+    from structgstream.atomic_files import give_name, partial_path
     from structgstream.codec.reader import open_stream
     from structgstream.codec.sinks import FileSink
+    from structgstream.errors import StorageError
     from structgstream.evaluation.recording import capture_of
     from structgstream.preparation.sound import chosen_sound
     from structgstream.recorder import copy_with_sound
@@ -321,5 +323,13 @@ def add_sound(arguments: list[str]) -> None:
         sound = chosen_sound(source, options.capture, options.sound, offset_seconds=options.sound_offset)
         if sound is None:
             raise UsageError("--sound none adds nothing; name a camera or a file.")
-        copy_with_sound(reader, FileSink(output, overwrite=options.overwrite), sound, name=str(options.stream))
+        part = partial_path(output)  # half a stream would look like a shorter one
+        try:
+            copy_with_sound(reader, FileSink(part, overwrite=True), sound, name=str(options.stream))
+            try:
+                give_name(part, output)
+            except OSError as error:
+                raise StorageError(f"{output} cannot be written ({error.strerror}).") from None
+        finally:
+            part.unlink(missing_ok=True)
     print_lines(Console(), f"Wrote {output}: {frames_text(len(reader))}, sound of {sound.name}")

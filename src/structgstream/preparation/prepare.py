@@ -29,7 +29,6 @@ from structgstream.data.prepared import (
     recognizes_prepared,
     write_prepared,
 )
-from structgstream.data.sound import read_audio
 from structgstream.data.source import FrameSource, WithRig
 from structgstream.data.timeline import Clock
 from structgstream.data.undistortion import rectilinear
@@ -77,7 +76,7 @@ from structgstream.preparation.solvers import (
     unpacked,
     unpacked_clocks,
 )
-from structgstream.preparation.sound import best_microphone
+from structgstream.preparation.sound import best_microphone, recording
 
 MIN_SOLVED = 3  # cameras, for poses that can be checked
 POINTS = "points.npy"
@@ -287,7 +286,7 @@ class Job:
         found = self.steps.run(
             "sound",
             {"files": fingerprint(footage.files)},
-            lambda: best_microphone((name, read_audio(footage.files[name])) for name in footage.cameras),
+            lambda: best_microphone((name, recording(footage.files[name])) for name in footage.cameras),
             pack=lambda camera: Stored({"camera": camera}),
             unpack=lambda stored: stored.values["camera"],
             summary=lambda camera: "no camera has any" if camera is None else f"the microphone of {camera} is the best",

@@ -28,6 +28,8 @@ from structgstream.preparation.synchronization.audio import PairLag, UnusableSou
 log = logging.getLogger(__name__)
 
 LEVEL_SECONDS = 0.05
+BLOCKS = 1200
+"""Levels that are measured at once: those of a minute."""
 LOUD, QUIET = 95, 10
 """Percentiles of the level: how far what happens stands out from the noise is their difference."""
 CLIPPED_AT, CLIPPED_SHARE, CLIPPED_DECIBELS = 0.99, 1e-4, 20.0
@@ -46,9 +48,13 @@ def loudness(samples: NDArray[np.float32], *, rate: float = SAMPLE_RATE) -> floa
     if count < 2 or not np.ptp(samples) > 0:
         return None
     blocks = samples[: count * length].reshape(count, length)
-    levels = 10 * np.log10(np.maximum(np.mean(blocks.astype(np.float64) ** 2, axis=1), 1e-10))
-    low, high = np.percentile(levels, [QUIET, LOUD])
-    clipped = float(np.mean(np.abs(samples) >= CLIPPED_AT)) > CLIPPED_SHARE
+    powers, clips = np.zeros(count), 0
+    for first in range(0, count, BLOCKS):  # two hours would take gigabytes at once
+        part = blocks[first : first + BLOCKS]
+        powers[first : first + BLOCKS] = np.mean(part.astype(np.float64) ** 2, axis=1)
+        clips += int(np.count_nonzero(np.abs(part) >= CLIPPED_AT))
+    low, high = np.percentile(10 * np.log10(np.maximum(powers, 1e-10)), [QUIET, LOUD])
+    clipped = clips / (count * length) > CLIPPED_SHARE
     return float(high - low) - CLIPPED_DECIBELS * clipped
 
 
@@ -58,9 +64,21 @@ def best_microphone(recordings: Iterable[tuple[str, NDArray[np.float32] | None]]
     Args:
         recordings: names of cameras and their samples ``[N]``, or None without sound; read one after the other.
     """
-    found = [(name, loudness(samples)) for name, samples in recordings if samples is not None]
-    heard = {name: level for name, level in found if level is not None}
+    heard: dict[str, float] = {}
+    for name, samples in recordings:
+        if samples is not None and (level := loudness(samples)) is not None:
+            heard[name] = level
+        del samples  # before the next is read
     return max(heard, key=lambda name: heard[name]) if heard else None
+
+
+def recording(video: Path) -> NDArray[np.float32] | None:
+    """Samples ``[N]`` of a camera's video; None where it has no sound, or, with a warning, one that cannot be read."""
+    try:
+        return read_audio(video)
+    except CaptureError as error:
+        log.warning("A camera's sound is left out: %s", error)
+        return None
 
 
 def chosen_sound(
@@ -85,7 +103,7 @@ def chosen_sound(
     if choice == NONE:
         return None
     if choice == AUTO:
-        choice = prepared or best_microphone((name, read_audio(path)) for name, path in videos.items())
+        choice = prepared or best_microphone((name, recording(path)) for name, path in videos.items())
         if choice is None:
             raise CaptureError(f"No camera of {folder} has sound; give a file with --sound.")
     path = Path(choice).expanduser()
@@ -127,7 +145,8 @@ def file_sound(source: FrameSource, path: Path, *, offset_seconds: float | None 
     """
     with open_sound(path) as container:
         sound_stream(container, path)
-    start = start_seconds(source)
+        begins = max(container.start_time or 0, 0) / 1e6  # MPEG-TS does not begin at 0
+    start = start_seconds(source) - begins
     if offset_seconds is not None:
         return SoundFile(path.name, path, Clock(start + offset_seconds))
     clock = _clock_by_cameras(source, path)
@@ -151,7 +170,7 @@ def _clock_by_cameras(source: FrameSource, path: Path) -> Clock | None:
     clocks: list[Clock] = []
     compared = 0
     for name, video in camera_videos(source).items():
-        own = read_audio(video)
+        own = recording(video)
         camera = camera_clock(source, name)
         if own is None or camera is None:
             continue

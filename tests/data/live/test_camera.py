@@ -11,6 +11,7 @@ import socket
 import threading
 import time
 from contextlib import closing
+from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,6 +25,7 @@ from hypothesis import strategies as st
 
 from structgstream.data.live.camera import MAX_UNSTAMPED, CameraFeed, ClockMapper, ClockResets, PictureTime
 from structgstream.data.live.rig_file import LiveCamera, TimeBase
+from structgstream.data.live.sound import LiveSound
 from structgstream.data.live.status import Fault, FaultLog
 from structgstream.data.live.synchronizer import LivePicture
 from tests.support.properties import examples
@@ -193,6 +195,47 @@ def test_a_clock_that_is_set_is_reported_and_the_pictures_go_on(fault: str, capl
     times = [p.seconds for p in received.pictures]
     assert max(times) - min(times) < 5.0
     assert "has set its clock by " + ("+" if fault == "jump" else "-") in caplog.text
+
+
+def test_sound_with_the_stamps_of_a_clock_that_pictures_do_not_have_yet_is_left_out() -> None:
+    """A camera sets its clock by an hour, and sound is the first to have it; later sound is heard all the same."""
+    sound, received = LiveSound("a"), Received()
+    feed = sound.open()
+    ended = threading.Event()
+    camera, _ = camera_feed(
+        received,
+        base=TimeBase.STREAM,
+        open_camera=lambda camera, timeout: closing(av.open(io.BytesIO(with_hasty_sound(sent_stream())))),
+        wait=lambda seconds: (camera.stop(), ended.set()),
+        sound=sound,
+    )
+    camera.start()
+    assert ended.wait(WAIT)
+    sound.synchronize(received.pictures[0].seconds)
+    times = [packet.seconds for packet in feed.until(3600.0)]
+    assert times[-1] == pytest.approx(1.9, abs=0.2)
+    assert np.diff(times) == pytest.approx(0.02)
+
+
+def with_hasty_sound(video: bytes) -> bytes:
+    """The same MPEG-TS with sound; the stamps are an hour later from 1 s on, those of sound from 0.9 s on."""
+    output = io.BytesIO()
+    with av.open(io.BytesIO(video)) as given, av.open(output, "w", format="mpegts") as container:
+        pictures = container.add_stream_from_template(given.streams.video[0])
+        stream = container.add_stream("aac", rate=48_000, layout="mono")
+        packets = [packet for packet in given.demux(given.streams.video[0]) if packet.size]
+        first = float(packets[0].pts * packets[0].time_base)
+        silence = av.AudioFrame.from_ndarray(np.zeros((1, 96_000), np.float32), format="fltp", layout="mono")
+        silence.sample_rate, silence.pts, silence.time_base = 48_000, round(first * 48_000), Fraction(1, 48_000)
+        packets += [*stream.encode(silence), *stream.encode(None)]
+        for packet in sorted(packets, key=lambda one: one.pts * one.time_base):
+            is_sound = packet.stream is stream
+            if float(packet.pts * packet.time_base) - first >= (0.9 if is_sound else 1.0):
+                later = round(3600 / packet.time_base)
+                packet.pts, packet.dts = packet.pts + later, packet.dts + later
+            packet.stream = stream if is_sound else pictures
+            container.mux(packet)
+    return output.getvalue()
 
 
 def test_of_two_pictures_with_one_stamp_the_first_is_taken() -> None:

@@ -175,6 +175,8 @@ log = logging.getLogger(__name__)
 FIRST_WAIT_SECONDS, MAX_WAIT_SECONDS = 0.5, 8.0
 MPEGTS_STAMPS = 2**33
 MAX_UNSTAMPED = 30  # pictures before a camera is taken to have no stamps
+MAX_SOUND_APART_SECONDS = 10.0
+"""Of the stamps of sound and pictures that come together; when a camera sets its clock, sound may come first."""
 SAMPLED_ROWS = 4  # every so many rows are compared to find pictures that stand still
 ENDED = "it ended"
 PROBE_OPTIONS = {"analyzeduration": "2000000", "probesize": "2000000", "fpsprobesize": "0"}
@@ -247,6 +249,7 @@ class CameraFeed:
         self._gone_since: float | None = None
         self._paced: float | None = None
         self._unstamped = 0
+        self._stamp: float | None = None  # of the last picture, as it came
         self._usable = True
         self.ended = False
         self.decoded = 0
@@ -330,11 +333,13 @@ class CameraFeed:
         return list(container.streams.audio[:1])
 
     def _hear(self, packet: "Packet") -> None:
-        """Passes sound on; what cannot be decoded, or comes before the first picture, is left out."""
+        """Passes sound on; what cannot be decoded, comes before the first picture, or is far from it, is left out."""
         assert self._sound is not None
         try:
             for frame in cast("list[AudioFrame]", packet.decode()):
-                if frame.time is not None and self._decodes and math.isfinite(self._clock.shift):
+                if frame.time is None or self._stamp is None or not self._decodes:
+                    continue
+                if math.isfinite(self._clock.shift) and abs(frame.time - self._stamp) < MAX_SOUND_APART_SECONDS:
                     self._sound.add(frame, frame.time + self._clock.shift)
         except (load_av().error.FFmpegError, ValueError) as error:  # The pictures go on.
             self._faults.warn(self.name, "sound", f"sends sound that cannot be decoded ({error}); it is left out")
@@ -407,6 +412,7 @@ class CameraFeed:
             stamp, self._unstamped = float(frame.pts * frame.time_base), 0
         if stamp is None:
             return None
+        self._stamp = stamp
         time = self._clock.map(stamp, arrived=unix, wrap_seconds=wrap_seconds)
         if time.fault is Fault.JUMP:
             text = f"has set its clock by {time.reset_seconds:+.3f} s; its pictures go on in step with their arrival"

@@ -426,7 +426,7 @@ export class StructgstreamPlayer extends HTMLElement {
 
   /** No pictures are asked for in a page that is hidden; its sound goes on, as that of a video. */
   private readonly listen = (): void => {
-    if (document.hidden && this.running?.player.sound.wanted) this.running.player.tick();
+    if (document.hidden && this.running?.player.sound.wanted) this.running.player.tick(false);
   };
 
   private applyAttributes(ui: PlayerUi): void {

@@ -202,13 +202,18 @@ export class Player extends Emitter<PlayerEvents> {
     return this.flight !== undefined;
   }
 
-  /** Must be called for every picture that the browser shows. */
-  tick(): void {
+  /**
+   * Must be called for every picture that the browser shows.
+   *
+   * @param isSeen whether it is shown; that of a hidden page says nothing of the device's speed
+   */
+  tick(isSeen = true): void {
     const { renderer, quality, now } = this.options;
     const time = now();
-    const since = time - (this.tickedAt ?? time);
-    this.tickedAt = time;
-    if (since < PAUSE_SECONDS) this.tickSeconds = 0.9 * this.tickSeconds + 0.1 * since;
+    const since = time - (this.tickedAt ?? Number.NEGATIVE_INFINITY);
+    this.tickedAt = isSeen ? time : undefined;
+    if (isSeen && since < PAUSE_SECONDS) this.tickSeconds = 0.9 * this.tickSeconds + 0.1 * since;
+    if (!isSeen) this.drawnAt = this.given = undefined;
     if (this.flight) {
       const { view, over } = this.flight.at(time);
       if (over) this.flight = undefined;
@@ -221,7 +226,7 @@ export class Player extends Emitter<PlayerEvents> {
         if (update.header) this.goOn(update.header);
         renderer.update(update);
         this.hasScene = true;
-        this.given ??= { index: update.index, at: time };
+        if (isSeen) this.given ??= { index: update.index, at: time };
       }
       const { camera } = this;
       if (!camera || !this.hasScene) return;

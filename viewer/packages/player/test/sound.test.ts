@@ -3,9 +3,11 @@
 
 import { recordBytes } from "@structgstream/core";
 import { afterEach, describe, expect, test, vi } from "vitest";
+import { Player } from "../src/player.ts";
 import { AudioClock } from "../src/sound/audioClock.ts";
 import { oggOf } from "../src/sound/ogg.ts";
 import { Sound } from "../src/sound/sound.ts";
+import { QualityControl } from "../src/view/quality.ts";
 import { CLIP, type Playing, playing, ServedFile } from "./served.ts";
 import { CLAP_SECONDS, clapping, clappingFile, FPS } from "./soundFile.ts";
 
@@ -432,4 +434,37 @@ describe("an engine with sound", () => {
     expect(CLAP_SECONDS * FPS).toBe(6);
     expect(frames.every(([packet]) => recordBytes(packet.subarray(0, 8)) === packet.length)).toBe(true);
   });
+});
+
+test("a page that is hidden costs no pixels, and its sound stays where it is", () => {
+  let [seconds, index] = [0, 0];
+  const quality = new QualityControl({ coarsePointer: false, memoryGigabytes: 8, processors: 8 });
+  const renderer = {
+    update: () => undefined,
+    render: () => ({ drawn: true, frameIndex: index, sortMilliseconds: 0 }),
+  };
+  const player = new Player({
+    renderer: renderer as never,
+    quality,
+    startPipeline: () => undefined as never,
+    now: () => seconds,
+    startAudio: () => undefined as never,
+  });
+  player.engine = { tick: () => ({ index: ++index }) } as never;
+  const viewmat = Float64Array.from([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]);
+  const camera = { viewmat, K: { fx: 1, fy: 1, cx: 0.5, cy: 0.5 }, width: 1, height: 1, near: 0.1 };
+  player.view = { camera, pivot: [0, 0, 1] };
+  const ticks = (count: number, interval: number, isSeen: boolean) => {
+    for (let i = 0; i < count; i++) {
+      seconds += interval;
+      player.tick(isSeen);
+    }
+  };
+  ticks(200, 1 / 60, true);
+  const lag = player.sound.lagSeconds;
+  ticks(200, 0.5, false);
+  ticks(1, 0.5, true);
+  ticks(2, 1 / 60, true);
+  expect(player.sound.lagSeconds).toBeCloseTo(lag, 3);
+  expect(quality.current.pixelScale).toBe(1);
 });
