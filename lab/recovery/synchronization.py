@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ from structgstream.data.source import FrameSource
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
 from structgstream.preparation.checking.times import check_synchronization, time_findings
+from structgstream.preparation.footage import Footage
 from structgstream.preparation.synchronization.synchronize import Synchronization, synchronize
 
 LATE_FRAMES = (1, 3)  # of two cameras, for the check
@@ -34,7 +36,8 @@ MAX_FRAMES = 300
 
 @dataclass(frozen=True)
 class Shifted:
-    """Some frames of a capture's cameras, as if each were a file that begins at 0.
+    """Some frames of a capture's cameras, as if each were a file that begins at 0: what synchronizing by motion asks of
+    a ``Footage``.
 
     Args:
         rig: the cameras.
@@ -127,7 +130,7 @@ def _measure(title: str, shifted: Shifted, *, calibrated: bool) -> None:
     cameras = {name: LensCamera(shifted.rig[name], Pinhole()) for name in shifted.cameras} if calibrated else None
     begun = time.process_time()
     try:
-        found = synchronize(shifted, method="motion", cameras=cameras)
+        found = synchronize(cast(Footage, shifted), method="motion", cameras=cameras)
     except CaptureError as error:
         print(f"{title:20} refused: {error}")
         return
