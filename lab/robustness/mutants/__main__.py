@@ -2,7 +2,7 @@
 """Whether the tests find mistakes: each of ``mutants.toml`` is made in a copy of the sources and its tests are run.
 
 ``python -m lab.robustness.mutants`` from the repository's folder, with the names of some or without for all; the status
-is 1 if one was not found. The native library must be built in place.
+is 1 if one was not found, 2 if a test fails without any. The native library must be built in place.
 """
 
 import argparse
@@ -66,6 +66,10 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         sources = Path(folder, "src")
         shutil.copytree(ROOT / "src", sources, ignore=shutil.ignore_patterns("__pycache__"))
+        tests = sorted({test for name in names for test in mutants[name]["tests"]})
+        if status := _run(sources, tests):
+            print(f"pytest ended with status {status} without any mistake; mend that first", file=sys.stderr)
+            return 2
         for name in names:
             start = time.monotonic()
             found = is_found(mutants[name], sources)
