@@ -11,12 +11,11 @@ from structgstream.scene.color import CameraColor
 from structgstream.scene.render import draw
 from structgstream.training.online.config import SpawnRules
 from structgstream.training.online.spawn import (
-    ViewResidual,
     _merge_points,
     outlier_mask,
     spawn_by_sweep,
-    view_residuals,
 )
+from structgstream.training.online.view_residuals import ViewResidual, view_residuals
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.views import View, training_views
 from tests.support.worlds import moving_world

@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 LONGEST_SECONDS = 7200.0
 BITS_PER_SECOND = {1: 64_000, 2: 96_000}
-"""Of Opus by number of channels: hardly to be told from the original."""
+"""Of Opus by number of channels: hardly distinguishable from the original."""
 GAP_SECONDS = 0.03
 """Difference of a time stamp from the samples before it above which something is missing, or comes twice."""
 SAME_RATE = 1e-7

@@ -33,8 +33,9 @@ from structgstream.training.online.patching import IDS_PER_FRAME
 from structgstream.training.online.preprocess import PictureChange, flow_views
 from structgstream.training.online.scene_flow import residual_flow
 from structgstream.training.online.select import select_dynamic
-from structgstream.training.online.spawn import outlier_mask, prune_and_spawn, view_residuals
+from structgstream.training.online.spawn import outlier_mask, prune_and_spawn
 from structgstream.training.online.split import DynamicSplit, find_active_tiles, with_displacements
+from structgstream.training.online.view_residuals import view_residuals
 from structgstream.training.parameters import pixel_size
 from structgstream.training.residuals import ResidualFloor
 from structgstream.training.result import FitResult, StepListener, Stopwatch

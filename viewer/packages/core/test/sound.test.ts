@@ -37,7 +37,7 @@ test("the golden sound, at once and byte by byte", () => {
   expect(parts).toEqual(wanted);
 });
 
-test("where a sound record ends is told, and frames that are forgotten have none", () => {
+test("where a sound record ends is stated, and frames that are forgotten have none", () => {
   const reader = readStream(STREAM);
   reader.forget(8);
   expect(reader.takeSounds().map(({ index, end }) => [index, STREAM[end]])).toEqual([
