@@ -33,7 +33,8 @@ from tests.support.properties import use_for_all
 from tests.support.shared_folder import open_shared_folder
 
 SHARED = pytest.StashKey[Path | None]()
-FROM_THE_END = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")) % 2 == 1
+WORKER = os.environ.get("PYTEST_XDIST_WORKER")
+FROM_THE_END = WORKER is not None and int(WORKER.removeprefix("gw")) % 2 == 1
 
 
 class _FromTheEnd(pytest.Dir):
@@ -77,7 +78,7 @@ def pytest_collect_directory(path: Path, parent: pytest.Collector) -> pytest.Dir
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     import torch
 
-    if FROM_THE_END:
+    if WORKER is not None:  # In the same order in all, whatever folders were named.
         items.sort(key=lambda item: item.path.parts)
     if torch.cuda.is_available() or os.environ.get("STRUCTGSTREAM_REQUIRE_CUDA"):
         return
