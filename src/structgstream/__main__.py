@@ -3,6 +3,6 @@
 
 import sys
 
-from structgstream.cli import main
+from structgstream.cli import program
 
-sys.exit(main())
+sys.exit(program())
