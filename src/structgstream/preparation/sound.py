@@ -113,9 +113,9 @@ def chosen_sound(
         return camera_sound(source, choice)
     if not path.is_file():
         heard = [name for name, video in videos.items() if has_sound(video)]
+        cameras = f"the cameras with sound are {', '.join(heard)}" if heard else "no camera has sound"
         raise CaptureError(
-            f"There is neither a camera nor a file {choice}; the cameras with sound are "
-            f"{', '.join(heard) or 'none'}, and --sound takes any file with sound, too."
+            f"There is neither a camera nor a file {choice}; {cameras}, and --sound takes any file with sound, too."
         )
     return file_sound(source, path, offset_seconds=offset_seconds)
 
