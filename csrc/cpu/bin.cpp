@@ -27,13 +27,11 @@ Tiles tiles_of(const Splat& s) {
     return {tile(s.box[0]), tile(s.box[1]), tile(s.box[2] - 1), tile(s.box[3] - 1)};
 }
 
-// Visits the tiles that are drawn.
+// Visits the tiles of a rectangle.
 template <typename Visit>
-inline void for_tiles(const Raster& raster, const Tiles& t, Visit visit) {
-    const uint8_t* drawn = raster.drawn_tiles.empty() ? nullptr : raster.drawn_tiles.data();
+inline void for_tiles(int tiles_x, const Tiles& t, Visit visit) {
     for (int y = t.y0; y <= t.y1; ++y)
-        for (int tile = y * raster.tiles_x + t.x0, end = y * raster.tiles_x + t.x1; tile <= end; ++tile)
-            if (!drawn || drawn[tile]) visit(tile);
+        for (int tile = y * tiles_x + t.x0, end = y * tiles_x + t.x1; tile <= end; ++tile) visit(tile);
 }
 
 constexpr size_t kAhead = 8;
@@ -56,7 +54,10 @@ void sort_by_depth(std::vector<uint64_t>& keys) {
 }  // namespace
 
 void bin(Raster& raster) {
-    const int tiles = raster.tiles_x * raster.tiles_y;
+    const int tiles = raster.tiles_x * raster.tiles_y, tiles_x = raster.tiles_x;
+    // Tiles that are not drawn are visited, too, and add nothing: whether one is drawn is hardly predictable.
+    const std::vector<uint8_t> all(raster.drawn_tiles.empty() ? tiles : 0, 1);
+    const uint8_t* drawn = all.empty() ? raster.drawn_tiles.data() : all.data();
     raster.starts.assign(tiles + 1, 0);
     raster.slots.resize(raster.splats.size() + 1);
     raster.slots[0] = 0;
@@ -74,22 +75,27 @@ void bin(Raster& raster) {
             keys.push_back(static_cast<uint64_t>(depth) << 32 | entries.size());
             entries.push_back({static_cast<int32_t>(i), static_cast<int32_t>(total), t});
             int32_t* counts = raster.starts.data() + 1;
-            for_tiles(raster, t, [&](int tile) { ++total, ++counts[tile]; });
+            for_tiles(tiles_x, t, [&](int tile) { total += drawn[tile], counts[tile] += drawn[tile]; });
             if (total > std::numeric_limits<int32_t>::max()) throw std::bad_alloc();  // gradients would need 80 GB
         }
         raster.slots[i + 1] = static_cast<int32_t>(total);
     }
     for (int t = 0; t < tiles; ++t) raster.starts[t + 1] += raster.starts[t];
     sort_by_depth(keys);
-    raster.pairs.resize(raster.starts[tiles]);
+    raster.pairs.resize(raster.starts[tiles] + 1);  // the last one takes those of tiles that are not drawn
     std::vector<int32_t> next(raster.starts.begin(), raster.starts.end() - 1);
+    for (int t = 0; t < tiles; ++t)
+        if (!drawn[t]) next[t] = raster.starts[tiles];
     Pair* pairs = raster.pairs.data();
     int32_t* places = next.data();
     for (size_t i = 0; i < keys.size(); ++i) {
         __builtin_prefetch(&entries[keys[std::min(i + kAhead, keys.size() - 1)] & 0xffffffffu]);
         const Entry& e = entries[keys[i] & 0xffffffffu];
         int32_t slot = e.slot;
-        for_tiles(raster, e.tiles, [&](int tile) { pairs[places[tile]++] = {e.splat, slot++}; });
+        for_tiles(tiles_x, e.tiles, [&](int tile) {
+            pairs[places[tile]] = {e.splat, slot};
+            places[tile] += drawn[tile], slot += drawn[tile];
+        });
     }
 }
 

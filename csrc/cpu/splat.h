@@ -46,7 +46,7 @@ struct Pair {
 struct Raster {
     Pinhole camera;
     int tiles_x, tiles_y;
-    std::vector<uint8_t> drawn_tiles; // [tiles_y * tiles_x], 0 where nothing is drawn; empty: all are
+    std::vector<uint8_t> drawn_tiles; // [tiles_y * tiles_x], 1 where something is drawn, else 0; empty: all are
     int64_t trained;                  // splats from here on get no gradient
     std::vector<Splat> splats;        // [N]; box empty where not drawn
     std::vector<int32_t> starts;      // [tiles + 1] into pairs

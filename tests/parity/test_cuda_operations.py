@@ -22,7 +22,7 @@ from tests.support.worlds import moving_world
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
-MAX_OPERATIONS = {4: 1_180, 27: 1_330}
+MAX_OPERATIONS = {4: 1_200, 27: 1_350}
 """By number of views, of the frame below: what it takes now, with little room. Whoever needs fewer lowers them."""
 MAX_WAITS = 20
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from structgstream.frames import MultiViewFrame
-from structgstream.training.views import View, area_mean, coarse_to_fine, shuffled_views, training_views
+from structgstream.training.views import View, area_mean, coarse_to_fine, dilated, shuffled_views, training_views
 from tests.support.rigs import arc_rig
 
 RIG = arc_rig()
@@ -121,3 +121,12 @@ def test_masked_pixels_are_black_and_reduce_to_pixels_that_do_not_count() -> Non
     assert torch.equal(half, view.mask.reshape(16, 2, 24, 2).all(3).all(1))
     frame = MultiViewFrame(0, 0.0, frame.images, {"cam02": np.ones((32, 48), bool)})
     assert training_views(frame, RIG, torch.device("cpu"))[0].mask is None
+
+
+@pytest.mark.parametrize("reach", [0, 1, 2, 7])
+@pytest.mark.parametrize("size", [(1, 1), (3, 20), (17, 5)])
+def test_dilation_takes_the_largest_around_each_pixel(size: tuple[int, int], reach: int) -> None:
+    values = torch.randn(2, *size, generator=torch.Generator().manual_seed(reach))
+    expected = torch.nn.functional.max_pool2d(values, 2 * reach + 1, stride=1, padding=reach)
+    assert torch.equal(dilated(values, reach), expected)
+    assert torch.equal(dilated(values > 0.5, reach), expected > 0.5)

@@ -84,6 +84,8 @@ class ViewByView:
             sampling_intervals: ``[M]`` of the anchors; None: the low-pass is that of the picture.
         """
         found = []
+        k = anchors.offsets.shape[1]
+        of_slots = None if sampling_intervals is None else sampling_intervals.repeat_interleave(k)
         for n, viewport in enumerate(viewports):
             structured = self.generate_structured(
                 anchors,
@@ -93,9 +95,8 @@ class ViewByView:
                 tiles=None if tiles is None else tiles[n],
                 sampling_intervals=sampling_intervals,
             ).gaussians
-            if sampling_intervals is not None:
-                of_anchor = structured.ids // anchors.offsets.shape[1]
-                structured = replace(structured, sampling_intervals=sampling_intervals[of_anchor])
+            if of_slots is not None:
+                structured = replace(structured, sampling_intervals=of_slots[structured.ids])
             found.append(concatenate(structured, free) if len(free) else structured)
         return found
 

@@ -9,14 +9,13 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
 from structgstream.scene.color import CameraColor
 from structgstream.scene.render import draw
 from structgstream.scene.scene import Scene
-from structgstream.training.views import View, in_groups, stacked_masks
+from structgstream.training.views import View, dilated, in_groups, stacked_masks
 
 FLOOR_PIXELS = 5
 """Side, in pixels of its maps, of the square over which the floor takes the maximum residual."""
@@ -139,6 +138,6 @@ def residual_floor(scene: Scene, views: Sequence[View], *, scale: float, backend
         for view in views:
             small = view.evidence(scale)
             found = rendering_residual(scene.gaussians(small.camera, backend), small, scene, backend)
-            floor = max_pool2d(found[None], FLOOR_PIXELS, stride=1, padding=FLOOR_PIXELS // 2)[0]
+            floor = dilated(found, FLOOR_PIXELS // 2)
             maps[view.index] = floor if small.mask is None else torch.where(small.mask, floor, 1.0)
     return ResidualFloor(scale, maps)

@@ -33,6 +33,7 @@ from structgstream.cameras import Camera
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
+from structgstream.training.views import dilated
 
 TABLE_LENGTH = 1 << 21
 """Of a table of random numbers; it is a few times what an iteration reads."""
@@ -225,4 +226,4 @@ def _nearest_depth(scene: Scene, camera: Camera, backend: Backend) -> Tensor:
     moments = torch.stack([z, torch.ones_like(z), torch.zeros_like(z)], dim=1)
     first, coverage, _ = backend.rasterize(replace(gaussians, colors=moments), viewport).image.unbind(-1)
     depth = torch.where(coverage > COVERED, first / coverage.clamp(min=COVERED), 0.0)
-    return -torch.nn.functional.max_pool2d(-depth[None], 3, stride=1, padding=1)[0]
+    return -dilated(-depth, 1)

@@ -23,14 +23,13 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from structgstream.codec.fields.quantization import round_straight_through
 from structgstream.kernels.values import HeadWeights
 from structgstream.scene.color import CameraColor
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import ExposureConfig
-from structgstream.training.views import View, by_size, evidence_views, stacked_colors, stacked_masks
+from structgstream.training.views import View, by_size, dilated, evidence_views, stacked_colors, stacked_masks
 
 MIN_COMPARED_VIEWS = 3
 """Fewer views have no median that leaves one out."""
@@ -115,8 +114,7 @@ def _view_changes(
     other = (difference - sensitivity * so_far).abs().mean(-1) > config.SAME_THRESHOLD
     for masks in (stacked_masks(now), stacked_masks(then)):
         other = other if masks is None else other | ~masks
-    width = 2 * REACH_PIXELS + 1
-    same = max_pool2d(other.float(), width, stride=1, padding=REACH_PIXELS) < 0.5
+    same = ~dilated(other, REACH_PIXELS)
     squares = sensitivity.square()
     weight = (squares * same[..., None]).sum((1, 2))
     enough = (weight > config.MIN_SHARE * squares.sum((1, 2))).all(1, keepdim=True)

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from structgstream.cameras import Camera
 from structgstream.gaussians import Gaussians, concatenate
@@ -26,6 +25,7 @@ from structgstream.training.residuals import ResidualFloor, residuals
 from structgstream.training.views import (
     View,
     area_mean,
+    dilated,
     evidence_views,
     in_groups,
     mean_of_counting,
@@ -264,9 +264,8 @@ def _measure_views(
     if floor is not None and views[0].index in floor.maps and config.residual_threshold > 0.0:
         floors = torch.stack([floor.maps[view.index] for view in views])
         wrong = residuals(list(drawn), small, scene.camera_color, backend) > config.residual_threshold + floors
-        wrong = wrong.to(changed)
-        wrong_shares = mean_of_counting(wrong, masks)
-        around = torch.maximum(changed, max_pool2d(wrong, 3, stride=1, padding=1))
+        wrong_shares = mean_of_counting(wrong.to(changed), masks)
+        around = torch.maximum(changed, dilated(wrong, 1).to(changed))
         # The pictures had to be drawn first; the few pixels in question are accumulated by themselves.
         beyond = ((around - changed) * valid)[..., None]
         sums[..., 1:2] += backend.weigh_views(gaussians, viewports, beyond, slots=slots)

@@ -19,7 +19,7 @@ from structgstream.scene.active_tiles import ActiveTiles
 from structgstream.scene.scene import Scene
 from structgstream.training.online.config import MotionConfig
 from structgstream.training.online.select import DynamicSelection
-from structgstream.training.views import View, by_size
+from structgstream.training.views import View, by_size, dilated
 
 REACH_SCALE = 0.25
 
@@ -108,10 +108,10 @@ def _active_tiles(
     )
     changed = changed_tiles(masks, [selection.changed.get(view.index) for view in views], (height, width))
     if config.tiles_around >= 0:
-        masks = masks & _grown(changed, round(config.tiles_around * enlarged))
+        masks = masks & dilated(changed, round(config.tiles_around * enlarged))
     # The loss reads ten pixels beyond a tile: a ring of tiles around them is drawn once and kept.
     tiles, tiles_of_change, rings = (
-        [TileSelection(mask, width, height) for mask in of_views] for of_views in (masks, changed, _grown(masks, 1))
+        [TileSelection(mask, width, height) for mask in of_views] for of_views in (masks, changed, dilated(masks, 1))
     )
     at_rest, backgrounds = static.gaussians_of_views(cameras, backend, tiles=rings), static.backgrounds(cameras)
     drawn = backend.draw_views(
@@ -139,11 +139,6 @@ def _active_tiles(
     ]
 
 
-def _grown(masks: Tensor, by: int) -> Tensor:
-    """The masks ``[V, rows, columns]``, dilated by ``by`` tiles."""
-    return torch.nn.functional.max_pool2d(masks.float(), 2 * by + 1, stride=1, padding=by) > 0
-
-
 def changed_tiles(masks: Tensor, changed: Sequence[Tensor | None], size: tuple[int, int]) -> Tensor:
     """Those of the tiles ``[V, rows, columns]`` that hold pixels of a view's mask ``[h, w]``; all if none do or there
     is no mask.
@@ -161,5 +156,6 @@ def changed_tiles(masks: Tensor, changed: Sequence[Tensor | None], size: tuple[i
     rows, columns = masks.shape[1:]
     large = torch.nn.functional.interpolate(pixels, size=size)
     padded = torch.nn.functional.pad(large, (0, columns * TILE_PIXELS - size[1], 0, rows * TILE_PIXELS - size[0]))
-    found = masks & (torch.nn.functional.max_pool2d(padded, TILE_PIXELS)[:, 0] > 0.0)
+    of_tiles = padded.reshape(-1, rows, TILE_PIXELS, columns, TILE_PIXELS)  # max_pool2d takes twice the time
+    found = masks & (of_tiles.amax((2, 4)) > 0.0)
     return torch.where(found.flatten(1).any(1)[:, None, None], found, masks)
