@@ -262,6 +262,37 @@ describe.skipIf(StagedTests.skipped)("the player in a headset", () => {
     };
     await expectDots(page, shifted);
     expect(await paused()).toBe(true);
+    // A trigger that is moved pulls, too, and does not play.
+    await trigger(1);
+    const lift = async (metres: number) => {
+      await page.evaluate((by) => {
+        headset.controllers.right!.position.y += by;
+      }, metres);
+      await later(page);
+    };
+    await lift(0.05);
+    await lift(0.2);
+    await trigger(0);
+    await expectDots(page, (dot) => {
+      const [x, y, z] = shifted(dot);
+      return [x!, y! + 0.2, z!];
+    });
+    expect(await paused()).toBe(true);
+    // So does a pinch play and pause.
+    await page.evaluate(() => {
+      headset.primaryInputMode = "hand";
+      headset.hands.left!.connected = true;
+      headset.hands.left!.updatePinchValue(1);
+    });
+    await later(page);
+    await page.evaluate(() => headset.hands.left!.updatePinchValue(0));
+    await later(page);
+    expect(await paused()).toBe(false);
+    await page.evaluate(() => {
+      headset.primaryInputMode = "controller";
+      document.querySelector("structgstream-player")!.pause();
+    });
+    await later(page);
     // Forward: what is ahead comes nearer, so that the eyes differ more.
     const disparity = async () => {
       const eyes = await page.evaluate(() => nextPicture());
