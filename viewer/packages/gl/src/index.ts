@@ -20,6 +20,7 @@ export { SplatRenderer } from "./renderer.js";
 export { focusPoint, upAxis } from "./rig.js";
 export type {
   Camera,
+  EyeView,
   Intrinsics,
   MlpPath,
   Renderer,
@@ -28,6 +29,7 @@ export type {
   RenderStats,
   ResourceCounts,
   SceneUpdate,
+  Views,
 } from "./types.js";
 export {
   across,
@@ -36,6 +38,7 @@ export {
   directionBetween,
   dot,
   length,
+  mean,
   type Rotation,
   rotationBetween,
   scaled,

@@ -18,6 +18,7 @@ import type {
   RenderStats,
   ResourceCounts,
   SceneUpdate,
+  Views,
 } from "./types.js";
 
 const MEAN_LOOK: Look = { gain: [1, 1, 1], bias: [0, 0, 0] };
@@ -106,16 +107,27 @@ export class SplatRenderer implements Renderer {
       this.pipeline !== undefined &&
       sameWanted(sorted, { snapshot, camera, maxSplats: this.maxSplats }) &&
       this.shows(sorted, camera, look);
-    return {
-      frameIndex: sorted?.snapshot.index,
-      ptsSeconds: sorted?.snapshot.ptsSeconds,
-      drawn,
-      settled,
-      anchors: sorted?.order.anchorCount ?? 0,
-      splats: sorted?.order.splats ?? 0,
-      sortMilliseconds: sorted?.order.milliseconds ?? 0,
-      callMilliseconds: performance.now() - began,
-    };
+    return this.statsOf(drawn, settled, began);
+  }
+
+  renderViews({ eyes, middle, framebuffer, transparent }: Views): RenderStats {
+    this.alive();
+    const began = performance.now();
+    const snapshot = this.scene?.latest;
+    const wanted = snapshot && { snapshot, camera: middle, maxSplats: this.maxSplats };
+    if (wanted) this.orders.want(wanted);
+    const { pipeline } = this;
+    if (pipeline) {
+      this.takeOrder(pipeline);
+      this.shown = undefined;
+      pipeline.evaluate(middle);
+      for (const { camera, x, y } of eyes) {
+        pipeline.draw(camera, this.pixelScale);
+        pipeline.show(camera, MEAN_LOOK, { framebuffer, x, y, transparent });
+      }
+    }
+    const settled = wanted !== undefined && this.sorted !== undefined && sameWanted(this.sorted, wanted);
+    return this.statsOf(pipeline !== undefined, settled, began);
   }
 
   async renderSettled(camera: Camera, options: RenderOptions = {}): Promise<RenderStats> {
@@ -179,17 +191,35 @@ export class SplatRenderer implements Renderer {
     this.settle();
   };
 
+  private statsOf(drawn: boolean, settled: boolean, began: number): RenderStats {
+    const { sorted } = this;
+    return {
+      frameIndex: sorted?.snapshot.index,
+      ptsSeconds: sorted?.snapshot.ptsSeconds,
+      drawn,
+      settled,
+      anchors: sorted?.order.anchorCount ?? 0,
+      splats: sorted?.order.splats ?? 0,
+      sortMilliseconds: sorted?.order.milliseconds ?? 0,
+      callMilliseconds: performance.now() - began,
+    };
+  }
+
+  /** Takes the newest order, if one has come. */
+  private takeOrder(pipeline: Pipeline): void {
+    const arrived = this.orders.take();
+    if (!arrived || !this.scene) return;
+    if (this.sorted) this.orders.release(this.sorted);
+    this.sorted = undefined;
+    pipeline.adopt(arrived, this.scene.header.distanceInput);
+    this.sorted = arrived;
+  }
+
   /** Whether anything had to be drawn, and could be. */
   private drawn(pipeline: Pipeline, camera: Camera, look: Look): boolean {
     if (this.shows(this.sorted, camera, look) && !this.orders.waiting) return false;
     if (this.pace.busy()) return false;
-    const arrived = this.orders.take();
-    if (arrived && this.scene) {
-      if (this.sorted) this.orders.release(this.sorted);
-      this.sorted = undefined;
-      pipeline.adopt(arrived, this.scene.header.distanceInput);
-      this.sorted = arrived;
-    }
+    this.takeOrder(pipeline);
     const { shown, sorted, pixelScale } = this;
     const same = shown && shown.sorted === sorted && sameCamera(shown.camera, camera);
     if (this.canvas.width !== camera.width) this.canvas.width = camera.width;

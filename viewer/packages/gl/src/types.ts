@@ -57,6 +57,26 @@ export interface RenderOptions {
   readonly cameraName?: string;
 }
 
+/** The picture of one eye, as a part of a framebuffer. */
+export interface EyeView {
+  /** Its width and height are those of the part. */
+  readonly camera: Camera;
+  /** The part's lower left corner, pixels. */
+  readonly x: number;
+  readonly y: number;
+}
+
+/** Pictures of one moment, drawn from one order. */
+export interface Views {
+  readonly eyes: readonly EyeView[];
+  /** A camera that sees what the eyes see: splats are sorted, and MLPs evaluated, for it. */
+  readonly middle: Camera;
+  /** Null for the canvas. */
+  readonly framebuffer: WebGLFramebuffer | null;
+  /** Without environment and background: colours times coverage, and coverage as alpha. */
+  readonly transparent: boolean;
+}
+
 /** Result of one call of `render`. */
 export interface RenderStats {
   /** The frame of the picture; undefined until the first order has come. It may be older than the last update. */
@@ -105,6 +125,8 @@ export interface Renderer {
   /** Sets the dynamic fields. The latest scene is shown as soon as its order has come. Throws GlError. */
   update(update: SceneUpdate): void;
   render(camera: Camera, options?: RenderOptions): RenderStats;
+  /** Draws the pictures of a headset, without waiting for the GPU; the canvas' own picture is not drawn. */
+  renderViews(views: Views): RenderStats;
   /** Draws until the picture is exact: of the last update, sorted for its camera. */
   renderSettled(camera: Camera, options?: RenderOptions): Promise<RenderStats>;
   /** The last rendered picture as PNG. */

@@ -10,6 +10,7 @@
  * | `embed` | few controls |
  * | `theme` | `dark` or `light`; default: that of the system |
  * | `truth` | address of a list of cameras with pictures, `truth.json`; pictures are at `truth/CAMERA/FRAME.jpg` next to it |
+ * | `metres` | metres per unit of the capture, for headsets; default: `assumedMetres` of `xr/room.ts` |
  * | `isolated` | the player ignores the page's address (`?src=&t=&view=&embed=1`) |
  *
  * It dispatches the player's events by the same names, and those of a `<video>` (`mediaEvents.ts`); they do not bubble, and
@@ -29,6 +30,7 @@ import { STYLES } from "./ui/styles.js";
 import { type Link, linkOf, viewFrom } from "./view/link.js";
 import { viewOf } from "./view/navigator.js";
 import { QualityControl } from "./view/quality.js";
+import { offersXr, XR_MODES, type XrMode, XrSession } from "./xr/session.js";
 
 /** As `MediaError.code` has it: the stream cannot be fetched or decoded. */
 const MEDIA_ERR_SRC_NOT_SUPPORTED = 4;
@@ -37,13 +39,18 @@ const HIDDEN_MILLISECONDS = 500;
 
 interface Running {
   readonly player: Player;
+  readonly canvas: HTMLCanvasElement;
+  readonly quality: QualityControl;
   readonly ui: PlayerUi;
   readonly media: MediaState;
   readonly observer: ResizeObserver;
 }
 
 /** All events of the element, and their data. */
-export type ElementEvents = PlayerEvents & MediaEvents;
+export interface ElementEvents extends PlayerEvents, MediaEvents {
+  /** A session of a headset has begun, or ended: then `mode` is undefined. */
+  xr: { readonly mode: XrMode | undefined };
+}
 
 export class StructgstreamPlayer extends HTMLElement {
   static readonly observedAttributes = ["src", "loop", "controls", "embed", "poster"];
@@ -57,12 +64,13 @@ export class StructgstreamPlayer extends HTMLElement {
   /** Whether it is muted; undefined: as the attribute says. */
   private silenced: boolean | undefined;
   private loudness = 1;
+  private session: XrSession | undefined;
 
   connectedCallback(): void {
     this.link ??= this.hasAttribute("isolated") ? undefined : linkOf(new URL(location.href));
     if (!this.running) this.start();
     if (!this.running) return;
-    this.ticking ??= requestAnimationFrame(this.tick);
+    if (!this.session) this.ticking ??= requestAnimationFrame(this.tick);
     this.listening ??= setInterval(this.listen, HIDDEN_MILLISECONDS);
   }
 
@@ -295,6 +303,39 @@ export class StructgstreamPlayer extends HTMLElement {
     this.running!.player.flyTo(found, seconds);
   }
 
+  /** The kind of the running WebXR session; undefined without one. */
+  get xr(): XrMode | undefined {
+    return this.session?.mode;
+  }
+
+  /**
+   * Shows the stream in a headset; needs a click. Rejects with a sentence if there is no WebXR, or the session is refused.
+   *
+   * @throws Error also for a `metres` that is no positive number
+   */
+  async enterXr(mode: XrMode = "immersive-vr"): Promise<void> {
+    const { running, session } = this;
+    if (session) throw new Error(`The player is in ${session.mode} already; call exitXr() first.`);
+    if (!running) throw new Error("There is nothing to show: the player is not in a page, or has no WebGL2.");
+    const text = this.getAttribute("metres");
+    const metres = text === null ? undefined : Number(text);
+    if (metres !== undefined && !(metres > 0 && metres < Number.POSITIVE_INFINITY)) {
+      throw new Error(`The attribute metres is ${JSON.stringify(text)}; expected the metres per unit of the capture.`);
+    }
+    const { player, canvas, quality } = running;
+    const started = await XrSession.start(mode, { player, canvas, quality, metres, onEnd: () => this.leftXr(started) });
+    // The headset's pictures drive the player now.
+    this.stopTicking();
+    this.session = started;
+    if (this.running !== running) await started.end();
+    else this.xrChanged();
+  }
+
+  /** Ends the session of the headset, if there is one. */
+  async exitXr(): Promise<void> {
+    await this.session?.end();
+  }
+
   /** Statistics of the last picture. */
   get stats(): RenderStats | undefined {
     return this.running?.player.stats;
@@ -364,6 +405,7 @@ export class StructgstreamPlayer extends HTMLElement {
       quality,
       open: (source) => this.open(source),
       saveScreenshot: () => void this.save(),
+      toggleXr: (mode) => void this.toggleXr(mode),
       linkedSource: () => this.linked,
     });
     root.replaceChildren(style, ui.root);
@@ -374,7 +416,9 @@ export class StructgstreamPlayer extends HTMLElement {
       () => performance.now() / 1000,
       (name) => this.dispatch(name, {}),
     );
-    this.running = { player, ui, media, observer };
+    this.running = { player, canvas, quality, ui, media, observer };
+    navigator.xr?.addEventListener("devicechange", this.offerXr);
+    this.offerXr();
     player.relay = (name, detail) => {
       media.take(name, detail);
       this.dispatch(name, detail);
@@ -407,15 +451,46 @@ export class StructgstreamPlayer extends HTMLElement {
   };
 
   private stop(): void {
-    if (this.ticking !== undefined) cancelAnimationFrame(this.ticking);
-    this.ticking = undefined;
+    this.stopTicking();
     clearInterval(this.listening);
     this.listening = undefined;
+    navigator.xr?.removeEventListener("devicechange", this.offerXr);
+    void this.exitXr();
     const { running } = this;
     this.running = undefined;
     running?.observer.disconnect();
     running?.player.destroy();
     this.shadowRoot?.replaceChildren();
+  }
+
+  private stopTicking(): void {
+    if (this.ticking !== undefined) cancelAnimationFrame(this.ticking);
+    this.ticking = undefined;
+  }
+
+  private readonly offerXr = (): void => {
+    for (const mode of XR_MODES) void offersXr(mode).then((offered) => this.running?.ui.offerXr(mode, offered));
+  };
+
+  private async toggleXr(mode: XrMode): Promise<void> {
+    try {
+      await (this.xr ? this.exitXr() : this.enterXr(mode));
+    } catch (error) {
+      this.running?.ui.say(error instanceof Error ? error.message : String(error), true);
+    }
+  }
+
+  private leftXr(ended: XrSession): void {
+    if (this.session !== ended) return;
+    this.session = undefined;
+    if (!this.running) return;
+    this.ticking ??= requestAnimationFrame(this.tick);
+    this.xrChanged();
+  }
+
+  private xrChanged(): void {
+    if (this.running) this.running.ui.xr = this.xr;
+    this.dispatch("xr", { mode: this.xr });
   }
 
   private readonly tick = (): void => {
@@ -424,9 +499,11 @@ export class StructgstreamPlayer extends HTMLElement {
     this.running?.ui.tick();
   };
 
-  /** No pictures are asked for in a page that is hidden; its sound goes on, as that of a video. */
+  /** No pictures are asked for in a page or headset that is hidden; its sound goes on, as that of a video. */
   private readonly listen = (): void => {
-    if (document.hidden && this.running?.player.sound.wanted) this.running.player.tick(false);
+    const { running, session } = this;
+    if (session) running?.ui.tick(); // the page may be seen next to the headset
+    if ((session?.hidden ?? document.hidden) && running?.player.sound.wanted) running.player.tick(false);
   };
 
   private applyAttributes(ui: PlayerUi): void {

@@ -2,7 +2,15 @@
 /** A stream on a canvas: engine, renderer and a moving camera, without a user interface. */
 
 import type { StreamHeader } from "@structgstream/core";
-import { type Camera, center, fitted, type Renderer, type RenderStats, type ResourceCounts } from "@structgstream/gl";
+import {
+  type Camera,
+  center,
+  fitted,
+  type Renderer,
+  type RenderStats,
+  type ResourceCounts,
+  type Views,
+} from "@structgstream/gl";
 import { Emitter } from "./engine/emitter.js";
 import { Engine } from "./engine/engine.js";
 import type { EngineEvents } from "./engine/events.js";
@@ -11,7 +19,7 @@ import { Sound } from "./sound/sound.js";
 import type { SourceDescription } from "./source/description.js";
 import { Flight } from "./view/flight.js";
 import { carried, type View, viewOf } from "./view/navigator.js";
-import type { QualityControl } from "./view/quality.js";
+import type { Pacing, QualityControl } from "./view/quality.js";
 import { nearPlane, type Rig, type RigCamera, rigOf } from "./view/rig.js";
 
 export interface PlayerEvents extends EngineEvents {
@@ -21,6 +29,11 @@ export interface PlayerEvents extends EngineEvents {
   rig: { readonly rig: Rig };
   /** A picture was drawn. */
   drawn: { readonly stats: RenderStats };
+}
+
+/** What a headset asks for. */
+export interface HeadsetViews extends Views {
+  readonly quality: Pacing;
 }
 
 export interface PlayerOptions {
@@ -206,9 +219,11 @@ export class Player extends Emitter<PlayerEvents> {
    * Must be called for every picture that the browser shows.
    *
    * @param isSeen whether it is shown; that of a hidden page says nothing of the device's speed
+   * @param views pictures of a headset, instead of that of the canvas
    */
-  tick(isSeen = true): void {
-    const { renderer, quality, now } = this.options;
+  tick(isSeen = true, views?: HeadsetViews): void {
+    const { renderer, now } = this.options;
+    const quality = views?.quality ?? this.options.quality;
     const time = now();
     const since = time - (this.tickedAt ?? Number.NEGATIVE_INFINITY);
     this.tickedAt = isSeen ? time : undefined;
@@ -234,14 +249,16 @@ export class Player extends Emitter<PlayerEvents> {
       renderer.maxSplats = maxSplats;
       renderer.pixelScale = pixelScale;
       const cameraName = this.exposed ? this.atCamera?.name : undefined;
-      this.stats = renderer.render(camera, cameraName === undefined ? {} : { cameraName });
+      this.stats = views
+        ? renderer.renderViews(views)
+        : renderer.render(camera, cameraName === undefined ? {} : { cameraName });
     } catch (error) {
       this.engine?.destroy();
       this.engine = undefined;
       this.emit("error", { message: error instanceof Error ? error.message : String(error), fatal: true });
       return;
     }
-    if (this.stats.drawn) this.measure(time, this.stats);
+    if (this.stats.drawn) this.measure(time, this.stats, quality, views !== undefined);
   }
 
   /** Seconds since the displayed frame was captured; undefined if unknown. */
@@ -312,16 +329,17 @@ export class Player extends Emitter<PlayerEvents> {
     this.emit("view", { view });
   }
 
-  private measure(time: number, stats: RenderStats): void {
+  private measure(time: number, stats: RenderStats, quality: Pacing, inHeadset: boolean): void {
     const since = this.drawnAt === undefined ? undefined : time - this.drawnAt;
     this.drawnAt = time;
     const following = since !== undefined && since < PAUSE_SECONDS;
     this.pictureSeconds = following ? 0.9 * (this.pictureSeconds ?? since) + 0.1 * since : undefined;
     // A stream of few frames per second is not a slow device. Pictures of a moving camera should follow each other at
     // the screen's rate, and a frame should be drawn soon after its arrival; sorting runs in another thread.
-    if (following && this.view !== this.drawnView) this.options.quality.picture(since);
-    else if (this.given && (stats.frameIndex ?? -1) >= this.given.index) {
-      this.options.quality.picture(Math.max(time - this.given.at - stats.sortMilliseconds / 1000, 0));
+    // A headset's pictures should always follow each other at its rate.
+    if (following && (inHeadset || this.view !== this.drawnView)) quality.picture(since, stats.splats);
+    else if (!inHeadset && this.given && (stats.frameIndex ?? -1) >= this.given.index) {
+      quality.picture(Math.max(time - this.given.at - stats.sortMilliseconds / 1000, 0), stats.splats);
     }
     if (this.given && (stats.frameIndex ?? -1) >= this.given.index) {
       this.drawSeconds.push(Math.min(time - this.given.at, MAX_DRAW_SECONDS));

@@ -7,7 +7,7 @@ import { describe, expect, test } from "vitest";
 import { Flight } from "../src/view/flight.ts";
 import { linkOf, linkTo, viewFrom } from "../src/view/link.ts";
 import { dollied, flown, looked, orbited, panned, type View, viewOf } from "../src/view/navigator.ts";
-import { QualityControl } from "../src/view/quality.ts";
+import { FrameBudget, QualityControl } from "../src/view/quality.ts";
 import { nearPlane, rigOf } from "../src/view/rig.ts";
 import { CLIP } from "./served.ts";
 
@@ -211,5 +211,59 @@ describe("quality", () => {
     quality.choice = { maxSplats: 1000, pixelScale: 1 };
     pictures(100, 0.1);
     expect(quality.current).toEqual({ maxSplats: 1000, pixelScale: 1 });
+  });
+});
+
+describe("the budget of a headset", () => {
+  const desk = { coarsePointer: false, memoryGigabytes: 8, processors: 16 };
+  const FRAME = 1 / 72;
+
+  /** A device that draws so many splats at full size in time, and so many pictures on it. */
+  function played(budget: FrameBudget, inTime: number, pictures: number, scene = 100_000): number[] {
+    return Array.from({ length: pictures }, () => {
+      const { maxSplats } = budget.current;
+      const splats = Math.min(scene, maxSplats);
+      budget.picture(splats > inTime ? 2 * FRAME : FRAME, splats);
+      return splats;
+    });
+  }
+
+  test("is all that there is, as long as pictures come in time", () => {
+    const budget = new FrameBudget(new QualityControl(desk), FRAME);
+    expect(new Set(played(budget, 200_000, 1000))).toEqual(new Set([100_000]));
+    expect(budget.current).toEqual({ maxSplats: Number.POSITIVE_INFINITY, pixelScale: 1 });
+  });
+
+  test("is reduced until pictures come in time, in seconds, and then held", () => {
+    const budget = new FrameBudget(new QualityControl(desk), FRAME);
+    const splats = played(budget, 40_000, 72 * 60);
+    expect(splats[0]).toBe(100_000);
+    expect(splats.findIndex((count) => count <= 40_000)).toBeLessThan(72 * 3);
+    // A larger share is tried more and more seldom.
+    const late = splats.filter((count, i) => i >= 72 * 3 && count > 40_000).length;
+    expect(late).toBeGreaterThan(0);
+    expect(late / splats.length).toBeLessThan(0.05);
+    expect(Math.min(...splats)).toBeGreaterThan(25_000);
+    expect(budget.current.pixelScale).toBeCloseTo(Math.sqrt(0.75 ** 4), 2);
+  });
+
+  test("grows again where there is less to draw, and one hitch changes nothing", () => {
+    const budget = new FrameBudget(new QualityControl(desk), FRAME);
+    played(budget, 60_000, 300);
+    expect(budget.current.maxSplats).toBeLessThan(60_000);
+    played(budget, 200_000, 72 * 60);
+    expect(budget.current).toEqual({ maxSplats: Number.POSITIVE_INFINITY, pixelScale: 1 });
+    budget.picture(0.9, 100_000);
+    played(budget, 200_000, 100);
+    expect(budget.current.pixelScale).toBe(1);
+  });
+
+  test("leaves what the user has chosen, and begins with what the page does", () => {
+    const quality = new QualityControl({ coarsePointer: true, memoryGigabytes: 2, processors: 4 });
+    const budget = new FrameBudget(quality, FRAME);
+    expect(budget.current).toEqual(quality.current);
+    quality.choice = { maxSplats: 50_000, pixelScale: 0.75 };
+    played(budget, 10_000, 1000);
+    expect(budget.current).toEqual({ maxSplats: 50_000, pixelScale: 0.75 });
   });
 });

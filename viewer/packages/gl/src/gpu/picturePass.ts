@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-/** The canvas: the blended splats in front of the environment, with the exposure of a camera of the rig. */
+/** The final picture: the blended splats in front of the environment, with the exposure of a camera of the rig. */
 
 import { axes } from "../cameraMath.js";
 import { pictureProgram } from "../shaders/picture.js";
@@ -11,6 +11,17 @@ import type { Program, Resources } from "./resources.js";
 export interface Look {
   readonly gain: readonly [number, number, number];
   readonly bias: readonly [number, number, number];
+}
+
+/** A part of a framebuffer; its size is that of the picture. */
+export interface Target {
+  /** Null for the canvas. */
+  readonly framebuffer: WebGLFramebuffer | null;
+  /** Lower left corner, pixels. */
+  readonly x: number;
+  readonly y: number;
+  /** The target gets coverage as alpha, and nothing behind the splats. */
+  readonly transparent: boolean;
 }
 
 export class PicturePass {
@@ -29,20 +40,24 @@ export class PicturePass {
     environment: Float32Array,
     background: readonly [number, number, number],
     look: Look,
+    { framebuffer, x, y, transparent }: Target,
   ): void {
     const { gl } = this.resources;
     const program = this.programFor(environment.length / 3);
     bindTextures(gl, program, { blended });
     gl.uniform2f(program.at("size"), camera.width, camera.height);
+    gl.uniform2f(program.at("corner"), x, y);
+    gl.uniform1i(program.at("transparent"), Number(transparent));
     gl.uniform3f(program.at("gain"), ...look.gain);
     gl.uniform3f(program.at("bias"), ...look.bias);
     gl.uniform3f(program.at("background"), ...background);
     if (environment.length) gl.uniform3fv(program.at("environment"), environment);
     gl.uniformMatrix3fv(program.at("rays"), true, rays(camera));
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
     gl.disable(gl.BLEND);
-    gl.viewport(0, 0, camera.width, camera.height);
+    gl.viewport(x, y, camera.width, camera.height);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
   }
 
   private programFor(rows: number): Program {

@@ -9,7 +9,7 @@ import type { Camera, MlpPath } from "../types.js";
 import { chosenPath, type Device } from "./device.js";
 import { FeedbackPass } from "./feedbackPass.js";
 import type { MlpPass } from "./mlpPass.js";
-import { type Look, PicturePass } from "./picturePass.js";
+import { type Look, PicturePass, type Target } from "./picturePass.js";
 import { ProjectionPass } from "./projectionPass.js";
 import { Resources } from "./resources.js";
 import { SamplingPass } from "./samplingPass.js";
@@ -27,6 +27,7 @@ interface Stage {
 }
 
 const NOTHING = new Float32Array(0);
+const CANVAS: Target = { framebuffer: null, x: 0, y: 0, transparent: false };
 
 export class Pipeline {
   readonly resources: Resources;
@@ -92,11 +93,11 @@ export class Pipeline {
     this.splats.draw(this.stage?.scene, this.stage?.projection, width, height);
   }
 
-  /** Copies the last rendering to the canvas. */
-  show(camera: Camera, look: Look): void {
+  /** Copies the last rendering to the canvas, or another target. */
+  show(camera: Camera, look: Look, target = CANVAS): void {
     const environment = this.fields?.get("environment")?.data as Float32Array | undefined;
     if (!this.splats.target) return;
-    this.picture.draw(this.splats.target, camera, environment ?? NOTHING, this.background, look);
+    this.picture.draw(this.splats.target, camera, environment ?? NOTHING, this.background, look, target);
   }
 
   private stageFor(shape: Shape): Stage {

@@ -37,18 +37,20 @@ ${basis.map((term, i) => `  sum += (${term}) * environment[${i}];`).join("\n")}
 const float Y0 = ${y0}, A = ${a}, B = ${b}, C = ${c};
 const float INVISIBLE = 1.0 / 512.0;
 uniform sampler2D blended;
-uniform vec2 size; // of the picture
+uniform vec2 size, corner; // of the picture
+uniform bool transparent;
 uniform vec3 gain, bias;
 out vec4 color;
 ${behind}
 void main() {
   // The picture's first row is the target's first and the canvas' last.
-  vec2 pixel = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
+  vec2 at = gl_FragCoord.xy - corner;
+  vec2 pixel = vec2(at.x, size.y - at.y);
   vec4 found = texture(blended, pixel / size);
   float rest = 1.0 - found.w;
   vec3 picture = found.xyz;
-  if (rest > INVISIBLE) picture += rest * behind(pixel);
-  color = vec4(clamp(gain * picture + bias, 0.0, 1.0), 1.0);
+  if (rest > INVISIBLE && !transparent) picture += rest * behind(pixel);
+  color = vec4(clamp(gain * picture + bias, 0.0, 1.0), transparent ? found.w : 1.0);
 }
 `,
   };

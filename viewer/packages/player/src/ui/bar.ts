@@ -2,6 +2,7 @@
 /** The bar of controls at the bottom. */
 
 import type { Player } from "../player.js";
+import type { XrMode } from "../xr/session.js";
 import { made, setText } from "./dom.js";
 import { timeText } from "./format.js";
 import { button, type IconName, icon } from "./icons.js";
@@ -15,12 +16,16 @@ export interface BarActions {
   share(): void;
   screenshot(): void;
   fullscreen(): void;
+  /** Enters a session of a headset, or leaves it. */
+  toggleXr(mode: XrMode): void;
 }
 
 export class Bar {
   readonly root: HTMLElement;
   readonly timeline: TimelineBar;
   readonly compare: HTMLButtonElement;
+  /** Hidden where the device has no such session. */
+  readonly xr: Readonly<Record<XrMode, HTMLButtonElement>>;
   private readonly play: HTMLButtonElement;
   private readonly loop: HTMLButtonElement;
   private readonly time = made("div", { class: "time" });
@@ -40,7 +45,13 @@ export class Bar {
     this.play = button("play", "Play", () => player.toggle());
     this.loop = button("loop", "Loop", () => player.setLoop(!player.loop), "medium");
     this.compare = button("compare", "Compare with the camera's picture", () => actions.compare());
-    this.compare.hidden = true;
+    const xr = (face: "vr" | "ar", mode: XrMode) => {
+      const made_ = button(face, `Enter ${face.toUpperCase()}`, () => actions.toggleXr(mode));
+      made_.setAttribute("aria-pressed", "false");
+      return made_;
+    };
+    this.xr = { "immersive-vr": xr("vr", "immersive-vr"), "immersive-ar": xr("ar", "immersive-ar") };
+    for (const hidden of [this.compare, ...Object.values(this.xr)]) hidden.hidden = true;
     this.rate = made("select", { "aria-label": "Speed", title: "Speed", class: "medium" });
     for (const rate of RATES) this.rate.append(made("option", { value: String(rate) }, `${rate}×`));
     this.rate.addEventListener("change", () => {
@@ -84,6 +95,7 @@ export class Bar {
         button("photo", "Save a screenshot", () => actions.screenshot(), "noembed wide"),
         button("link", "Copy a link to this view and time", () => actions.share(), "noembed wide"),
         panel("help", "help", "Keys", "noembed wide"),
+        ...Object.values(this.xr),
         button("full", "Full screen", () => actions.fullscreen()),
       ),
     );

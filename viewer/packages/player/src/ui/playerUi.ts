@@ -6,6 +6,7 @@ import type { SourceDescription } from "../source/description.js";
 import { linkTo } from "../view/link.js";
 import type { QualityControl } from "../view/quality.js";
 import type { RigCamera } from "../view/rig.js";
+import type { XrMode } from "../xr/session.js";
 import { Bar } from "./bar.js";
 import { Compare } from "./compare.js";
 import { made } from "./dom.js";
@@ -32,6 +33,7 @@ export interface PlayerUiOptions {
   readonly quality: QualityControl;
   readonly open: (source: SourceDescription) => void;
   readonly saveScreenshot: () => void;
+  readonly toggleXr: (mode: XrMode) => void;
   /** The address of the stream for links; undefined if a link cannot contain it. */
   readonly linkedSource: () => string | undefined;
 }
@@ -78,6 +80,7 @@ export class PlayerUi {
       share: () => void this.share(),
       screenshot: () => options.saveScreenshot(),
       fullscreen: () => this.fullscreen(),
+      toggleXr: (mode) => options.toggleXr(mode),
     });
     const label = "Scene: drag to turn around it, wheel or pinch to come closer";
     const stage = made("div", {
@@ -117,6 +120,21 @@ export class PlayerUi {
     if (address === undefined) this.posterImage.removeAttribute("src");
     else if (this.posterImage.src !== address) this.posterImage.src = address;
     this.showPoster(!this.options.player.stats?.drawn && !this.playButton);
+  }
+
+  /** Shows the button of a kind of session, if the device offers it. */
+  offerXr(mode: XrMode, offered: boolean): void {
+    this.bar.xr[mode].hidden = !offered;
+  }
+
+  /** Shows which session runs, if one does. */
+  set xr(running: XrMode | undefined) {
+    for (const [mode, button] of Object.entries(this.bar.xr)) {
+      const label = button.title.replace(/^\w+/, mode === running ? "Leave" : "Enter");
+      button.title = label;
+      button.setAttribute("aria-label", label);
+      button.setAttribute("aria-pressed", String(mode === running));
+    }
   }
 
   private showPoster(shown: boolean): void {

@@ -6,6 +6,7 @@ import { afterAll, beforeAll, describe, expect, test, vi } from "vitest";
 import { chromiumPath, launched } from "../../../gl/test/support/chromium.ts";
 import { LiveRun } from "../liveRun.ts";
 import { clappingFile, FPS } from "../soundFile.ts";
+import { emulatedHeadset } from "./headset.ts";
 import { TestServer } from "./server.ts";
 import { builtPlayer, pageWith } from "./stage.ts";
 
@@ -61,10 +62,11 @@ function watch(): void {
   const player = document.querySelector("structgstream-player")!;
   const small = document.createElement("canvas").getContext("2d", { willReadFrequently: true })!;
   const { times } = globalThis as unknown as { times: Times };
+  const canvas = player.shadowRoot!.querySelector("canvas")!;
   let white = false;
   player.on("drawn", () => {
     const now = performance.now();
-    small.drawImage(player.shadowRoot!.querySelector("canvas")!, 0, 0, 1, 1);
+    small.drawImage(canvas, 0, 0, 1, 1);
     const light = small.getImageData(0, 0, 1, 1).data[0]! > 100;
     if (light && !white) times.flashes.push(now);
     white = light;
@@ -104,10 +106,11 @@ describe.skipIf(!chromiumPath())("sound in a browser", () => {
     await server.stop();
   });
 
-  async function opened(attributes: string): Promise<Page> {
+  async function opened(attributes: string, script?: string): Promise<Page> {
     server.put("/page.html", pageWith(attributes), { type: "text/html" });
     const page = await (await browser.newContext({ viewport: { width: 96, height: 72 } })).newPage();
     await page.addInitScript(tap);
+    if (script) await page.addInitScript({ content: script });
     await page.goto(`${server.origin}/page.html`);
     await page.waitForFunction(() => heard.frames.length > 0);
     await page.evaluate(watch);
@@ -139,6 +142,15 @@ describe.skipIf(!chromiumPath())("sound in a browser", () => {
     } finally {
       clearInterval(writing);
     }
+  });
+
+  test("goes on in a headset, in step", async () => {
+    const page = await opened('src="claps.sgs" autoplay', emulatedHeadset());
+    await page.evaluate(() => document.querySelector("structgstream-player")!.enterXr());
+    expectInStep(await differences(page, 4), "in a headset");
+    await page.evaluate(() => document.querySelector("structgstream-player")!.exitXr());
+    expectInStep(await differences(page, 2), "after it");
+    await page.close();
   });
 
   test("is muted by attribute, property, button and key, and loud as its volume says", async () => {

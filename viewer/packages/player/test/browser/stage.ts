@@ -48,11 +48,23 @@ export class Stage {
     return new Stage(browser, server);
   }
 
-  /** A page with one player: `attributes` are the element's, written as in HTML; `options` give it a context of its own. */
-  async open(attributes = 'src="clip.sgs"', query = "", options?: BrowserContextOptions): Promise<Opened> {
+  /**
+   * A page with one player.
+   *
+   * @param attributes of the element, written as in HTML
+   * @param options give the page a context of its own
+   * @param script runs in that page before its own scripts
+   */
+  async open(
+    attributes = 'src="clip.sgs"',
+    query = "",
+    options?: BrowserContextOptions,
+    script?: string,
+  ): Promise<Opened> {
     this.server.put("/page.html", pageWith(attributes), { type: "text/html" });
     this.server.requests.length = 0;
     const opened = options ? await this.newPage(options) : await this.usualPage();
+    if (script) await opened.page.addInitScript({ content: script });
     await opened.page.goto(`${this.server.origin}/page.html${query}`);
     return opened;
   }
