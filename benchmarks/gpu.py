@@ -31,6 +31,7 @@ from structgstream.session.presets import COMPACT
 from structgstream.training.online.fit import fit_next_frame
 from structgstream.training.online.preprocess import preprocess
 from structgstream.training.result import FitResult
+from structgstream.training.views import training_views
 
 BUDGET_SECONDS = 330.0
 SIZES = {
@@ -76,7 +77,7 @@ def fitted(world: World, backend: Backend) -> FitResult:
     pictures = preprocess(
         world.frame,
         world.rig,
-        before=world.previous,
+        before=training_views(world.previous, world.rig, backend.device),
         motion=config.motion,
         scene_flow=config.scene_flow,
         backend=backend,

@@ -21,6 +21,7 @@ from structgstream.training.online.config import MotionConfig, OnlineConfig
 from structgstream.training.online.fit import fit_next_frame
 from structgstream.training.online.preprocess import preprocess
 from structgstream.training.result import FitResult
+from structgstream.training.views import training_views
 
 NOISE = 1.0  # Levels of 255: what a good camera leaves after denoising.
 Contest = Literal["back-ends", "shares", "pictures", "growth"]
@@ -51,7 +52,7 @@ def _fitting(
         pictures = preprocess(
             world.frame,
             world.rig,
-            before=world.previous,
+            before=training_views(world.previous, world.rig, backend.device),
             motion=config.motion,
             scene_flow=config.scene_flow,
             backend=backend,

@@ -66,6 +66,7 @@ def usual(monkeypatch: pytest.MonkeyPatch) -> Usual:
     monkeypatch.setattr(method, "StructGStream", made)
     monkeypatch.setattr(method, "fit_group_start", made.start)
     monkeypatch.setattr(method, "preprocess", lambda frame, rig, **options: options)
+    monkeypatch.setattr(method, "training_views", lambda frame, rig, device: f"views of {frame}")
     return made
 
 
@@ -129,9 +130,9 @@ def test_the_first_frames_catch_up(usual: Usual) -> None:
 
 def test_the_first_frame_is_compared_with_frame_0_and_others_with_the_one_before(usual: Usual) -> None:
     made, before = group(), object()
-    options: Any = {"rig": None, "backend": None}
+    options: Any = {"rig": None, "backend": task(FIRST).backend}
     found: Any = made.observe(task(FIRST).frame, before, **options)  # type: ignore[arg-type]
-    assert (found["before"], found["scene_flow"].enabled) == ("frame 0", False)
+    assert (found["before"], found["scene_flow"].enabled) == ("views of frame 0", False)
     assert made.observe(task(FIRST + 1).frame, before, **options) == "as usual"  # type: ignore[arg-type]
     assert usual.asked == [("observe", before)]
 

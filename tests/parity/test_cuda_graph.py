@@ -12,6 +12,7 @@ from structgstream.scene.state import state_of
 from structgstream.training.online.config import MotionConfig, OnlineConfig, PatchingConfig, SmoothnessConfig
 from structgstream.training.online.fit import fit_next_frame
 from structgstream.training.online.preprocess import preprocess
+from structgstream.training.views import training_views
 from tests.support.backends import quickest_backend
 from tests.support.pretended_gpu import moved
 from tests.support.recorders import Repeater
@@ -86,7 +87,7 @@ def test_a_frame_of_recorded_iterations_is_that_of_single_ones(device: str) -> N
             pictures=preprocess(
                 world.frames[1],
                 world.rig,
-                before=world.frames[0],
+                before=training_views(world.frames[0], world.rig, backend.device),
                 motion=config.motion,
                 scene_flow=config.scene_flow,
                 backend=backend,

@@ -20,6 +20,7 @@ from structgstream.training.online.fit import fit_next_frame
 from structgstream.training.online.patching import IDS_PER_FRAME
 from structgstream.training.online.preprocess import preprocess
 from structgstream.training.result import Step
+from structgstream.training.views import training_views
 from tests.support.backends import quickest_backend
 from tests.support.varied import varied
 from tests.support.worlds import moving_world, psnr, rendered
@@ -149,7 +150,8 @@ FOLLOWING = replace(
 
 
 def followed(scene, world, index, *, config=FOLLOWING, seed=0, backend: Backend | None = None, **past):
-    backend, frame, before = backend or quickest_backend(), world.frames[index], world.frames[index - 1]
+    backend, frame = backend or quickest_backend(), world.frames[index]
+    before = training_views(world.frames[index - 1], world.rig, backend.device)
     pictures = preprocess(
         frame, world.rig, before=before, motion=config.motion, scene_flow=config.scene_flow, backend=backend
     )

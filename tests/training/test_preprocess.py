@@ -6,6 +6,7 @@ import torch
 from structgstream.kernels.backend import reference_backend
 from structgstream.training.online.config import MotionConfig, SceneFlowConfig
 from structgstream.training.online.preprocess import FramePictures, PictureChange, preprocess
+from structgstream.training.views import training_views
 from tests.support.worlds import moving_world
 
 WORLD = moving_world(2, cameras=6, movers=60, speed=0.08, width=128, height=96)
@@ -14,8 +15,8 @@ START = SceneFlowConfig(enabled=True, views=3)
 
 
 def pictures(*, motion: MotionConfig = MOTION, start: SceneFlowConfig = START, first: bool = False) -> FramePictures:
-    before = None if first else WORLD.frames[0]
     backend = reference_backend()
+    before = None if first else training_views(WORLD.frames[0], WORLD.rig, backend.device)
     return preprocess(WORLD.frames[1], WORLD.rig, before=before, motion=motion, scene_flow=start, backend=backend)
 
 
@@ -47,7 +48,8 @@ def test_what_moves_changes_and_flow_is_looked_for_in_some_views() -> None:
 def test_equal_pictures_are_the_same() -> None:
     backend = reference_backend()
     frozen = replace(WORLD.frames[0], index=1)
-    found = preprocess(frozen, WORLD.rig, before=WORLD.frames[0], motion=MOTION, scene_flow=START, backend=backend)
+    before = training_views(WORLD.frames[0], WORLD.rig, backend.device)
+    found = preprocess(frozen, WORLD.rig, before=before, motion=MOTION, scene_flow=START, backend=backend)
     changes = known(found)
     assert all(change.repeated and not change.changed.any() for change in changes)
     assert all(change.flow is None or not change.flow[..., :3].any() for change in changes)

@@ -6,7 +6,7 @@ The first frame of a group is fitted from frame 0 and the track, the others as i
 
 import hashlib
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -38,6 +38,7 @@ from structgstream.training.online.fit import held
 from structgstream.training.online.preprocess import FramePictures, preprocess
 from structgstream.training.online.split import with_displacements
 from structgstream.training.result import FitResult, StepListener
+from structgstream.training.views import View, training_views
 
 CATCH_UP_FRAMES = 6
 """Number of frames, from a group's first one, that also spawn what the frames before the group would have spawned."""
@@ -86,14 +87,14 @@ class GroupMethod:
         return self._usual.needs_older
 
     def observe(
-        self, frame: MultiViewFrame, before: MultiViewFrame | None, *, rig: CameraRig, backend: Backend
+        self, frame: MultiViewFrame, before: Sequence[View] | None, *, rig: CameraRig, backend: Backend
     ) -> FramePictures:
         """The training pictures and their changes, which in the group's first frame are those since frame 0."""
         if self.entry is None or frame.index != self.entry.frame:
             return self._usual.observe(frame, before, rig=rig, backend=backend)
         online = self.config.online
         without_flow = replace(online.scene_flow, enabled=False)
-        first = self.entry.first_pictures()
+        first = training_views(self.entry.first_pictures(), rig, backend.device)
         return preprocess(frame, rig, before=first, motion=online.motion, scene_flow=without_flow, backend=backend)
 
     def first(self, task: FrameTask) -> FitResult[Scene]:

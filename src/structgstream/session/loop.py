@@ -41,6 +41,7 @@ from structgstream.session.presets import completed
 from structgstream.session.rate_control import RateController
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.result import StepListener
+from structgstream.training.views import training_views
 
 
 class Session(Generic[State, Memory]):
@@ -141,12 +142,15 @@ class Session(Generic[State, Memory]):
         # Changes are relative to the previous frame, so a resumed stream reads that one again.
         again = start > 0 and method.needs_before
         frames = self._source.frames(start - again)
-        before = self._showing_from(next(frames)) if again else None
+        before = None
+        if again:
+            before = training_views(self._showing_from(next(frames)), self._rig, self._backend.device)
         for frame in frames:
             check_enough_pictures(frame, self._rig, self._source.name)
-            yield frame, method.observe(frame, before, rig=self._rig, backend=self._backend)
+            pictures = method.observe(frame, before, rig=self._rig, backend=self._backend)
+            yield frame, pictures
             if method.needs_before and (frame.index == 0 or shows_enough(frame, self._rig)):
-                before = frame
+                before = pictures.views
 
     def _showing_from(self, frame: MultiViewFrame) -> MultiViewFrame:
         """``frame``, or the last one before it with pictures that are not blank."""

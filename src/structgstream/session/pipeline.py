@@ -27,6 +27,7 @@ from structgstream.session.periods import PeriodConfig
 from structgstream.session.rate_control import RateConfig
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.result import FitResult, StepListener
+from structgstream.training.views import View
 
 State = TypeVar("State", bound=Drawable)
 """A decoded frame. Its length, if it has one, is its number of Gaussians."""
@@ -102,9 +103,10 @@ class Method(Protocol[State, Memory]):
         ...
 
     def observe(
-        self, frame: MultiViewFrame, before: MultiViewFrame | None, *, rig: CameraRig, backend: Backend
+        self, frame: MultiViewFrame, before: Sequence[View] | None, *, rig: CameraRig, backend: Backend
     ) -> FramePictures:
-        """Preprocesses pictures independently of the scene; called in a thread while the previous frame is fitted."""
+        """Preprocesses pictures independently of the scene, with the views ``before``; called in a thread while the
+        previous frame is fitted."""
         ...
 
     def first(self, task: FrameTask) -> FitResult[State]:

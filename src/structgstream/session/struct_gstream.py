@@ -2,7 +2,7 @@
 """Struct-GStream: frame 0 from initial points, each later frame from the decoded previous one; and its two codecs of
 scenes, ``raw`` and ``compact``, with their headers."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -42,6 +42,7 @@ from structgstream.training.online.preprocess import FramePictures, preprocess
 from structgstream.training.parameters import pixel_size
 from structgstream.training.residuals import ResidualFloor, mean_residual, residual_floor
 from structgstream.training.result import FitResult
+from structgstream.training.views import View
 
 
 @dataclass(frozen=True)
@@ -166,7 +167,7 @@ class StructGStream:
         return needs_older(self.config.online)
 
     def observe(
-        self, frame: MultiViewFrame, before: MultiViewFrame | None, *, rig: CameraRig, backend: Backend
+        self, frame: MultiViewFrame, before: Sequence[View] | None, *, rig: CameraRig, backend: Backend
     ) -> FramePictures:
         """The training pictures and their changes."""
         online = self.config.online

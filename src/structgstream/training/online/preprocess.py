@@ -102,12 +102,12 @@ def preprocess(
     frame: MultiViewFrame,
     rig: CameraRig,
     *,
-    before: MultiViewFrame | None,
+    before: Sequence[View] | None,
     motion: MotionConfig,
     scene_flow: SceneFlowConfig,
     backend: Backend,
 ) -> FramePictures:
-    """The pictures of ``frame``, and their changes since the frame ``before`` (None: without motion selection).
+    """The pictures of ``frame``, and their changes since the views ``before`` (None: without motion selection).
 
     With fewer cameras in both frames than a primitive needs votes there is no motion selection: everything is trained.
 
@@ -117,13 +117,12 @@ def preprocess(
     views = training_views(frame, rig, backend.device)
     if before is None or not motion.enabled:
         return FramePictures(views, None)
-    earlier = training_views(before, rig, backend.device)
-    known = {view.index for view in earlier}
+    known = {view.index for view in before}
     compared = [view for view in views if view.index in known]
     if len(compared) < min(motion.MIN_VOTES, len(rig.training)):
         return FramePictures(views, None)
     flow_from = flow_views(compared, frame.index, scene_flow)
-    changes = detect_changes(views, earlier, config=motion, backend=backend, flow_from=flow_from, flow=scene_flow.FLOW)
+    changes = detect_changes(views, before, config=motion, backend=backend, flow_from=flow_from, flow=scene_flow.FLOW)
     return FramePictures(views, changes)
 
 
