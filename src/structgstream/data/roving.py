@@ -5,11 +5,10 @@ Note [What stands still]
 ~~~~~~~~~~~~~~~~~~~~~~~~
 The roving pictures are of another time: where people are in frame 0, they show what is behind, and people elsewhere.
 Many pictures that agree with each other would outvote the still cameras. What moves in frame 0 is known from these: it
-differs from the median of their own pictures over the take. A place in space may be such a thing if all still cameras
-that see it have a differing pixel there (a visual hull; Laurentini, PAMI 1994), but one in four, before which something
-may stand. Pixels of a roving picture whose ray passes through such a place do not count. What moves in the roving
-pictures alone is left out while frame 0 is trained (``training/frame0/roving.py``). Who stands at one place throughout
-the take is not known to move.
+differs from the most frequent colour of its pixel over the take. A place in space may be such a thing if all still
+cameras that see it have a differing pixel there (a visual hull; Laurentini, PAMI 1994). Pixels of a roving picture whose
+ray passes through such a place do not count. What moves in the roving pictures alone is left out while frame 0 is
+trained (``training/frame0/roving.py``). Who stands at one place throughout the take is not known to move.
 """
 
 from collections.abc import Iterator, Mapping
@@ -32,8 +31,8 @@ from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame, RovingPicture
 from structgstream.geometry import Floats
 
-INSTANTS = 9  # of the take, whose median is what stands still
-CHANGED_LEVELS = 12.0  # of 255, in a channel, beyond which a pixel of the reduced pictures differs
+INSTANTS = 15  # of the take
+CHANGED_LEVELS = 12.0  # of 255, in a channel, beyond which two pixels of the reduced pictures differ
 REDUCED_SIDE = 160  # pixels, to which the longer side is reduced
 REACH_PIXELS = 2  # of the reduced pictures, by which what differs is enlarged
 DEPTHS = 96  # places on a ray, evenly in inverse depth
@@ -100,17 +99,17 @@ class WithRoving(SourceWrapper):
 
     @cached_property
     def _still(self) -> dict[str, NDArray[np.uint8]]:
-        """The median picture of each camera over the take, reduced."""
+        """What stands still before each camera, reduced."""
         seen: dict[str, list[NDArray[np.uint8]]] = {name: [] for name in self.rig.training}
         count = min(INSTANTS, len(self.whole))
         for index in np.linspace(0, len(self.whole) - 1, count).round().astype(int).tolist():
             for shown in _one(self.whole, index):
                 for name in seen.keys() & shown.images.keys():
                     seen[name].append(reduced(shown.images[name]))
-        return {name: np.median(own, axis=0).astype(np.uint8) for name, own in seen.items() if own}
+        return {name: most_frequent(np.stack(own)) for name, own in seen.items() if own}
 
 
-MIN_INSTANTS = 3  # below which a median says nothing
+MIN_INSTANTS = 3  # below which none is frequent
 
 
 def _one(source: FrameSource, index: int) -> Iterator[MultiViewFrame]:
@@ -159,6 +158,16 @@ def reduced(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(opencv().resize(picture, size, interpolation=opencv().INTER_AREA), np.uint8)
 
 
+def most_frequent(pictures: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Of each pixel of ``[T, H, W, 3]`` the one that differs from the fewest others.
+
+    A median fails where people are before a pixel half of the time; they have several colours.
+    """
+    levels = pictures.astype(np.int16)
+    alike = np.stack([(np.abs(levels - own).max(-1) <= CHANGED_LEVELS).sum(0) for own in levels])
+    return np.take_along_axis(pictures, alike.argmax(0)[None, ..., None], 0)[0]
+
+
 def differs(picture: NDArray[np.uint8], still: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Where a picture ``[H, W, 3]`` differs from another, but for a change of all pixels; a little enlarged."""
     difference = picture.astype(np.float32) - still
@@ -195,4 +204,4 @@ def _moving(points: Floats, rig: CameraRig, changed: Mapping[str, NDArray[np.boo
         inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         seen += inside
         moving += inside & mask[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)]
-    return (seen >= MIN_SEEN) & (moving >= seen - seen // 4)
+    return (seen >= MIN_SEEN) & (moving == seen)
