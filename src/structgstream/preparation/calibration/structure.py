@@ -109,7 +109,7 @@ def solve_structure(
     starts = _starts(sizes, lens, intrinsics, _fields_of_view(sizes, lens, focals or {}))
     best = _best_attempt(keypoints, matches, starts, stills=pictures, workers=workers)
     frames: Mapping[str, NDArray[np.uint8]] = roving or {}
-    placed = _placed(best)
+    alone = best
     if frames:
         instants = next(iter(keypoints.values())).seen.shape[1]
         walked = roving_keypoints(frames, instants=instants, workers=workers)
@@ -117,13 +117,18 @@ def solve_structure(
         matches = {**matches, **all_matches(keypoints, workers=workers, pairs=_roving_pairs([*pictures], [*frames]))}
         starts = [_with_roving(start, frames, lens) for start in starts]
         best = _best_attempt(keypoints, matches, starts, stills=pictures, workers=workers)
-        if not any(name in _placed(best) for name in frames):
+        if best.size[0] == 0 or best.size[0] == best.size[1]:
             raise CalibrationError(_nothing_roving(keypoints, matches, best.pairs, [*frames]))
+        if best.size[0] < 3:
+            raise CalibrationError(
+                f"The roving video connects {best.size[0]} of {len(pictures)} cameras, fewer than three; walk slowly "
+                "from the view of each camera to that of the next, around the whole set."
+            )
     if best.model is None or best.size[0] < 3:
         raise CalibrationError(_nothing(pictures, matches, best.pairs))
     solved = _finished(best, keypoints, pictures, frames, lens=lens, workers=workers)
-    if solved.roving is not None:
-        bridged = tuple(name for name in solved.cameras if name not in placed)
+    if frames and solved.roving is not None:
+        bridged = tuple(name for name in solved.cameras if name not in _placed(alone))
         solved = replace(solved, roving=replace(solved.roving, bridged=bridged))
     if solved.missing:
         _log.warning("%s", missing_cameras(solved.missing, matches, best.pairs))
