@@ -4,9 +4,13 @@
     python -m lab.recovery.roving film build/roving --cameras 4 6 8
     python -m lab.recovery.roving poses build/roving --cameras 8 --walk empty --json poses.json
     python -m lab.recovery.roving psnr build/roving --cameras 8 --walk empty --seeds 0 --json psnr.json
+    python -m lab.recovery.roving basketball build/roving --capture basketball --cameras 4 --json psnr.json
 
 Walks are ``none``, ``empty`` (filmed while nobody is in the room) and ``people`` (while two people walk). Held-out
 cameras stand half-way between the cameras; they have their true poses, in the coordinates of the prepared capture.
+
+There is no roving video of basketball: pictures of its other training cameras, each of another instant, stand in for
+one, with their given poses. So nothing is registered there, and only the views of frame 0 and their masks are tried.
 """
 
 import argparse
@@ -22,14 +26,18 @@ import numpy as np
 
 from lab.recovery.roving_room import FPS, film, phone, rig
 from structgstream import evaluate, reconstruct
-from structgstream.data.lenses import LensCamera
-from structgstream.data.prepared import PreparedCamera, read_prepared, write_prepared
+from structgstream.data.lenses import LensCamera, Pinhole
+from structgstream.data.open import open_capture
+from structgstream.data.prepared import PreparedCamera, PreparedCapture, read_prepared, write_prepared
 from structgstream.data.undistortion import rectilinear
 from structgstream.errors import CaptureError
 from structgstream.preparation.calibration.solved import rig_alignment
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.prepare import prepare_capture
 from tests.support.calibration_errors import calibration_errors
+
+
+HELD_OUT = ("0", "10", "15", "30")  # of basketball
 
 
 def prepared(folder: Path, count: int, walk: str) -> tuple[Path, str]:
@@ -111,10 +119,21 @@ def scored_capture(folder: Path, count: int, walk: str) -> Path:
 def psnr(folder: Path, count: int, walk: str, *, without: bool, seed: int, preset: str) -> dict[str, Any]:
     """Scores of frame 0 at the held-out cameras; ``without`` leaves the roving pictures out and takes their poses."""
     capture = scored_capture(folder, count, walk)
-    stream = folder / f"{count}-{walk}{'-without' if without else ''}-{seed}.sgs"
+    return _scores(capture, folder / "room.sgs", without=without, seed=seed, preset=preset, scale=1.0)
+
+
+def _scores(capture: Path, stream: Path, *, without: bool, seed: int, preset: str, scale: float) -> dict[str, Any]:
     begun = time.process_time()
     (report,) = reconstruct(
-        capture, stream, preset=preset, frames=1, seed=seed, roving=not without, overwrite=True, backend="cpu"
+        capture,
+        stream,
+        preset=preset,
+        frames=1,
+        seed=seed,
+        scale=scale,
+        roving=not without,
+        overwrite=True,
+        backend="cpu",
     )
     seconds = time.process_time() - begun
     scores = evaluate(stream, capture, metrics="basic", backend="cpu").mean
@@ -124,15 +143,49 @@ def psnr(folder: Path, count: int, walk: str, *, without: bool, seed: int, prese
     }  # fmt: skip
 
 
+def stand_in_capture(capture: Path, target: Path, count: int) -> None:
+    """``count`` training cameras of a capture of PanopticSports, far from each other, and its held-out ones; of each
+    other camera one picture of an instant in the last two thirds as a roving one."""
+    source = open_capture(capture, held_out=HELD_OUT)
+    rig = source.rig
+    chosen = [rig.training[0]]
+    while len(chosen) < count:
+        away = {
+            name: min(float((rig[name].center - rig[own].center).norm()) for own in chosen) for name in rig.training
+        }
+        chosen.append(max(away, key=lambda name: away[name]))
+    cameras, roving = {}, {}
+    for number, (name, camera) in enumerate(rig.cameras.items()):
+        filmed, files = LensCamera(camera, Pinhole()), sorted((capture / "ims" / name).glob("*.jpg"))
+        if name in chosen or name in rig.held_out:
+            shutil.copytree(capture / "ims" / name, target / "pictures" / name, dirs_exist_ok=True)
+            cameras[name] = PreparedCamera(f"pictures/{name}", filmed, rectilinear(filmed))
+        else:
+            instant = len(files) // 3 + 7 * number % (len(files) - len(files) // 3)
+            (target / "roving").mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(files[instant], target / "roving" / f"{name}.jpg")
+            roving[f"roving/{name}"] = PreparedCamera(f"roving/{name}.jpg", filmed, rectilinear(filmed))
+    near = next(iter(rig.cameras.values())).near
+    write_prepared(target, PreparedCapture(cameras, source.fps, near, held_out=rig.held_out, roving=roving))
+
+
+def basketball(folder: Path, capture: Path, count: int, *, without: bool, seed: int, preset: str) -> dict[str, Any]:
+    """Scores of frame 0 at half the size."""
+    target = folder / f"basketball-{count}"
+    stand_in_capture(capture, target, count)
+    return _scores(target, folder / "basketball.sgs", without=without, seed=seed, preset=preset, scale=0.5)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["film", "poses", "psnr"])
+    parser.add_argument("what", choices=["film", "poses", "psnr", "basketball"])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--cameras", type=int, nargs="+", default=[8])
     parser.add_argument("--walk", nargs="+", default=["empty"], choices=["none", "empty", "people"])
     parser.add_argument("--without", action="store_true", help="leave the roving pictures out of frame 0")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--preset", default="fast")
+    parser.add_argument("--capture", type=Path, help="of basketball")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     if options.what == "film":
@@ -140,10 +193,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     for count in options.cameras:
         for walk in options.walk:
-            for seed in options.seeds if options.what == "psnr" else [0]:
+            for seed in [0] if options.what == "poses" else options.seeds:
                 key = f"{options.what} {count} {walk}"
                 if options.what == "poses":
                     found = poses(options.folder, count, walk)
+                elif options.what == "basketball":
+                    key = f"basketball {count}{' without' if options.without else ''} {options.preset} {seed}"
+                    found = basketball(
+                        options.folder,
+                        options.capture,
+                        count,
+                        without=options.without,
+                        seed=seed,
+                        preset=options.preset,
+                    )
                 else:
                     key += f"{' without' if options.without else ''} {options.preset} {seed}"
                     found = psnr(options.folder, count, walk, without=options.without, seed=seed, preset=options.preset)
