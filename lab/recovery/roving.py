@@ -36,7 +36,6 @@ from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.prepare import prepare_capture
 from tests.support.calibration_errors import calibration_errors
 
-
 HELD_OUT = ("0", "10", "15", "30")  # of basketball
 
 
