@@ -3,20 +3,32 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
 
-from structgstream.cameras import Camera
+from structgstream.cameras import Camera, CameraRig
+from structgstream.data import roving as roving_module
 from structgstream.data.lenses import LensCamera, Pinhole, RadialTangential
 from structgstream.data.open import open_capture
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, prepared_entries, read_prepared, write_prepared
-from structgstream.data.roving import differs, joined, most_frequent, passes_through, roving_of
+from structgstream.data.roving import (
+    WithRoving,
+    differs,
+    frame_points,
+    joined,
+    most_frequent,
+    passes_through,
+    roving_of,
+)
 from structgstream.data.source import Prefetch, resized
 from structgstream.data.undistortion import rectilinear
 from structgstream.errors import CaptureError
+from structgstream.frames import MultiViewFrame
 from tests.support.captures import HEIGHT, WIDTH, small_rig, write_picture
 from tests.support.rigs import arc_rig, look_at
 
@@ -111,10 +123,27 @@ def test_a_capture_has_its_roving_pictures(tmp_path: Path) -> None:
     assert [own.camera.width for own in pictures] == [WIDTH, WIDTH]
     assert pictures[0].camera.near == pytest.approx(0.25 * 0.25)
     assert 0 < pictures[0].mask.mean() < 1  # what moves in the frame is left out
-    more, rig = joined(source, frame)
+    more, rig = joined(source.rig, frame, pictures)
     assert [*rig][-2:] == ["roving/0", "roving/1"]
     assert rig.testing == ("cam01",)
     assert more.masks["roving/0"] is pictures[0].mask or (more.masks["roving/0"] == pictures[0].mask).all()
+
+
+def test_what_moves_has_the_points_of_the_still_cameras_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_capture(tmp_path)
+    source = open_capture(tmp_path)
+    moving, still, behind = np.array([[0.0, 0.0, 0.0]]), np.array([[0.5, 0.5, 0.5]]), np.array([[0.1, 0.2, 3.0]])
+
+    def found(frame: MultiViewFrame, rig: CameraRig, **options: Any) -> Any:
+        return SimpleNamespace(positions=behind if "roving/0" in rig.cameras else np.concatenate([moving, still]))
+
+    monkeypatch.setattr(roving_module, "initial_points", found)
+    monkeypatch.setattr(WithRoving, "moving", lambda self, points, frame: (points == 0).all(1))
+    frame = next(source.frames())
+    np.testing.assert_array_equal(frame_points(source, frame), np.concatenate([behind, moving]))
+    np.testing.assert_array_equal(frame_points(source, replace(frame, index=1)), np.concatenate([moving, still]))
+    alone = open_capture(tmp_path, roving=False)
+    np.testing.assert_array_equal(frame_points(alone, frame), np.concatenate([moving, still]))
 
 
 def test_roving_pictures_are_reduced_as_the_capture_is(tmp_path: Path) -> None:

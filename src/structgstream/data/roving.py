@@ -11,7 +11,7 @@ whose ray passes through such a place do not count. What moves in the roving pic
 is trained (``training/frame0/roving.py``). Who stands at one place throughout the take is not known to move.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.images import opencv, read_picture, reduced_mask
+from structgstream.data.points import PointsConfig, initial_points
 from structgstream.data.prepared import ROVING, PreparedCapture
 from structgstream.data.source import FrameSource, FrameStream, SourceWrapper, resized_to
 from structgstream.data.undistortion import Undistortion
@@ -63,6 +64,10 @@ class WithRoving(SourceWrapper):
         scale, near = self.rig[name].width / self.stored[name].width, NEAR_SHARE * self.rig[name].near
         changed = self._changed(frame)
         return tuple(self._picture(*one, scale=scale, near=near, changed=changed) for one in self.pictures)
+
+    def moving(self, points: Floats, frame: MultiViewFrame) -> NDArray[np.bool_]:
+        """Which points ``[P, 3]`` are of what moves in ``frame``."""
+        return moving_places(points, self.rig, self._changed(frame))
 
     def _picture(
         self,
@@ -138,12 +143,27 @@ def roving_of(source: FrameStream) -> WithRoving | None:
     return inner
 
 
-def joined(source: FrameStream, frame: MultiViewFrame) -> tuple[MultiViewFrame, CameraRig]:
-    """Frame 0 and its rig, with the roving pictures as further cameras, for what looks at one frame alone."""
-    rig, roving = source.rig, roving_of(source)
-    if roving is None:
-        return frame, rig
-    more = {f"{ROVING}/{number}": own for number, own in enumerate(roving.roving(frame))}
+def frame_points(
+    source: FrameStream, frame: MultiViewFrame, *, config: PointsConfig | None = None, seed: int = 0
+) -> Floats:
+    """Initial points ``[P, 3]`` of a frame; of frame 0 from the roving pictures, too.
+
+    Roving pictures are closer to a still camera than its neighbours are, and have nothing of what moves. So what moves
+    has the points of the still cameras alone.
+    """
+    config, roving = config or PointsConfig(), roving_of(source)
+    found = initial_points(frame, source.rig, config=config, seed=seed).positions
+    if roving is None or frame.index > 0:
+        return found
+    still = initial_points(*joined(source.rig, frame, roving.roving(frame)), config=config, seed=seed).positions
+    return np.concatenate([still, found[roving.moving(found, frame)]])
+
+
+def joined(
+    rig: CameraRig, frame: MultiViewFrame, pictures: Sequence[RovingPicture]
+) -> tuple[MultiViewFrame, CameraRig]:
+    """A frame and its rig, with the roving pictures as further cameras."""
+    more = {f"{ROVING}/{number}": own for number, own in enumerate(pictures)}
     images = {**frame.images, **{name: own.image for name, own in more.items()}}
     masks = {**frame.masks, **{name: own.mask for name, own in more.items()}}
     cameras = {**rig.cameras, **{name: own.camera for name, own in more.items()}}
@@ -186,15 +206,15 @@ def passes_through(camera: Camera, rig: CameraRig, changed: Mapping[str, NDArray
         flat = np.stack([across, down, np.ones_like(across)], -1) @ np.linalg.inv(small.K.numpy()).T
         rays, eye = flat @ small.viewmat[:3, :3].numpy(), small.center.numpy()
         for depth in small.near / np.linspace(1, 0, DEPTHS, endpoint=False):
-            found |= _moving(eye + depth * rays, rig, changed)
+            found |= moving_places(eye + depth * rays, rig, changed)
     # Its pixels are areas of the picture's.
     whole = opencv().resize(found.astype(np.uint8), (camera.width, camera.height), interpolation=opencv().INTER_NEAREST)
     return np.asarray(whole, bool)
 
 
-def _moving(points: Floats, rig: CameraRig, changed: Mapping[str, NDArray[np.bool_]]) -> NDArray[np.bool_]:
-    """Which points ``[H, W, 3]`` the still cameras that see them take for moving."""
-    seen, moving = np.zeros((2, *points.shape[:2]), np.int16)
+def moving_places(points: Floats, rig: CameraRig, changed: Mapping[str, NDArray[np.bool_]]) -> NDArray[np.bool_]:
+    """Which places ``[..., 3]`` all still cameras that see them take for moving."""
+    seen, moving = np.zeros((2, *points.shape[:-1]), np.int16)
     for name, mask in changed.items():
         camera = rig[name].resized(mask.shape[1], mask.shape[0])
         local = points @ camera.viewmat[:3, :3].numpy().T + camera.viewmat[:3, 3].numpy()

@@ -19,7 +19,6 @@ from structgstream.data.calibration import NEAR_IN_RIG_RADII, Calibration, liste
 from structgstream.data.camera_files import REPORT
 from structgstream.data.masks import FOLDER as MASKS
 from structgstream.data.open import best_surrounded, open_capture
-from structgstream.data.points import initial_points
 from structgstream.data.prepared import (
     ROVING,
     PreparedCamera,
@@ -31,7 +30,7 @@ from structgstream.data.prepared import (
     recognizes_prepared,
     write_prepared,
 )
-from structgstream.data.roving import joined
+from structgstream.data.roving import frame_points
 from structgstream.data.source import FrameSource, WithRig
 from structgstream.data.timeline import Clock
 from structgstream.data.undistortion import rectilinear
@@ -282,7 +281,7 @@ class Job:
     def points(self, content: PreparedCapture) -> PreparedCapture:
         def estimate() -> NDArray[np.float64]:
             source = self._source(content)
-            return initial_points(*joined(source, next(source.frames(0)))).positions
+            return frame_points(source, next(source.frames(0)))
 
         found = self.steps.run(
             "points",

@@ -20,8 +20,8 @@ from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader, check_picture_sizes
 from structgstream.codec.scene_coder import Encoded
 from structgstream.data.denoising import denoised
-from structgstream.data.points import PointsConfig, initial_points
-from structgstream.data.roving import joined, roving_of
+from structgstream.data.points import PointsConfig
+from structgstream.data.roving import frame_points, roving_of
 from structgstream.data.source import FrameStream, frame_count, is_recording, retain_frames
 from structgstream.errors import CaptureError, ConfigError, StorageError
 from structgstream.frames import MIN_CAMERAS, MultiViewFrame, RovingPicture
@@ -351,8 +351,7 @@ def initial_points_of(
     check_poses(frame, source.rig)
     given = source.points if frame.index == 0 else None
     if given is None:
-        seen = joined(source, frame) if frame.index == 0 else (frame, source.rig)
-        given = initial_points(*seen, config=config, seed=seed).positions
+        given = frame_points(source, frame, config=config, seed=seed)
     return similarity.points(torch.from_numpy(given))
 
 
