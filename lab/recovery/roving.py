@@ -24,16 +24,21 @@ from typing import Any
 
 import numpy as np
 
-from lab.recovery.roving_room import FPS, film, phone, rig
+from lab.recovery.roving_room import FPS, covered, film, phone, rig
 from structgstream import evaluate, reconstruct
+from structgstream.codec.reader import open_stream
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.open import open_capture
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, read_prepared, write_prepared
-from structgstream.data.undistortion import rectilinear
+from structgstream.data.roving import WithRoving
+from structgstream.data.undistortion import Undistortion, rectilinear
 from structgstream.errors import CaptureError
+from structgstream.kernels.backend import select_backend
 from structgstream.preparation.calibration.solved import rig_alignment
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.prepare import prepare_capture
+from structgstream.scene.render import render, to_8bit_image
+from structgstream.training.frame0 import roving as roving_views
 from tests.support.calibration_errors import calibration_errors
 
 HELD_OUT = ("0", "10", "15", "30")  # of basketball
@@ -118,7 +123,26 @@ def scored_capture(folder: Path, count: int, walk: str) -> Path:
 def psnr(folder: Path, count: int, walk: str, *, without: bool, seed: int, preset: str) -> dict[str, Any]:
     """Scores of frame 0 at the held-out cameras; ``without`` leaves the roving pictures out and takes their poses."""
     capture = scored_capture(folder, count, walk)
-    return _scores(capture, folder / "room.sgs", without=without, seed=seed, preset=preset, scale=1.0)
+    scores = _scores(capture, folder / "room.sgs", without=without, seed=seed, preset=preset, scale=1.0)
+    return {**scores, **_split_psnr(capture, folder / "room.sgs", count)}
+
+
+def _split_psnr(capture: Path, stream: Path, count: int) -> dict[str, float]:
+    """Mean PSNR of the held-out cameras where people are in frame 0 (and two pixels around), and elsewhere."""
+    content, frame = read_prepared(capture), next(open_capture(capture, frames=1).frames())
+    found: dict[str, list[float]] = {"psnr_people": [], "psnr_still": []}
+    with open_stream(stream) as reader:
+        scene = reader.scene(0)
+        for name, filmed in rig(count, between=True).items():
+            camera = content.cameras[name]
+            people = (
+                Undistortion(camera.filmed, camera.pinhole)(np.repeat(covered(filmed)[..., None], 3, -1))[..., 0] > 0
+            )
+            drawn = to_8bit_image(render(scene, reader.header.camera(name), select_backend("cpu")).image)
+            errors = ((drawn.astype(float) - frame.images[name]) ** 2).mean(2)
+            for kind, mask in (("psnr_people", people), ("psnr_still", ~people)):
+                found[kind].append(float(-10 * np.log10(errors[mask].mean() / 255**2)))
+    return {kind: float(np.mean(own)) for kind, own in found.items()}
 
 
 def _scores(capture: Path, stream: Path, *, without: bool, seed: int, preset: str, scale: float) -> dict[str, Any]:
@@ -185,11 +209,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--capture", type=Path, help="of basketball")
+    parser.add_argument("--masks", choices=["moving", "none"], default="moving", help="none: what moves counts, too")
+    parser.add_argument("--outliers", choices=["left-out", "used"], default="left-out")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     if options.what == "film":
         film(options.folder, options.cameras)
         return
+    if options.masks == "none":
+        WithRoving._changed = lambda self, frame: {}  # type: ignore[method-assign]
+    if options.outliers == "used":
+        roving_views.OUTLIER_FLOOR = 10.0  # no residual is as large
     for count in options.cameras:
         for walk in options.walk:
             for seed in [0] if options.what == "poses" else options.seeds:
@@ -207,6 +237,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
                         preset=options.preset,
                     )
                 else:
+                    key += "" if options.masks == "moving" else " unmasked"
+                    key += "" if options.outliers == "left-out" else " with outliers"
                     key += f"{' without' if options.without else ''} {options.preset} {seed}"
                     found = psnr(options.folder, count, walk, without=options.without, seed=seed, preset=options.preset)
                 print(key, json.dumps(found), flush=True)

@@ -183,5 +183,13 @@ def picture(filmed: LensCamera, planes: Sequence[Plane], *, seed: int, gain: flo
     return Film(filmed).picture(brighter, noise=NOISE_LEVELS, seed=seed)
 
 
+def covered(filmed: LensCamera) -> NDArray[np.uint8]:
+    """255 where people of frame 0 are in a camera's picture ``[H, W]``, and two pixels around, else 0."""
+    camera = Film(filmed)
+    empty, busy = (camera.picture(planes).astype(int) for planes in (still_planes(), [*still_planes(), *people(0.0)]))
+    found = 255 * (np.abs(busy - empty).max(2) > 4).astype(np.uint8)
+    return np.asarray(cv2.dilate(found, np.ones((5, 5), np.uint8)), np.uint8)
+
+
 def _exposed(texture: NDArray[np.uint8], gain: float) -> NDArray[np.uint8]:
     return (texture.astype(np.float32) * gain).clip(0, 255).round().astype(np.uint8)
