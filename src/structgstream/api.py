@@ -104,6 +104,7 @@ def reconstruct(
     frames: int | None = None,
     near: float | None = None,
     every: int = 1,
+    roving: bool = True,
     backend: Backend | BackendName = "auto",
     resume: bool = False,
     overwrite: bool = False,
@@ -133,6 +134,7 @@ def reconstruct(
         frames: number of frames; None for all.
         near: distance of the near plane, in units of the capture; None for the capture's own.
         every: step between used frames; the frame rate is divided by it.
+        roving: whether frame 0 is trained on a capture's roving pictures, too, where ``prepare`` registered some.
         backend: the compute back-end; ``auto`` takes the first available of cuda, cpu, reference.
         resume: continue after the last complete frame of ``path``.
         overwrite: replace ``path`` if it exists.
@@ -165,15 +167,22 @@ def reconstruct(
     metadata: dict[str, object] = {} if named is None else {"preset": named}
     if isinstance(capture, Path | str):
         source = open_capture(
-            capture, held_out=held_out, scale=scale, start=start, frames=frames, near=near, every=every
+            capture,
+            held_out=held_out,
+            scale=scale,
+            start=start,
+            frames=frames,
+            near=near,
+            every=every,
+            roving=roving,
         )
         metadata |= part_metadata(start=start, scale=scale, every=every)
         if sound is None or isinstance(sound, str):
             sound = chosen_sound(source, Path(capture), sound, offset_seconds=sound_offset)
-    elif (held_out, scale, start, frames, near, every) != (None, 1.0, 0, None, None, 1):
+    elif (held_out, scale, start, frames, near, every, roving) != (None, 1.0, 0, None, None, 1, True):
         raise ConfigError(
-            "held_out, scale, start, frames, near and every choose from a folder; an opened capture was given, for "
-            "which open_capture takes them."
+            "held_out, scale, start, frames, near, every and roving choose from a folder; an opened capture was given, "
+            "for which open_capture takes them."
         )
     elif isinstance(sound, str) or sound_offset is not None:
         raise ConfigError("sound and sound_offset choose from a folder; an opened capture takes a SoundSource.")

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from structgstream.cameras import Camera
+
 MIN_CAMERAS = 2
 """Training cameras that a frame needs, because a single picture does not determine depth."""
 BLANK_LEVELS = 2.0
@@ -66,3 +68,18 @@ class MultiViewFrame:
     def __repr__(self) -> str:
         shapes = sorted({image.shape for image in self.images.values()})
         return f"MultiViewFrame(index={self.index}, pts_seconds={self.pts_seconds:.4f}, {len(self.images)} x {shapes})"
+
+
+@dataclass(frozen=True)
+class RovingPicture:
+    """A picture by a camera that was carried through the set, which trains frame 0 alone (``data/roving.py``).
+
+    Args:
+        camera: its pose, in the units of the rig.
+        image: ``[H, W, 3]`` uint8 sRGB.
+        mask: ``[H, W]`` bool, False where frame 0 has what moves; such pixels do not count.
+    """
+
+    camera: Camera
+    image: NDArray[np.uint8]
+    mask: NDArray[np.bool_]

@@ -87,7 +87,7 @@ def test_an_interrupted_preparation_goes_on(tmp_path: Path, monkeypatch: pytest.
     write_room(tmp_path / "videos", cameras=4)
     monkeypatch.setattr(Job, "check", lambda self, content: ())
     with monkeypatch.context() as patched:
-        patched.setattr("structgstream.preparation.prepare.initial_points", interrupt)
+        patched.setattr("structgstream.preparation.prepare.frame_points", interrupt)
         with pytest.raises(KeyboardInterrupt):
             prepare_capture(tmp_path / "videos", tmp_path / "out", options=OPTIONS)
     assert len(open_capture(tmp_path / "out")) == 2

@@ -29,11 +29,11 @@ def test_seeds_of_frames_and_of_streams_are_apart() -> None:
 def test_points_of_the_capture_are_taken_and_normalised(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
 
-    def found(frame, rig, *, config, seed):
+    def found(source, frame, *, config, seed):
         asked.append(seed)
-        return type("Points", (), {"positions": np.ones((4, 3))})
+        return np.ones((4, 3))
 
-    monkeypatch.setattr(loop, "initial_points", found)
+    monkeypatch.setattr(loop, "frame_points", found)
     given = np.array([[0.0, 0.1, 0.0], [1.0, 0.1, -1.0]])
     options = {"config": PointsConfig(), "seed": 5, "similarity": SIMILARITY}
     points = initial_points_of(source(given), WORLD.frames[0], **options)

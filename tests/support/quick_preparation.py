@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from structgstream.data.points import initial_points
+from structgstream.data.roving import frame_points
 from structgstream.preparation import prepare as capture_steps
 from structgstream.preparation import report as page
 from tests.support.small_presets import FEW_POINTS
@@ -17,7 +17,7 @@ def quicken(monkeypatch: pytest.MonkeyPatch) -> None:
 
     What is left out: tests/data/test_points.py and tests/preparation/report.
     """
-    monkeypatch.setattr(capture_steps, "initial_points", partial(initial_points, config=FEW_POINTS))
+    monkeypatch.setattr(capture_steps, "frame_points", partial(frame_points, config=FEW_POINTS))
     for name in ("draw_overlay", "draw_epipolar", "draw_matrix", "draw_coverage", "draw_times", "draw_colors"):
         monkeypatch.setattr(page, name, _nothing_drawn)
 

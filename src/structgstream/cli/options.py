@@ -60,6 +60,8 @@ class CaptureOptions:
     near: Annotated[float | None, tyro.conf.arg(help_behavior_hint="")] = None
     """Distance of the near plane, in units of the capture. Default: the capture's own, else 0.12 times the
     largest distance of a training camera to their centre."""
+    roving: Literal["auto", "none"] = "auto"
+    """Whether frame 0 is trained on the pictures of a roving camera, too, where prepare registered some."""
 
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif")
@@ -177,6 +179,7 @@ def open_selected_capture(scene: Path, options: CaptureOptions) -> "FrameSource"
         frames=options.frames,
         near=options.near,
         every=options.every,
+        roving=options.roving == "auto",
     )
 
 

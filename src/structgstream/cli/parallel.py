@@ -195,7 +195,7 @@ def _job(options: Parallel, rest: list[str]) -> "Job":
 
     capture = options.capture
     header = as_arguments(options, "preset", "quality", "seed")
-    header += as_arguments(capture, "start", "near", "every", "scale", "held_out")
+    header += as_arguments(capture, "start", "near", "every", "scale", "held_out", "roving")
     track = as_arguments(options, "groups", "split_at_low_motion", "allow_unaligned")
     unit = Unit(
         str(options.scene.absolute()),
@@ -383,7 +383,7 @@ def _probe(options: Plan, rest: list[str], console: Console) -> Path:
     probe = ["parallel", str(options.scene), "-o", str(stream), "--frames", str(PROBE_FRAMES)]
     probe += ["--groups", str(PROBE_GROUP), "--allow-unaligned", "--workers", "1"]
     probe += as_arguments(options, "device", "preset")
-    probe += as_arguments(options.capture, "held_out", "scale", "start", "every", "near")
+    probe += as_arguments(options.capture, "held_out", "scale", "start", "every", "near", "roving")
     console.print(f"Probe: frame 0 and {PROBE_FRAMES - 1} frames, on one worker.", highlight=False)
     if status := command([*probe, *rest]):
         raise SystemExit(status)  # It has said why.

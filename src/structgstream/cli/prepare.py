@@ -82,6 +82,9 @@ class Prepare:
     """Frames a second of folders of pictures. Default: 30."""
     without: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAMERA [CAMERA ...]", help_behavior_hint="")] = ()
     """Cameras to leave out."""
+    roving: Annotated[Path | None, tyro.conf.arg(metavar="VIDEO", help_behavior_hint="")] = None
+    """A video of the set by a camera that is carried through it: it connects cameras that see too little in common, and
+    gives frame 0 more views of what stands still."""
     link: Literal["hard", "symlink", "copy"] = "hard"
     """How videos get into the capture; hard links need no room, and become copies on another file system."""
     report: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
@@ -149,6 +152,7 @@ def _chosen(options: Prepare) -> "PrepareOptions":
         fps=options.fps,
         without=options.without,
         link=options.link,
+        roving=options.roving,
     )
 
 

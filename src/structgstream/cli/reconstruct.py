@@ -164,6 +164,7 @@ class OpenedScene:
 
 def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, console: Console) -> OpenedScene:
     """The capture, or the live cameras, that the options name; says what it is."""
+    from structgstream.data.roving import roving_of
     from structgstream.evaluation.recording import part_metadata
     from structgstream.kernels.backend import select_backend
     from structgstream.preparation.sound import chosen_sound
@@ -185,6 +186,8 @@ def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, con
         options.live.check(options.scene)
         source = open_selected_capture(options.scene, options.capture)
         length, captured = f"{len(source)} frames", None
+        if (roving := roving_of(source)) is not None:
+            length = f"{length}; {len(roving.pictures)} roving pictures for frame 0"
         sound = chosen_sound(source, options.scene, options.sound, offset_seconds=options.sound_offset)
     backend = select_backend(options.device)
     print_lines(

@@ -60,7 +60,8 @@ from structgstream.data.dataset_layouts import (
 from structgstream.data.images import PICTURE_SUFFIXES
 from structgstream.data.masks import FOLDER, with_masks
 from structgstream.data.posed_capture import NoFrames, open_posed
-from structgstream.data.prepared import open_prepared, recognizes_prepared
+from structgstream.data.prepared import open_prepared, read_prepared, recognizes_prepared
+from structgstream.data.roving import with_roving
 from structgstream.data.source import FrameSource, WithoutPoints, WithRig, resized, section
 from structgstream.errors import CalibrationError, CaptureError, ConfigError, StructGStreamError
 from structgstream.geometry import Floats
@@ -250,6 +251,7 @@ def open_capture(
     frames: int | None = None,
     near: float | None = None,
     every: int = 1,
+    roving: bool = True,
 ) -> FrameSource:
     """Opens the capture in a folder, recognising its layout.
 
@@ -262,6 +264,7 @@ def open_capture(
         frames: number of frames to use, None for all.
         near: near plane in capture units; None for the capture's own, else 0.12 rig radii.
         every: step from one frame that is used to the next; the rate is divided by it.
+        roving: whether a prepared capture's roving pictures are used, where it has some.
 
     Raises:
         CaptureError: the folder is missing, empty or of an unknown layout, or its content is broken.
@@ -272,9 +275,13 @@ def open_capture(
         log.warning("%s is no capture, but holds one, which is opened: %s", path, folder)
     source = _opened(folder, opens)
     sized = selected(source, held_out=held_out, scale=scale, near=near)
-    if opens is open_prepared and not sized.rig.held_out <= source.rig.held_out:
-        sized = WithoutPoints(sized)  # its points come from pictures of a camera that is held out now
-    return section(sized, start=start, frames=frames, every=every)
+    if opens is not open_prepared:
+        return section(sized, start=start, frames=frames, every=every)
+    capture = read_prepared(folder)
+    if not sized.rig.held_out <= source.rig.held_out or (capture.roving and not roving):
+        sized = WithoutPoints(sized)  # its points come from pictures that are not trained on now
+    part = section(sized, start=start, frames=frames, every=every)
+    return with_roving(part, sized, folder, capture) if roving else part
 
 
 def selected(

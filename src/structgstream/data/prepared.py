@@ -32,6 +32,7 @@ from structgstream.data.video_index import scan_videos
 from structgstream.errors import CalibrationError, CaptureError
 
 FILE = "capture.json"
+ROVING = "roving"  # section of the file and folder of the pictures; programs that do not know it train without
 FORMAT, VERSION = "structgstream-capture", 1
 EXPECTED = "a capture that structgstream prepare wrote (docs/captures.md)"
 LENSES: Mapping[str, type[Lens]] = {"pinhole": Pinhole, "opencv": RadialTangential, "fisheye": Fisheye}
@@ -61,6 +62,7 @@ class PreparedCapture:
     held_out: frozenset[str] = field(default_factory=frozenset)  # names of the held-out cameras
     points: str | None = None  # file of points ``[P, 3]`` (``.npy``) relative to the capture, or None
     sound: str | None = None  # camera of the best microphone; None where none has sound
+    roving: Mapping[str, PreparedCamera] = field(default_factory=dict)  # frames of a roving camera (data/roving.py)
 
     def only(self, names: Collection[str]) -> "PreparedCapture":
         """These cameras, in the order of the capture, without points."""
@@ -81,12 +83,6 @@ def write_prepared(path: Path, capture: PreparedCapture) -> None:
 
 def prepared_entries(capture: PreparedCapture) -> dict[str, Any]:
     """What ``capture.json`` holds."""
-    cameras = {}
-    for name, camera in capture.cameras.items():
-        pinhole = {"size": [camera.pinhole.width, camera.pinhole.height], "K": camera.pinhole.K.tolist()}
-        cameras[name] = {
-            "files": camera.files, **filmed_entry(camera.filmed), "clock": asdict(camera.clock), "pinhole": pinhole,
-        }  # fmt: skip
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -96,8 +92,14 @@ def prepared_entries(capture: PreparedCapture) -> dict[str, Any]:
         "held_out": sorted(capture.held_out, key=natural),
         "points": capture.points,
         **({"sound": capture.sound} if capture.sound is not None else {}),
-        "cameras": cameras,
+        "cameras": {name: _entry(camera) for name, camera in capture.cameras.items()},
+        **({ROVING: {name: _entry(camera) for name, camera in capture.roving.items()}} if capture.roving else {}),
     }
+
+
+def _entry(camera: PreparedCamera) -> dict[str, Any]:
+    pinhole = {"size": [camera.pinhole.width, camera.pinhole.height], "K": camera.pinhole.K.tolist()}
+    return {"files": camera.files, **filmed_entry(camera.filmed), "clock": asdict(camera.clock), "pinhole": pinhole}
 
 
 def read_prepared(path: Path) -> PreparedCapture:
@@ -125,6 +127,7 @@ def read_prepared(path: Path) -> PreparedCapture:
             held_out=frozenset(content["held_out"]),
             points=None if content["points"] is None else str(content["points"]),
             sound=str(content["sound"]) if content.get("sound") in entries else None,
+            roving={name: _read_camera(name, entry, file) for name, entry in mapping(content.get(ROVING, {})).items()},
         )
 
 

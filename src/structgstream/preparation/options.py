@@ -51,6 +51,7 @@ class PrepareOptions:
         without: names of cameras to leave out.
         link: how files get into the capture.
         instants: most instants that structure from motion looks at; it looks at three where these have texture enough.
+        roving: a video, or a folder of pictures, of a camera that was walked through the set; None without one.
     """
 
     calibration: str | Path = "auto"
@@ -69,6 +70,7 @@ class PrepareOptions:
     without: tuple[str, ...] = ()
     link: Link = "hard"
     instants: int = 9
+    roving: Path | None = None
 
     def __post_init__(self) -> None:
         if self.near is not None and not 0 < self.near < math.inf:

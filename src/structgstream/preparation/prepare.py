@@ -19,16 +19,18 @@ from structgstream.data.calibration import NEAR_IN_RIG_RADII, Calibration, liste
 from structgstream.data.camera_files import REPORT
 from structgstream.data.masks import FOLDER as MASKS
 from structgstream.data.open import best_surrounded, open_capture
-from structgstream.data.points import initial_points
 from structgstream.data.prepared import (
+    ROVING,
     PreparedCamera,
     PreparedCapture,
+    Unit,
     prepared_entries,
     prepared_rig,
     read_prepared,
     recognizes_prepared,
     write_prepared,
 )
+from structgstream.data.roving import frame_points
 from structgstream.data.source import FrameSource, WithRig
 from structgstream.data.timeline import Clock
 from structgstream.data.undistortion import rectilinear
@@ -55,6 +57,7 @@ from structgstream.preparation.output_folder import (
     unlink,
 )
 from structgstream.preparation.report import write_report
+from structgstream.preparation.roving import frames_named, open_roving, write_png
 from structgstream.preparation.solvers import (
     TIMESTAMPS,
     Clocks,
@@ -89,6 +92,7 @@ class Job:
     def __init__(self, videos: Path, capture: Path, options: PrepareOptions, steps: Steps) -> None:
         self.videos, self.capture, self.options, self.steps = videos, capture, options, steps
         self.examination: Examination | None = None  # which two steps look at
+        self.roving = None if options.roving is None else open_roving(options.roving)
         self._opened: FrameSource | None = None
 
     def find(self) -> Footage:
@@ -169,6 +173,8 @@ class Job:
             "board_videos": None if options.board_videos is None else fingerprint({"board": options.board_videos}),
             "instants": options.instants,
         }
+        if self.roving is not None:
+            inputs["roving"] = fingerprint(self.roving.files)
         focals = stated_focals(footage) if method == "sfm" else {}
         if focals:
             inputs["focals"] = focals
@@ -178,7 +184,8 @@ class Job:
         def solve() -> SolvedCalibration:
             if not isinstance(method, str):
                 return given_cameras(method, footage)
-            return check_complete(solve_cameras(method, footage, clocks, options, focals=focals), footage)
+            found = solve_cameras(method, footage, clocks, options, focals=focals, roving=self.roving)
+            return check_complete(found, footage)
 
         calibrated = self.steps.run(
             "calibrate", inputs, solve, pack=packed, unpack=unpacked, after=("synchronize",),
@@ -222,9 +229,21 @@ class Job:
             if not footage.tracks:
                 remove_others(self.capture / camera.files, [file.name for file in footage.stills[name]])
         self._link_masks()
+        self._write_roving(content)
         write_prepared(self.capture, content)
         how = {"hard": "hard link or copy", "symlink": "symlink", "copy": "copy"}[self.options.link]
         self.steps.end("link", f"{len(content.cameras)} cameras by {how}")
+
+    def _write_roving(self, content: PreparedCapture) -> None:
+        """Pictures of the registered frames; those of an earlier run are removed."""
+        names = [f"{name}.png" for name in content.roving]
+        if self.roving is not None and not (
+            "calibrate" in self.steps.skipped and all((self.capture / name).is_file() for name in names)
+        ):
+            for name, picture in frames_named(self.roving, content.roving).items():
+                write_png(self.capture / f"{name}.png", picture)
+        if (folder := self.capture / ROVING).is_dir():
+            remove_others(folder, [Path(name).name for name in names])
 
     def _link_masks(self) -> None:
         """All masks but those of cameras that are left out; these are removed where an earlier run linked them."""
@@ -262,7 +281,7 @@ class Job:
     def points(self, content: PreparedCapture) -> PreparedCapture:
         def estimate() -> NDArray[np.float64]:
             source = self._source(content)
-            return initial_points(next(source.frames(0)), source.rig).positions
+            return frame_points(source, next(source.frames(0)))
 
         found = self.steps.run(
             "points",
@@ -372,6 +391,11 @@ def check_used(method: str | Calibration, footage: Footage, options: PrepareOpti
             "Shared intrinsics (--intrinsics) are estimated by structure from motion alone; choose --calibration sfm, "
             "or leave them out."
         )
+    if options.roving is not None and method != "sfm":
+        raise ConfigError(
+            "A roving video (--roving) is registered by structure from motion alone; choose --calibration sfm, or "
+            "leave it out."
+        )
     if options.lens is not None and isinstance(method, Calibration) and not options.refine:
         raise ConfigError(
             f"{method.where} states the lenses, so --lens {options.lens} has no effect; add --refine to adjust them to "
@@ -416,7 +440,10 @@ def assembled(
     held_out = held_out_of(options, rig)
     near = options.near or NEAR_IN_RIG_RADII * rig_radius(rig.with_held_out(held_out))
     fps = measured_fps(footage.tracks, clocks) if footage.tracks else None
-    return PreparedCapture(cameras, fps or footage.fps, near, "metres" if solved.metres else "arbitrary", held_out)
+    walked = {} if solved.roving is None else solved.roving.cameras
+    roving = {name: PreparedCamera(f"{name}.png", filmed, rectilinear(filmed)) for name, filmed in walked.items()}
+    unit: Unit = "metres" if solved.metres else "arbitrary"
+    return PreparedCapture(cameras, fps or footage.fps, near, unit, held_out, roving=roving)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from structgstream.data.prepared import LENSES, camera_of, filmed_entry, read_pr
 from structgstream.data.timeline import Clock
 from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.calibration.board_solving import solve_board
-from structgstream.preparation.calibration.solved import Observations, SolvedCalibration
+from structgstream.preparation.calibration.solved import Observations, RovingFrames, SolvedCalibration
 from structgstream.preparation.calibration.structure import refine, solve_structure
 from structgstream.preparation.footage import (
     Footage,
@@ -36,6 +37,7 @@ from structgstream.preparation.footage import (
 )
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.output_folder import Stored
+from structgstream.preparation.roving import sharpest_frames
 from structgstream.preparation.synchronization.synchronize import Method, synchronize
 
 TIMESTAMPS = "timestamps.csv"
@@ -108,13 +110,24 @@ BOARD_MOMENTS = 60
 
 
 def solve_cameras(
-    method: str, footage: Footage, clocks: Clocks, options: PrepareOptions, *, focals: Mapping[str, float]
+    method: str,
+    footage: Footage,
+    clocks: Clocks,
+    options: PrepareOptions,
+    *,
+    focals: Mapping[str, float],
+    roving: Footage | None = None,
 ) -> SolvedCalibration:
-    """Cameras by ``sfm``, which begins with ``focals``, the focal lengths in pixels that cameras state, or
-    ``board``."""
+    """Cameras by ``sfm``, which begins with ``focals``, the focal lengths in pixels that cameras state, and registers
+    frames of ``roving``, or by ``board``."""
     if method == "sfm":
-        pictures = matched_pictures(footage, clocks, options)
-        return solve_structure(pictures, lens=options.lens or "radial", intrinsics=options.intrinsics, focals=focals)
+        return solve_structure(
+            matched_pictures(footage, clocks, options),
+            lens=options.lens or "radial",
+            intrinsics=options.intrinsics,
+            focals=focals,
+            roving=None if roving is None else sharpest_frames(roving),
+        )
     if options.board_videos is not None:
         footage = board_footage(footage, options)
         clocks = synchronized(footage, options)
@@ -219,26 +232,38 @@ def summary(solved: SolvedCalibration) -> str:
         errors = solved.errors()
         errors = errors[np.isfinite(errors)]
         text += f", {len(solved.points)} points, median reprojection error {np.median(errors):.2f} px"
-    return text
+    return text if solved.roving is None else f"{text}; {solved.roving.summary}"
 
 
 def packed(solved: SolvedCalibration) -> Stored:
     """The calibration as plain values."""
     cameras = {name: filmed_entry(filmed) for name, filmed in solved.cameras.items()}
     arrays = {"points": solved.points, **vars(solved.observations)}
-    return Stored({"cameras": cameras, "missing": list(solved.missing), "metres": solved.metres}, arrays)
+    values = {"cameras": cameras, "missing": list(solved.missing), "metres": solved.metres}
+    if (roving := solved.roving) is not None:
+        frames = {name: filmed_entry(filmed) for name, filmed in roving.cameras.items()}
+        values["roving"] = {**vars(roving), "cameras": frames}
+    return Stored(values, arrays)
 
 
 def unpacked(stored: Stored) -> SolvedCalibration:
     """The reverse of :func:`packed`."""
+    seen = {name: array for name, array in stored.arrays.items() if name != "points"}
+    missing, metres = tuple(stored.values["missing"]), bool(stored.values["metres"])
+    roving = None
+    if (found := stored.values.get("roving")) is not None:
+        roving = RovingFrames(**{**found, "cameras": _cameras(found["cameras"]), "bridged": tuple(found["bridged"])})
+    cameras = _cameras(stored.values["cameras"])
+    return SolvedCalibration(cameras, stored.arrays["points"], Observations(**seen), missing, metres, roving)
+
+
+def _cameras(entries: Mapping[str, Any]) -> dict[str, LensCamera]:
     cameras = {}
-    for name, entry in stored.values["cameras"].items():
+    for name, entry in entries.items():
         lens = dict(entry["lens"])
         kind = LENSES[lens.pop("model")]
         cameras[name] = LensCamera(camera_of(entry["viewmat"], entry["K"], entry["size"]), kind(**lens))
-    seen = {name: array for name, array in stored.arrays.items() if name != "points"}
-    missing, metres = tuple(stored.values["missing"]), bool(stored.values["metres"])
-    return SolvedCalibration(cameras, stored.arrays["points"], Observations(**seen), missing, metres)
+    return cameras
 
 
 def find_calibration(where: Path) -> Calibration | None:

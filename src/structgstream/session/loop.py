@@ -8,6 +8,7 @@ returns its newest frame is read only after the previous frame is stored.
 from collections import deque
 from collections.abc import Generator, Iterable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from typing import Generic
 
@@ -19,10 +20,11 @@ from structgstream.codec.contents import PacketInfo
 from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHeader, check_picture_sizes
 from structgstream.codec.scene_coder import Encoded
 from structgstream.data.denoising import denoised
-from structgstream.data.points import PointsConfig, initial_points
+from structgstream.data.points import PointsConfig
+from structgstream.data.roving import frame_points, roving_of
 from structgstream.data.source import FrameStream, frame_count, is_recording, retain_frames
 from structgstream.errors import CaptureError, ConfigError, StorageError
-from structgstream.frames import MIN_CAMERAS, MultiViewFrame
+from structgstream.frames import MIN_CAMERAS, MultiViewFrame, RovingPicture
 from structgstream.kernels.backend import Backend
 from structgstream.lookahead import Lookahead
 from structgstream.session.frame_report import FrameReport, metered
@@ -82,13 +84,15 @@ class Session(Generic[State, Memory]):
         self._on_step = on_step
         self._similarity = normalizing_similarity(source.rig, radius=pipeline.normalised_radius)
         self._rig = self._similarity.rig(source.rig)
+        self._roving = roving_of(source)
+        roving = {} if self._roving is None else {"roving": len(self._roving.pictures)}
         self._facts = StreamFacts(
             codec=pipeline.codec.name,
             rig=source.rig,
             similarity=self._similarity,
             fps=source.fps,
             config=pipeline.config,
-            metadata={"capture": source.name, **pipeline.metadata, **(metadata or {})},
+            metadata={"capture": source.name, **pipeline.metadata, **roving, **(metadata or {})},
         )
         self._keys = KeyFrames(pipeline.codec.key_interval(source.fps), source.fps)
         self._plan = PeriodPlan(pipeline.period, most=MAX_PERIODS)
@@ -184,9 +188,15 @@ class Session(Generic[State, Memory]):
             seed=frame_seed(pipeline.seed, frame.index),
             steps=self._steps,
             pressure=self._controller.pressure,
+            roving=partial(self._roving_pictures, frame),
             begins=begins,
             on_step=self._on_step,
         )
+
+    def _roving_pictures(self, frame: MultiViewFrame) -> list[RovingPicture]:
+        """Those of a roving camera for frame 0, in normalised units."""
+        found = () if self._roving is None or frame.index > 0 else self._roving.roving(frame)
+        return [replace(picture, camera=self._similarity.camera(picture.camera)) for picture in found]
 
     def _encode(self, fitted: State, task: FrameTask) -> Encoded[State]:
         """The packet of a frame; writes the header before the first packet of a period."""
@@ -345,7 +355,7 @@ def initial_points_of(
     check_poses(frame, source.rig)
     given = source.points if frame.index == 0 else None
     if given is None:
-        given = initial_points(frame, source.rig, config=config, seed=seed).positions
+        given = frame_points(source, frame, config=config, seed=seed)
     return similarity.points(torch.from_numpy(given))
 
 

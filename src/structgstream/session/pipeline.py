@@ -20,7 +20,7 @@ from structgstream.codec.packets import Packet, PacketKind, PacketSink, StreamHe
 from structgstream.codec.scene_coder import Encoded
 from structgstream.data.denoising import DenoisingConfig
 from structgstream.data.points import PointsConfig
-from structgstream.frames import MultiViewFrame
+from structgstream.frames import MultiViewFrame, RovingPicture
 from structgstream.kernels.backend import Backend
 from structgstream.scene.render import Drawable
 from structgstream.session.periods import PeriodConfig
@@ -48,6 +48,7 @@ class FrameTask:
     seed: int  # seed of all random numbers, so that a frame can be repeated separately
     steps: Mapping[str, float] = field(default_factory=dict)  # the codec's quantization steps by name; empty in frame 0
     pressure: float = 1.0  # factor of the rate control (rate_control, Note [Pressure])
+    roving: Callable[[], Sequence[RovingPicture]] = tuple  # reads pictures of a roving camera; none after frame 0
     begins: str | None = None  # why the frame begins another period, in a few words (periods); None if it does not
     on_step: StepListener | None = None  # called after every optimisation step
 

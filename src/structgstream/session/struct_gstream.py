@@ -189,6 +189,7 @@ class StructGStream:
                 backend=task.backend,
                 seed=task.seed,
                 on_step=task.on_step,
+                roving=task.roving(),
             )
         return self._with_environment(fit, task)
 

@@ -8,6 +8,7 @@ from itertools import count
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -21,7 +22,7 @@ from structgstream.preparation.calibration.keypoints import Keypoints, all_keypo
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.calibration.structure import Refinement, refine, solve_structure
 from tests.support.calibration_errors import calibration_errors
-from tests.support.filmed import filmed_room, noise_texture
+from tests.support.filmed import Film, filmed_room, noise_texture, ring, room
 
 
 def noise(seed: int) -> NDArray[np.uint8]:
@@ -247,3 +248,53 @@ def test_a_lens_that_cannot_be_refined_is_refused() -> None:
     rig, pictures = filmed_room()
     with pytest.raises(ConfigError, match="model brown cannot be refined; take opencv"):
         refine(pictures, rig, lens="brown")
+
+
+@cache
+def walked_room() -> tuple[dict[str, LensCamera], dict[str, list[NDArray[np.uint8]]], dict[str, NDArray[np.uint8]]]:
+    """Three cameras too far apart for structure from motion, and frames of another one that is carried past them."""
+    rig = ring(3, radius=2.6, arc_degrees=120, focal=290, lens=RadialTangential(k1=-0.12, k2=0.02), size=(320, 240))
+    path = ring(9, radius=2.4, arc_degrees=124, focal=250, lens=RadialTangential(k1=0.05), size=(320, 240))
+    pictures = {
+        name: [Film(one).picture(room(), noise=1, seed=number)] for number, (name, one) in enumerate(rig.items())
+    }
+    frames = {
+        f"roving/{number}": Film(one).picture(room(), noise=1, seed=50 + number)
+        for number, one in enumerate(path.values())
+    }
+    return rig, pictures, frames
+
+
+def test_a_roving_video_connects_cameras_that_see_too_little_in_common(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(structure, "FIELDS_OF_VIEW", {"radial": (60.0,)})
+    rig, pictures, frames = walked_room()
+    found = solve_structure(pictures, lens="radial", roving=frames)
+    assert (found.missing, list(found.cameras)) == ((), list(rig))
+    assert set(found.observations.camera) == {0, 1, 2}
+    roving = found.roving
+    assert roving is not None
+    assert (len(roving.cameras), roving.looked_at) == (9, 9)
+    assert roving.bridged == tuple(rig)
+    assert roving.median_pixels < 0.4
+    assert len({(one.lens, tuple(one.camera.K.flatten().tolist())) for one in roving.cameras.values()}) == 1
+    for error in calibration_errors(found.cameras, rig).values():
+        assert error.rotation_degrees < 0.3
+        assert error.position_percent < 1
+    centers = np.stack([one.camera.center.numpy() for one in found.cameras.values()])
+    np.testing.assert_allclose(centers.mean(0), 0, atol=1e-9)  # of the still cameras alone
+
+
+def test_a_roving_video_of_another_place_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(structure, "FIELDS_OF_VIEW", {"radial": (60.0,)})
+    _, pictures, _ = walked_room()
+    elsewhere = {f"roving/{number}": noise(500 + number)[:120, :160] for number in range(4)}
+    with pytest.raises(CalibrationError, match="No roving frame can be placed among the cameras"):
+        solve_structure(pictures, lens="radial", roving=elsewhere)
+
+
+def test_a_blurred_roving_video_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(structure, "FIELDS_OF_VIEW", {"radial": (60.0,)})
+    _, pictures, frames = walked_room()
+    blurred = {name: np.asarray(cv2.GaussianBlur(frame, (0, 0), 12), np.uint8) for name, frame in frames.items()}
+    with pytest.raises(CalibrationError, match="The roving video is blurred: its sharpest frames have"):
+        solve_structure(pictures, lens="radial", roving=dict(list(blurred.items())[:4]))

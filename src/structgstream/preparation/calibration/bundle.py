@@ -249,19 +249,24 @@ class Limits:
 
 
 def adjust_together(
-    found: SolvedCalibration, *, lens: Sequence[int], free: Sequence[int], limits: Limits
+    found: SolvedCalibration,
+    *,
+    lens: Sequence[int],
+    free: Sequence[int],
+    limits: Limits,
+    makes: Sequence[int] | None = None,
 ) -> SolvedCalibration:
     """``found`` with poses, points and the free terms (``lens_terms.py``) of its lenses adjusted, without the
     observations that are off. ``lens`` has the number of the lens of each camera; cameras with shared intrinsics have
-    one."""
-    bundle, parameters = _problem(found, np.asarray(lens, np.intp), tuple(free))
+    one. Lenses of one picture size share a mean; where ``makes`` has a number for each camera, those of one number."""
+    bundle, parameters = _problem(found, np.asarray(lens, np.intp), tuple(free), makes)
     bundle, parameters = estimated(bundle, parameters)
     adjusted = replace(
         found, cameras=cameras_in(parameters, found.cameras, bundle.lens), points=parameters.body_positions
     )
     inliers = cleaned(adjusted, limits)
     _log_adjustment(adjusted, inliers, bundle)
-    again, parameters = _problem(inliers, bundle.lens, bundle.free)
+    again, parameters = _problem(inliers, bundle.lens, bundle.free, makes)
     again = replace(again, prior=bundle.prior, noise=bundle.noise)
     parameters = solved(again, parameters)
     cameras = cameras_in(parameters, inliers.cameras, again.lens)
@@ -285,11 +290,14 @@ def chosen(found: SolvedCalibration, good: NDArray[np.bool_]) -> SolvedCalibrati
     return replace(found, points=found.points[inliers], observations=observations)
 
 
-def _problem(found: SolvedCalibration, lens: Indices, free: tuple[int, ...]) -> tuple[Bundle, Parameters]:
+def _problem(
+    found: SolvedCalibration, lens: Indices, free: tuple[int, ...], makes: Sequence[int] | None
+) -> tuple[Bundle, Parameters]:
     cameras, seen = list(found.cameras.values()), found.observations
     observations = BodyObservations(seen.camera, seen.point, np.zeros((len(seen), 3)), seen.pixels)
     rotations = np.broadcast_to(np.eye(3), (len(found.points), 3, 3))
-    return posed_problem(cameras, observations, (rotations, found.points), lens=lens, free=free, rotating=False)
+    bodies = rotations, found.points
+    return posed_problem(cameras, observations, bodies, lens=lens, free=free, rotating=False, makes=makes)
 
 
 def posed_problem(
@@ -300,6 +308,7 @@ def posed_problem(
     lens: Indices,
     free: tuple[int, ...],
     rotating: bool,
+    makes: Sequence[int] | None = None,
 ) -> tuple[Bundle, Parameters]:
     """The problem of cameras that see ``bodies``, rotations ``[B, 3, 3]`` and positions ``[B, 3]``, with the usual
     prior of their lenses."""
@@ -307,7 +316,8 @@ def posed_problem(
     rows = np.stack([row_of(cameras[index]) for index in first])
     sizes = np.array([[filmed.camera.width, filmed.camera.height] for filmed in cameras], np.float64)
     fisheye = np.array([isinstance(filmed.lens, Fisheye) for filmed in cameras])
-    _, alike = np.unique(sizes[first], axis=0, return_inverse=True)
+    kinds = sizes if makes is None else np.column_stack([sizes, makes])
+    _, alike = np.unique(kinds[first], axis=0, return_inverse=True)
     prior = usual_prior(alike.ravel(), free, fisheye=bool(fisheye.any()))
     views = np.stack([filmed.camera.viewmat.numpy() for filmed in cameras])
     bundle = Bundle(observations, lens, sizes, fisheye, free, rotating, prior)

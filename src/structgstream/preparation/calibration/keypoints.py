@@ -11,7 +11,7 @@ little texture gets several times the matches once poses are known roughly.
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from threading import Event
 from typing import Any
@@ -156,6 +156,12 @@ def _extracted(extractor: Any, picture: NDArray[np.uint8]) -> tuple[Floats, NDAr
     return places * (width / grey.shape[1], height / grey.shape[0]), descriptors / np.maximum(norms, 1e-9)
 
 
+def roving_keypoints(pictures: Mapping[str, NDArray[np.uint8]], *, instants: int, workers: int) -> dict[str, Keypoints]:
+    """Keypoints of each frame of a roving camera; they are matched with those of any of ``instants`` instants."""
+    found = _with_instants({name: [picture] for name, picture in pictures.items()}, {}, [0], workers=workers)
+    return {name: replace(own, seen=np.ones((len(own), instants), bool)) for name, own in found.items()}
+
+
 def _repeated(known: Keypoints, pixels: Floats, descriptors: NDArray[np.float32]) -> Indices:
     """For each of the new keypoints the known one that it repeats, or -1."""
     from scipy.spatial import KDTree
@@ -188,9 +194,11 @@ def keypoint_matches(first: Keypoints, second: Keypoints) -> NDArray[np.uint32]:
     return found.astype(np.uint32)
 
 
-def all_matches(keypoints: Mapping[str, Keypoints], *, workers: int) -> dict[Pair, NDArray[np.uint32]]:
-    """:func:`keypoint_matches` of every pair of cameras."""
-    pairs = list(combinations(keypoints, 2))
+def all_matches(
+    keypoints: Mapping[str, Keypoints], *, workers: int, pairs: Sequence[Pair] | None = None
+) -> dict[Pair, NDArray[np.uint32]]:
+    """:func:`keypoint_matches` of every pair of cameras, or of some."""
+    pairs = list(combinations(keypoints, 2)) if pairs is None else pairs
     with ThreadPoolExecutor(workers) as pool:
         found = pool.map(lambda pair: keypoint_matches(keypoints[pair[0]], keypoints[pair[1]]), pairs)
         return dict(zip(pairs, found, strict=True))

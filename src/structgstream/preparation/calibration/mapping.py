@@ -11,7 +11,7 @@ near the epipolar lines of the first solution are more, and of more depths.
 import logging
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -110,8 +110,8 @@ Mapper = Literal["incremental", "global"]
 HUBER_PIXELS = 1.0
 
 
-def mapped(database: Path, *, mapper: Mapper) -> Any | None:
-    """The model of the most images that a mapper finds, None without one; one thread, so it is repeatable.
+def mapped(database: Path, *, mapper: Mapper, stills: Collection[str]) -> Any | None:
+    """The largest model (:func:`size_of`) that a mapper finds, None without one; one thread, so it is repeatable.
 
     Focal lengths and distortion are estimated; principal points stay (Note [Alike lenses])."""
     pycolmap = pycolmap_module()
@@ -122,12 +122,13 @@ def mapped(database: Path, *, mapper: Mapper) -> Any | None:
         found = pycolmap.incremental_mapping(database, folder, folder, _incremental_options())
     else:
         found = pycolmap.global_mapping(database, folder, folder, _global_options())
-    return max(found.values(), key=size_of, default=None)
+    return max(found.values(), key=lambda model: size_of(model, stills), default=None)
 
 
-def size_of(model: Any) -> tuple[int, int]:
-    """How large a model is: images, observations."""
-    return model.num_reg_images(), model.compute_num_observations()
+def size_of(model: Any, stills: Collection[str]) -> tuple[int, int, int]:
+    """How large a model is: images of still cameras, all images, observations."""
+    names = [model.image(number).name for number in model.reg_image_ids()]
+    return sum(name in stills for name in names), len(names), model.compute_num_observations()
 
 
 def _incremental_options() -> Any:

@@ -26,6 +26,27 @@ class Observations:
 
 
 @dataclass(frozen=True)
+class RovingFrames:
+    """Frames of a camera that was walked through the set, registered with the still cameras."""
+
+    cameras: Mapping[str, LensCamera]  # by frame; all have one lens
+    looked_at: int  # number of frames that were tried
+    median_pixels: float  # of their reprojection errors
+    bridged: tuple[str, ...] = ()  # still cameras that could not be placed without them
+
+    def aligned(self, alignment: Alignment) -> "RovingFrames":
+        """The same frames in other coordinates."""
+        return replace(self, cameras={name: alignment.filmed(filmed) for name, filmed in self.cameras.items()})
+
+    @property
+    def summary(self) -> str:
+        """For users."""
+        placed = f"{len(self.cameras)} of {self.looked_at} roving frames"
+        text = f"{placed}, median reprojection error {self.median_pixels:.2f} px"
+        return f"{text}, which connect {', '.join(self.bridged)}" if self.bridged else text
+
+
+@dataclass(frozen=True)
 class SolvedCalibration:
     """Cameras with lenses, estimated from their pictures."""
 
@@ -34,6 +55,7 @@ class SolvedCalibration:
     observations: Observations  # where the points were seen
     missing: tuple[str, ...] = ()  # names of the cameras that could not be placed
     metres: bool = False  # whether the unit is a metre; otherwise it is arbitrary
+    roving: RovingFrames | None = None  # None without a roving camera
 
     def residuals(self) -> Floats:
         """Reprojection error ``[M, 2]`` of each observation, pixels; NaN where a point is out of a lens' reach."""
@@ -59,6 +81,7 @@ class SolvedCalibration:
             cameras={name: alignment.filmed(filmed) for name, filmed in self.cameras.items()},
             points=alignment.points(self.points),
             metres=self.metres if metres is None else metres,
+            roving=None if self.roving is None else self.roving.aligned(alignment),
         )
 
 

@@ -7,11 +7,13 @@ and Frahm, CVPR 2016; Pan et al., ECCV 2024 for the global one).
 """
 
 import logging
+import math
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,9 +24,15 @@ from structgstream.data.calibration import listed
 from structgstream.data.lenses import LensCamera
 from structgstream.data.matching import Pair, connected_groups
 from structgstream.errors import CalibrationError, ConfigError
-from structgstream.preparation.calibration.bundle import Limits, adjust_together
+from structgstream.preparation.calibration.bundle import Limits, adjust_together, chosen
 from structgstream.preparation.calibration.colmap import MODELS, field_of_view, guessed_camera, holding, pycolmap_module
-from structgstream.preparation.calibration.keypoints import Keypoints, all_keypoints, all_matches, epipolar_pixels
+from structgstream.preparation.calibration.keypoints import (
+    Keypoints,
+    all_keypoints,
+    all_matches,
+    epipolar_pixels,
+    roving_keypoints,
+)
 from structgstream.preparation.calibration.lens_terms import ACROSS, ASPECT, DISTORTION, DOWN, FOCAL, LensModel
 from structgstream.preparation.calibration.mapping import (
     Matches,
@@ -43,7 +51,7 @@ from structgstream.preparation.calibration.mapping import (
     without,
     write_database,
 )
-from structgstream.preparation.calibration.solved import SolvedCalibration, normalized, rig_alignment
+from structgstream.preparation.calibration.solved import RovingFrames, SolvedCalibration, normalized, rig_alignment
 
 _log = logging.getLogger(__name__)
 
@@ -66,6 +74,7 @@ def solve_structure(
     lens: LensModel = "radial",
     intrinsics: Intrinsics = "own",
     focals: Mapping[str, float] | None = None,
+    roving: Mapping[str, NDArray[np.uint8]] | None = None,
 ) -> SolvedCalibration:
     """Poses, intrinsics and lenses of still cameras from their own pictures.
 
@@ -75,13 +84,17 @@ def solve_structure(
         intrinsics: ``"shared"`` for cameras of one make and zoom, else ``"own"``.
         focals: focal lengths in pixels by name, of those cameras that state one. Fields of view that are tried begin
             with these; cameras that state none take the median one.
+        roving: frames ``[H, W, 3]`` of one more camera, which was walked through the set at any time, in their order.
+            They have one lens; a rolling shutter is ignored.
 
     Returns:
         the calibration in arbitrary units: the mean camera is the origin and the farthest is one unit away, as the
-        axes of the first camera. Cameras that see too little in common with the others are ``missing``.
+        axes of the first camera. Cameras that see too little in common with the others are ``missing``. Points and
+        observations are those of the still cameras.
 
     Raises:
-        CalibrationError: fewer than three cameras, pictures that do not belong together, or too little in common.
+        CalibrationError: fewer than three cameras, pictures that do not belong together, too little in common, or no
+            roving frame that has.
     """
     pycolmap_module()
     if len(pictures) < 3:
@@ -92,20 +105,104 @@ def solve_structure(
     workers = max(1, min(len(pictures), os.cpu_count() or 1))
     keypoints = all_keypoints(pictures, workers=workers)
     matches = all_matches(keypoints, workers=workers)
-    best: _Attempt | None = None
     sizes = {name: (shots[0].shape[1], shots[0].shape[0]) for name, shots in pictures.items()}
-    for cameras in _starts(sizes, lens, intrinsics, _fields_of_view(sizes, lens, focals or {})):
-        attempt = _attempt(keypoints, matches, cameras, workers=workers)
-        best = attempt if best is None or attempt.size > best.size else best
-        if best.size[0] == len(pictures):
-            break
-    assert best is not None
+    starts = _starts(sizes, lens, intrinsics, _fields_of_view(sizes, lens, focals or {}))
+    best = _best_attempt(keypoints, matches, starts, stills=pictures, workers=workers)
+    frames: Mapping[str, NDArray[np.uint8]] = roving or {}
+    alone = best
+    if frames:
+        instants = next(iter(keypoints.values())).seen.shape[1]
+        walked = roving_keypoints(frames, instants=instants, workers=workers)
+        keypoints = {**keypoints, **walked}
+        matches = {**matches, **all_matches(keypoints, workers=workers, pairs=_roving_pairs([*pictures], [*frames]))}
+        starts = [_with_roving(start, frames, lens) for start in starts]
+        best = _best_attempt(keypoints, matches, starts, stills=pictures, workers=workers)
+        if best.size[0] == 0 or best.size[0] == best.size[1]:
+            raise CalibrationError(_nothing_roving(keypoints, matches, best.pairs, [*frames]))
+        if best.size[0] < 3:
+            raise CalibrationError(
+                f"The roving video connects {best.size[0]} of {len(pictures)} cameras, fewer than three; walk slowly "
+                "from the view of each camera to that of the next, around the whole set."
+            )
     if best.model is None or best.size[0] < 3:
         raise CalibrationError(_nothing(pictures, matches, best.pairs))
-    solved = _finished(best, keypoints, pictures, lens=lens, workers=workers)
+    solved = _finished(best, keypoints, pictures, frames, lens=lens, workers=workers)
+    if frames and solved.roving is not None:
+        bridged = tuple(name for name in solved.cameras if name not in _placed(alone))
+        solved = replace(solved, roving=replace(solved.roving, bridged=bridged))
     if solved.missing:
         _log.warning("%s", missing_cameras(solved.missing, matches, best.pairs))
     return solved
+
+
+NEIGHBOURS = 4  # frames of a roving camera that are matched with the next so many
+ENOUGH_ROVING = 0.5  # share of the roving frames that a start places, with all still cameras, for no other to be tried
+
+
+def _best_attempt(
+    keypoints: Mapping[str, Keypoints],
+    matches: Matches,
+    starts: Sequence[Mapping[str, Any]],
+    *,
+    stills: Collection[str],
+    workers: int,
+) -> "_Attempt":
+    """That of the largest model, of those before all still cameras and enough of the others are placed."""
+    best: _Attempt | None = None
+    enough = len(stills) + ENOUGH_ROVING * (len(starts[0]) - len(stills))
+    for cameras in starts:
+        attempt = _attempt(keypoints, matches, cameras, stills=stills, workers=workers)
+        best = attempt if best is None or attempt.size > best.size else best
+        if best.size[0] == len(stills) and best.size[1] >= enough:
+            break
+    assert best is not None
+    return best
+
+
+def _placed(attempt: "_Attempt") -> set[str]:
+    model = attempt.model
+    return set() if model is None else {model.image(number).name for number in model.reg_image_ids()}
+
+
+def _roving_pairs(stills: Sequence[str], frames: Sequence[str]) -> list[Pair]:
+    """Every still camera with every frame, and every frame with the next ones."""
+    following = [(one, two) for index, one in enumerate(frames) for two in frames[index + 1 : index + 1 + NEIGHBOURS]]
+    return [*product(stills, frames), *following]
+
+
+def _with_roving(
+    start: Mapping[str, Any], frames: Mapping[str, NDArray[np.uint8]], lens: LensModel
+) -> Mapping[str, Any]:
+    """The cameras to begin with, and one for all frames, of the median field of view of the others."""
+    degrees = [
+        field_of_view(lens, camera.mean_focal_length(), (camera.width, camera.height)) for camera in start.values()
+    ]
+    height, width = next(iter(frames.values())).shape[:2]
+    number = 1 + max(camera.camera_id for camera in start.values())
+    return {**start, **dict.fromkeys(frames, guessed_camera(lens, number, (width, height), float(np.median(degrees))))}
+
+
+def _nothing_roving(
+    keypoints: Mapping[str, Keypoints], matches: Matches, pairs: Mapping[Pair, Any], frames: Sequence[str]
+) -> str:
+    """Why no frame of the roving camera could be placed."""
+    counts = [
+        np.median([len(keypoints[name]) for name in keypoints if (name in frames) == own]) for own in (True, False)
+    ]
+    if counts[0] < BLURRED * counts[1]:
+        return (
+            f"The roving video is blurred: its sharpest frames have {counts[0]:.0f} keypoints, the cameras "
+            f"{counts[1]:.0f}; walk slower, with more light or a shorter exposure, or leave out --roving."
+        )
+    with_stills = [pair for pair in matches if (pair[0] in frames) != (pair[1] in frames)]
+    best = max((len(pairs[pair].inlier_matches) if pair in pairs else 0 for pair in with_stills), default=0)
+    return (
+        f"No roving frame can be placed among the cameras (at best {best} matches agree between a frame and a camera): "
+        "film the same set, with what the cameras see in view, or leave out --roving."
+    )
+
+
+BLURRED = 0.2  # share of the keypoints of a still camera below which roving frames are blurred
 
 
 def missing_cameras(missing: Sequence[str], matches: Matches, pairs: Mapping[Pair, Any]) -> str:
@@ -134,10 +231,7 @@ class _Attempt:
 
     model: Any | None
     pairs: Mapping[Pair, Any]
-
-    @property
-    def size(self) -> tuple[int, int]:
-        return (0, 0) if self.model is None else size_of(self.model)
+    size: tuple[int, int, int] = (0, 0, 0)  # of the model
 
 
 def _fields_of_view(
@@ -175,9 +269,14 @@ def _starts(
 
 
 def _attempt(
-    keypoints: Mapping[str, Keypoints], matches: Matches, cameras: Mapping[str, Any], *, workers: int
+    keypoints: Mapping[str, Keypoints],
+    matches: Matches,
+    cameras: Mapping[str, Any],
+    *,
+    stills: Collection[str],
+    workers: int,
 ) -> _Attempt:
-    """The incremental model, or the global one if that places more cameras."""
+    """The incremental model, or the global one if that places more still cameras."""
     pairs = verified_pairs(keypoints, matches, cameras, workers=workers)
     attempt = _Attempt(None, pairs)
     if not pairs:
@@ -185,20 +284,27 @@ def _attempt(
     with tempfile.TemporaryDirectory(prefix="structgstream-sfm-") as folder:
         database = Path(folder) / "database.db"
         write_database(database, keypoints, cameras, pairs)
-        reachable = len(connected_groups(keypoints, pairs)[0])
+        reachable = max(sum(name in stills for name in group) for group in connected_groups(keypoints, pairs))
         for mapper in ("incremental", "global"):
-            found = mapped(database, mapper=mapper)
-            if found is not None and size_of(found) > attempt.size:
-                attempt = replace(attempt, model=found)
+            found = mapped(database, mapper=mapper, stills=stills)
+            if found is not None and size_of(found, stills) > attempt.size:
+                attempt = replace(attempt, model=found, size=size_of(found, stills))
             if attempt.size[0] == reachable:
                 break
     return attempt
 
 
 def _finished(
-    attempt: _Attempt, keypoints: Mapping[str, Keypoints], pictures: Pictures, *, lens: LensModel, workers: int
+    attempt: _Attempt,
+    keypoints: Mapping[str, Keypoints],
+    pictures: Pictures,
+    roving: Mapping[str, NDArray[np.uint8]],
+    *,
+    lens: LensModel,
+    workers: int,
 ) -> SolvedCalibration:
-    """The model with all intrinsics adjusted, matched again, without outliers, in normalised coordinates."""
+    """The model with all intrinsics adjusted, without outliers, in normalised coordinates; without roving frames, of
+    which each camera has matches enough, matched again."""
     model = attempt.model
     assert model is not None
     longest = max(max(shots[0].shape[:2]) for shots in pictures.values())
@@ -207,7 +313,7 @@ def _finished(
         adjust(model)
         filtered(model, pixels=limits.pixels, degrees=limits.degrees)
     found = cameras_of(model)
-    cameras = {name: found[name] for name in pictures if name in found}
+    cameras = {name: found[name] for name in (*pictures, *roving) if name in found}
     points, observations = observed(model, keypoints, cameras)
     missing = tuple(name for name in pictures if name not in found)
     rough = SolvedCalibration(cameras, points, observations, missing)
@@ -218,9 +324,26 @@ def _finished(
         lens=[lenses.index(numbers[name]) for name in cameras],
         free=(FOCAL, ASPECT, ACROSS, DOWN, *DISTORTION[lens]),
         limits=limits,
+        makes=[name in roving for name in cameras] if roving else None,
     )
+    if roving:
+        return normalized(_split(adjusted(normalized(rough)), roving))
     return normalized(
         rematched(normalized(adjusted(rough)), keypoints, limits=limits, adjust=adjusted, workers=workers)
+    )
+
+
+def _split(found: SolvedCalibration, roving: Collection[str]) -> SolvedCalibration:
+    """The still cameras, with the roving frames apart."""
+    names = [*found.cameras]
+    walked = np.array([name in roving for name in names])[found.observations.camera]
+    errors = found.errors()[walked]
+    frames = {name: filmed for name, filmed in found.cameras.items() if name in roving}
+    still = chosen(found, ~walked)  # the still cameras come first, so their numbers stay
+    return replace(
+        still,
+        cameras={name: filmed for name, filmed in found.cameras.items() if name not in roving},
+        roving=RovingFrames(frames, len(roving), float(np.median(errors)) if len(errors) else math.nan),
     )
 
 

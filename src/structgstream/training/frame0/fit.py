@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frame 0: a static reconstruction with anchors (paper, section Structured 3DGs)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from statistics import median
 from typing import ClassVar
@@ -9,7 +10,7 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import CameraRig
-from structgstream.frames import MultiViewFrame
+from structgstream.frames import MultiViewFrame, RovingPicture
 from structgstream.kernels.backend import Backend
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
@@ -24,6 +25,7 @@ from structgstream.training.frame0.regularizers import (
     in_free_space,
     perturbation_at,
 )
+from structgstream.training.frame0.roving import RovingViews, alternating
 from structgstream.training.frame0.seeding import seeded_scene, warm_start
 from structgstream.training.losses import InitialLossWeights, SceneLoss, offset_distance, view_loss, with_term
 from structgstream.training.optim import Adam, Hooks, LastPass, LearningRate, Schedule, minimize
@@ -145,6 +147,7 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
     numbers: RandomNumbers
     watch: Stopwatch
     last_pass: LastPass
+    roving: RovingViews
 
     @property
     def scene(self) -> Scene:
@@ -153,11 +156,12 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
 
     def loss(self, iteration: int, sample: View) -> SceneLoss:
         config, generator = self.config, self.generator
-        scene = self.scene
+        scene, roving = self.scene, self.roving.has(sample)
+        scene, view = self.roving.applied(scene, sample) if roving else (scene, sample)
         # The result depends on the order of random draws.
         loss = view_loss(
             scene,
-            sample,
+            view,
             backend=self.backend,
             weights=config.losses,
             track_screen=self.densifier.collects(iteration),
@@ -177,7 +181,10 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
                     loss.unperturbed, sample.camera, scale=config.depth_distortion.SCALE, backend=self.backend
                 )
                 loss = with_term(loss, "depth_distortion", spread, weight=weight)
-        self.last_pass.add(iteration, loss, sample)
+        if roving:
+            self.roving.note(sample, loss.rendering, share=iteration / config.iterations)
+        else:
+            self.last_pass.add(iteration, loss, sample)
         return loss
 
     def after_step(self, iteration: int, sample: View, loss: SceneLoss, screen_gradient: Tensor | None) -> None:
@@ -202,6 +209,7 @@ def fit_first_frame(
     backend: Backend,
     seed: int,
     on_step: StepListener | None = None,
+    roving: Sequence[RovingPicture] = (),
 ) -> FitResult[Scene]:
     """Reconstruct frame 0 from its training views.
 
@@ -213,10 +221,13 @@ def fit_first_frame(
         backend: the compute back-end.
         seed: of all random numbers.
         on_step: called after every iteration.
+        roving: pictures of a roving camera, in normalised units; every second iteration takes one of them.
     """
     generator = torch.Generator().manual_seed(seed)
     template = _seeded(points, cameras=len(rig.training), config=config, device=backend.device, generator=generator)
-    return _fit(frame, rig, template, config=config, backend=backend, generator=generator, on_step=on_step)
+    return _fit(
+        frame, rig, template, config=config, backend=backend, generator=generator, on_step=on_step, roving=roving
+    )
 
 
 def fit_first_frame_again(
@@ -261,6 +272,7 @@ def _fit(
     generator: torch.Generator,
     done: int = 0,
     on_step: StepListener | None = None,
+    roving: Sequence[RovingPicture] = (),
 ) -> FitResult[Scene]:
     """Train ``template`` in the iterations of frame 0 after the first ``done``."""
     watch = Stopwatch()
@@ -270,18 +282,33 @@ def _fit(
     adam = Adam(backend, parameters.values)
     growth = config.growth.for_pictures(median(view.enlargement for view in views))
     densifier = Densifier.of(template, config=growth, iterations=config.iterations, voxel_size=config.voxel_size)
-    last_pass = LastPass(config.iterations - len(views))
+    walked = RovingViews.of(roving, first=len(rig.training), colors=config.camera_color, device=backend.device)
+    last_pass = LastPass(config.iterations - len(views) * (2 if roving else 1))
     numbers = RandomNumbers(generator, backend.device)
     hooks = _FirstFrameHooks(
-        config, backend, template, parameters, adam, densifier, views, extent, generator, numbers, watch, last_pass
+        config,
+        backend,
+        template,
+        parameters,
+        adam,
+        densifier,
+        views,
+        extent,
+        generator,
+        numbers,
+        watch,
+        last_pass,
+        walked,
     )
     samples = coarse_to_fine(views, config.stages(done=done), generator=generator)
+    if roving:
+        samples = alternating(views, walked.views, config.stages(done=done), generator=generator)
     schedule = Schedule(config.iterations, lambda iteration: rates_at(iteration, config, extent=extent), done=done)
     iterations = minimize(adam, samples, schedule, hooks, watch=watch, on_step=on_step)
     scene, counts = detached(hooks.scene), {}
     if config.floaters.enabled:
         with watch.stage("densify"):
-            cameras = [view.camera for view in views]
+            cameras = [view.camera for view in (*views, *walked.views)]
             floating = in_free_space(scene, cameras, config=config.floaters, backend=backend)
             scene = replace(scene, anchors=scene.anchors.select(~floating))
             counts["floaters"] = int(floating.sum())

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures by a camera that was carried through the set, of which frame 0 uses what stands still.
+
+Note [What stands still]
+~~~~~~~~~~~~~~~~~~~~~~~~
+The roving pictures are of another time: where people are in frame 0, they show what is behind, and people elsewhere.
+Many pictures that agree with each other would outvote the still cameras. What moves in frame 0 is known from these: it
+differs from the most frequent colour of its pixel over the take. A place in space may be such a thing if all still
+cameras that see it have a differing pixel there (a visual hull; Laurentini, PAMI 1994). Pixels of a roving picture
+whose ray passes through such a place do not count. What moves in the roving pictures alone is left out while frame 0
+is trained (``training/frame0/roving.py``). Who stands at one place throughout the take is not known to move.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from structgstream.cameras import Camera, CameraRig
+from structgstream.data.images import opencv, read_picture, reduced_mask
+from structgstream.data.points import PointsConfig, initial_points
+from structgstream.data.prepared import ROVING, PreparedCapture
+from structgstream.data.source import FrameSource, FrameStream, SourceWrapper, resized_to
+from structgstream.data.undistortion import Undistortion
+from structgstream.errors import CaptureError
+from structgstream.frames import MultiViewFrame, RovingPicture
+from structgstream.geometry import Floats
+
+INSTANTS = 15  # of the take
+CHANGED_LEVELS = 12.0  # of 255, in a channel, beyond which two pixels of the reduced pictures differ
+REDUCED_SIDE = 160  # pixels, to which the longer side is reduced
+REACH_PIXELS = 2  # of the reduced pictures, by which what differs is enlarged
+DEPTHS = 96  # places on a ray, evenly in inverse depth
+MIN_SEEN = 2  # still cameras that see a place
+NEAR_SHARE = 0.25  # of the near plane of the still cameras: one walks closer to things
+
+
+@dataclass(frozen=True)
+class WithRoving(SourceWrapper):
+    """A capture, or a part of it, with the pictures of a roving camera.
+
+    Args:
+        whole: the capture over its whole time, with the cameras and pictures of ``source``.
+        pictures: as stored, with their cameras.
+    """
+
+    whole: FrameSource
+    pictures: tuple[tuple[Path, Undistortion], ...]
+    stored: CameraRig  # the cameras of the capture at the size of their stored pictures
+
+    def resized(self, rig: CameraRig) -> FrameSource:
+        """See ``Resizable``."""
+        return replace(self, source=resized_to(self.source, rig), whole=resized_to(self.whole, rig))
+
+    def roving(self, frame: MultiViewFrame) -> tuple[RovingPicture, ...]:
+        """The pictures, reduced as the capture's are, for the scene of ``frame``."""
+        name = next(iter(self.rig))
+        scale, near = self.rig[name].width / self.stored[name].width, NEAR_SHARE * self.rig[name].near
+        changed = self._changed(frame)
+        return tuple(self._picture(*one, scale=scale, near=near, changed=changed) for one in self.pictures)
+
+    def moving(self, points: Floats, frame: MultiViewFrame) -> NDArray[np.bool_]:
+        """Which points ``[P, 3]`` are of what moves in ``frame``."""
+        return moving_places(points, self.rig, self._changed(frame))
+
+    def _picture(
+        self,
+        file: Path,
+        undistortion: Undistortion,
+        *,
+        scale: float,
+        near: float,
+        changed: Mapping[str, NDArray[np.bool_]],
+    ) -> RovingPicture:
+        picture = read_picture(file)
+        filmed = undistortion.filmed.camera
+        if picture.shape[1::-1] != (filmed.width, filmed.height):
+            raise CaptureError(
+                f"The roving picture {file} has {picture.shape[1]}x{picture.shape[0]} pixels, expected {filmed.width}x"
+                f"{filmed.height}; prepare the capture again."
+            )
+        camera = replace(undistortion.target.scaled(scale), near=near)
+        size = camera.width, camera.height
+        image = opencv().resize(undistortion(picture), size, interpolation=opencv().INTER_AREA)
+        shown = np.ones(image.shape[:2], bool) if undistortion.shown is None else reduced_mask(undistortion.shown, size)
+        return RovingPicture(camera, image, shown & ~passes_through(camera, self.rig, changed))
+
+    def _changed(self, frame: MultiViewFrame) -> dict[str, NDArray[np.bool_]]:
+        """Where each training camera's picture of ``frame``, reduced, differs from what stands still; nothing for one
+        frame."""
+        if len(self.whole) < MIN_INSTANTS:
+            return {}
+        return {
+            name: differs(reduced(frame.images[name]), self._still[name])
+            for name in self.rig.training
+            if name in frame.images and name in self._still
+        }
+
+    @cached_property
+    def _still(self) -> dict[str, NDArray[np.uint8]]:
+        """What stands still before each camera, reduced."""
+        seen: dict[str, list[NDArray[np.uint8]]] = {name: [] for name in self.rig.training}
+        count = min(INSTANTS, len(self.whole))
+        for index in np.linspace(0, len(self.whole) - 1, count).round().astype(int).tolist():
+            for shown in _one(self.whole, index):
+                for name in seen.keys() & shown.images.keys():
+                    seen[name].append(reduced(shown.images[name]))
+        return {name: most_frequent(np.stack(own)) for name, own in seen.items() if own}
+
+
+MIN_INSTANTS = 3  # below which none is frequent
+
+
+def _one(source: FrameSource, index: int) -> Iterator[MultiViewFrame]:
+    frames: Any = source.frames(index)
+    with closing(frames):
+        yield from islice(frames, 1)
+
+
+def with_roving(source: FrameSource, whole: FrameSource, folder: Path, capture: PreparedCapture) -> FrameSource:
+    """``source``, a part of the prepared ``capture`` in ``folder``, with its roving pictures, where it has some."""
+    if not capture.roving:
+        return source
+    files = {name: folder / own.files for name, own in capture.roving.items()}
+    if missing := [file for file in files.values() if not file.is_file()]:
+        raise CaptureError(f"The roving picture {missing[0]} is missing; restore it, or prepare the capture again.")
+    pictures = tuple((files[name], Undistortion(own.filmed, own.pinhole)) for name, own in capture.roving.items())
+    stored = source.rig.mapped({name: capture.cameras[name].pinhole for name in source.rig})
+    return WithRoving(source, whole, pictures, stored)
+
+
+def roving_of(source: FrameStream) -> WithRoving | None:
+    """The source of roving pictures among the wrappers of ``source``; None without any."""
+    inner: Any = source
+    while inner is not None and not isinstance(inner, WithRoving):
+        inner = getattr(inner, "source", None)
+    return inner
+
+
+def frame_points(
+    source: FrameStream, frame: MultiViewFrame, *, config: PointsConfig | None = None, seed: int = 0
+) -> Floats:
+    """Initial points ``[P, 3]`` of a frame; of frame 0 from the roving pictures, too.
+
+    Roving pictures are closer to a still camera than its neighbours are, and have nothing of what moves. So what moves
+    has the points of the still cameras alone.
+    """
+    config, roving = config or PointsConfig(), roving_of(source)
+    found = initial_points(frame, source.rig, config=config, seed=seed).positions
+    if roving is None or frame.index > 0:
+        return found
+    still = initial_points(*joined(source.rig, frame, roving.roving(frame)), config=config, seed=seed).positions
+    return np.concatenate([still, found[roving.moving(found, frame)]])
+
+
+def joined(
+    rig: CameraRig, frame: MultiViewFrame, pictures: Sequence[RovingPicture]
+) -> tuple[MultiViewFrame, CameraRig]:
+    """A frame and its rig, with the roving pictures as further cameras."""
+    more = {f"{ROVING}/{number}": own for number, own in enumerate(pictures)}
+    images = {**frame.images, **{name: own.image for name, own in more.items()}}
+    masks = {**frame.masks, **{name: own.mask for name, own in more.items()}}
+    cameras = {**rig.cameras, **{name: own.camera for name, own in more.items()}}
+    return replace(frame, images=images, masks=masks), CameraRig(cameras, rig.held_out)
+
+
+def reduced(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A picture ``[H, W, 3]`` at the size at which changes are looked for."""
+    height, width = picture.shape[:2]
+    factor = min(1.0, REDUCED_SIDE / max(width, height))
+    size = max(round(width * factor), 1), max(round(height * factor), 1)
+    return np.asarray(opencv().resize(picture, size, interpolation=opencv().INTER_AREA), np.uint8)
+
+
+def most_frequent(pictures: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Of each pixel of ``[T, H, W, 3]`` the one that differs from the fewest others.
+
+    A median fails where people are before a pixel half of the time; they have several colours.
+    """
+    levels = pictures.astype(np.int16)
+    alike = np.stack([(np.abs(levels - own).max(-1) <= CHANGED_LEVELS).sum(0) for own in levels])
+    return np.take_along_axis(pictures, alike.argmax(0)[None, ..., None], 0)[0]
+
+
+def differs(picture: NDArray[np.uint8], still: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Where a picture ``[H, W, 3]`` differs from another, but for a change of all pixels; a little enlarged."""
+    difference = picture.astype(np.float32) - still
+    difference -= np.median(difference, axis=(0, 1))
+    changed = (np.abs(difference).max(2) > CHANGED_LEVELS).astype(np.uint8)
+    side = 2 * REACH_PIXELS + 1
+    return np.asarray(opencv().dilate(changed, np.ones((side, side), np.uint8)), bool)
+
+
+def passes_through(camera: Camera, rig: CameraRig, changed: Mapping[str, NDArray[np.bool_]]) -> NDArray[np.bool_]:
+    """Pixels ``[H, W]`` of ``camera`` whose ray passes through a place of Note [What stands still]."""
+    small = camera.scaled(min(1.0, REDUCED_SIDE / max(camera.width, camera.height)))
+    found = np.zeros((small.height, small.width), bool)
+    if changed:
+        across, down = np.meshgrid(np.arange(small.width) + 0.5, np.arange(small.height) + 0.5)
+        flat = np.stack([across, down, np.ones_like(across)], -1) @ np.linalg.inv(small.K.numpy()).T
+        rays, eye = flat @ small.viewmat[:3, :3].numpy(), small.center.numpy()
+        for depth in small.near / np.linspace(1, 0, DEPTHS, endpoint=False):
+            found |= moving_places(eye + depth * rays, rig, changed)
+    # Its pixels are areas of the picture's.
+    whole = opencv().resize(found.astype(np.uint8), (camera.width, camera.height), interpolation=opencv().INTER_NEAREST)
+    return np.asarray(whole, bool)
+
+
+def moving_places(points: Floats, rig: CameraRig, changed: Mapping[str, NDArray[np.bool_]]) -> NDArray[np.bool_]:
+    """Which places ``[..., 3]`` all still cameras that see them take for moving."""
+    seen, moving = np.zeros((2, *points.shape[:-1]), np.int16)
+    for name, mask in changed.items():
+        camera = rig[name].resized(mask.shape[1], mask.shape[0])
+        local = points @ camera.viewmat[:3, :3].numpy().T + camera.viewmat[:3, 3].numpy()
+        ahead = local[..., 2] > camera.near
+        pixels = local @ camera.K.numpy().T / np.where(ahead, local[..., 2], 1.0)[..., None]
+        column, row = (np.floor(pixels[..., axis]).clip(-1, 2**20).astype(int) for axis in (0, 1))
+        inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        seen += inside
+        moving += inside & mask[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)]
+    return (seen >= MIN_SEEN) & (moving == seen)
