@@ -50,9 +50,9 @@ def test_two_cameras() -> None:
 def test_sparsity_ends_with_many_cameras_and_with_close_ones_and_has_no_step() -> None:
     assert spacing.sparsity(evenly(4, 60.0)) == 1.0
     assert spacing.sparsity(evenly(12, 30.0)) == spacing.sparsity(evenly(27, 13.0)) == 0.0
-    assert spacing.sparsity(evenly(9, 14.0)) == 0.0
-    assert spacing.sparsity(evenly(10, 36.0)) == pytest.approx(0.5)
-    assert spacing.sparsity(evenly(6, 22.5)) == pytest.approx(0.5, abs=0.01)
+    assert spacing.sparsity(evenly(9, 34.0)) == 0.0
+    assert spacing.sparsity(ring([*range(0, 300, 60), *range(1, 301, 60)])) == pytest.approx(0.5)  # pairs, 59 apart
+    assert spacing.sparsity(evenly(6, 42.5)) == pytest.approx(0.5, abs=0.01)
 
 
 def test_what_is_expected_falls_with_the_angle_and_ends_with_what_was_measured() -> None:

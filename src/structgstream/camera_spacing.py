@@ -54,11 +54,11 @@ def camera_spacing(cameras: Mapping[str, Camera]) -> float:
 
 
 MANY_CAMERAS, FEW_CAMERAS = 12, 8
-NEAR_DEGREES, FAR_DEGREES = 15.0, 30.0
+NEAR_DEGREES, FAR_DEGREES = 35.0, 50.0
 
 
 def sparsity(cameras: Mapping[str, Camera]) -> float:
-    """How much stands against explaining each camera alone, 0 to 1 (Note [Few cameras]).
+    """How much frame 0 needs against explaining each camera alone, 0 to 1 (Note [Few cameras]).
 
     It falls from 1 to 0 between :data:`FEW_CAMERAS` and :data:`MANY_CAMERAS` cameras, and between a
     :func:`camera_spacing` of :data:`FAR_DEGREES` and :data:`NEAR_DEGREES`.
@@ -117,13 +117,11 @@ def expectation(cameras: Mapping[str, Camera]) -> Expectation | None:
         return None
     psnr = expected_psnr(degrees)
     enough = math.ceil(count * (degrees / GOOD_DEGREES) ** (1.0 / COUNT_EXPONENT))
-    others = [number for number in (2 * count, enough) if count < number <= enough]
-    better = ", ".join(
-        f"{expected_psnr(degrees * (count / number) ** COUNT_EXPONENT):.0f} with {number}"
-        for number in sorted({*others})
-    )
+    closer = {number: degrees * (count / number) ** COUNT_EXPONENT for number in (min(2 * count, enough), enough)}
+    better = ", ".join(f"{expected_psnr(apart):.0f} with {number}" for number, apart in closer.items())
+    torn = ", where people and objects are torn" if psnr < WARNING_PSNR else ""
     return Expectation(
-        f"{count} cameras, about {degrees:.0f} degrees apart: expect about {psnr:.0f} dB at viewpoints between them "
-        f"({better}); add cameras, or move them closer together.",
+        f"{count} cameras, about {degrees:.0f} degrees apart: expect about {psnr:.0f} dB at viewpoints between "
+        f"them{torn} ({better}); add cameras, or move them closer together.",
         psnr,
     )

@@ -80,7 +80,7 @@ def projected(camera, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]
 
 
 def test_few_cameras_get_seeds_where_no_point_is_at_the_depth_of_those_around() -> None:
-    cameras = evenly(4, 40.0)
+    cameras = evenly(4, 50.1)
     wall = torch.rand(400, 3, generator=torch.manual_seed(0)) * torch.tensor([1.6, 1.0, 0.02]) - torch.tensor(
         [0.8, 0.5, 0]
     )
@@ -101,12 +101,12 @@ def test_few_cameras_get_seeds_where_no_point_is_at_the_depth_of_those_around() 
 
 def test_larger_pictures_have_no_more_rays() -> None:
     points = torch.rand(100, 3, generator=torch.manual_seed(0)) * 0.2
-    cameras = {name: camera.resized(640, 480) for name, camera in evenly(4, 40.0).items()}
+    cameras = {name: camera.resized(640, 480) for name, camera in evenly(4, 50.1).items()}
     doubled = {name: camera.resized(1280, 960) for name, camera in cameras.items()}
     assert len(with_completed_depth(points, cameras)) == len(with_completed_depth(points, doubled)) > 1000
 
 
-@pytest.mark.parametrize(("count", "apart"), [(12, 30.0), (9, 14.0)])
+@pytest.mark.parametrize(("count", "apart"), [(12, 30.0), (9, 34.0)])
 def test_many_or_close_cameras_get_no_further_seeds(count: int, apart: float) -> None:
     points = torch.rand(50, 3)
     assert with_completed_depth(points, evenly(count, apart)) is points
