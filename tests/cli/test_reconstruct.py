@@ -37,6 +37,19 @@ def test_a_rig_that_is_not_the_papers_is_reported(tmp_path: Path, capsys: pytest
     assert "The paper's data of paper-meetroom are others: pictures of 80x60 instead of 1280x720;" in said
 
 
+def test_few_cameras_are_told_at_the_start_what_to_expect(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = ["reconstruct", CLIP, "--frames", "1", "--scale", "0.25", *QUICK, "-o"]
+    assert main([*asked, str(tmp_path / "s.sgs")]) == 0
+    assert "degrees apart" not in capsys.readouterr().out
+    most = ["cam00", "cam02", "cam03", "cam04"]
+    assert main([*asked, str(tmp_path / "few.sgs"), "--held-out", *most]) == 0
+    first, second, *_ = capsys.readouterr().out.splitlines()
+    assert "2 training cameras" in first
+    assert re.fullmatch(
+        r"(Warning: )?2 cameras, about \d+ degrees apart: expect about \d+ dB at viewpoints between them .*", second
+    )
+
+
 def test_quality_and_rate_reach_the_stream(tmp_path: Path) -> None:
     base = ["reconstruct", CLIP, "-o", str(tmp_path / "s.sgs"), "--scale", "0.25", "--frames", "1", *QUICK]
     assert main([*base, "--codec", "compact", "--quality", "1.5", "--mbits", "0.5"]) == 0

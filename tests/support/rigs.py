@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Small rigs and scenes that several tests look at."""
 
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -31,6 +35,21 @@ def arc_rig(cameras: int = 4, *, width: int = 48, height: int = 32, radius: floa
         K = torch.tensor([[40.0, 0, width / 2], [0, 40.0, height / 2], [0, 0, 1]], dtype=torch.float64)
         found[f"cam{i:02d}"] = Camera(look_at(eye, torch.zeros(3, dtype=torch.float64)), K, width, height, near=0.1)
     return CameraRig(found, held_out=frozenset({"cam00"}))
+
+
+def ring(degrees: Sequence[float], *, radius: float = 3.0) -> dict[str, Camera]:
+    """Cameras around the origin at these angles, that look at it."""
+    like, middle = arc_rig()["cam00"], torch.zeros(3, dtype=torch.float64)
+    eyes = [
+        torch.tensor([radius * math.sin(angle), 0.0, -radius * math.cos(angle)], dtype=torch.float64)
+        for angle in map(math.radians, degrees)
+    ]
+    return {f"cam{i:02d}": replace(like, viewmat=look_at(eye, middle)) for i, eye in enumerate(eyes)}
+
+
+def evenly(count: int, apart: float) -> dict[str, Camera]:
+    """A ring of ``count`` cameras, ``apart`` degrees from one to the next."""
+    return ring([apart * i for i in range(count)])
 
 
 def random_scene(anchors: int = 40, *, free: int = 0, cameras: int = 3, seed: int = 0, width: int = 32) -> Scene:

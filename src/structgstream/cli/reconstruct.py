@@ -164,6 +164,7 @@ class OpenedScene:
 
 def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, console: Console) -> OpenedScene:
     """The capture, or the live cameras, that the options name; says what it is."""
+    from structgstream.camera_spacing import expectation
     from structgstream.data.roving import roving_of
     from structgstream.evaluation.recording import part_metadata
     from structgstream.kernels.backend import select_backend
@@ -195,6 +196,8 @@ def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, con
         f"{source.name}: {len(source.rig.training)} training cameras, held out: "
         f"{', '.join(source.rig.testing) or 'none'}; {length}; preset {preset}, back-end {backend.name}.",
     )
+    if expected := expectation({name: source.rig[name] for name in source.rig.training}):
+        print_lines(console, f"{'Warning: ' if expected.poor else ''}{expected.sentence}")
     if differences := departures(preset, source.rig):
         console.print(f"The paper's data of {preset} are others: {'; '.join(differences)}.", highlight=False)
     blind = unrecognized_faults(len(source.rig.training)) if config.online.motion.enabled else None

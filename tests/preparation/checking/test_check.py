@@ -76,6 +76,14 @@ def test_a_good_rig_is_fine() -> None:
         assert camera.overlaps >= 3
 
 
+def test_cameras_that_are_too_far_apart_are_told_what_to_expect() -> None:
+    rig, frame = room()
+    assert not any("degrees apart" in finding.sentence for finding in checked().report.findings)
+    far = rig.with_held_out(frozenset([*rig][1:-1]))
+    found = check_capture(MemoryCapture(far, [frame])).report.findings
+    assert [f.severity for f in found if f.sentence.startswith("2 cameras, about 45 degrees apart")] == ["note"]
+
+
 def test_the_camera_that_was_turned_is_named() -> None:
     def bump(cameras: Cameras) -> None:
         cameras["cam02"] = turned(cameras["cam02"], 1.5)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from structgstream.camera_spacing import expectation
 from structgstream.cameras import Camera
 from structgstream.data.source import FrameSource, select_cameras
 from structgstream.frames import MultiViewFrame
@@ -176,6 +177,8 @@ def check_capture(
     presence = {name: present.copy() for name, present in first.presence.items()}
     findings = explain(first.evidence, first.cameras, first.verdict)
     findings += overlap_findings(first.evidence.overlapping(), list(first.cameras))
+    if expected := expectation({name: cameras[name] for name in source.rig.training}):
+        findings.append(Finding("warning" if expected.poor else "note", expected.sentence))
     depths = observed_depths(first.tracks, first.cameras, off=first.suspects.off)
     off = () if first.suspects.everything else first.suspects.off
     centers = np.stack([camera.center.numpy() for name, camera in first.cameras.items() if name not in off])
