@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from structgstream.scene.state import FieldName
-from structgstream.session.presets import StreamConfig
+from structgstream.session.presets import PAPER, PRESETS, StreamConfig
 from structgstream.training.online.config import OnlineConfig, PatchingConfig
 
 PaperFigures = Mapping[str, float]
@@ -54,6 +54,14 @@ class AblationTable:
 
 
 FULL = "full"
+FULL_METHODS: Mapping[str, StreamConfig] = {
+    "rig": PRESETS["rig"],
+    "paper-n3dv": PRESETS["paper-n3dv"],
+    "paper-n3dv, l_v as six scales": replace(
+        PAPER, online=replace(PAPER.online, dynamic=PAPER.online.dynamic.union(["base_scales"]))
+    ),
+}
+"""The methods that studies edit: what the row ``full`` may be."""
 COSTS = ("bytes_with_header", "decode_and_render_fps")
 """The last columns of every table: the paper's starred storage, and its rendering speed."""
 
@@ -80,7 +88,8 @@ TABLES: Mapping[str, AblationTable] = {
             scene="flame steak, N3DV",
             rows={
                 "without-free": {"psnr": 33.26, "free_bytes": 0.0, "t_lpips": 1.55e-2, "e_warp": 4.89e-3},
-                "random-spawn": {"psnr": 33.48, "free_bytes": 2.28e6, "t_lpips": 1.52e-2, "e_warp": 4.85e-3},
+                "uniform-spawn": {"psnr": 33.48, "free_bytes": 2.28e6, "t_lpips": 1.52e-2, "e_warp": 4.85e-3},
+                "random-spawn": {},
                 "without-quantity-control": {
                     "psnr": 33.93,
                     "free_bytes": 2.87e6,
@@ -135,12 +144,14 @@ def variants(full: StreamConfig) -> dict[str, Variant]:
         online(key, title, replace(full.online, patching=config), *paths)
 
     base, patch = full.online.dynamic, full.online.patching
-    dynamic("without-scaling-factor", "w/o scaling factor", base.difference(["offset_scales"]))
+    # Where l_v is read as all six scales of Scaffold-GS, both go.
+    dynamic("without-scaling-factor", "w/o scaling factor", base.difference(["offset_scales", "base_scales"]))
     dynamic("without-covariance-mlp", "w/o covariance MLP", base.difference(["covariance_mlp"]))
     dynamic("with-opacity-mlp", "w opacity MLP", base.union(["opacity_mlp"]))
     dynamic("with-color-mlp", "w colour MLP", base.union(["color_mlp"]))
     patching("without-free", "w/o free 3DGs", replace(patch, spawn="off"), "spawn")
-    patching("random-spawn", "random generation", replace(patch, spawn="random"), "spawn")
+    patching("uniform-spawn", "random generation", replace(patch, spawn="uniform"), "spawn")
+    patching("random-spawn", "random parents", replace(patch, spawn="random"), "spawn")
     patching("without-quantity-control", "w/o quantity control", replace(patch, prune_opacity=None), "prune_opacity")
     alone = replace(patch, lifetime="frame")
     patching("independent-1", "I1: independent, tau 0.001", alone, "lifetime")
