@@ -46,7 +46,7 @@ class Options:
 
 
 def compared(hooks: Any, loss: SceneLoss) -> dict[str, float]:
-    """Gradients and counts of one iteration; ratios of the printed sum's gradient, times its weight, to the picture's."""
+    """Counts of one iteration, and ratios of the printed sum's gradient, times its weight, to the picture's."""
     values, config = hooks.parameters.values, hooks.config
     offsets, anchors = values["anchor_offsets"], hooks.scene.anchors
     (everything,) = torch.autograd.grad(loss.total, offsets, retain_graph=True)
