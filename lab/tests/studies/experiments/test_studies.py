@@ -54,7 +54,7 @@ def test_variants_of_a_seed_wait_for_one_first_frame(tmp_path: Path) -> None:
     for task in tasks:
         assert before.issuperset(task.needs)
         before.add(task.name)
-    assert len(before) == len(tasks) == 8 + 2 * 8
+    assert len(before) == len(tasks) == 8 + 2 * 9
 
 
 def test_readings_are_edits_of_what_is_asked_for(tmp_path: Path) -> None:

@@ -94,6 +94,7 @@ TABLES: Mapping[str, AblationTable] = {
                 "without-free": {"psnr": 33.26, "free_bytes": 0.0, "t_lpips": 1.55e-2, "e_warp": 4.89e-3},
                 "uniform-spawn": {"psnr": 33.48, "free_bytes": 2.28e6, "t_lpips": 1.52e-2, "e_warp": 4.85e-3},
                 "random-spawn": {},
+                "harmonic-color": {},
                 "without-quantity-control": {
                     "psnr": 33.93,
                     "free_bytes": 2.87e6,
@@ -156,6 +157,9 @@ def variants(full: StreamConfig) -> dict[str, Variant]:
     patching("without-free", "w/o free 3DGs", replace(patch, spawn="off"), "spawn")
     patching("uniform-spawn", "random generation", replace(patch, spawn="uniform"), "spawn")
     patching("random-spawn", "random parents", replace(patch, spawn="random"), "spawn")
+    rates = replace(full.online.rates, free_color="sh")
+    harmonic = replace(full.online, rates=rates)
+    online("harmonic-color", "colour as a spherical harmonic", harmonic, "rates.free_color")
     patching("without-quantity-control", "w/o quantity control", replace(patch, prune_opacity=None), "prune_opacity")
     alone = replace(patch, lifetime="frame")
     patching("independent-1", "I1: independent, tau 0.001", alone, "lifetime")
