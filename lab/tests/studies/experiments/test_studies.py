@@ -71,8 +71,8 @@ def test_unknown_tables_and_methods_are_refused(tmp_path: Path) -> None:
         comparison_runs(["rig", "nerf"], CLIP, frames=3, alone_every=1, seeds=(0,), folder=tmp_path)
 
 
-def test_the_papers_presets_are_methods_that_are_named_as_what_is_printed() -> None:
-    assert method_titles()["paper-n3dv"] == "Struct-GStream as printed (paper-n3dv)"
+def test_the_papers_presets_are_methods_that_are_named_as_the_papers() -> None:
+    assert method_titles()["paper-n3dv"] == "Struct-GStream, the paper's preset (paper-n3dv)"
     assert method_titles()["rig"] == "Struct-GStream (rig)"
 
 

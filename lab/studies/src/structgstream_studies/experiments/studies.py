@@ -161,7 +161,7 @@ def method_key(name: str) -> str:
 def method_titles() -> dict[str, str]:
     """Every method that can be compared, with its name in tables."""
     ours = {name: f"Struct-GStream ({name})" for name in PRESETS}
-    ours |= {name: f"Struct-GStream as printed ({name})" for name in PAPER_DATA}
+    ours |= {name: f"Struct-GStream, the paper's preset ({name})" for name in PAPER_DATA}
     return ours | {"held": "frame 0 held"} | dict(PEER_TITLES)
 
 

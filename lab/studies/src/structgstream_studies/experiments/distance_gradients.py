@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How strong L_dist is beside the picture in frame 0: ``python -m structgstream_studies.distance_gradients CAPTURE``.
+"""How strong L_dist is beside the picture in frame 0: ``python -m`` this module and a capture.
 
 L_dist acts on the components of O * l_v beyond 2 eps. Every ``--every`` iterations the gradients by O of the printed
 sum, times its weight, and of the other terms are compared on these components: the median of the ratio over those that
