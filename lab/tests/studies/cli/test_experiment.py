@@ -226,7 +226,7 @@ def test_failed_steps_are_named_with_those_that_were_not_begun(
     outcome = Outcome(failed=("first-1.seed0",), blocked=("full.seed0", "held.seed0"), skipped=())
     monkeypatch.setattr("structgstream_studies.experiments.sweep.sweep", lambda *_, **__: outcome)
     error = error_of(ablate(tmp_path), capsys, status=1)
-    assert "1 of 4 steps failed (first-1.seed0), and 2 that needed them were not begun." in error
+    assert "1 of 8 steps failed (first-1.seed0), and 2 that needed them were not begun." in error
     assert f"{tmp_path / 'logs' / 'first-1.seed0.txt'}; the same command goes on" in error
 
 
