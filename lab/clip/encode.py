@@ -13,7 +13,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from rig import FPS, FRAMES, HEIGHT, RIGS, WIDTH, Rig
+from rig import FPS, FRAMES, RIGS, Rig
 
 Pictures = NDArray[np.uint8]
 RED, GREEN, BLUE = 0.2126, 0.7152, 0.0722  # luma weights of BT.709
@@ -41,20 +41,21 @@ def encode(path: Path, pictures: Pictures, *, quality: int, psy: bool = True) ->
                 "crf": str(quality),
                 "preset": "veryslow",
                 "psy": str(int(psy)),
-                "g": str(FRAMES),
+                "g": str(len(pictures)),
                 "threads": "1",
                 "flags": "+bitexact",
             },
         )
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv444p"
+        height, width = pictures.shape[1:3]
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv444p"
         context = stream.codec_context
         context.bit_rate = 0  # a rate left at its default would win over the constant quality
         context.color_range, context.colorspace, context.color_primaries, context.color_trc = 1, 1, 1, 1
         for number, picture in enumerate(pictures):
-            frame = av.VideoFrame(WIDTH, HEIGHT, "yuv444p")
+            frame = av.VideoFrame(width, height, "yuv444p")
             for plane, values in zip(frame.planes, yuv_planes(picture), strict=True):
-                padded = np.zeros((HEIGHT, plane.line_size), np.uint8)
-                padded[:, :WIDTH] = values
+                padded = np.zeros((height, plane.line_size), np.uint8)
+                padded[:, :width] = values
                 plane.update(padded.tobytes())
             frame.pts, frame.time_base = number, Fraction(1, FPS)
             frame.color_range, frame.colorspace = 1, 1
@@ -74,11 +75,11 @@ def psnr(a: Pictures, b: Pictures) -> float:
     return float(10 * np.log10(255**2 / error))
 
 
-def description(rig: Rig) -> dict[str, object]:
+def description(rig: Rig, frames: int) -> dict[str, object]:
     """The content of ``cameras.json``."""
     views = rig.views()
     return {
-        "width": WIDTH, "height": HEIGHT, "fps": FPS, "frames": FRAMES, "held_out": [views[0].name],
+        "width": rig.width, "height": rig.height, "fps": FPS, "frames": frames, "held_out": [views[0].name],
         "cameras": {view.name: {"K": view.K.tolist(), "viewmat": view.viewmat.tolist()} for view in views},
         "convention": "viewmat: world to camera, OpenCV axes (x right, y down, z forward), world z up; "
         "the top-left pixel's centre is (0.5, 0.5)",
@@ -92,6 +93,7 @@ def main() -> None:
     parser.add_argument("scene", choices=sorted(RIGS))
     parser.add_argument("pictures", type=Path, help="folder written by scene.py")
     parser.add_argument("out", type=Path, help="folder for the videos and cameras.json")
+    parser.add_argument("--frames", type=int, default=FRAMES, help="how many there are")
     parser.add_argument("--crf", type=int, default=9, help="x264 constant rate factor")
     parser.add_argument(
         "--psy", action=argparse.BooleanOptionalAction, default=True, help="x264's psychovisual decisions"
@@ -99,9 +101,9 @@ def main() -> None:
     options = parser.parse_args()
     rig = RIGS[options.scene]
     options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "cameras.json").write_text(json.dumps(description(rig), indent=1) + "\n")
+    (options.out / "cameras.json").write_text(json.dumps(description(rig, options.frames), indent=1) + "\n")
     for view in rig.views():
-        files = [options.pictures / f"{view.name}_{frame:02d}.png" for frame in range(FRAMES)]
+        files = [options.pictures / f"{view.name}_{frame:02d}.png" for frame in range(options.frames)]
         pictures = np.stack([np.asarray(Image.open(file).convert("RGB")) for file in files])
         path = options.out / f"{view.name}.mp4"
         encode(path, pictures, quality=options.crf, psy=options.psy)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ten cameras of each clip: a two-row arc, and camera 0 in its middle as the held-out view."""
+"""The cameras of each clip: a two-row arc, and camera 0 in its middle as the held-out view."""
 
 import math
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-WIDTH, HEIGHT, FPS, FRAMES = 320, 240, 30, 12
+FPS, FRAMES = 30, 12
 FIELD_OF_VIEW_DEGREES = 52.0
 
 
@@ -21,10 +21,10 @@ class View:
     viewmat: NDArray[np.float64]
 
 
-def intrinsics() -> NDArray[np.float64]:
+def intrinsics(width: int, height: int) -> NDArray[np.float64]:
     """K for square pixels and a centred principal point, with the top-left pixel's centre at (0.5, 0.5)."""
-    focal = WIDTH / 2 / math.tan(math.radians(FIELD_OF_VIEW_DEGREES) / 2)
-    return np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
+    focal = width / 2 / math.tan(math.radians(FIELD_OF_VIEW_DEGREES) / 2)
+    return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,8 @@ class Rig:
     near_metres: float
     # (azimuth, elevation) in degrees about the target; azimuth 0 looks along +y
     directions: tuple[tuple[float, float], ...]
+    width: int = 320
+    height: int = 240
 
     def views(self) -> list[View]:
         """The cameras in the order of their numbers."""
@@ -54,11 +56,24 @@ class Rig:
             viewmat = np.eye(4)
             viewmat[:3, :3] = [right, np.cross(forward, right), forward]
             viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-            out.append(View(f"cam{number:02d}", eye, intrinsics(), viewmat))
+            out.append(View(f"cam{number:02d}", eye, intrinsics(self.width, self.height), viewmat))
         return out
 
 
 RIGS = {
+    # The table as 21 cameras of the size of N3DV's see it, in two rows as there.
+    "n3dv": Rig(
+        target=(0.02, 0.12, 0.155),
+        radius_metres=1.5,
+        near_metres=0.6,
+        directions=(
+            (0.0, 17.0),
+            *((-31.5 + 7.0 * step, 10.0) for step in range(10)),
+            *((-31.5 + 7.0 * step, 24.0) for step in range(10)),
+        ),
+        width=1352,
+        height=1014,
+    ),
     "table": Rig(
         target=(0.02, 0.12, 0.155),
         radius_metres=1.5,

@@ -6,7 +6,6 @@ Pictures that exist are skipped, so a run that was stopped goes on where it ende
 
 import argparse
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +18,12 @@ mi.set_variant("llvm_ad_rgb")
 import mitsuba_oidn  # noqa: E402  (needs the variant)
 from materials import lights, shape  # noqa: E402
 from meshes import Parts  # noqa: E402
-from rig import FIELD_OF_VIEW_DEGREES, FPS, FRAMES, HEIGHT, RIGS, WIDTH, View  # noqa: E402
+from rig import FIELD_OF_VIEW_DEGREES, FPS, FRAMES, RIGS, Rig, View  # noqa: E402
 from table.stage import TABLE  # noqa: E402
 from throw.stage import THROW  # noqa: E402
 from tone import developed  # noqa: E402
 
-STAGES = {"table": TABLE, "throw": THROW}
+STAGES = {"n3dv": TABLE, "table": TABLE, "throw": THROW}
 
 
 def shapes(parts: Parts, surfaces: dict[str, Any]) -> dict[str, Any]:
@@ -32,13 +31,13 @@ def shapes(parts: Parts, surfaces: dict[str, Any]) -> dict[str, Any]:
     return {name: shape(name, mesh, surfaces[surface]) for name, (mesh, surface) in parts.items()}
 
 
-def sensor(view: View, target: Sequence[float]) -> Any:
+def sensor(view: View, rig: Rig) -> Any:
     """The view as a Mitsuba camera; the box filter keeps pixels independent, as the denoiser expects."""
-    to_world = mi.ScalarTransform4f().look_at(origin=view.eye.tolist(), target=list(target), up=[0, 0, 1])
+    to_world = mi.ScalarTransform4f().look_at(origin=view.eye.tolist(), target=list(rig.target), up=[0, 0, 1])
     film = {
         "type": "hdrfilm",
-        "width": WIDTH,
-        "height": HEIGHT,
+        "width": rig.width,
+        "height": rig.height,
         "rfilter": {"type": "box"},
         "pixel_format": "rgb",
     }
@@ -65,7 +64,7 @@ def main() -> None:
     parser.add_argument("scene", choices=sorted(RIGS))
     parser.add_argument("out", type=Path, help="folder for the pictures")
     parser.add_argument("--frames", type=int, nargs="*", default=list(range(FRAMES)))
-    parser.add_argument("--cameras", type=int, nargs="*", default=list(range(10)))
+    parser.add_argument("--cameras", type=int, nargs="*", help="default: all")
     parser.add_argument("--samples", type=int, default=48, help="a pixel, training cameras")
     parser.add_argument("--held-out-samples", type=int, default=160, help="a pixel, camera 0")
     parser.add_argument("--guide-samples", type=int, default=16, help="a pixel, albedo and normals for the denoiser")
@@ -73,13 +72,14 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     rig, stage = RIGS[options.scene], STAGES[options.scene]
     views, surfaces = rig.views(), stage.surfaces()
+    numbers = range(len(views)) if options.cameras is None else options.cameras
     light = lights(size=stage.lights_size, panel=stage.panel, window=stage.window)
     still = shapes(stage.still(), surfaces) | {name: mi.load_dict(part) for name, part in light.items()}
-    cameras = {number: sensor(views[number], rig.target) for number in options.cameras}
+    cameras = {number: sensor(views[number], rig) for number in numbers}
     for frame in options.frames:
         missing = {
             number: path
-            for number in options.cameras
+            for number in numbers
             if not (path := options.out / f"{views[number].name}_{frame:02d}.png").exists()
         }
         if not missing:

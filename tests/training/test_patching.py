@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 from dataclasses import replace
+from typing import Literal
 
+import pytest
 import torch
 
 from structgstream.gaussians import Gaussians
@@ -39,7 +41,7 @@ def test_children_are_drawn_from_two_sigma() -> None:
     source = parents(200_000)
     config = PatchingConfig()
     means = spawn_children(
-        source, first_identity=1 * IDS_PER_FRAME, config=config, generator=generator()
+        source, source.means, first_identity=1 * IDS_PER_FRAME, config=config, generator=generator()
     ).means.double()
     rotation = quaternion_matrices(source.quats[:1].double())[0]
     sigma = rotation @ torch.diag(source.scales[0].double() ** 2) @ rotation.T
@@ -47,9 +49,21 @@ def test_children_are_drawn_from_two_sigma() -> None:
     assert torch.allclose(torch.cov(means.T), 2.0 * sigma, atol=5e-3)
 
 
+def test_uniform_children_are_anywhere_in_the_box_of_the_anchors() -> None:
+    anchors = torch.tensor([[-1.0, 5.0, 0.0], [1.0, 0.0, 3.0], [0.0, 1.0, 2.0]])
+    config = PatchingConfig(spawn="uniform")
+    children = spawn_children(parents(100_000), anchors, first_identity=0, config=config, generator=generator())
+    low, high = torch.tensor([-1.0, 0.0, 0.0]), torch.tensor([1.0, 5.0, 3.0])
+    assert torch.allclose(children.means.mean(0), (low + high) / 2, atol=2e-2)
+    assert torch.allclose(children.means.var(0), (high - low) ** 2 / 12, atol=2e-2)
+    assert ((children.means >= low) & (children.means <= high)).all()
+
+
 def test_a_childs_other_attributes() -> None:
     source = parents(3)
-    children = spawn_children(source, first_identity=7 * IDS_PER_FRAME, config=PatchingConfig(), generator=generator())
+    children = spawn_children(
+        source, source.means, first_identity=7 * IDS_PER_FRAME, config=PatchingConfig(), generator=generator()
+    )
     assert torch.allclose(children.log_scales.exp(), source.scales)
     assert torch.equal(children.colors, source.colors)
     assert torch.equal(children.quats, torch.tensor([[1.0, 0, 0, 0]]).expand(3, 4))
@@ -70,10 +84,11 @@ def test_the_cap_prefers_large_gradients() -> None:
     assert chosen.tolist() == [1, 2]
 
 
-def test_random_spawning_takes_as_many_but_others() -> None:
+@pytest.mark.parametrize("rule", ["random", "uniform"])
+def test_random_spawning_takes_as_many_but_others(rule: Literal["random", "uniform"]) -> None:
     gradient = torch.zeros(1000)
     gradient[:50] = 1.0
-    config = PatchingConfig(spawn="random")
+    config = PatchingConfig(spawn=rule)
     chosen = choose_parents(gradient, torch.ones(1000), room=999, config=config, generator=generator())
     assert len(chosen) == 50
     assert (chosen >= 50).any()

@@ -155,6 +155,9 @@ def to_json(config: StreamConfig) -> dict[str, Any]:
     found = plain_value(config)
     if found.get("period") == asdict(PeriodConfig()):
         del found["period"]
+    rates = found.get("online", {}).get("rates", {})
+    if rates.get("free_color") == "rgb":
+        del rates["free_color"]
     return found
 
 

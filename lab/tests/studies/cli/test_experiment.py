@@ -11,11 +11,13 @@ import pytest
 from rich.console import Console
 
 from structgstream.cli import main
+from structgstream.cli.app import UsageError
 from structgstream.cli.options import CaptureOptions, resolve_config
 from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.data.source import WithRig
 from structgstream.kernels.backend import select_backend
 from structgstream.session.presets import PRESETS, StreamConfig
+from structgstream_studies.cli.dataset import captures_in
 from structgstream_studies.cli.experiment import Display, ExperimentOptions, capture_part, print_sheet
 from structgstream_studies.experiments.captures import CapturePart
 from structgstream_studies.experiments.results import read_results
@@ -63,7 +65,7 @@ def ablated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config, _ = resolve_config(QUICK[1], QUICK[2:], command="ablate", seed=None)
     part = CapturePart(Path(CLIP), scale=0.25, frames=2)
     *tasks, last = with_dependencies(ablation_runs(["distance"], config, part, frames=2, seeds=(0,), folder=folder))
-    assert len(tasks) == 3
+    assert len(tasks) == 7
     for task in tasks:
         task.run(backend)
     before = contents(folder)
@@ -86,10 +88,27 @@ def test_ablate_leaves_table_pictures_results_and_streams(ablated: Path) -> None
     assert {(result.key, result.seed) for result in read_results(ablated / "results")} == {
         ("full", 0),
         ("without-distance", 0),
+        ("acting-distance", 0),
+        ("printed-distance", 0),
     }
-    assert len(list((ablated / "first").glob("*.sgs"))) == 2
-    assert len(list((ablated / "streams").glob("*.sgs"))) == 2
+    assert len(list((ablated / "first").glob("*.sgs"))) == 4
+    assert len(list((ablated / "streams").glob("*.sgs"))) == 4
     assert not list(ablated.rglob("*.partial"))
+
+
+def test_dataset_runs_every_capture_and_prints_our_row(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("one", "two"):
+        (tmp_path / "scenes" / name).parent.mkdir(exist_ok=True)
+        (tmp_path / "scenes" / name).symlink_to(CLIP, target_is_directory=True)
+    asked = ["dataset", str(tmp_path / "scenes"), "n3dv", "-o", str(tmp_path / "out"), "--preset", "tiny"]
+    assert main([*asked, *SMALL]) == 0
+    table = (tmp_path / "out" / "dataset.md").read_text()
+    results = [read_results(tmp_path / "out" / name / "results")[0] for name in ("one", "two")]
+    assert [result.identity["capture"]["held_out"] for result in results] == [["cam00"], ["cam00"]]
+    assert f"{(results[0].mean['psnr'] + results[1].mean['psnr']) / 2:.2f}" in table.splitlines()[-1]
+    assert "| cited: 3DGStream |" in table
+    with pytest.raises(UsageError, match="has no folders of captures"):
+        captures_in(tmp_path / "out" / "one" / "results")
 
 
 def test_a_second_time_prints_the_table_and_does_nothing_again(
@@ -102,7 +121,7 @@ def test_a_second_time_prints_the_table_and_does_nothing_again(
     text = capsys.readouterr().out
     assert contents(ablated) == before
     assert (ablated / "distance.md").read_text() == table
-    assert "2 of 2 steps were done already." in text
+    assert "4 of 4 steps were done already." in text
     assert f"{read_results(ablated / 'results')[0].mean['psnr']:.2f}" in text
     assert "w/o distance" in text
     assert f"Tables and pictures: {ablated}" in text
@@ -207,7 +226,7 @@ def test_failed_steps_are_named_with_those_that_were_not_begun(
     outcome = Outcome(failed=("first-1.seed0",), blocked=("full.seed0", "held.seed0"), skipped=())
     monkeypatch.setattr("structgstream_studies.experiments.sweep.sweep", lambda *_, **__: outcome)
     error = error_of(ablate(tmp_path), capsys, status=1)
-    assert "1 of 4 steps failed (first-1.seed0), and 2 that needed them were not begun." in error
+    assert "1 of 8 steps failed (first-1.seed0), and 2 that needed them were not begun." in error
     assert f"{tmp_path / 'logs' / 'first-1.seed0.txt'}; the same command goes on" in error
 
 

@@ -56,7 +56,7 @@ def outcome(
 def present(key: str) -> Mapping[str, Any]:
     """The configuration that a row has today, as results record it; without its seed."""
     nested: dict[str, Any] = {}
-    for path, value in present_configs().get(key, {}).items():
+    for path, value in present_configs().get(key, {}).get("rig", {}).items():
         *folders, name = path.split(".")
         place = nested
         for folder in folders:

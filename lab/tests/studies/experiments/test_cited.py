@@ -5,9 +5,11 @@ import re
 
 import pytest
 
+from outcomes import outcome
 from structgstream.errors import ConfigError
-from structgstream_studies.experiments.cited import CITED, cited_sheet
+from structgstream_studies.experiments.cited import CITED, cited_sheet, dataset_sheet
 from structgstream_studies.experiments.documents import refresh_text
+from structgstream_studies.experiments.results import Result
 
 
 @pytest.mark.parametrize("name", CITED)
@@ -37,6 +39,21 @@ def test_the_papers_own_rows_are_as_printed() -> None:
         "meetroom": ["30.95", "2.97", "3.02", "0.08", "123"],
         "immersive": ["28.48", "5.2", "5.4", "0.26", "96"],
     }
+
+
+def test_our_row_is_the_mean_over_captures_of_the_means_over_seeds() -> None:
+    def of(name: str, psnr: float, seed: int) -> Result:
+        facts = {"online_bytes": 2e6, "bytes_with_header": 3e6, "online_seconds": 6.0}
+        return outcome(
+            "full", seed, psnr=psnr, mean=facts, stream={"decode_and_render_fps": 50.4}, capture={"name": name}
+        )
+
+    results = [of("coffee", 30.0, 0), of("coffee", 31.0, 1), of("steak", 33.5, 0)]
+    sheet = dataset_sheet("meetroom", results, name="paper-meetroom")
+    ours = ["32.00", "2.00", "3.00", "0.10", "50"]
+    assert sheet.rows[-1] == ["ours: paper-meetroom, 2 captures (coffee, steak)", "online", *ours]
+    assert sheet.rows[-2] == ["cited: Struct-GStream", "online", "30.95", "2.97", "3.02", "0.08", "123"]
+    assert dataset_sheet("meetroom", [], name="x").rows[-1][2:] == ["-"] * 5
 
 
 def test_what_is_not_cited() -> None:

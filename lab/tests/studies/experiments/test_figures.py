@@ -8,7 +8,13 @@ import pytest
 
 from outcomes import outcome
 from structgstream.figure import COLORS
-from structgstream_studies.experiments.figures import most_varied_crop, write_comparison, write_curves, write_details
+from structgstream_studies.experiments.figures import (
+    most_varied_crop,
+    write_adjacent,
+    write_comparison,
+    write_curves,
+    write_details,
+)
 from structgstream_studies.experiments.results import Result
 from tests.support.drawn import coloured, pixels_of
 
@@ -89,6 +95,22 @@ def test_five_pictures_stand_in_two_rows(tmp_path: Path) -> None:
     grey = [coloured(picture, f"#{60 + 20 * i:02x}{60 + 20 * i:02x}{60 + 20 * i:02x}") for i in range(5)]
     assert min(grey) > 5000
     assert picture.shape[0] > picture.shape[1] // 3
+
+
+def test_adjacent_pictures_show_where_a_method_changes_and_the_camera_saw_nothing_change(tmp_path: Path) -> None:
+    still = np.full((64, 64, 3), 90, np.uint8)
+    moved = still.copy()
+    moved[:16, :16] = (10, 20, 250)  # the camera saw it, too
+    flickering = moved.copy()
+    flickering[40:52, 40:52, 0] = 110
+    write_adjacent(
+        tmp_path / "a.png", {"ours": [still, flickering, moved]}, [still, moved, moved], title="ring, camera a"
+    )
+    picture = pixels_of(tmp_path / "a.png")
+    ours, truth = np.split(picture, [picture.shape[0] // 2])
+    assert coloured(ours, "#6e5a5a") > 1000
+    assert coloured(ours, "#a00000") > 1000  # 20 levels, 8 times
+    assert coloured(truth, "#a00000") == coloured(picture, "#0a14fa") == 0
 
 
 @pytest.mark.parametrize(("top", "left"), [(0, 0), (7, 20), (30, 60), (13, 1)])

@@ -12,7 +12,7 @@ from structgstream.session.presets import PAPER_METHOD_PRESET, PRESETS, to_json
 from structgstream_studies.experiments.documents import refresh_text
 from structgstream_studies.experiments.present import former
 from structgstream_studies.experiments.results import Result, round_floats
-from structgstream_studies.experiments.variants import variants
+from structgstream_studies.experiments.variants import FULL_METHODS, variants
 
 TABLE = "<!-- ablation structured ring{} -->\n<!-- end -->\n"
 
@@ -37,6 +37,19 @@ def test_results_of_today_whatever_their_seed_are_shown_without_a_remark() -> No
     shown = [recorded(), recorded("without-scaling-factor")]
     assert not former(shown)
     assert "former" not in table("", *shown)
+
+
+def test_a_study_may_edit_another_method_which_the_table_names_but_not_two() -> None:
+    def edited(key: str) -> Result:
+        found = outcome(key)
+        config = round_floats(to_json(variants(FULL_METHODS["paper-n3dv, l_v as six scales"])[key].config))
+        return replace(found, identity={**found.identity, "config": config})
+
+    six = [edited("full"), edited("without-covariance-mlp"), edited("without-scaling-factor")]
+    assert "The full method is paper-n3dv, l_v as six scales." in table("", *six)
+    assert "The full method is rig." in table("", recorded())
+    with pytest.raises(ConfigError, match=r"initial\.voxel_size"):
+        table("", *six, recorded("with-color-mlp"))
 
 
 def test_another_value_is_refused_and_the_marker_that_accepts_it_is_proposed() -> None:

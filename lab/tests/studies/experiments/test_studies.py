@@ -48,13 +48,13 @@ def test_every_row_is_run_with_every_seed_and_those_of_two_tables_once(tmp_path:
 def test_variants_of_a_seed_wait_for_one_first_frame(tmp_path: Path) -> None:
     tasks = with_dependencies(runs_of("free", "distance", folder=tmp_path, seeds=(0, 1)))
     firsts = [task for task in tasks if isinstance(task, FirstFrameRun)]
-    # Each seed has one for the variants that differ later, and one without the regularisation.
-    assert len(firsts) == 4
+    # Each seed has one for the variants that differ later, and one for each other reading of the regularisation.
+    assert len(firsts) == 8
     before = set()
     for task in tasks:
         assert before.issuperset(task.needs)
         before.add(task.name)
-    assert len(before) == len(tasks) == 4 + 2 * 5
+    assert len(before) == len(tasks) == 8 + 2 * 9
 
 
 def test_readings_are_edits_of_what_is_asked_for(tmp_path: Path) -> None:
@@ -71,8 +71,8 @@ def test_unknown_tables_and_methods_are_refused(tmp_path: Path) -> None:
         comparison_runs(["rig", "nerf"], CLIP, frames=3, alone_every=1, seeds=(0,), folder=tmp_path)
 
 
-def test_the_papers_presets_are_methods_that_are_named_as_what_is_printed() -> None:
-    assert method_titles()["paper-n3dv"] == "Struct-GStream as printed (paper-n3dv)"
+def test_the_papers_presets_are_methods_that_are_named_as_the_papers() -> None:
+    assert method_titles()["paper-n3dv"] == "Struct-GStream, the paper's preset (paper-n3dv)"
     assert method_titles()["rig"] == "Struct-GStream (rig)"
 
 

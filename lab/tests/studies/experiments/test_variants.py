@@ -9,8 +9,8 @@ from structgstream_studies.experiments.variants import FULL, TABLES, variants
 
 def differing(old: object, new: object, path: str = "") -> set[str]:
     if isinstance(old, dict) and isinstance(new, dict):
-        assert old.keys() == new.keys()
-        return set().union(*(differing(old[key], new[key], f"{path}.{key}" if path else key) for key in old))
+        keys = old.keys() | new.keys()  # a field may be left out while it has its default
+        return set().union(*(differing(old.get(key), new.get(key), f"{path}.{key}" if path else key) for key in keys))
     return {path} if old != new else set()
 
 

@@ -277,8 +277,9 @@ class ExposureConfig:
 class PatchingConfig:
     """Spawning and pruning of free Gaussians."""
 
-    spawn: Literal["gradient", "random", "off"] = "gradient"
-    """Choice of parents: ``gradient`` (paper), ``random`` (its ablation: as many, drawn at random), ``off``."""
+    spawn: Literal["gradient", "random", "uniform", "off"] = "gradient"
+    """Choice of parents: ``gradient`` (paper), ``random`` (as many, drawn at random), ``uniform`` (the same, with
+    children anywhere in the box of the anchors: the paper's ablation), ``off``."""
     iteration: int = 50
     """Iteration after which patching is done, once per frame (paper: 50 of 100)."""
     grad_threshold: float = 1e-3
@@ -305,7 +306,13 @@ class OnlineRates:
 
     final_share: float = 1.0
     """Learning rates of anchors and MLPs decay log-linearly to this share within a frame (paper: 1, constant)."""
+    free_color: Literal["rgb", "sh"] = "rgb"
+    """What ``FREE_COLORS`` is the rate of: sRGB numbers, or the constant term of spherical harmonics, as in 3DGS, of
+    which a step changes the colour by ``SH_CONSTANT``. ``rgb`` is left out of headers."""
 
+    SH_CONSTANT: ClassVar[float] = 0.28209479177387814
+    """The spherical harmonic of degree 0, 1 / (2 sqrt(pi)). Adam's steps do not depend on the gradient's scale, so a
+    colour that is trained as this term's coefficient has a rate this much smaller."""
     ANCHOR_POSITIONS: ClassVar[float] = 4e-4
     OFFSET_SCALES: ClassVar[float] = 5e-3
     COVARIANCE_MLP: ClassVar[float] = 4e-3
@@ -372,4 +379,6 @@ def online_rates(config: OnlineConfig, share: float) -> dict[ParameterName, floa
         for parameter in row.parameters:
             rate = getattr(config.rates, parameter.online_rate.upper()) if parameter.online_rate else 0.0
             rates[parameter.name] = rate if row.granularity == "free" else rate * falling
+    if config.rates.free_color == "sh":
+        rates["free_colors"] *= config.rates.SH_CONSTANT
     return rates

@@ -40,12 +40,12 @@ def choose_parents(
         count: ``[slots]`` number of views that drew each Gaussian.
         room: largest number of parents.
         config: the rule.
-        generator: for the random rule.
+        generator: for the random rules.
     """
     if config.spawn == "off" or room <= 0:
         return torch.zeros(0, dtype=torch.int64, device=count.device)
     chosen = ((mean_gradient > config.grad_threshold) & (count > 0)).nonzero()[:, 0]
-    if config.spawn == "random":
+    if config.spawn in ("random", "uniform"):
         drawn = (count > 0).nonzero()[:, 0]
         pick = torch.randperm(drawn.numel(), generator=generator)[: chosen.numel()].to(drawn.device)
         chosen = drawn[pick]
@@ -82,21 +82,26 @@ def _empty_like(scene: Scene) -> Gaussians:
 
 
 def spawn_children(
-    parents: Gaussians, *, first_identity: int, config: PatchingConfig, generator: torch.Generator
+    parents: Gaussians, anchors: Tensor, *, first_identity: int, config: PatchingConfig, generator: torch.Generator
 ) -> FreeGaussians:
     """One free Gaussian per parent, with its mean drawn from N(mu, factor * Sigma).
 
-    With Sigma = R S S^T R^T a sample is mu + sqrt(factor) R S z with z standard normal. Colour and scale are the
-    parent's, the rotation is the identity, the opacity ``config.OPACITY``. Identities count from ``first_identity``.
+    With Sigma = R S S^T R^T a sample is mu + sqrt(factor) R S z with z standard normal; by the rule ``uniform`` it is
+    anywhere in the box around the positions ``anchors`` ``[M, 3]``. Colour and scale are the parent's, the rotation is
+    the identity, the opacity ``config.OPACITY``. Identities count from ``first_identity``.
     """
     count = len(parents)
-    z = torch.randn(count, 3, generator=generator).to(parents.means)
-    local = (config.COVARIANCE_FACTOR**0.5) * parents.scales * z
-    rotations = quaternion_matrices(parents.quats)
+    if config.spawn == "uniform":
+        low, high = anchors.aminmax(dim=0)
+        means = low + (high - low) * torch.rand(count, 3, generator=generator).to(low)
+    else:
+        z = torch.randn(count, 3, generator=generator).to(parents.means)
+        local = (config.COVARIANCE_FACTOR**0.5) * parents.scales * z
+        means = parents.means + (quaternion_matrices(parents.quats) @ local[:, :, None])[:, :, 0]
     unit = parents.means.new_tensor([1.0, 0.0, 0.0, 0.0])
     opacity = torch.tensor(config.OPACITY)
     return FreeGaussians(
-        means=parents.means + (rotations @ local[:, :, None])[:, :, 0],
+        means=means,
         log_scales=parents.scales.clamp(min=1e-9).log(),
         quats=unit.expand(count, 4).clone(),
         logit_opacities=torch.logit(opacity).to(parents.means).expand(count).clone(),
@@ -152,7 +157,11 @@ class FreeSet:
         others = [other for other in self.views if other.index != view.index]
         parents = gaussians_by_id(current, [view, *others], self._parents(keep), self.backend)
         children = spawn_children(
-            parents, first_identity=self._next_identity(), config=self.config, generator=self.generator
+            parents,
+            current.anchors.positions,
+            first_identity=self._next_identity(),
+            config=self.config,
+            generator=self.generator,
         )
         if keep.all() and not len(children):
             return keep

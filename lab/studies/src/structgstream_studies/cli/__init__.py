@@ -4,4 +4,5 @@
 COMMANDS = {
     "ablate": "run the paper's ablations on a capture, ours beside the paper's figures",
     "compare": "run several methods on a capture and score their files",
+    "dataset": "run a preset on every capture of a data set of the paper, ours beside the paper's rows",
 }

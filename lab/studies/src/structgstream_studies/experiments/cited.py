@@ -9,7 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from structgstream.errors import ConfigError
+from structgstream_studies.experiments.results import Result
 from structgstream_studies.experiments.sheets import Sheet
+from structgstream_studies.experiments.summary import score_of
 
 NOTHING = "-"
 
@@ -121,6 +123,42 @@ def cited_sheet(name: str) -> Sheet:
         for row in CITED[name].rows
     ]
     return Sheet(f"Cited: {CITED[name].data}", heads, rows)
+
+
+def dataset_sheet(data: str, results: Sequence[Result], *, name: str) -> Sheet:
+    """The paper's rows of a data set, and below them ours: the mean over captures of the means over seeds.
+
+    Args:
+        data: the data set.
+        results: of every capture and seed; the training is that of frames after the first, as the machine took it.
+        name: what made them.
+
+    Raises:
+        ConfigError: the paper has no such data set.
+    """
+    cited = cited_sheet(data)
+    captures: dict[str, list[Result]] = {}
+    for result in results:
+        captures.setdefault(result.identity["capture"]["name"], []).append(result)
+
+    def mean(score: str, digits: int, factor: float = 1.0) -> str:
+        by_capture = [[score_of(result, score) for result in found] for found in captures.values()]
+        values = [[value for value in found if value is not None] for found in by_capture]
+        if not values or not all(values):
+            return NOTHING
+        return f"{factor * sum(sum(found) / len(found) for found in values) / len(values):.{digits}f}"
+
+    ours = [
+        f"ours: {name}, {len(captures)} captures ({', '.join(captures)})",
+        _ONLINE,
+        mean("psnr", 2),
+        mean("online_bytes", 2, 1e-6),
+        mean("bytes_with_header", 2, 1e-6),
+        mean("online_seconds", 2, 1 / 60),
+        mean("decode_and_render_fps", 0),
+    ]
+    rows = [[f"cited: {row[0]}", *row[1:]] for row in cited.rows]
+    return Sheet(f"{CITED[data].data}, and ours", ["method", *cited.columns[1:]], [*rows, ours])
 
 
 def cited_words(name: str) -> str:

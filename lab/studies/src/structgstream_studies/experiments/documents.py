@@ -25,7 +25,7 @@ from structgstream_studies.experiments.cited import cited_sheet, cited_words
 from structgstream_studies.experiments.effects import effects_sheet
 from structgstream_studies.experiments.figures import write_comparison, write_curves
 from structgstream_studies.experiments.folds import folds_sheet
-from structgstream_studies.experiments.present import remark
+from structgstream_studies.experiments.present import full_method, remark
 from structgstream_studies.experiments.rate_distortion import (
     bd_sheet,
     bullet_list,
@@ -147,7 +147,9 @@ def _ablation(words: Sequence[str], studies: Studies) -> str:
     table, study = words
     if table not in TABLES:
         raise ConfigError(f"A document asks for the ablation {table!r}; there are {', '.join(TABLES)}.")
-    return markdown(ablation_sheet(TABLES[table], studies.get(study, ()), titles=variant_titles()))
+    shown = _shown("ablation", words, studies)
+    named = f"\nThe full method is {full_method(shown)}.\n" if shown else ""
+    return markdown(ablation_sheet(TABLES[table], studies.get(study, ()), titles=variant_titles())) + named
 
 
 def _methods(words: Sequence[str], studies: Studies) -> str:

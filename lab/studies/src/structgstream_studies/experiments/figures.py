@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 Picture = NDArray[np.uint8]
 CROP_SHARE = 4  # a detail is a quarter of the picture across
+CHANGE_GAIN = 8
 CURVES = ("psnr", "psnr_camera_color", "psnr_changed", "e_warp", "flicker")
 
 
@@ -99,6 +100,39 @@ def write_details(path: Path, pictures: Mapping[str, Picture], truth: Picture, *
     for axis, (name, picture) in zip(axes, cells.items()):
         axis.imshow(picture[top : top + height, left : left + width], interpolation="nearest")
         axis.set_title(name, fontsize=8)
+    save_figure(figure, path)
+
+
+def write_adjacent(
+    path: Path, pictures: Mapping[str, Sequence[Picture]], truth: Sequence[Picture], *, title: str
+) -> None:
+    """The part of consecutive pictures that changes most beyond what the camera saw change, a row for each method, and
+    beside it the change between the first two, :data:`CHANGE_GAIN` times as strong.
+
+    Args:
+        path: the PNG.
+        pictures: renderings ``[H, W, 3]`` of consecutive frames by title.
+        truth: what the camera took in these frames.
+        title: a line above.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
+    real = pixel_range(truth[:2])
+    beyond = [np.maximum(pixel_range(shown[:2]) - real, 0) for shown in pictures.values()]
+    top, left, height, width = most_varied_crop(np.sum(beyond, axis=0))
+    rows, columns = {**pictures, "ground truth": truth}, len(truth) + 1
+    figure = figure_of(2.6 * columns, (2.6 * height / width + 0.3) * len(rows) + 0.4)
+    figure.suptitle(title, fontsize=10, fontweight="bold", color=INK)
+    axes = figure.subplots(len(rows), columns, squeeze=False)
+    for row, (name, shown) in zip(axes, rows.items(), strict=True):
+        crops = [picture[top : top + height, left : left + width] for picture in shown]
+        change = np.abs(crops[1].astype(np.int64) - crops[0]) * CHANGE_GAIN
+        for axis, picture in zip(row, [*crops, change.clip(0, 255).astype(np.uint8)], strict=True):
+            axis.imshow(picture, interpolation="nearest")
+            axis.set_axis_off()
+        row[0].set_title(name, fontsize=8, loc="left")
+        row[-1].set_title(f"change, {CHANGE_GAIN} times", fontsize=8, loc="left")
     save_figure(figure, path)
 
 

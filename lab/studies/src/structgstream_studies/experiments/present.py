@@ -10,13 +10,13 @@ from functools import cache
 from typing import Any
 
 from structgstream.errors import ConfigError
-from structgstream.session.presets import DEFAULT_PRESET, PAPER_METHOD_PRESET, PRESETS, to_json
+from structgstream.session.presets import DEFAULT_PRESET, PRESETS, to_json
 from structgstream_studies.experiments.effects import effects
 from structgstream_studies.experiments.parts import parts
 from structgstream_studies.experiments.rate_distortion import qualities
 from structgstream_studies.experiments.readings import READINGS
 from structgstream_studies.experiments.results import Result, round_floats
-from structgstream_studies.experiments.variants import variants
+from structgstream_studies.experiments.variants import FULL_METHODS, variants
 
 
 @dataclass(frozen=True)
@@ -48,16 +48,32 @@ class Former:
 
 
 @cache
-def present_configs() -> Mapping[str, Mapping[str, Any]]:
-    """Today's configuration of every row of a table, as a value for each path, by the row's key."""
+def present_configs() -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
+    """Today's configurations of every row of a table, as a value for each path, by the row's key and by the method that
+    it edits (``variants.FULL_METHODS``)."""
     from structgstream_studies.peers.methods import METHODS
 
-    rig, compact = PRESETS[PAPER_METHOD_PRESET], PRESETS[DEFAULT_PRESET]
-    configs: dict[str, Any] = {key: method.config for key, method in METHODS.items()} | dict(PRESETS)
-    configs |= {key: reading.edit(rig) for key, reading in READINGS.items()}
-    rows = (variants(rig), effects(compact, paper=rig), parts(compact), qualities(compact))
-    configs |= {key: row.config for found in rows for key, row in found.items()}
-    return {key: _fields(round_floats(to_json(config))) for key, config in configs.items()}
+    compact, found = PRESETS[DEFAULT_PRESET], {}
+    for name, full in FULL_METHODS.items():
+        configs: dict[str, Any] = {key: method.config for key, method in METHODS.items()} | dict(PRESETS)
+        configs |= {key: reading.edit(full) for key, reading in READINGS.items()}
+        rows = (variants(full), effects(compact, paper=full), parts(compact), qualities(compact))
+        configs |= {key: row.config for table in rows for key, row in table.items()}
+        for key, config in configs.items():
+            found.setdefault(key, {})[name] = _fields(round_floats(to_json(config)))
+    return found
+
+
+def full_method(results: Iterable[Result]) -> str:
+    """The method that most ``results`` are edits of: the first that differs least from their configurations."""
+    found = [(result.key, _fields(result.identity["config"])) for result in results]
+    known = [(present_configs()[key], then) for key, then in found if key in present_configs()]
+    return min(FULL_METHODS, key=lambda name: sum(_differences(now[name], then) for now, then in known))
+
+
+def _differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> int:
+    missing = object()
+    return sum(one.get(path, missing) != other.get(path, missing) for path in one.keys() | other.keys())
 
 
 def former(results: Iterable[Result]) -> Former:
@@ -66,10 +82,12 @@ def former(results: Iterable[Result]) -> Former:
     commits: dict[str, None] = {}
     gone: set[str] = set()
     new: set[str] = set()
+    results = list(results)
+    name = full_method(results)
     for result in results:
-        now = present_configs().get(result.key)
-        if now is None:
+        if result.key not in present_configs():
             continue
+        now = present_configs()[result.key][name]
         then = _fields(result.identity["config"])
         changed = [path for path in then.keys() & now.keys() if then[path] != now[path]]
         for path in changed:

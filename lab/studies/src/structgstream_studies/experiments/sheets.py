@@ -70,7 +70,8 @@ class Sheet:
 def ablation_sheet(table: AblationTable, results: Iterable[Result], *, titles: Mapping[str, str]) -> Sheet:
     """One of the paper's tables: ours, the difference to the full method, the paper's figures, and what follows.
 
-    The verdict is on PSNR (``summary.verdict``); variants without a result have dashes.
+    The verdict is on PSNR (``summary.verdict``); variants without a result have dashes, and no row if the paper has no
+    figure of them either.
     """
     found = summaries(results)
     full = found.get(FULL)
@@ -84,6 +85,8 @@ def ablation_sheet(table: AblationTable, results: Iterable[Result], *, titles: M
             columns.append(f"paper: {SCORES[name].title}")
     rows = []
     for key, paper in table.rows.items():
+        if key not in found and not paper:
+            continue
         row = [titles[key], *(_cell(found.get(key), name) for name in ("psnr", held))]
         row.append(_difference(found.get(key), full, key))
         theirs = paper.get("psnr")

@@ -3,6 +3,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,13 @@ from structgstream.errors import ConfigError
 from structgstream.session.presets import PAPER_DATA, PAPER_METHOD_PRESET, PRESETS, StreamConfig
 from structgstream_studies.experiments.captures import CapturePart
 from structgstream_studies.experiments.effects import EFFECTS_TABLE, effects, effects_sheet
-from structgstream_studies.experiments.figures import Picture, write_comparison, write_curves, write_details
+from structgstream_studies.experiments.figures import (
+    Picture,
+    write_adjacent,
+    write_comparison,
+    write_curves,
+    write_details,
+)
 from structgstream_studies.experiments.parts import PARTS_TABLE, parts
 from structgstream_studies.experiments.peer_runs import PEER_TITLES, PeerRun
 from structgstream_studies.experiments.rate_distortion import (
@@ -39,6 +46,8 @@ READINGS_TABLE = "readings"
 COMPACT_TABLES = (EFFECTS_TABLE, PARTS_TABLE, RATES_TABLE)
 """Tables of the compact stream."""
 COMPACT_PRESET = "compact"
+ADJACENT = 3
+"""Number of consecutive frames in the picture of methods side by side."""
 COMPARED = (
     "psnr_first", "psnr", "psnr_camera_color", "ssim", "ms_ssim", "lpips_alex", "flip", "psnr_changed", "psnr_still",
     "drift_db_per_frame", "online_bytes", "bytes_with_header", "online_cpu_seconds", "first_cpu_seconds",
@@ -152,7 +161,7 @@ def method_key(name: str) -> str:
 def method_titles() -> dict[str, str]:
     """Every method that can be compared, with its name in tables."""
     ours = {name: f"Struct-GStream ({name})" for name in PRESETS}
-    ours |= {name: f"Struct-GStream as printed ({name})" for name in PAPER_DATA}
+    ours |= {name: f"Struct-GStream, the paper's preset ({name})" for name in PAPER_DATA}
     return ours | {"held": "frame 0 held"} | dict(PEER_TITLES)
 
 
@@ -224,7 +233,8 @@ def _ablation_sheet(table: str, results: Sequence[Result]) -> Sheet:
 
 
 def write_methods(folder: Path, runs: Sequence[VariantRun | PeerRun], *, backend: "Backend") -> Sheet:
-    """The comparison, and in ``folder`` ``methods.md``, ``methods.png`` and ``methods-detail.png``."""
+    """The comparison, and in ``folder`` ``methods.md``, ``methods.png``, ``methods-detail.png`` and
+    ``methods-adjacent.png``."""
     titles = {method_key(name): title for name, title in method_titles().items()}
     results = results_of(runs)
     sheet = comparison_sheet(results, titles=titles, scores=COMPARED)
@@ -232,6 +242,7 @@ def write_methods(folder: Path, runs: Sequence[VariantRun | PeerRun], *, backend
     if results:
         write_comparison(folder / "methods.png", results, titles=titles)
         _write_details(folder / "methods-detail.png", runs, titles=titles, backend=backend)
+        _write_adjacent(folder / "methods-adjacent.png", runs, titles=titles, backend=backend)
     return sheet
 
 
@@ -284,3 +295,29 @@ def _write_details(
         _, scene = next(iter(recording.scenes(index // run.capture.every)))
         pictures[titles[run.key]] = rendered(scene, view, backend)[0]
     write_details(path, pictures, truth, title=f"{source.name}, camera {camera}, frame {index}")
+
+
+def _write_adjacent(
+    path: Path, runs: Sequence[VariantRun | PeerRun], *, titles: Mapping[str, str], backend: "Backend"
+) -> None:
+    """Consecutive pictures of the methods that have all frames, at the first held-out camera, from the middle on; none
+    if there are fewer than :data:`ADJACENT` frames."""
+    from structgstream.data.source import select_cameras
+    from structgstream.evaluation.evaluate import rendered
+
+    found = [run for run in runs if run.capture.every == 1 and read_result(run.result) is not None]
+    found = [run for run in found if run.seed == found[0].seed]
+    if not found or min(run.frames for run in found) < ADJACENT:
+        return
+    source = found[0].capture.open()
+    camera, first = source.rig.testing[0], (len(source) - ADJACENT) // 2
+    taken = select_cameras(source, (camera,)).frames(first)
+    truth = [frame.images[camera] for frame in islice(taken, ADJACENT)]
+    pictures: dict[str, list[Picture]] = {}
+    for run in found:
+        recording = run.recording()
+        view = recording.header.camera(camera)
+        scenes = islice(recording.scenes(first), ADJACENT)
+        pictures[titles[run.key]] = [rendered(scene, view, backend)[0] for _, scene in scenes]
+    last = first + ADJACENT - 1
+    write_adjacent(path, pictures, truth, title=f"{source.name}, camera {camera}, frames {first} to {last}")
