@@ -53,6 +53,7 @@ from structgstream.session.presets import MAX_QUALITY, StreamConfig, with_budget
 from structgstream.session.struct_gstream import FrameZeroContext, StructGStream, stream_pipeline
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.result import FitResult, StepListener
+from structgstream.training.views import View
 
 
 @dataclass(frozen=True)
@@ -217,7 +218,7 @@ class Once(Generic[Value]):
 class SharedWork:
     """Shared results of the qualities of one run."""
 
-    # preprocessed pictures, by the numbers of a frame and of the frame before
+    # preprocessed pictures, by the number of a frame and whether they are compared with the frame before
     pictures: Once[FramePictures] = field(default_factory=lambda: Once(PICTURES_KEPT))
     first: Once[FitResult[Scene]] = field(default_factory=lambda: Once(1))  # fits of first frames, by frame number
 
@@ -229,9 +230,9 @@ class SharedMethod(StructGStream):
     shared: SharedWork = field(default_factory=SharedWork)  # the shared results
 
     def observe(
-        self, frame: MultiViewFrame, before: MultiViewFrame | None, *, rig: CameraRig, backend: Backend
+        self, frame: MultiViewFrame, before: Sequence[View] | None, *, rig: CameraRig, backend: Backend
     ) -> FramePictures:
-        key = frame.index, None if before is None else before.index
+        key = frame.index, before is None
         observe = super().observe
         return self.shared.pictures.value(key, lambda: observe(frame, before, rig=rig, backend=backend))[0]
 

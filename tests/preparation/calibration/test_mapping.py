@@ -51,9 +51,9 @@ def test_a_mapper_places_all_cameras(tmp_path: Path, mapper: Mapper) -> None:
     cameras = {name: colmap_camera(filmed, number) for number, (name, filmed) in enumerate(RIG.items(), 1)}
     database = tmp_path / "database.db"
     write_database(database, graph.keypoints, cameras, graph.geometries)
-    model = mapped(database, mapper=mapper)
+    model = mapped(database, mapper=mapper, stills=RIG)
     assert model is not None
-    assert size_of(model)[0] == 5
+    assert size_of(model, RIG)[0] == 5
     adjust(model)
     for error in calibration_errors(cameras_of(model), RIG).values():
         assert error.rotation_degrees < 0.06
