@@ -23,9 +23,8 @@ from structgstream.training.frame0.regularizers import (
     depth_distortion,
     in_free_space,
     perturbation_at,
-    view_noise,
 )
-from structgstream.training.frame0.seeding import seeded_scene, warm_start, with_completed_depth
+from structgstream.training.frame0.seeding import seeded_scene, warm_start
 from structgstream.training.losses import InitialLossWeights, SceneLoss, offset_distance, view_loss, with_term
 from structgstream.training.optim import Adam, Hooks, LastPass, LearningRate, Schedule, minimize
 from structgstream.training.parameters import CAMERA_ROWS, Parameters, detached
@@ -144,7 +143,6 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
     extent: float
     generator: torch.Generator
     numbers: RandomNumbers
-    view_noise: float
     watch: Stopwatch
     last_pass: LastPass
 
@@ -157,10 +155,6 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
         config, generator = self.config, self.generator
         scene = self.scene
         # The result depends on the order of random draws.
-        seen_from = None
-        if self.view_noise:
-            shift = self.view_noise * torch.randn(3, generator=generator, dtype=torch.float64)
-            seen_from = sample.camera.center + shift
         loss = view_loss(
             scene,
             sample,
@@ -170,7 +164,6 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
             watch=self.watch,
             perturbation=perturbation_at(iteration, config.iterations, config.perturbation, self.numbers),
             background=torch.rand(3, generator=generator).to(self.backend.device) if config.random_background else None,
-            seen_from=seen_from,
         )
         if config.losses.offset_distance:
             with self.watch.stage("loss"):
@@ -222,8 +215,6 @@ def fit_first_frame(
         on_step: called after every iteration.
     """
     generator = torch.Generator().manual_seed(seed)
-    if config.perturbation.enabled:
-        points = with_completed_depth(points, {name: rig[name] for name in rig.training})
     template = _seeded(points, cameras=len(rig.training), config=config, device=backend.device, generator=generator)
     return _fit(frame, rig, template, config=config, backend=backend, generator=generator, on_step=on_step)
 
@@ -281,11 +272,9 @@ def _fit(
     densifier = Densifier.of(template, config=growth, iterations=config.iterations, voxel_size=config.voxel_size)
     last_pass = LastPass(config.iterations - len(views))
     numbers = RandomNumbers(generator, backend.device)
-    noise = view_noise({name: rig[name] for name in rig.training}, config.perturbation)
     hooks = _FirstFrameHooks(
-        config, backend, template, parameters, adam, densifier, views, extent, generator, numbers, noise, watch,
-        last_pass,
-    )  # fmt: skip
+        config, backend, template, parameters, adam, densifier, views, extent, generator, numbers, watch, last_pass
+    )
     samples = coarse_to_fine(views, config.stages(done=done), generator=generator)
     schedule = Schedule(config.iterations, lambda iteration: rates_at(iteration, config, extent=extent), done=done)
     iterations = minimize(adam, samples, schedule, hooks, watch=watch, on_step=on_step)
