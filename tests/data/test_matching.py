@@ -5,9 +5,11 @@ Matches of pairs of pictures, of a picture and the same one moved.
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
 from structgstream import cameras
@@ -29,6 +31,7 @@ from structgstream.data.matching import (
     sift_features,
     triangulate,
     unique_pairs,
+    viewing_distance,
 )
 from tests.support.filmed import noise_texture
 from tests.support.planes import distance_to_surface, room_frame, room_rig
@@ -59,6 +62,11 @@ def test_two_rays_meet_where_they_came_from() -> None:
     points, depths = triangulate(first, second, project(first, POINTS)[0], project(second, POINTS)[0])
     np.testing.assert_allclose(points, POINTS, atol=1e-6)
     np.testing.assert_allclose(depths[:, 0], project(first, POINTS)[1], atol=1e-6)
+
+
+def test_a_rig_that_looks_at_one_place_says_how_far_it_is() -> None:
+    cameras = dict(arc_rig(5, radius=3.0).cameras)
+    assert viewing_distance(cameras) == pytest.approx((3.0**2 + 0.3**2) ** 0.5, rel=0.05)
 
 
 def test_every_pair_of_neighbours_comes_once() -> None:
@@ -100,6 +108,17 @@ def test_texture_that_repeats_along_the_line_is_not_matched() -> None:
     assert matched(there) == 1
     assert matched(np.concatenate([there, there + 0.5])) == 1
     assert matched(np.concatenate([there, apart])) == 0
+
+
+def test_cameras_that_do_not_converge_fall_back_on_their_spread() -> None:
+    cameras = {f"cam{i}": replace(room_rig()["cam02"], viewmat=shifted(i)) for i in range(5)}
+    assert viewing_distance(cameras) == pytest.approx(5 * 2.0)
+
+
+def shifted(steps: int) -> torch.Tensor:
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[0, 3] = -float(steps)
+    return viewmat
 
 
 def test_level_is_square_to_the_horizontal_axes_even_for_cameras_that_look_down() -> None:

@@ -53,13 +53,3 @@ def test_anchors_are_appended_with_every_column_that_they_have() -> None:
     both = cloud.select(torch.arange(2)).append(cloud.select(torch.arange(2, 5)))
     for name in ("positions", "log_offset_scales", "log_base_scales", "offsets", "features", "appearance"):
         assert torch.equal(getattr(both, name), getattr(cloud, name)), name
-
-
-def test_the_mlps_can_see_another_centre_than_the_camera_draws_from() -> None:
-    scene, camera, backend = random_scene(), arc_rig()["cam01"], reference_backend()
-    plain = scene.structured(camera, backend)
-    same = scene.structured(camera, backend, seen_from=camera.center)
-    other = scene.structured(camera, backend, seen_from=camera.center + 0.5)
-    assert torch.equal(plain.raw_opacities, same.raw_opacities)
-    assert torch.equal(plain.anchors, other.anchors), "what is in view does not depend on it"
-    assert not torch.equal(plain.raw_opacities, other.raw_opacities)

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Dropout and jitter of Gaussians in frame 0."""
 
-import math
-
 import pytest
 import torch
 
@@ -12,9 +10,7 @@ from structgstream.training.frame0.regularizers import (
     PerturbationConfig,
     RandomNumbers,
     perturbation_at,
-    view_noise,
 )
-from tests.support.rigs import evenly
 from tests.support.varied import varied
 
 COUNT = 20_000
@@ -104,12 +100,3 @@ def test_it_fades_and_ends() -> None:
     assert shares == pytest.approx([0.4 * 0.98, 0.4 * 0.5, 0.4 * 0.02], abs=0.01)
     assert perturbation_at(50, 100, config, numbers()) is None
     assert perturbation_at(1, 100, PerturbationConfig(), numbers()) is None
-
-
-def test_view_noise_is_a_share_of_the_way_to_the_next_camera_and_for_few_cameras_alone() -> None:
-    config = varied(PerturbationConfig(dropped_share=0.2), VIEW_NOISE=0.5)
-    assert view_noise(evenly(6, 60.0), config) == pytest.approx(0.5 * 3.0, rel=0.01)
-    between = view_noise(evenly(8, 42.5), config)  # half as few
-    assert between == pytest.approx(0.5 * 0.5 * 6.0 * math.sin(math.radians(42.5 / 2)), rel=0.01)
-    assert view_noise(evenly(12, 30.0), config) == 0.0
-    assert view_noise(evenly(6, 60.0), PerturbationConfig()) == 0.0, "the paper has none"

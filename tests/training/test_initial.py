@@ -5,11 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from structgstream.camera_spacing import sparsity
-from structgstream.cameras import CameraRig
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
-from structgstream.scene.render import draw
 from structgstream.scene.state import state_of
 from structgstream.session.presets import PRESETS
 from structgstream.training.frame0.densify import GrowthConfig
@@ -17,12 +14,10 @@ from structgstream.training.frame0.fit import InitialConfig, InitialRates, fit_f
 from structgstream.training.frame0.regularizers import (
     DepthDistortionConfig,
     FreeSpaceConfig,
-    PerturbationConfig,
     in_free_space,
 )
 from structgstream.training.frame0.seeding import voxel_centers
 from tests.support.backends import quickest_backend
-from tests.support.rigs import evenly
 from tests.support.varied import varied
 from tests.support.worlds import moving_world, psnr, rendered
 
@@ -171,30 +166,3 @@ def test_rates_of_the_reference_schedule() -> None:
     assert rates["color_mlp"] == pytest.approx(0.00406, rel=3e-3)
     assert rates["covariance_mlp"] == 0.004
     assert "anchor_positions" not in rates, "they are fixed"
-
-
-def few_cameras_world():
-    """A world seen by four training cameras that are 60 degrees apart."""
-    world = moving_world(1)
-    cameras = evenly(5, 60.0)
-    backend = quickest_backend()
-    images = {}
-    for name, camera in cameras.items():
-        image = draw(world.scene.gaussians(camera, backend), camera, backend).image.detach()
-        images[name] = (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-    return replace(world, rig=CameraRig(cameras, frozenset({"cam00"})), frames=[MultiViewFrame(0, 0.0, images)])
-
-
-def test_few_cameras_are_perturbed_and_completed_and_only_where_the_paper_is_left_anyway() -> None:
-    world, short = few_cameras_world(), replace(QUICK, iterations=3)
-    assert sparsity({name: world.rig[name] for name in world.rig.training}) == 1.0
-    points = world.scene.anchors.positions[:20]
-    perturbation = PerturbationConfig(dropped_share=0.2)
-    seeds = len(voxel_centers(points, 0.05))
-    plain = fit(world, config=short, points=points).scene
-    assert len(plain.anchors) == seeds
-    noisy = fit(world, config=replace(short, perturbation=perturbation), points=points).scene
-    assert len(noisy.anchors) > seeds
-    calm = fit(world, config=replace(short, perturbation=varied(perturbation, VIEW_NOISE=0.0)), points=points).scene
-    assert len(calm.anchors) == len(noisy.anchors)
-    assert not torch.equal(calm.anchors.features, noisy.anchors.features)

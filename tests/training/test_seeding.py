@@ -3,13 +3,7 @@ import pytest
 import torch
 
 from structgstream.errors import CaptureError
-from structgstream.training.frame0.seeding import (
-    neighbor_distances,
-    seeded_scene,
-    voxel_centers,
-    with_completed_depth,
-)
-from tests.support.rigs import evenly
+from structgstream.training.frame0.seeding import neighbor_distances, seeded_scene, voxel_centers
 
 
 def seeded(points: torch.Tensor, **options):
@@ -71,47 +65,3 @@ def test_the_seed_decides_the_weights() -> None:
 def test_points_in_one_voxel_are_not_a_scene() -> None:
     with pytest.raises(CaptureError, match="at least 4"):
         seeded(torch.rand(100, 3) * 0.01)
-
-
-def projected(camera, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    local = points.double() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    pixels = local @ camera.K.T
-    return pixels[:, :2] / pixels[:, 2:], local[:, 2]
-
-
-def test_few_cameras_get_seeds_where_no_point_is_at_the_depth_of_those_around() -> None:
-    cameras = evenly(4, 50.1)
-    wall = torch.rand(400, 3, generator=torch.manual_seed(0)) * torch.tensor([1.6, 1.0, 0.02]) - torch.tensor(
-        [0.8, 0.5, 0]
-    )
-    seen_by_one = torch.tensor([[0.3, 0.2, -2.0]])  # right in front of the first camera, alone
-    found = with_completed_depth(torch.cat([wall, seen_by_one]), cameras)
-    assert torch.equal(found[:401], torch.cat([wall, seen_by_one]))
-    added = found[401:]
-    assert len(added) > 20
-    assert added.isfinite().all()
-    pixels, depths = projected(cameras["cam00"], added)
-    own = ((pixels - 0.5) / 8.0 - (pixels / 8.0).floor() - 0.4375).abs().amax(1) < 1e-3  # rays of its grid
-    assert own.any()
-    assert (depths[own] > 2.9).all(), "one point before the wall is no surface"
-    assert (depths[own] < 3.1).all()
-    taken, _ = projected(cameras["cam00"], wall)
-    assert torch.cdist(pixels[own], taken).amin() > 8.0
-
-
-def test_larger_pictures_have_no_more_rays() -> None:
-    points = torch.rand(100, 3, generator=torch.manual_seed(0)) * 0.2
-    cameras = {name: camera.resized(640, 480) for name, camera in evenly(4, 50.1).items()}
-    doubled = {name: camera.resized(1280, 960) for name, camera in cameras.items()}
-    assert len(with_completed_depth(points, cameras)) == len(with_completed_depth(points, doubled)) > 1000
-
-
-@pytest.mark.parametrize(("count", "apart"), [(12, 30.0), (9, 34.0)])
-def test_many_or_close_cameras_get_no_further_seeds(count: int, apart: float) -> None:
-    points = torch.rand(50, 3)
-    assert with_completed_depth(points, evenly(count, apart)) is points
-
-
-def test_a_camera_that_sees_no_points_gets_none() -> None:
-    points = torch.tensor([[0.0, 0.0, -10.0]]).expand(20, 3)
-    assert len(with_completed_depth(points, {"cam00": evenly(1, 0.0)["cam00"]})) == 20

@@ -164,7 +164,7 @@ class OpenedScene:
 
 def open_scene(options: Reconstruct, config: "StreamConfig", *, preset: str, console: Console) -> OpenedScene:
     """The capture, or the live cameras, that the options name; says what it is."""
-    from structgstream.camera_spacing import expectation
+    from structgstream.data.camera_spacing import expectation
     from structgstream.data.roving import roving_of
     from structgstream.evaluation.recording import part_metadata
     from structgstream.kernels.backend import select_backend

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.camera_spacing import viewing_distance
 from structgstream.cameras import Camera, enlargement
 from structgstream.data.images import opencv, reduced_mask, reduced_picture
 from structgstream.geometry import Floats, Indices, cross_matrices
@@ -93,6 +92,23 @@ def inside(camera: Camera, pixels: Floats, depths: Floats, *, near: float) -> ND
     return (depths > near) & (pixels >= 0).all(1) & (pixels < size).all(1)
 
 
+def viewing_distance(cameras: Mapping[str, Camera]) -> float:
+    """Typical distance from a camera to the scene, estimated from the poses.
+
+    It is the distance to the point nearest to all optical axes, if that lies in front of most cameras; for nearly
+    parallel axes (a flat forward-facing array) five times the rig's radius.
+    """
+    centers = np.stack([camera.center.numpy() for camera in cameras.values()])
+    axes = np.stack([camera.viewmat.numpy()[2, :3] for camera in cameras.values()])
+    projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    focus = np.linalg.lstsq(projectors.sum(0), (projectors @ centers[:, :, None]).sum(0)[:, 0], rcond=1e-6)[0]
+    depths = ((focus - centers) * axes).sum(1)
+    radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
+    distance = float(np.median(depths))
+    meets = (depths > 0).mean() > 0.7 and distance < 30 * radius
+    return max(distance if meets else 5 * radius, 1e-9)
+
+
 def level_normal(cameras: Mapping[str, Camera]) -> Floats:
     """The unit normal ``[3]`` of horizontal planes, pointing up: perpendicular to the cameras' x axes.
 
@@ -110,8 +126,8 @@ def level_normal(cameras: Mapping[str, Camera]) -> Floats:
 def neighbor_views(cameras: Mapping[str, Camera], *, count: int, distance: float) -> dict[str, tuple[str, ...]]:
     """For each camera the ``count`` others that see most of its volume under a useful parallax, best first.
 
-    The volume is sampled around ``distance`` (see ``camera_spacing.viewing_distance``). Too small a parallax gives no
-    depth, too large a one changes appearance.
+    The volume is sampled around ``distance`` (see :func:`viewing_distance`). Too small a parallax gives no depth, too
+    large a one changes appearance.
     """
     low, high = _BEST_ANGLES_DEGREES
     chosen: dict[str, tuple[str, ...]] = {}

@@ -15,7 +15,6 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from structgstream.camera_spacing import viewing_distance
 from structgstream.cameras import Camera, CameraRig, enlargement
 from structgstream.data.images import opencv, reduced_mask
 from structgstream.data.matching import (
@@ -30,6 +29,7 @@ from structgstream.data.matching import (
     sift_features,
     triangulate,
     unique_pairs,
+    viewing_distance,
 )
 from structgstream.data.plane_sweep import DEFAULT_LEVELS, SweepBounds, SweepConfig, sweep_points
 from structgstream.frames import MultiViewFrame
@@ -43,7 +43,7 @@ class PointsConfig:
     """Initial points, for captures without points.
 
     Keypoints are matched in pictures of at most the reference size (``cameras.enlargement``), the plane sweep reduces
-    pictures by itself: pixels are of these. Shares are of the viewing distance (``camera_spacing.viewing_distance``).
+    pictures by itself: pixels are of these. Shares are of the viewing distance (``data.matching.viewing_distance``).
     """
 
     max_points: int = 60_000

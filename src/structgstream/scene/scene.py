@@ -80,21 +80,14 @@ class Scene:
         return environment(self.environment.contiguous(), axes)
 
     def structured(
-        self,
-        camera: Camera,
-        backend: Backend,
-        *,
-        tiles: TileSelection | None = None,
-        seen_from: Tensor | None = None,
+        self, camera: Camera, backend: Backend, *, tiles: TileSelection | None = None
     ) -> StructuredGaussians:
-        """The structured Gaussians of the anchors in ``camera``'s view, or of those that reach ``tiles``; with the
-        directions and distances of ``seen_from`` ``[3]`` instead of the camera's centre."""
+        """The structured Gaussians of the anchors in ``camera``'s view, or of those that reach ``tiles``."""
         cloud, intervals = self.anchors, self._intervals_of_anchors()
-        viewport = camera.viewport(cloud.positions)
         generated = backend.generate_structured(
             self._anchors_to_generate(),
             self.mlps,
-            viewport if seen_from is None else viewport._replace(center=seen_from.to(viewport.center)),
+            camera.viewport(cloud.positions),
             distance_input=self.distance_input,
             tiles=tiles,
             sampling_intervals=intervals,

@@ -223,16 +223,15 @@ def view_loss(
     active: ActiveTiles | None = None,
     perturbation: Callable[[Gaussians], Gaussians] | None = None,
     background: Tensor | None = None,
-    seen_from: Tensor | None = None,
 ) -> SceneLoss:
     """Render ``view`` and compare it with its picture, or the tiles of ``active`` (paper, equation for L).
 
-    Optionally the Gaussians are perturbed by ``perturbation``, ``background`` ``[3]`` replaces the scene's
-    environment, and ``seen_from`` ``[3]`` the camera's centre in the inputs of the MLPs.
+    Optionally the Gaussians are perturbed by ``perturbation``, and ``background`` ``[3]`` replaces the scene's
+    environment.
     """
     with watch.stage("generate"):
         tiles = None if active is None else active.tiles
-        structured = scene.structured(view.camera, backend, tiles=tiles, seen_from=seen_from)
+        structured = scene.structured(view.camera, backend, tiles=tiles)
         unperturbed = scene.with_free_gaussians(structured)
         gaussians = unperturbed if perturbation is None else perturbation(unperturbed)
     loss = picture_loss(

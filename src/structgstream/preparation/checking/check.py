@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from structgstream.camera_spacing import expectation
 from structgstream.cameras import Camera
+from structgstream.data.camera_spacing import expectation
 from structgstream.data.source import FrameSource, select_cameras
 from structgstream.frames import MultiViewFrame
 from structgstream.pose_check.check import Finding, examine_poses, explain, worst_first

@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from structgstream.cameras import Camera, CameraRig
+from structgstream.cameras import CameraRig
 from structgstream.frames import MultiViewFrame, RovingPicture
 from structgstream.kernels.backend import Backend
 from structgstream.scene.sampling import RigSampling
@@ -24,10 +24,9 @@ from structgstream.training.frame0.regularizers import (
     depth_distortion,
     in_free_space,
     perturbation_at,
-    view_noise,
 )
 from structgstream.training.frame0.roving import RovingViews, alternating
-from structgstream.training.frame0.seeding import seeded_scene, warm_start, with_completed_depth
+from structgstream.training.frame0.seeding import seeded_scene, warm_start
 from structgstream.training.losses import InitialLossWeights, SceneLoss, offset_distance, view_loss, with_term
 from structgstream.training.optim import Adam, Hooks, LastPass, LearningRate, Schedule, minimize
 from structgstream.training.parameters import CAMERA_ROWS, Parameters, detached
@@ -146,7 +145,6 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
     extent: float
     generator: torch.Generator
     numbers: RandomNumbers
-    view_noise: float
     watch: Stopwatch
     last_pass: LastPass
     roving: RovingViews
@@ -161,10 +159,6 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
         scene, roving = self.scene, self.roving.has(sample)
         scene, view = self.roving.applied(scene, sample) if roving else (scene, sample)
         # The result depends on the order of random draws.
-        seen_from = None
-        if self.view_noise:
-            shift = self.view_noise * torch.randn(3, generator=generator, dtype=torch.float64)
-            seen_from = sample.camera.center + shift
         loss = view_loss(
             scene,
             view,
@@ -174,7 +168,6 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
             watch=self.watch,
             perturbation=perturbation_at(iteration, config.iterations, config.perturbation, self.numbers),
             background=torch.rand(3, generator=generator).to(self.backend.device) if config.random_background else None,
-            seen_from=seen_from,
         )
         if config.losses.offset_distance:
             with self.watch.stage("loss"):
@@ -231,8 +224,6 @@ def fit_first_frame(
         roving: pictures of a roving camera, in normalised units; every second iteration takes one of them.
     """
     generator = torch.Generator().manual_seed(seed)
-    if config.perturbation.enabled:
-        points = with_completed_depth(points, _cameras(rig, roving))
     template = _seeded(points, cameras=len(rig.training), config=config, device=backend.device, generator=generator)
     return _fit(
         frame, rig, template, config=config, backend=backend, generator=generator, on_step=on_step, roving=roving
@@ -294,7 +285,6 @@ def _fit(
     walked = RovingViews.of(roving, first=len(rig.training), colors=config.camera_color, device=backend.device)
     last_pass = LastPass(config.iterations - len(views) * (2 if roving else 1))
     numbers = RandomNumbers(generator, backend.device)
-    noise = view_noise(_cameras(rig, roving), config.perturbation)
     hooks = _FirstFrameHooks(
         config,
         backend,
@@ -306,7 +296,6 @@ def _fit(
         extent,
         generator,
         numbers,
-        noise,
         watch,
         last_pass,
         walked,
@@ -333,12 +322,6 @@ def _fit(
         seconds=watch.seconds,
         losses=last_pass.terms,
     )
-
-
-def _cameras(rig: CameraRig, roving: Sequence[RovingPicture]) -> dict[str, Camera]:
-    """The cameras whose pictures train frame 0."""
-    walked = {f"roving/{number}": picture.camera for number, picture in enumerate(roving)}
-    return {name: rig[name] for name in rig.training} | walked
 
 
 def _seeded(

@@ -22,14 +22,13 @@ haze. A surface is not like that: few cameras see it in front of what they draw.
 something behind it, and hardly any of them draws it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from structgstream.camera_spacing import neighbor_distance, sparsity
 from structgstream.cameras import Camera
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
@@ -51,14 +50,6 @@ class PerturbationConfig:
 
     UNTIL_SHARE: ClassVar[float] = 0.7
     """Both decrease linearly to 0 at this share of the iterations."""
-    VIEW_NOISE: ClassVar[float] = 0.33
-    """Where cameras are few and far apart (``camera_spacing.sparsity``), standard deviation of normal noise on the
-    camera's centre in the inputs of the MLPs, in distances from one camera to the next; none without the other two."""
-
-    @property
-    def enabled(self) -> bool:
-        """Whether frame 0 is kept from explaining each camera alone at all (paper: no)."""
-        return bool(self.dropped_share or self.noise_scales)
 
 
 class RandomNumbers:
@@ -126,20 +117,9 @@ def perturbation_at(
 ) -> Perturbation | None:
     """The perturbation of ``iteration`` of ``iterations``; None for none."""
     strength = 1.0 - iteration / max(1.0, iterations * config.UNTIL_SHARE)
-    if strength <= 0.0 or not config.enabled:
+    if strength <= 0.0 or not (config.dropped_share or config.noise_scales):
         return None
     return Perturbation(config, numbers, strength=strength)
-
-
-def view_noise(cameras: Mapping[str, Camera], config: PerturbationConfig) -> float:
-    """Standard deviation of the noise on the centres that the MLPs see, in units of the scene.
-
-    What a few directions see can be explained by Gaussians that are opaque in one direction alone. A camera whose
-    centre moves by a share of the way to the next one in each iteration is explained by surfaces.
-    """
-    if not config.enabled:
-        return 0.0
-    return config.VIEW_NOISE * sparsity(cameras) * neighbor_distance(cameras)
 
 
 COVERED = 0.5

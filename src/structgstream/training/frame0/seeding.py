@@ -17,7 +17,7 @@ stays transparent is unobserved.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -25,8 +25,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from structgstream.camera_spacing import sparsity
-from structgstream.cameras import Camera, enlargement
 from structgstream.errors import CaptureError, MissingExtraError
 from structgstream.kernels.backend import Backend
 from structgstream.kernels.values import HeadWeights, MLPWeights
@@ -118,53 +116,6 @@ def seeded_scene(
         camera_color=CameraColor.identity(cameras, positions),
         distance_input=distance_input,
     )
-
-
-RAY_STEP_PIXELS = 8.0
-"""Pixels of the reference size between the rays that get a point where cameras are few; by the root of
-``camera_spacing.sparsity`` more where they are less few."""
-_NEIGHBOURS = 7
-_SURFACE_SHARE = 0.15  # of the inverse depth: points within it are of one surface
-
-
-def with_completed_depth(points: Tensor, cameras: Mapping[str, Camera]) -> Tensor:
-    """``points`` ``[P, 3]``, and further ones where few ``cameras`` far apart see none, ``[P + Q, 3]``.
-
-    Where matches are rare, whole regions of a picture have no seed, and what grows there starts from places that suit
-    one camera: a screen in front of its lens, which hides the scene from it and is in the way of all others. So each
-    ray of a grid that no point is near to gets one, at the depth of the points that the camera sees around it: the
-    mean of those of the nearest that are of one surface, weighted by the inverse square of their distance in the
-    picture. Nothing changes with many or close cameras (``camera_spacing.sparsity``).
-    """
-    few = sparsity(cameras)
-    if few <= 0.0:
-        return points
-    try:
-        from scipy.spatial import KDTree
-    except ImportError as error:
-        raise MissingExtraError("scipy", "capture") from error
-    found = [points]
-    for camera in cameras.values():
-        local = points.double() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-        pixels = (local @ camera.K.T)[:, :2] / local[:, 2:]
-        size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
-        seen = (local[:, 2] > camera.near) & ((pixels >= 0) & (pixels < size)).all(1)
-        if int(seen.sum()) < _NEIGHBOURS:
-            continue
-        step = RAY_STEP_PIXELS * enlargement(camera.width, camera.height) / math.sqrt(few)
-        columns, rows = (torch.arange(step / 2, side, step, dtype=torch.float64) for side in size.tolist())
-        rays = torch.cartesian_prod(columns, rows)
-        distances, index = KDTree(pixels[seen].numpy()).query(rays.numpy(), k=_NEIGHBOURS)
-        inverse = 1.0 / local[seen, 2][torch.from_numpy(index)]
-        middle = inverse.median(1, keepdim=True).values
-        near = torch.from_numpy(distances)
-        weights = ((inverse - middle).abs() <= _SURFACE_SHARE * middle) / near.clamp(min=1e-6).square()
-        depths = weights.sum(1) / (weights * inverse).sum(1)
-        empty = near[:, 0] > step
-        toward = torch.linalg.solve(camera.K, torch.cat([rays, torch.ones(len(rays), 1)], 1).T.double()).T
-        world = (toward * depths[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
-        found.append(world[empty].to(points))
-    return torch.cat(found)
 
 
 _STRIDE = 4  # pixels between samples: enough for a few coefficients
