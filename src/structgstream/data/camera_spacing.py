@@ -69,7 +69,8 @@ class Expectation:
 
 def expected_psnr(degrees: float) -> float:
     """PSNR in dB that cameras ``degrees`` apart gave at held-out ones, interpolated between what was measured."""
-    return float(np.interp(degrees, *zip(*MEASURED, strict=True)))
+    apart, psnr = zip(*MEASURED, strict=True)
+    return float(np.interp(degrees, apart, psnr))
 
 
 def expectation(cameras: Mapping[str, Camera]) -> Expectation | None:
