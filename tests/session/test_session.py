@@ -46,7 +46,7 @@ def quick_fits(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Fits that take no time and depend on seed and start as real ones do; the list fills with the seeds used."""
     seeds: list[int] = []
 
-    def first(frame, rig, points, *, config, backend, seed, on_step, before=None):
+    def first(frame, rig, points, *, config, backend, seed, on_step, before=None, roving=()):
         seeds.append(seed)
         return FitResult(small_scene(seed=seed % 1000), 1, 20.0, grown=4, removed=3)
 
