@@ -61,7 +61,7 @@ class Rig:
 
 
 RIGS = {
-    # The table as 21 cameras of the size of N3DV's see it, in two rows as there.
+    # The table as 21 cameras see it, as many and of the size of N3DV's.
     "n3dv": Rig(
         target=(0.02, 0.12, 0.155),
         radius_metres=1.5,

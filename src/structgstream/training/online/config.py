@@ -300,6 +300,11 @@ class PatchingConfig:
     """Opacity at birth (paper: 0.1)."""
 
 
+SH_CONSTANT = 0.28209479177387814
+"""The spherical harmonic of degree 0, 1 / (2 sqrt(pi)). Adam's steps do not depend on the gradient's scale, so a colour
+that is trained as this term's coefficient has a rate this much smaller."""
+
+
 @dataclass(frozen=True)
 class OnlineRates:
     """Learning rates of online frames (values of the paper, section Implementations), in normalised units."""
@@ -310,9 +315,6 @@ class OnlineRates:
     """What ``FREE_COLORS`` is the rate of: sRGB numbers, or the constant term of spherical harmonics, as in 3DGS, of
     which a step changes the colour by ``SH_CONSTANT``. ``rgb`` is left out of headers."""
 
-    SH_CONSTANT: ClassVar[float] = 0.28209479177387814
-    """The spherical harmonic of degree 0, 1 / (2 sqrt(pi)). Adam's steps do not depend on the gradient's scale, so a
-    colour that is trained as this term's coefficient has a rate this much smaller."""
     ANCHOR_POSITIONS: ClassVar[float] = 4e-4
     OFFSET_SCALES: ClassVar[float] = 5e-3
     COVARIANCE_MLP: ClassVar[float] = 4e-3
@@ -380,5 +382,5 @@ def online_rates(config: OnlineConfig, share: float) -> dict[ParameterName, floa
             rate = getattr(config.rates, parameter.online_rate.upper()) if parameter.online_rate else 0.0
             rates[parameter.name] = rate if row.granularity == "free" else rate * falling
     if config.rates.free_color == "sh":
-        rates["free_colors"] *= config.rates.SH_CONSTANT
+        rates["free_colors"] *= SH_CONSTANT
     return rates
