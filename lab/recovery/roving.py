@@ -38,7 +38,6 @@ from structgstream.preparation.calibration.solved import rig_alignment
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.prepare import prepare_capture
 from structgstream.scene.render import render, to_8bit_image
-from structgstream.training.frame0 import roving as roving_views
 from tests.support.calibration_errors import calibration_errors
 
 HELD_OUT = ("0", "10", "15", "30")  # of basketball
@@ -210,7 +209,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--capture", type=Path, help="of basketball")
     parser.add_argument("--masks", choices=["moving", "none"], default="moving", help="none: what moves counts, too")
-    parser.add_argument("--outliers", choices=["left-out", "used"], default="left-out")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     if options.what == "film":
@@ -218,8 +216,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     if options.masks == "none":
         WithRoving._changed = lambda self, frame: {}  # type: ignore[method-assign]
-    if options.outliers == "used":
-        roving_views.OUTLIER_FLOOR = 10.0  # no residual is as large
     for count in options.cameras:
         for walk in options.walk:
             for seed in [0] if options.what == "poses" else options.seeds:
@@ -238,7 +234,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
                     )
                 else:
                     key += "" if options.masks == "moving" else " unmasked"
-                    key += "" if options.outliers == "left-out" else " with outliers"
                     key += f"{' without' if options.without else ''} {options.preset} {seed}"
                     found = psnr(options.folder, count, walk, without=options.without, seed=seed, preset=options.preset)
                 print(key, json.dumps(found), flush=True)

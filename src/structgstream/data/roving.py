@@ -7,8 +7,8 @@ The roving pictures are of another time: where people are in frame 0, they show 
 Many pictures that agree with each other would outvote the still cameras. What moves in frame 0 is known from these: it
 differs from the most frequent colour of its pixel over the take. A place in space may be such a thing if all still
 cameras that see it have a differing pixel there (a visual hull; Laurentini, PAMI 1994). Pixels of a roving picture
-whose ray passes through such a place do not count. What moves in the roving pictures alone is left out while frame 0
-is trained (``training/frame0/roving.py``). Who stands at one place throughout the take is not known to move.
+whose ray passes through such a place do not count. Who walks in the roving pictures alone counts in few of them, what
+is behind in the others. Who stands at one place throughout the take is not known to move.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

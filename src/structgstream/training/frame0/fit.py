@@ -182,7 +182,7 @@ class _FirstFrameHooks(Hooks[View, SceneLoss]):
                 )
                 loss = with_term(loss, "depth_distortion", spread, weight=weight)
         if roving:
-            self.roving.note(sample, loss.rendering, share=iteration / config.iterations)
+            self.roving.fit_gains(sample, loss.rendering, share=iteration / config.iterations)
         else:
             self.last_pass.add(iteration, loss, sample)
         return loss
@@ -282,7 +282,7 @@ def _fit(
     adam = Adam(backend, parameters.values)
     growth = config.growth.for_pictures(median(view.enlargement for view in views))
     densifier = Densifier.of(template, config=growth, iterations=config.iterations, voxel_size=config.voxel_size)
-    walked = RovingViews.of(roving, first=len(rig.training), colors=config.camera_color, device=backend.device)
+    walked = RovingViews.of(roving, first=len(rig.training), fits_gains=config.camera_color, device=backend.device)
     last_pass = LastPass(config.iterations - len(views) * (2 if roving else 1))
     numbers = RandomNumbers(generator, backend.device)
     hooks = _FirstFrameHooks(
