@@ -201,6 +201,25 @@ def test_roving_pictures_can_be_left_out(tmp_path: Path) -> None:
     assert source.points is None  # roving pictures helped to find them
 
 
+def test_pictures_of_a_scale_are_the_same_without_roving_pictures(tmp_path: Path) -> None:
+    """A stream of ``--roving none --scale 0.5`` is evaluated on the pictures that it was trained on."""
+    content = write_capture(tmp_path)
+    cameras = {}
+    for name, own in content.cameras.items():
+        filmed = replace(own.filmed, lens=RadialTangential(k1=-0.05))
+        cameras[name] = replace(own, filmed=filmed, pinhole=rectilinear(filmed))
+    write_prepared(tmp_path, replace(content, cameras=cameras))
+    sources = [
+        open_capture(tmp_path, scale=0.5),
+        open_capture(tmp_path, scale=0.5, roving=False),
+        resized(open_capture(tmp_path), 0.5),
+        resized(open_capture(tmp_path, roving=False), 0.5),
+    ]
+    first, *others = [next(source.frames()).images["cam00"] for source in sources]
+    for other in others:
+        np.testing.assert_array_equal(first, other)
+
+
 def test_a_roving_picture_that_lacks_is_named(tmp_path: Path) -> None:
     write_capture(tmp_path)
     (tmp_path / "roving/000001.png").unlink()

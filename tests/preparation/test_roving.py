@@ -17,6 +17,7 @@ from structgstream.data.open import open_capture
 from structgstream.data.prepared import read_prepared
 from structgstream.data.roving import roving_of
 from structgstream.errors import CaptureError, ConfigError
+from structgstream.evaluation.recording import capture_of
 from structgstream.preparation import prepare as preparation
 from structgstream.preparation import solvers
 from structgstream.preparation.calibration.solved import Observations, RovingFrames, SolvedCalibration
@@ -127,6 +128,12 @@ def test_registered_frames_are_in_the_capture_and_train_frame_0_alone(
         assert one.header.metadata["roving"] == 8
         assert "roving" not in other.header.metadata
         assert list(one.header.rig) == list(other.header.rig) == list(room_rig(5))
+        # What only looks at a stream needs none of them.
+        (out / "roving" / "000004.png").unlink()
+        with pytest.raises(CaptureError, match="is missing"):
+            open_capture(out)
+        for header in (one.header, other.header):
+            assert roving_of(capture_of(header, out, frames=None)) is None
 
     without = prepare_capture(tmp_path / "videos", out, options=OPTIONS)
     assert "calibrate" not in without.skipped
