@@ -26,7 +26,7 @@ from structgstream.data.roving import (
     roving_of,
 )
 from structgstream.data.source import Prefetch, resized
-from structgstream.data.undistortion import rectilinear
+from structgstream.data.undistortion import Undistortion, rectilinear
 from structgstream.errors import CaptureError
 from structgstream.frames import MultiViewFrame
 from tests.support.captures import HEIGHT, WIDTH, small_rig, write_picture
@@ -44,7 +44,8 @@ def ball(camera: Camera, *, radius: float, factor: float = 1.0) -> NDArray[np.bo
     return np.asarray(np.linalg.norm(np.cross(rays, camera.center.numpy()), axis=-1) < factor * radius)
 
 
-def test_rays_through_what_moves_before_the_still_cameras_do_not_count() -> None:
+@pytest.mark.parametrize("near", [0.5, 0.04, 0.001])
+def test_rays_through_what_moves_before_the_still_cameras_do_not_count(near: float) -> None:
     rig = arc_rig(6, width=160, height=120)
     rig = rig.mapped(
         {name: replace(own, K=own.K * torch.tensor([[3.3], [3.3], [1.0]])) for name, own in rig.cameras.items()}
@@ -52,7 +53,7 @@ def test_rays_through_what_moves_before_the_still_cameras_do_not_count() -> None
     rig = rig.mapped({name: replace(own, K=_centred(own)) for name, own in rig.cameras.items()})
     changed = {name: ball(rig[name], radius=0.3) for name in rig.training}
     eye = torch.tensor([0.6, -1.4, -2.2], dtype=torch.float64)
-    camera = replace(rig["cam00"], viewmat=look_at(eye, torch.zeros(3, dtype=torch.float64)), near=0.5)
+    camera = replace(rig["cam00"], viewmat=look_at(eye, torch.zeros(3, dtype=torch.float64)), near=near)
     moving = passes_through(camera, rig, changed)
     assert moving[ball(camera, radius=0.3, factor=0.9)].all()
     assert not moving[~ball(camera, radius=0.3, factor=2.0)].any()
@@ -156,6 +157,40 @@ def test_roving_pictures_are_reduced_as_the_capture_is(tmp_path: Path) -> None:
         assert (one.camera.height, one.camera.width) == one.mask.shape
 
 
+def test_roving_pictures_are_no_larger_than_those_of_the_cameras(tmp_path: Path) -> None:
+    content = write_capture(tmp_path)
+    larger = {}
+    for name, own in content.roving.items():
+        filmed = replace(own.filmed, camera=own.filmed.camera.scaled(3.0))
+        larger[name] = PreparedCamera(own.files, filmed, rectilinear(filmed))
+        write_picture(tmp_path / own.files, np.full((3 * HEIGHT, 3 * WIDTH, 3), 100, np.uint8))
+    write_prepared(tmp_path, replace(content, roving=larger))
+    for scale in (1.0, 0.5):
+        source = open_capture(tmp_path, scale=scale)
+        roving = roving_of(source)
+        assert roving is not None
+        for own in roving.roving(next(source.frames())):
+            assert own.image.shape == (HEIGHT * scale, WIDTH * scale, 3)
+            assert (own.camera.width, own.camera.height) == (WIDTH * scale, HEIGHT * scale)
+
+
+def test_the_lens_of_all_roving_pictures_is_computed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_capture(tmp_path)
+    made = []
+
+    def counted(*own: Any) -> Undistortion:
+        made.append(own)
+        return Undistortion(*own)
+
+    monkeypatch.setattr(roving_module, "Undistortion", counted)
+    source = open_capture(tmp_path)
+    roving = roving_of(source)
+    assert roving is not None
+    first, second = roving.roving(next(source.frames()))
+    assert len(made) == 1
+    assert first.image.shape == second.image.shape
+
+
 def test_roving_pictures_can_be_left_out(tmp_path: Path) -> None:
     content = write_capture(tmp_path)
     np.save(tmp_path / "points.npy", np.zeros((3, 3)))
@@ -164,6 +199,25 @@ def test_roving_pictures_can_be_left_out(tmp_path: Path) -> None:
     source = open_capture(tmp_path, roving=False)
     assert roving_of(source) is None
     assert source.points is None  # roving pictures helped to find them
+
+
+def test_pictures_of_a_scale_are_the_same_without_roving_pictures(tmp_path: Path) -> None:
+    """A stream of ``--roving none --scale 0.5`` is evaluated on the pictures that it was trained on."""
+    content = write_capture(tmp_path)
+    cameras = {}
+    for name, own in content.cameras.items():
+        filmed = replace(own.filmed, lens=RadialTangential(k1=-0.05))
+        cameras[name] = replace(own, filmed=filmed, pinhole=rectilinear(filmed))
+    write_prepared(tmp_path, replace(content, cameras=cameras))
+    sources = [
+        open_capture(tmp_path, scale=0.5),
+        open_capture(tmp_path, scale=0.5, roving=False),
+        resized(open_capture(tmp_path), 0.5),
+        resized(open_capture(tmp_path, roving=False), 0.5),
+    ]
+    first, *others = [next(source.frames()).images["cam00"] for source in sources]
+    for other in others:
+        np.testing.assert_array_equal(first, other)
 
 
 def test_a_roving_picture_that_lacks_is_named(tmp_path: Path) -> None:

@@ -17,11 +17,13 @@ from structgstream.data.open import open_capture
 from structgstream.data.prepared import read_prepared
 from structgstream.data.roving import roving_of
 from structgstream.errors import CaptureError, ConfigError
+from structgstream.evaluation.recording import capture_of
+from structgstream.preparation import prepare as preparation
 from structgstream.preparation import solvers
 from structgstream.preparation.calibration.solved import Observations, RovingFrames, SolvedCalibration
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.prepare import prepare_capture
-from structgstream.preparation.roving import open_roving, sharpest_frames
+from structgstream.preparation.roving import open_roving, sharpest_frames, write_png
 from tests.support.captures import write_picture, write_video
 from tests.support.filmed import noise_texture
 from tests.support.planes import HEIGHT, WIDTH, room_frame, room_rig
@@ -70,6 +72,9 @@ def test_what_is_no_roving_video_is_refused(tmp_path: Path) -> None:
     write_picture(tmp_path / "few" / "0.png", noise_texture(0, size=64))
     with pytest.raises(CaptureError, match=r"is too short \(1 frames\)"):
         open_roving(tmp_path / "few")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(CaptureError, match=r"The folder .*empty holds no pictures; give a video"):
+        open_roving(tmp_path / "empty")
 
 
 def solved(pictures: Any, *, roving: Any, **options: Any) -> SolvedCalibration:
@@ -88,9 +93,9 @@ def solved(pictures: Any, *, roving: Any, **options: Any) -> SolvedCalibration:
     )
 
 
-def write_walk(folder: Path) -> Path:
+def write_walk(folder: Path, *, darker: int = 1) -> Path:
     """Nine pictures of the room from the place of a camera."""
-    picture = room_frame(room_rig(5)).images["cam02"]
+    picture = room_frame(room_rig(5)).images["cam02"] // darker
     assert picture.shape == (HEIGHT, WIDTH, 3)
     for number in range(9):
         write_picture(folder / f"{number:04d}.png", picture)
@@ -123,6 +128,12 @@ def test_registered_frames_are_in_the_capture_and_train_frame_0_alone(
         assert one.header.metadata["roving"] == 8
         assert "roving" not in other.header.metadata
         assert list(one.header.rig) == list(other.header.rig) == list(room_rig(5))
+        # What only looks at a stream needs none of them.
+        (out / "roving" / "000004.png").unlink()
+        with pytest.raises(CaptureError, match="is missing"):
+            open_capture(out)
+        for header in (one.header, other.header):
+            assert roving_of(capture_of(header, out, frames=None)) is None
 
     without = prepare_capture(tmp_path / "videos", out, options=OPTIONS)
     assert "calibrate" not in without.skipped
@@ -140,6 +151,60 @@ def test_a_capture_without_roving_pictures_says_nothing_of_them(
     assert "roving" not in (tmp_path / "out" / "capture.json").read_text()
     assert not (tmp_path / "out" / "roving").exists()
     assert "roving" not in made.steps["calibrate"]
+
+
+def test_pictures_are_of_the_video_that_is_given_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(solvers, "solve_structure", solved)
+    write_room(tmp_path / "videos")
+    out, picture = tmp_path / "out", tmp_path / "out" / "roving" / "000004.png"
+    one, other = write_walk(tmp_path / "one"), write_walk(tmp_path / "other", darker=2)
+    prepare_capture(tmp_path / "videos", out, options=replace(OPTIONS, roving=one))
+    before = cv2.imread(str(picture))
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(preparation, "assembled", interrupted)  # after the calibration
+        with pytest.raises(KeyboardInterrupt):
+            prepare_capture(tmp_path / "videos", out, options=replace(OPTIONS, roving=other))
+    made = prepare_capture(tmp_path / "videos", out, options=replace(OPTIONS, roving=other))
+    assert "calibrate" in made.skipped
+    np.testing.assert_array_equal(cv2.imread(str(picture)), before // 2)
+
+    with monkeypatch.context() as patched:
+        written = []
+
+        def first_alone(path: Path, shown: Any) -> None:
+            if len(written) == 4:
+                raise KeyboardInterrupt
+            written.append(path)
+            write_png(path, shown)
+
+        patched.setattr(preparation, "write_png", first_alone)
+        with pytest.raises(KeyboardInterrupt):
+            prepare_capture(tmp_path / "videos", out, options=replace(OPTIONS, roving=one))
+    made = prepare_capture(tmp_path / "videos", out, options=replace(OPTIONS, roving=other))
+    assert "roving" not in made.skipped
+    np.testing.assert_array_equal(cv2.imread(str(picture)), before // 2)
+    again = prepare_capture(tmp_path / "videos", out, options=replace(OPTIONS, roving=other))
+    assert "roving" in again.skipped
+
+
+def test_a_roving_video_among_the_others_is_no_still_camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(solvers, "solve_structure", solved)
+    write_room(tmp_path / "videos")
+    file = walk(tmp_path / "videos")
+    made = prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(OPTIONS, roving=file))
+    assert made.steps["link"].startswith("5 cameras")
+    assert list(read_prepared(tmp_path / "out").cameras) == list(room_rig(5))
+
+
+def test_refining_would_leave_the_roving_frames_behind(tmp_path: Path) -> None:
+    write_room(tmp_path / "videos")
+    options = replace(OPTIONS, refine=True, roving=write_walk(tmp_path / "walk"))
+    with pytest.raises(ConfigError, match="adjusts the still cameras alone"):
+        prepare_capture(tmp_path / "videos", tmp_path / "out", options=options)
 
 
 def test_a_given_calibration_registers_no_roving_video(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from structgstream.cameras import Camera, CameraRig
 from structgstream.data.images import opencv, read_picture, reduced_mask
 from structgstream.data.points import PointsConfig, initial_points
-from structgstream.data.prepared import ROVING, PreparedCapture
+from structgstream.data.prepared import ROVING, PreparedCamera, PreparedCapture
 from structgstream.data.source import FrameSource, FrameStream, SourceWrapper, resized_to
 from structgstream.data.undistortion import Undistortion
 from structgstream.errors import CaptureError
@@ -36,7 +36,8 @@ INSTANTS = 15  # of the take
 CHANGED_LEVELS = 12.0  # of 255, in a channel, beyond which two pixels of the reduced pictures differ
 REDUCED_SIDE = 160  # pixels, to which the longer side is reduced
 REACH_PIXELS = 2  # of the reduced pictures, by which what differs is enlarged
-DEPTHS = 96  # places on a ray, evenly in inverse depth
+DEPTHS = 96  # places on a ray, evenly in the logarithm of depth: 5 % apart, less than people are thick
+FAR_NEARS = 96.0  # near planes to the farthest place on a ray, which is as far as all still cameras at least
 MIN_SEEN = 2  # still cameras that see a place
 NEAR_SHARE = 0.25  # of the near plane of the still cameras: one walks closer to things
 
@@ -47,11 +48,11 @@ class WithRoving(SourceWrapper):
 
     Args:
         whole: the capture over its whole time, with the cameras and pictures of ``source``.
-        pictures: as stored, with their cameras.
+        pictures: as stored, with their cameras; all have one lens.
     """
 
     whole: FrameSource
-    pictures: tuple[tuple[Path, Undistortion], ...]
+    pictures: tuple[tuple[Path, PreparedCamera], ...]
     stored: CameraRig  # the cameras of the capture at the size of their stored pictures
 
     def resized(self, rig: CameraRig) -> FrameSource:
@@ -59,11 +60,17 @@ class WithRoving(SourceWrapper):
         return replace(self, source=resized_to(self.source, rig), whole=resized_to(self.whole, rig))
 
     def roving(self, frame: MultiViewFrame) -> tuple[RovingPicture, ...]:
-        """The pictures, reduced as the capture's are, for the scene of ``frame``."""
-        name = next(iter(self.rig))
-        scale, near = self.rig[name].width / self.stored[name].width, NEAR_SHARE * self.rig[name].near
-        changed = self._changed(frame)
-        return tuple(self._picture(*one, scale=scale, near=near, changed=changed) for one in self.pictures)
+        """The pictures for the scene of ``frame``, reduced as the capture's are, and to the size of its largest."""
+        name, shown = next(iter(self.rig)), self.pictures[0][1]
+        longest = max(max(own.width, own.height) for own in self.rig.cameras.values())
+        scale = self.rig[name].width / self.stored[name].width
+        scale = min(scale, longest / max(shown.pinhole.width, shown.pinhole.height))
+        near, changed = NEAR_SHARE * self.rig[name].near, self._changed(frame)
+        undistortion = Undistortion(shown.filmed, shown.pinhole)  # its grids are large: one for all, let go afterwards
+        return tuple(
+            self._picture(file, own.pinhole, undistortion, scale=scale, near=near, changed=changed)
+            for file, own in self.pictures
+        )
 
     def moving(self, points: Floats, frame: MultiViewFrame) -> NDArray[np.bool_]:
         """Which points ``[P, 3]`` are of what moves in ``frame``."""
@@ -72,6 +79,7 @@ class WithRoving(SourceWrapper):
     def _picture(
         self,
         file: Path,
+        pinhole: Camera,
         undistortion: Undistortion,
         *,
         scale: float,
@@ -85,7 +93,7 @@ class WithRoving(SourceWrapper):
                 f"The roving picture {file} has {picture.shape[1]}x{picture.shape[0]} pixels, expected {filmed.width}x"
                 f"{filmed.height}; prepare the capture again."
             )
-        camera = replace(undistortion.target.scaled(scale), near=near)
+        camera = replace(pinhole.scaled(scale), near=near)
         size = camera.width, camera.height
         image = opencv().resize(undistortion(picture), size, interpolation=opencv().INTER_AREA)
         shown = np.ones(image.shape[:2], bool) if undistortion.shown is None else reduced_mask(undistortion.shown, size)
@@ -130,7 +138,7 @@ def with_roving(source: FrameSource, whole: FrameSource, folder: Path, capture: 
     files = {name: folder / own.files for name, own in capture.roving.items()}
     if missing := [file for file in files.values() if not file.is_file()]:
         raise CaptureError(f"The roving picture {missing[0]} is missing; restore it, or prepare the capture again.")
-    pictures = tuple((files[name], Undistortion(own.filmed, own.pinhole)) for name, own in capture.roving.items())
+    pictures = tuple((files[name], own) for name, own in capture.roving.items())
     stored = source.rig.mapped({name: capture.cameras[name].pinhole for name in source.rig})
     return WithRoving(source, whole, pictures, stored)
 
@@ -205,7 +213,8 @@ def passes_through(camera: Camera, rig: CameraRig, changed: Mapping[str, NDArray
         across, down = np.meshgrid(np.arange(small.width) + 0.5, np.arange(small.height) + 0.5)
         flat = np.stack([across, down, np.ones_like(across)], -1) @ np.linalg.inv(small.K.numpy()).T
         rays, eye = flat @ small.viewmat[:3, :3].numpy(), small.center.numpy()
-        for depth in small.near / np.linspace(1, 0, DEPTHS, endpoint=False):
+        apart = max(float((rig[name].center - small.center).norm()) for name in changed)
+        for depth in np.geomspace(small.near, max(FAR_NEARS * small.near, 2 * apart), DEPTHS):
             found |= moving_places(eye + depth * rays, rig, changed)
     # Its pixels are areas of the picture's.
     whole = opencv().resize(found.astype(np.uint8), (camera.width, camera.height), interpolation=opencv().INTER_NEAREST)

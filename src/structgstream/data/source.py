@@ -147,6 +147,10 @@ class WithoutPoints(SourceWrapper):
     def points(self) -> NDArray[np.float64] | None:
         return None
 
+    def resized(self, rig: CameraRig) -> FrameSource:
+        """See ``Resizable``."""
+        return replace(self, source=resized_to(self.source, rig))
+
 
 @dataclass(frozen=True)
 class Resized(WithRig):

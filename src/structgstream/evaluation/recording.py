@@ -90,7 +90,7 @@ def captures_of(
     Raises:
         CaptureError: the folder contains no capture, or the capture ends before the stream's first frame.
     """
-    whole = open_capture(folder, roving="roving" in header.metadata)
+    whole = open_capture(folder, roving=False)  # they train frame 0, which the stream has
     scale = _scale(header, whole)
     return _part(resized(whole, scale), header, frames), _part(whole, header, frames) if scale < 1.0 else None
 

@@ -102,7 +102,10 @@ class Job:
         held_out = () if options.held_out == ("auto",) else options.held_out
         footage = find_footage(self.videos, picture_fps=options.fps)
         self._check_names(options.without, footage, purpose="leave out")
-        footage = footage.only([name for name in footage.cameras if name not in options.without])
+        # A roving video that lies among the others is none of the still cameras'.
+        walked = None if options.roving is None else options.roving.resolve()
+        still = [name for name in footage.cameras if footage.path(name).resolve() != walked]
+        footage = footage.only([name for name in still if name not in options.without])
         self._check_names(held_out, footage, purpose="hold out")
         self._check_names(
             () if distance is None else (distance.first, distance.second), footage, purpose="measure from"
@@ -229,19 +232,34 @@ class Job:
             if not footage.tracks:
                 remove_others(self.capture / camera.files, [file.name for file in footage.stills[name]])
         self._link_masks()
-        self._write_roving(content)
         write_prepared(self.capture, content)
         how = {"hard": "hard link or copy", "symlink": "symlink", "copy": "copy"}[self.options.link]
         self.steps.end("link", f"{len(content.cameras)} cameras by {how}")
 
-    def _write_roving(self, content: PreparedCapture) -> None:
-        """Pictures of the registered frames; those of an earlier run are removed."""
+    def roving_pictures(self, content: PreparedCapture) -> None:
+        """Writes those of the registered frames; others, of an earlier run, are removed."""
         names = [f"{name}.png" for name in content.roving]
-        if self.roving is not None and not (
-            "calibrate" in self.steps.skipped and all((self.capture / name).is_file() for name in names)
-        ):
-            for name, picture in frames_named(self.roving, content.roving).items():
-                write_png(self.capture / f"{name}.png", picture)
+        if self.roving is not None:
+            footage, result = self.roving, self.capture / FOLDER / f"{ROVING}.json"
+
+            def write() -> int:
+                result.unlink(missing_ok=True)  # an interruption leaves pictures of two videos, whose names are alike
+                for number, (name, picture) in enumerate(frames_named(footage, content.roving)):
+                    self.steps.progress(number, len(names), name)
+                    write_png(self.capture / f"{name}.png", picture)
+                return len(names)
+
+            if not all((self.capture / name).is_file() for name in names):
+                result.unlink(missing_ok=True)
+            self.steps.run(
+                ROVING,
+                {},
+                write,
+                pack=lambda count: Stored({"count": count}),
+                unpack=lambda stored: int(stored.values["count"]),
+                summary=lambda count: f"{count} pictures",
+                after=("calibrate",),
+            )
         if (folder := self.capture / ROVING).is_dir():
             remove_others(folder, [Path(name).name for name in names])
 
@@ -396,6 +414,11 @@ def check_used(method: str | Calibration, footage: Footage, options: PrepareOpti
             "A roving video (--roving) is registered by structure from motion alone; choose --calibration sfm, or "
             "leave it out."
         )
+    if options.roving is not None and options.refine:
+        raise ConfigError(
+            "Refining (--refine) adjusts the still cameras alone, so the frames of a roving video (--roving) would no "
+            "longer fit them; leave out one of the two."
+        )
     if options.lens is not None and isinstance(method, Calibration) and not options.refine:
         raise ConfigError(
             f"{method.where} states the lenses, so --lens {options.lens} has no effect; add --refine to adjust them to "
@@ -492,6 +515,7 @@ def prepare_capture(
         solved = job.calibrate(footage, first, method)
         clocks = job.synchronize_again(footage, first, method, solved)
         content = assembled(footage, clocks.clocks, solved, options)
+        job.roving_pictures(content)
         job.link(footage, content)
         content = job.points(job.near(content))
         findings = job.check(content)

@@ -4,7 +4,7 @@
 The camera is any phone. Its exposure, its lens and the time are its own; a rolling shutter is ignored.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +35,10 @@ def open_roving(path: Path) -> Footage:
     files = {ROVING: path}
     if path.is_dir():
         footage = Footage(path.parent, files, {}, {ROVING: pictures_of(path)})
+        if not footage.stills[ROVING]:
+            raise CaptureError(
+                f"The folder {path} holds no pictures; give a video, or a folder of pictures of one camera."
+            )
     elif path.suffix.lower() in VIDEO_SUFFIXES:
         footage = Footage(path.parent, files, scan_videos(files), {})
     else:
@@ -70,11 +74,11 @@ def sharpness(picture: Picture) -> float:
     return float(cv2.Laplacian(grey, cv2.CV_32F).var())
 
 
-def frames_named(footage: Footage, names: Mapping[str, object]) -> Mapping[str, Picture]:
-    """The frames of these names, read again."""
+def frames_named(footage: Footage, names: Mapping[str, object]) -> Iterator[tuple[str, Picture]]:
+    """The frames of these names with their names, read again one by one."""
     numbers = sorted(int(name.removeprefix(f"{ROVING}/")) for name in names)
     found = footage.pictures(ROVING, numbers)
-    return {f"{ROVING}/{number:06d}": picture for number, picture in zip(numbers, found, strict=True)}
+    yield from ((f"{ROVING}/{number:06d}", picture) for number, picture in zip(numbers, found, strict=True))
 
 
 def write_png(path: Path, picture: Picture) -> None:

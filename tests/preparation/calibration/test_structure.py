@@ -296,5 +296,7 @@ def test_a_blurred_roving_video_is_refused(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(structure, "FIELDS_OF_VIEW", {"radial": (60.0,)})
     _, pictures, frames = walked_room()
     blurred = {name: np.asarray(cv2.GaussianBlur(frame, (0, 0), 12), np.uint8) for name, frame in frames.items()}
-    with pytest.raises(CalibrationError, match="The roving video is blurred: its sharpest frames have"):
+    with pytest.raises(
+        CalibrationError, match="The roving video is blurred, or of bare surfaces: its sharpest frames have"
+    ):
         solve_structure(pictures, lens="radial", roving=dict(list(blurred.items())[:4]))

@@ -191,8 +191,9 @@ def _nothing_roving(
     ]
     if counts[0] < BLURRED * counts[1]:
         return (
-            f"The roving video is blurred: its sharpest frames have {counts[0]:.0f} keypoints, the cameras "
-            f"{counts[1]:.0f}; walk slower, with more light or a shorter exposure, or leave out --roving."
+            f"The roving video is blurred, or of bare surfaces: its sharpest frames have {counts[0]:.0f} keypoints, "
+            f"the cameras {counts[1]:.0f}; walk slower, with more light and what the cameras see, or leave out "
+            "--roving."
         )
     with_stills = [pair for pair in matches if (pair[0] in frames) != (pair[1] in frames)]
     best = max((len(pairs[pair].inlier_matches) if pair in pairs else 0 for pair in with_stills), default=0)
