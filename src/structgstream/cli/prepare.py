@@ -166,7 +166,9 @@ def _conclude(findings: "Sequence[Finding]", console: Console) -> None:
             print_lines(console, f"{finding.severity}: {finding.sentence}")
     if errors:
         raise CaptureError(errors[0].sentence)
-    print_lines(console, "The check found nothing that would spoil a stream.")
+    warned = any(finding.severity == "warning" for finding in findings)
+    found = "no error; see the warnings" if warned else "nothing that would spoil a stream"
+    print_lines(console, f"The check found {found}.")
 
 
 @dataclass(frozen=True)

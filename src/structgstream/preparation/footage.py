@@ -125,7 +125,7 @@ class Footage:
         def refuse(lost: int, following: int | None, reason: str) -> None:
             raise CaptureError(
                 f"The video {track.path} of camera {name!r} cannot be decoded at {lost * track.tick_seconds:.3f} s "
-                f"({reason}): truncated or damaged; copy or record it again, or leave it out with --without {name}."
+                f"({reason}): truncated or damaged; copy or record it again, or go on without it."
             )
 
         stamps = [track.stamps[index] for index in indices]
