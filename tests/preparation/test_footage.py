@@ -150,7 +150,7 @@ def test_a_damaged_video_names_its_camera(tmp_path: Path) -> None:
     data[begin + (len(data) - begin) // 3 :] = bytes(len(data) - begin - (len(data) - begin) // 3)
     footage = find_footage(tmp_path)
     file.write_bytes(bytes(data))
-    with pytest.raises(CaptureError, match=r"a\.mp4 of camera 'a' cannot be decoded .*--without a"):
+    with pytest.raises(CaptureError, match=r"a\.mp4 of camera 'a' cannot be decoded .* go on without it"):
         list(footage.pictures("a", range(40)))
 
 
