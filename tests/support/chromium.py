@@ -109,11 +109,15 @@ class Tab:
         return found["result"].get("value")
 
     def wait_for(self, expression: str) -> Any:
-        """What the expression gives once that is truthy."""
+        """What the expression gives once that is truthy; the page may be left for another one meanwhile."""
         last = time.monotonic() + PATIENCE_SECONDS
         while time.monotonic() < last:
-            if value := self.evaluate(expression):
-                return value
+            try:
+                if value := self.evaluate(expression):
+                    return value
+            except AssertionError as error:
+                if "navigated" not in str(error):
+                    raise
             time.sleep(0.1)
         raise AssertionError(f"{expression} never came true; the page says {self.complaints}")
 
