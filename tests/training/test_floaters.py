@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import torch
 
-from structgstream.cameras import Camera
 from structgstream.kernels.backend import Backend, reference_backend
 from structgstream.kernels.values import HeadWeights, MLPWeights
 from structgstream.scene.anchors import AnchorCloud
@@ -13,13 +12,14 @@ from structgstream.scene.color import CameraColor
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.training.frame0.regularizers import FreeSpaceConfig, in_free_space
+from structgstream.training.views import View
 from tests.support.backends import quickest_backend
 from tests.support.rigs import arc_rig
 from tests.support.varied import varied
 
 CONFIG = varied(FreeSpaceConfig(), MIN_CAMERAS=4, SCALE=1.0)
 RIG = arc_rig(9, width=64, height=48)
-CAMERAS = [RIG[name] for name in RIG.training]
+VIEWS = [View(row, RIG[name], torch.zeros(48, 64, 3, dtype=torch.uint8), None) for row, name in enumerate(RIG.training)]
 WIDTH = 8
 DIRECTION = slice(WIDTH, WIDTH + 3)
 
@@ -38,7 +38,7 @@ def wall_and(floating: list[tuple[float, float, float]], *, opacity: float, view
     w1, w2 = torch.zeros(32, WIDTH + 4), torch.zeros(1, 32)
     w1[0, 0], w2[0, 0] = 1.0, torch.atanh(torch.tensor(opacity)) - visible
     if view_dependent:  # 1 - cos of the angle to the direction from cam01
-        towards = torch.tensor(floating[0]) - CAMERAS[0].center.float()
+        towards = torch.tensor(floating[0]) - VIEWS[0].camera.center.float()
         w1[1, 0], w1[1, DIRECTION], w2[0, 1] = 1.0, -torch.nn.functional.normalize(towards, dim=0), -2000.0
     colors, covariances = torch.zeros(3), torch.tensor([6.0, 6.0, 6.0, 1.0, 0.0, 0.0, 0.0])
     still = (torch.zeros(32, WIDTH + 4), torch.zeros(32))
@@ -56,7 +56,7 @@ def wall_and(floating: list[tuple[float, float, float]], *, opacity: float, view
             covariance=HeadWeights(*still, torch.zeros(7, 32), covariances),
         ),
         free=FreeGaussians.empty(positions),
-        camera_color=CameraColor.identity(len(CAMERAS)),
+        camera_color=CameraColor.identity(len(VIEWS)),
     )
 
 
@@ -64,10 +64,10 @@ def found(
     scene: Scene,
     *,
     config: FreeSpaceConfig = CONFIG,
-    cameras: list[Camera] = CAMERAS,
+    views: list[View] = VIEWS,
     backend: Backend | None = None,
 ) -> list[bool]:
-    mask = in_free_space(scene, cameras, config=config, backend=backend or quickest_backend())
+    mask = in_free_space(scene, views, config=config, backend=backend or quickest_backend())
     wall = 25 * 33
     assert not mask[:wall].any(), "no surface is in free space"
     return mask[wall:].tolist()
@@ -87,10 +87,10 @@ def test_what_all_cameras_draw_stays() -> None:
 def test_what_one_camera_draws_goes() -> None:
     scene = wall_and(FLOATING[:1], opacity=0.4, view_dependent=True)
     drawn = [
-        int((scene.structured(camera, quickest_backend()).raw_opacities[-1] > CONFIG.DRAWN_OPACITY).sum())
-        for camera in CAMERAS
+        int((scene.structured(view.camera, quickest_backend()).raw_opacities[-1] > CONFIG.DRAWN_OPACITY).sum())
+        for view in VIEWS
     ]
-    assert drawn == [1] + [0] * (len(CAMERAS) - 1)
+    assert drawn == [1] + [0] * (len(VIEWS) - 1)
     assert found(scene) == [True]
 
 
@@ -100,9 +100,9 @@ def test_what_lies_on_or_behind_a_surface_stays() -> None:
 
 def test_too_few_cameras_judge_nothing() -> None:
     scene = wall_and(FLOATING, opacity=-0.5)
-    assert found(scene, cameras=CAMERAS[:3]) == [False, False]
-    assert found(scene, config=varied(CONFIG, MIN_CAMERAS=len(CAMERAS) + 1)) == [False, False]
-    assert found(scene, cameras=[]) == [False, False]
+    assert found(scene, views=VIEWS[:3]) == [False, False]
+    assert found(scene, config=varied(CONFIG, MIN_CAMERAS=len(VIEWS) + 1)) == [False, False]
+    assert found(scene, views=[]) == [False, False]
 
 
 def test_where_nothing_is_drawn_nothing_is_in_front_of_it() -> None:
@@ -116,8 +116,15 @@ def test_where_nothing_is_drawn_nothing_is_in_front_of_it() -> None:
         anchors.offsets[rows],
         anchors.features[rows],
     )
-    mask = in_free_space(replace(scene, anchors=alone), CAMERAS, config=CONFIG, backend=quickest_backend())
+    mask = in_free_space(replace(scene, anchors=alone), VIEWS, config=CONFIG, backend=quickest_backend())
     assert not mask.any()
+
+
+def test_pixels_that_do_not_count_judge_nothing() -> None:
+    scene = wall_and(FLOATING, opacity=-0.5)
+    nothing, everything = torch.zeros(48, 64, dtype=torch.bool), torch.ones(48, 64, dtype=torch.bool)
+    assert found(scene, views=[replace(view, mask=nothing) for view in VIEWS]) == [False, False]
+    assert found(scene, views=[replace(view, mask=everything) for view in VIEWS]) == [True, True]
 
 
 def test_smaller_pictures_tell_the_same() -> None:

@@ -17,6 +17,7 @@ from structgstream.training.frame0.regularizers import (
     in_free_space,
 )
 from structgstream.training.frame0.seeding import voxel_centers
+from structgstream.training.views import training_views
 from tests.support.backends import quickest_backend
 from tests.support.varied import varied
 from tests.support.worlds import moving_world, psnr, rendered
@@ -114,8 +115,8 @@ def test_what_floats_before_surfaces_is_removed_in_the_end_and_nothing_else_chan
     points = torch.cat([surface, between])
     removing = replace(QUICK, floaters=varied(FreeSpaceConfig(enabled=True), MIN_CAMERAS=2, DRAWN_OPACITY=2.0))
     kept, found = fit(world, points=points), fit(world, points=points, config=removing)
-    cameras = [world.rig[name] for name in world.rig.training]
-    floating = in_free_space(kept.scene, cameras, config=removing.floaters, backend=quickest_backend())
+    views = training_views(world.frames[0], world.rig, torch.device("cpu"))
+    floating = in_free_space(kept.scene, views, config=removing.floaters, backend=quickest_backend())
     assert floating.any()
     assert found.counts == {"floaters": int(floating.sum())}
     assert found.removed == kept.removed + int(floating.sum())

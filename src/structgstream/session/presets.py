@@ -329,7 +329,7 @@ COMPACT = replace(
             min_growth=0.25,
             room_until=1600,
         ),
-        losses=replace(MOTION.initial.losses, l1=0.6, ssim=0.45),
+        losses=replace(MOTION.initial.losses, l1=0.6, ssim=0.45, offset_distance=0.0),
         perturbation=PerturbationConfig(dropped_share=0.2, noise_scales=0.5),
         depth_distortion=DepthDistortionConfig(weight=0.05),
         floaters=FreeSpaceConfig(enabled=True),

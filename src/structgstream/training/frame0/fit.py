@@ -308,8 +308,7 @@ def _fit(
     scene, counts = detached(hooks.scene), {}
     if config.floaters.enabled:
         with watch.stage("densify"):
-            cameras = [view.camera for view in (*views, *walked.views)]
-            floating = in_free_space(scene, cameras, config=config.floaters, backend=backend)
+            floating = in_free_space(scene, (*views, *walked.views), config=config.floaters, backend=backend)
             scene = replace(scene, anchors=scene.anchors.select(~floating))
             counts["floaters"] = int(floating.sum())
     return FitResult(

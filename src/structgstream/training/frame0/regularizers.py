@@ -19,7 +19,8 @@ Note [Free space]
 F_alpha sees the direction, so an anchor near one camera can be opaque for that camera alone, and make up for its lens
 or its exposure there. From any other place near it, what F_alpha says is chance: a viewer who comes close stands in a
 haze. A surface is not like that: few cameras see it in front of what they draw. So an anchor goes if many cameras see
-something behind it, and hardly any of them draws it.
+something behind it, and hardly any of them draws it. What masks leave out is no evidence: a roving camera, which films
+an empty room, would see through the people of frame 0.
 """
 
 from collections.abc import Sequence
@@ -33,7 +34,7 @@ from structgstream.cameras import Camera
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.backend import Backend
 from structgstream.scene.scene import Scene
-from structgstream.training.views import dilated
+from structgstream.training.views import View, dilated
 
 TABLE_LENGTH = 1 << 21
 """Of a table of random numbers; it is a few times what an iteration reads."""
@@ -190,14 +191,17 @@ class FreeSpaceConfig:
     """Scale of width and height of the pictures in which depth is drawn."""
 
 
-def in_free_space(scene: Scene, cameras: Sequence[Camera], *, config: FreeSpaceConfig, backend: Backend) -> Tensor:
-    """Mask ``[M]`` of the anchors of ``scene`` that float in front of surfaces, as ``cameras`` see it."""
+def in_free_space(scene: Scene, views: Sequence[View], *, config: FreeSpaceConfig, backend: Backend) -> Tensor:
+    """Mask ``[M]`` of the anchors of ``scene`` that float in front of surfaces, as the cameras of ``views`` see it.
+
+    Pixels that do not count (``training/views.py``, Note [Masked pixels]) show no surface.
+    """
     in_front = scene.anchors.positions.new_zeros(len(scene.anchors))
     drawn = torch.zeros_like(in_front)
     with torch.no_grad():
-        for camera in cameras:
-            small = camera.scaled(config.SCALE)
-            structured = scene.structured(small, backend)
+        for view in views:
+            small = view.reduced(config.SCALE)
+            structured = scene.structured(small.camera, backend)
             rows = structured.anchors
             before = _before_surfaces(scene.anchors.positions[rows], scene, small, config.DEPTH_SHARE, backend)
             opaque = structured.raw_opacities.amax(1) > config.DRAWN_OPACITY
@@ -206,10 +210,11 @@ def in_free_space(scene: Scene, cameras: Sequence[Camera], *, config: FreeSpaceC
     return (in_front >= config.MIN_CAMERAS) & (drawn <= (config.DRAWN_SHARE * in_front).clamp(min=1.0))
 
 
-def _before_surfaces(points: Tensor, scene: Scene, camera: Camera, share: float, backend: Backend) -> Tensor:
-    """Mask ``[n]`` of the points that lie in ``camera``'s picture, nearer than ``share`` of the depth drawn there."""
-    viewport = camera.viewport(points)
+def _before_surfaces(points: Tensor, scene: Scene, view: View, share: float, backend: Backend) -> Tensor:
+    """Mask ``[n]`` of the points in the picture of ``view`` that are nearer than ``share`` of the depth drawn there."""
+    camera, viewport = view.camera, view.camera.viewport(points)
     depth = _nearest_depth(scene, camera, backend)
+    depth = depth if view.mask is None else torch.where(view.mask, depth, 0.0)
     at = points @ viewport.viewmat[:3, :3].T + viewport.viewmat[:3, 3]
     x, y, z = (at @ viewport.K.T).unbind(1)
     column, row = (x / z).floor().long(), (y / z).floor().long()
