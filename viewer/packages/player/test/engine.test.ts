@@ -4,6 +4,9 @@
 import { readStream, type Tensor } from "@structgstream/core";
 import { afterEach, describe, expect, test, vi } from "vitest";
 import { expectSame } from "../../core/test/streams.ts";
+import type { FromDecoder } from "../src/decode/messages.ts";
+import { Engine } from "../src/engine/engine.ts";
+import type { Pipeline } from "../src/engine/pipeline.ts";
 import { CLIP, type Playing, playing, ServedFile, URL_OF_CLIP } from "./served.ts";
 
 vi.setConfig({ testTimeout: 60_000 });
@@ -155,6 +158,73 @@ test("late frames are dropped, and playback continues at the next key", async ()
   // Those decoded ahead were there; the ones between were not made into numbers, nor waited for.
   expect(play.shown.filter((index) => index > 5)).toEqual([9]);
   expect(play.engine.stalled).toBe(false);
+});
+
+describe("on a network that is slower than the stream", () => {
+  /** Plays the first frame; no other packets arrive yet. */
+  async function starved() {
+    const file = new ServedFile(CLIP);
+    const play = opened(file);
+    await play.settled();
+    file.heldFrom = PACKETS[1]!.offset;
+    play.engine.play();
+    return { file, play };
+  }
+
+  /** Lets all packets arrive; every frame is shown. */
+  async function goesOn({ file, play }: Awaited<ReturnType<typeof starved>>) {
+    file.heldFrom = Number.POSITIVE_INFINITY;
+    await play.until(() => {
+      // No frame is late from now on.
+      if (play.shown.at(-1) === play.engine.frameIndex) play.seconds += 1 / 240;
+      return play.engine.ended;
+    }, "end");
+    expect(play.shown).toEqual(PACKETS.map(({ index }) => index));
+    expect(play.errors).toEqual([]);
+  }
+
+  test("a picture that takes as long as the rest of the stream does not end it", async () => {
+    const { file, play } = await starved();
+    play.seconds += 1;
+    play.engine.tick();
+    expect([play.engine.ended, play.engine.stalled, play.engine.frameIndex]).toEqual([false, true, 0]);
+    await goesOn({ file, play });
+  });
+
+  test("frames that have arrived and are not decoded yet do not let the clock run past the missing ones", async () => {
+    const { file, play } = await starved();
+    const decoded = play.holdFrames();
+    file.heldFrom = PACKETS[2]!.offset;
+    await play.until(() => play.engine.stored.has(1), "packet");
+    play.seconds += 0.3;
+    let ticks = 0;
+    await play.until(() => ++ticks > 5);
+    decoded();
+    await goesOn({ file, play });
+  });
+
+  test("frames that were dropped as late, and have left memory since, are not waited for", () => {
+    const pipeline: Pipeline = { send: () => undefined, onmessage: undefined, close: () => undefined };
+    let now = 0;
+    const engine = new Engine(pipeline, () => now);
+    const hear = (message: FromDecoder) => pipeline.onmessage!(message);
+    const ptsSeconds = Float64Array.from({ length: 30 }, (_, i) => i / 30);
+    const facts = { first: 0, count: 30, ptsSeconds, keys: Uint32Array.of(0, 10, 20), lost: [], complete: true };
+    hear({ type: "catalog", facts });
+    const update = { index: 0, ptsSeconds: 0, fields: new Map() };
+    hear({ type: "frame", serial: 1, update, exact: true, packets: [], decodeMilliseconds: 0 });
+    hear({ type: "stored", ranges: [[0, 20]], fetchedBytes: 0 });
+    engine.play();
+    now = 0.5;
+    engine.tick();
+    hear({ type: "stored", ranges: [[10, 20]], fetchedBytes: 0 });
+    engine.tick();
+    expect([engine.stalled, engine.frameIndex]).toEqual([false, 15]);
+    now = 0.8;
+    engine.tick();
+    expect([engine.stalled, engine.frameIndex]).toEqual([true, 19]);
+    engine.destroy();
+  });
 });
 
 test("steps", async () => {

@@ -31,6 +31,8 @@ export class ServedFile {
   failures = 0;
   lastModified = new Date().toUTCString();
   chunkBytes = 5000;
+  /** Bytes from this one on do not arrive until it is raised. */
+  heldFrom = Number.POSITIVE_INFINITY;
 
   constructor(public bytes: Uint8Array) {}
 
@@ -61,14 +63,20 @@ export class ServedFile {
 
   private body(start: number, end: number): ReadableStream<Uint8Array> {
     let at = start;
+    let cancelled = false;
     const { bytes, chunkBytes } = this;
     return new ReadableStream({
-      async pull(controller) {
-        await new Promise((resolve) => setTimeout(resolve, 0));
+      pull: async (controller) => {
+        do await new Promise((resolve) => setTimeout(resolve, 0));
+        while (!cancelled && at < end && at >= this.heldFrom);
+        if (cancelled) return;
         if (at >= end) return controller.close();
-        const next = Math.min(at + chunkBytes, end);
+        const next = Math.min(at + chunkBytes, end, this.heldFrom);
         controller.enqueue(bytes.slice(at, next));
         at = next;
+      },
+      cancel: () => {
+        cancelled = true;
       },
     });
   }
@@ -82,6 +90,8 @@ export interface Playing {
   /** Frames given by `tick`, in order. */
   readonly shown: number[];
   seconds: number;
+  /** Decoded frames do not reach the engine until the function that it gives back is called. */
+  holdFrames(): () => void;
   /** Ticks, letting workers work in between, until `reached`. */
   until(reached: () => boolean, what?: string): Promise<void>;
   /** Until the stream is there and nothing is sought; what was found has been given. */
@@ -108,7 +118,11 @@ export function playing(request: typeof fetch, options: EngineOptions = {}): Pla
     send: (message: ToDecoder) => engineLine.port2.postMessage(message),
     close,
   };
-  engineLine.port2.onmessage = ({ data }: MessageEvent<FromDecoder>) => pipeline.onmessage?.(data);
+  let held: FromDecoder[] | undefined;
+  engineLine.port2.onmessage = ({ data }: MessageEvent<FromDecoder>) => {
+    if (held && data.type === "frame") held.push(data);
+    else pipeline.onmessage?.(data);
+  };
   const found: Playing = {
     engine: new Engine(pipeline, () => found.seconds, options),
     errors: [],
@@ -122,6 +136,14 @@ export function playing(request: typeof fetch, options: EngineOptions = {}): Pla
         found.engine.tick();
         await new Promise((resolve) => setTimeout(resolve, 1));
       }
+    },
+    holdFrames() {
+      const late: FromDecoder[] = [];
+      held = late;
+      return () => {
+        held = undefined;
+        for (const message of late) pipeline.onmessage?.(message);
+      };
     },
     async settled() {
       await found.until(() => found.engine.frames.count > 0 && !found.engine.seeking, "frame that was sought");

@@ -107,7 +107,7 @@ describe.skipIf(StagedTests.skipped)("a live stream in a browser", () => {
       stage.server.publish("/live/", live.files, { bytesPerSecond: 500 });
       stage.server.put("/live/manifest.json", live.files.get("manifest.json")!);
     }, 100);
-    await page.getByText("Playback was too slow and continues with the newest frames.").waitFor({ timeout: 50_000 });
+    await page.getByText("Playback fell behind and continues with the newest frames.").waitFor({ timeout: 50_000 });
     const frames = await ask(page, (_, __, shown) => shown);
     expect(frames).toEqual([...frames].sort((a, b) => a - b));
     expect(await reported(page)).toEqual([]);
