@@ -2,6 +2,8 @@
 /** Streams as tests see them: a server that is a function, and an engine with its workers in this very thread. */
 
 import { readFileSync } from "node:fs";
+import type { Tensor } from "@structgstream/core";
+import { afterEach } from "vitest";
 import { Decoding } from "../src/decode/decoding.ts";
 import type { FromDecoder, ToDecoder } from "../src/decode/messages.ts";
 import { Engine } from "../src/engine/engine.ts";
@@ -96,7 +98,25 @@ export interface Playing {
   until(reached: () => boolean, what?: string): Promise<void>;
   /** Until the stream is there and nothing is sought; what was found has been given. */
   settled(): Promise<void>;
+  /** Plays on to the end, so many seconds a tick. */
+  toEnd(step?: number): Promise<void>;
+  /** Ticks until a frame is given, and takes what is given into `fields`. */
+  given(index: number, fields: Map<string, Tensor>): Promise<void>;
   close(): void;
+}
+
+let open: Playing[] = [];
+
+afterEach(() => {
+  for (const play of open) play.close();
+  open = [];
+});
+
+/** An engine that opens a file, which is closed after the test. */
+export function playingFile(file: ServedFile, startSeconds = 0, options: EngineOptions = {}): Playing {
+  const play = playing(file.fetch as typeof fetch, options);
+  play.engine.load({ kind: "url", url: URL_OF_CLIP, name: "clip.sgs" }, startSeconds);
+  return play;
 }
 
 export function playing(request: typeof fetch, options: EngineOptions = {}): Playing {
@@ -107,16 +127,15 @@ export function playing(request: typeof fetch, options: EngineOptions = {}): Pla
     fetchLine.port2 as unknown as Port<ReadRequest, ReadReply>,
     () => new Promise((resolve) => setImmediate(resolve)),
   );
-  const close = () => {
-    for (const { port1, port2 } of [engineLine, fetchLine]) {
-      port1.close();
-      port2.close();
-    }
-  };
   const pipeline = {
     onmessage: undefined as ((message: FromDecoder) => void) | undefined,
     send: (message: ToDecoder) => engineLine.port2.postMessage(message),
-    close,
+    close: () => {
+      for (const { port1, port2 } of [engineLine, fetchLine]) {
+        port1.close();
+        port2.close();
+      }
+    },
   };
   let held: FromDecoder[] | undefined;
   engineLine.port2.onmessage = ({ data }: MessageEvent<FromDecoder>) => {
@@ -149,8 +168,23 @@ export function playing(request: typeof fetch, options: EngineOptions = {}): Pla
       await found.until(() => found.engine.frames.count > 0 && !found.engine.seeking, "frame that was sought");
       found.engine.tick();
     },
-    close,
+    toEnd(step = 1 / 60) {
+      return found.until(() => {
+        found.seconds += step;
+        return found.engine.ended;
+      }, "end");
+    },
+    async given(index, fields) {
+      for (let last = -1; last !== index; ) {
+        const update = found.engine.tick();
+        for (const [name, tensor] of update?.fields ?? []) fields.set(name, tensor);
+        last = update?.index ?? last;
+        await new Promise((resolve) => setTimeout(resolve, 1));
+      }
+    },
+    close: () => found.engine.destroy(),
   };
+  open.push(found);
   found.engine.on("error", ({ message }) => found.errors.push(message));
   found.engine.on("notice", ({ message }) => found.notices.push(message));
   found.engine.on("frame", ({ index }) => found.shown.push(index));

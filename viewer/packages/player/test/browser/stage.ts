@@ -105,6 +105,8 @@ export class Stage {
 export class StagedTests {
   private stageOfAll: Stage | undefined;
   private opened: Opened | undefined;
+  /** What its pages may complain of. */
+  private expected: RegExp | undefined;
 
   /** Without a browser the tests that use this are to be skipped. */
   static readonly skipped = !chromiumPath();
@@ -115,8 +117,12 @@ export class StagedTests {
     });
     afterAll(() => this.stageOfAll?.close());
     afterEach(async () => {
-      await this.close();
-      this.server.put("/clip.sgs", CLIP);
+      try {
+        await this.close();
+      } finally {
+        this.server.put("/clip.sgs", CLIP);
+        this.expected = undefined;
+      }
     });
   }
 
@@ -129,16 +135,41 @@ export class StagedTests {
     return this.opened.page;
   }
 
+  /** Closes the page, which must not have complained, but of what the test expects. */
   async close(): Promise<void> {
-    if (this.opened) await this.stageOfAll!.leave(this.opened);
+    const { opened, expected } = this;
     this.opened = undefined;
-  }
-
-  /** Everything went without a complaint, but for those that a test expects. */
-  expectQuiet(...expected: RegExp[]): void {
-    const left = this.opened!.complaints.filter((text) => !expected.some((one) => one.test(text)));
+    if (!opened) return;
+    const left = opened.complaints.filter((text) => !expected?.test(text));
+    await this.stageOfAll!.leave(opened);
     expect(left).toEqual([]);
   }
+
+  expectComplaints(expected: RegExp): void {
+    this.expected = expected;
+  }
+}
+
+/** Waits until playback has reached the end. */
+export async function ended(page: Page, timeout = 30_000): Promise<void> {
+  await page.waitForFunction(() => heard.reported.some(([name]) => name === "ended"), undefined, { timeout });
+}
+
+/** What a page takes must be the same before and after something: garbage aside, memory, workers and textures. */
+export async function expectSteady(page: Page, before: () => Promise<unknown>, after: () => Promise<unknown>) {
+  const client = await page.context().newCDPSession(page);
+  const state = async () => {
+    await client.send("HeapProfiler.collectGarbage");
+    const { usedSize } = await client.send("Runtime.getHeapUsage");
+    const counts = await ask(page, (player) => player.resources);
+    return { usedSize, workers: page.workers().length, ...counts };
+  };
+  await before();
+  const first = await state();
+  await after();
+  const last = await state();
+  expect({ ...last, usedSize: 0 }).toEqual({ ...first, usedSize: 0 });
+  expect(last.usedSize).toBeLessThan(first.usedSize * 1.1 + 2e5);
 }
 
 /** The messages of an event that the player has reported. */
@@ -195,7 +226,7 @@ export async function darkest(page: Page, first: number, last: number): Promise<
     },
     [first, last] as const,
   );
-  await page.waitForFunction(() => heard.reported.some(([name]) => name === "ended"), undefined, { timeout: 50_000 });
+  await ended(page, 50_000);
   return (await page.evaluate("least")) as { light: number; pictures: number };
 }
 
