@@ -3,10 +3,10 @@
 
 import { readFileSync } from "node:fs";
 import { afterEach, describe, expect, test, vi } from "vitest";
+import { TestServer } from "../../../gl/test/support/server.ts";
 import { LiveRun, type RunOptions } from "../liveRun.ts";
 import { periodFile } from "../periodFile.ts";
 import { CLIP } from "../served.ts";
-import { TestServer } from "./server.ts";
 import { ask, darkest, ended, expectSteady, reported, StagedTests, shows } from "./stage.ts";
 
 vi.setConfig({ testTimeout: 60_000, hookTimeout: 60_000 });

@@ -4,8 +4,8 @@
 import { readFileSync } from "node:fs";
 import { readStream } from "@structgstream/core";
 import { describe, expect, test, vi } from "vitest";
+import { TestServer } from "../../../gl/test/support/server.ts";
 import { CLIP } from "../served.ts";
-import { TestServer } from "./server.ts";
 import { ask, ended, pageWith, reported, StagedTests, shows } from "./stage.ts";
 
 vi.setConfig({ testTimeout: 60_000, hookTimeout: 60_000 });

@@ -4,10 +4,10 @@
 import { readFileSync } from "node:fs";
 import type { Browser, BrowserContextOptions, Page } from "playwright-core";
 import { afterAll, afterEach, beforeAll, expect } from "vitest";
-import { chromiumPath, launched } from "../../../gl/test/support/chromium.ts";
+import { chromiumPath, complaintsOf, launched } from "../../../gl/test/support/chromium.ts";
+import { TestServer } from "../../../gl/test/support/server.ts";
 import type { StructgstreamPlayer } from "../../src/element.ts";
 import { CLIP } from "../served.ts";
-import { TestServer } from "./server.ts";
 
 declare global {
   /** What `pageWith` gathers in the page. */
@@ -17,35 +17,51 @@ declare global {
   }
 }
 
-export function builtPlayer(): string {
+function builtPlayer(): string {
   return readFileSync(new URL("../../dist/player.js", import.meta.url), "utf8");
 }
 
 /** Pages are composited without software GL, which takes twice as long for them; WebGL still has it. */
-const FLAGS = ["--js-flags=--expose-gc", "--disable-gpu-compositing", "--disable-gpu-rasterization"];
+const FLAGS = ["--disable-gpu-compositing", "--disable-gpu-rasterization"];
 const VIEWPORT = { width: 320, height: 240 };
 
-export interface Opened {
+interface Opened {
   readonly page: Page;
   /** What the console and the page complained of. */
   readonly complaints: string[];
 }
 
-/** One browser, whose garbage can be collected when a test asks for it, and one server for a file of tests. */
-export class Stage {
+/** One browser and one server for a file of tests; a page is closed after its test. */
+export class StagedTests {
+  server!: TestServer;
+  private browser!: Browser;
   /** The page of all tests that ask for no options of their own. */
   private usual: Opened | undefined;
+  private opened: Opened | undefined;
+  /** What its pages may complain of. */
+  private expected: RegExp | undefined;
 
-  private constructor(
-    readonly browser: Browser,
-    readonly server: TestServer,
-  ) {}
+  /** Without a browser the tests that use this are to be skipped. */
+  static readonly skipped = !chromiumPath();
 
-  static async opened(executablePath: string): Promise<Stage> {
-    const [browser, server] = await Promise.all([launched(executablePath, ...FLAGS), TestServer.started()]);
-    server.put("/player.js", builtPlayer(), { type: "text/javascript" });
-    server.put("/clip.sgs", CLIP);
-    return new Stage(browser, server);
+  constructor() {
+    beforeAll(async () => {
+      [this.browser, this.server] = await Promise.all([launched(chromiumPath()!, ...FLAGS), TestServer.started()]);
+      this.server.put("/player.js", builtPlayer(), { type: "text/javascript" });
+      this.server.put("/clip.sgs", CLIP);
+    });
+    afterAll(async () => {
+      await this.browser.close();
+      await this.server.stop();
+    });
+    afterEach(async () => {
+      try {
+        await this.close();
+      } finally {
+        this.server.put("/clip.sgs", CLIP);
+        this.expected = undefined;
+      }
+    });
   }
 
   /**
@@ -60,19 +76,29 @@ export class Stage {
     query = "",
     options?: BrowserContextOptions,
     script?: string,
-  ): Promise<Opened> {
+  ): Promise<Page> {
     this.server.put("/page.html", pageWith(attributes), { type: "text/html" });
     this.server.requests.length = 0;
-    const opened = options ? await this.newPage(options) : await this.usualPage();
-    if (script) await opened.page.addInitScript({ content: script });
-    await opened.page.goto(`${this.server.origin}/page.html${query}`);
-    return opened;
+    this.opened = options ? await this.newPage(options) : await this.usualPage();
+    const { page } = this.opened;
+    if (script) await page.addInitScript({ content: script });
+    await page.goto(`${this.server.origin}/page.html${query}`);
+    return page;
   }
 
-  /** Ends what the page does. */
-  async leave(opened: Opened): Promise<void> {
+  /** Ends what the page does, which must not have complained, but of what the test expects. */
+  async close(): Promise<void> {
+    const { opened, expected } = this;
+    this.opened = undefined;
+    if (!opened) return;
+    const left = opened.complaints.filter((text) => !expected?.test(text));
     if (opened === this.usual) await opened.page.goto("about:blank");
     else await opened.page.context().close();
+    expect(left).toEqual([]);
+  }
+
+  expectComplaints(expected: RegExp): void {
+    this.expected = expected;
   }
 
   private async usualPage(): Promise<Opened> {
@@ -85,68 +111,7 @@ export class Stage {
   private async newPage(options: BrowserContextOptions): Promise<Opened> {
     const context = await this.browser.newContext({ viewport: VIEWPORT, ...options });
     const page = await context.newPage();
-    const complaints: string[] = [];
-    page.on("pageerror", (error) => complaints.push(`page: ${error.message}`));
-    page.on("console", (message) => {
-      const text = message.text();
-      const usual = text.includes("GPU stall due to ReadPixels");
-      if (["error", "warning"].includes(message.type()) && !usual) complaints.push(text);
-    });
-    return { page, complaints };
-  }
-
-  async close(): Promise<void> {
-    await this.browser.close();
-    await this.server.stop();
-  }
-}
-
-/** The stage of a file of tests, which begins and ends with them; a page is closed after its test. */
-export class StagedTests {
-  private stageOfAll: Stage | undefined;
-  private opened: Opened | undefined;
-  /** What its pages may complain of. */
-  private expected: RegExp | undefined;
-
-  /** Without a browser the tests that use this are to be skipped. */
-  static readonly skipped = !chromiumPath();
-
-  constructor() {
-    beforeAll(async () => {
-      this.stageOfAll = await Stage.opened(chromiumPath()!);
-    });
-    afterAll(() => this.stageOfAll?.close());
-    afterEach(async () => {
-      try {
-        await this.close();
-      } finally {
-        this.server.put("/clip.sgs", CLIP);
-        this.expected = undefined;
-      }
-    });
-  }
-
-  get server(): TestServer {
-    return this.stageOfAll!.server;
-  }
-
-  async open(...given: Parameters<Stage["open"]>): Promise<Page> {
-    this.opened = await this.stageOfAll!.open(...given);
-    return this.opened.page;
-  }
-
-  /** Closes the page, which must not have complained, but of what the test expects. */
-  async close(): Promise<void> {
-    const { opened, expected } = this;
-    this.opened = undefined;
-    if (!opened) return;
-    const left = opened.complaints.filter((text) => !expected?.test(text));
-    await this.stageOfAll!.leave(opened);
-    expect(left).toEqual([]);
-  }
-
-  expectComplaints(expected: RegExp): void {
-    this.expected = expected;
+    return { page, complaints: complaintsOf(page) };
   }
 }
 
