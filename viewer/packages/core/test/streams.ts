@@ -4,6 +4,7 @@
 import { readFileSync } from "node:fs";
 import { expect } from "vitest";
 import type { Tensor } from "../src/fields.ts";
+import { StreamReader } from "../src/reader.ts";
 import { CHECKSUM_BYTES, crc32, HEAD_BYTES, PREFIX_BYTES, RecordType, viewOf } from "../src/records.ts";
 
 export const VECTORS = new URL("../../../../tests/vectors/", import.meta.url);
@@ -51,6 +52,21 @@ export function piecesOf(stream: Uint8Array): Uint8Array[] {
     at = end;
   }
   return pieces;
+}
+
+/** The bytes with these bits inverted. */
+export function flipped(stream: Uint8Array, ...bits: number[]): Uint8Array {
+  const damaged = stream.slice();
+  for (const bit of bits) damaged[bit >> 3]! ^= 1 << (bit & 7);
+  return damaged;
+}
+
+/** A reader that was given the stream in pieces of so many bytes. */
+export function inPieces(stream: Uint8Array, size: number): StreamReader {
+  const reader = new StreamReader();
+  for (let at = 0; at < stream.length; at += size) reader.push(stream.subarray(at, at + size));
+  reader.finish();
+  return reader;
 }
 
 /** Compares bits, so that NaNs and the sign of zero count. */
