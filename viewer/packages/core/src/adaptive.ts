@@ -3,7 +3,7 @@
 
 import { Arithmetic, type Model, type Models, NUMBER_NODES } from "./decisions.js";
 import { StreamError } from "./errors.js";
-import type { FieldName } from "./fields.js";
+import { type FieldName, fieldIn } from "./fields.js";
 
 const LARGEST_NUMBER = 2 ** 31 - 1;
 const LARGEST_RESIDUAL = 2 ** 23;
@@ -207,8 +207,4 @@ function sizeClass(size: number): number {
 
 function limited(value: number, most: number): number {
   return Math.max(-most, Math.min(value, most));
-}
-
-function fieldIn(name: string): string {
-  return name.slice(0, name.indexOf("."));
 }

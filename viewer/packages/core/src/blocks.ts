@@ -71,14 +71,11 @@ export function blocksIn(payload: Uint8Array, start: number, where: string): Blo
  * @throws StreamError see {@link blocksIn}, or a block is coded
  */
 export function unpackedBlocks(payload: Uint8Array, start: number, where: string): Map<FieldName, Tensor> {
-  const fields = new Map<FieldName, Tensor>();
-  for (const block of blocksIn(payload, start, where)) {
-    if (block.coded) {
-      throw new StreamError(`${where} holds field ${block.name} coded, where its numbers as they are belong.`);
-    }
-    fields.set(block.name, tensorOf(payload, block));
+  const { values, coded } = mixedBlocks(payload, start, where);
+  for (const name of coded.keys()) {
+    throw new StreamError(`${where} holds field ${name} coded, where its numbers as they are belong.`);
   }
-  return fields;
+  return values;
 }
 
 /**
@@ -113,12 +110,9 @@ function tensorOf(payload: Uint8Array, block: Block): Tensor {
  * @throws StreamError as {@link blocksIn}, or a block is not coded
  */
 export function codedFields(payload: Uint8Array, start: number, where: string): Map<FieldName, Uint8Array> {
-  const fields = new Map<FieldName, Uint8Array>();
-  for (const block of blocksIn(payload, start, where)) {
-    if (!block.coded) {
-      throw new StreamError(`${where} holds field ${block.name} as it is, where it should be coded.`);
-    }
-    fields.set(block.name, payload.subarray(block.data, block.end));
+  const { values, coded } = mixedBlocks(payload, start, where);
+  for (const name of values.keys()) {
+    throw new StreamError(`${where} holds field ${name} as it is, where it should be coded.`);
   }
-  return fields;
+  return coded;
 }

@@ -3,7 +3,7 @@
 
 import { BitReader } from "./bits.js";
 import { StreamError } from "./errors.js";
-import type { FieldName } from "./fields.js";
+import { type FieldName, fieldIn } from "./fields.js";
 import { decodedSymbols, sectionHead } from "./rans.js";
 import { RESIDUAL_ALPHABET, residualsOf } from "./residualSymbols.js";
 import { decodedTables, type FrequencyTables, geometric } from "./tables.js";
@@ -101,8 +101,4 @@ export class Decoder {
     this.left.set(fieldIn(name), data.subarray(size));
     return data.subarray(0, size);
   }
-}
-
-function fieldIn(name: string): string {
-  return name.slice(0, name.indexOf("."));
 }

@@ -52,6 +52,11 @@ export function fieldOf(code: number): FieldName | undefined {
   return FIELD_NAMES[code - 1];
 }
 
+/** The field of an array, whose name is what comes before the dot. */
+export function fieldIn(name: string): string {
+  return name.slice(0, name.indexOf("."));
+}
+
 export function isFieldName(name: unknown): name is FieldName {
   return FIELD_NAMES.some((known) => known === name);
 }

@@ -2,7 +2,7 @@
 
 export { ByteQueue } from "./byteQueue.js";
 export type { Damage } from "./damage.js";
-export { checkFollows, type Frame, fieldBytes, type Packet, packetOf, SceneDecoder } from "./decoder.js";
+export { type Frame, fieldBytes, type Packet, packetOf, SceneDecoder } from "./decoder.js";
 export { StreamError } from "./errors.js";
 export { FIELD_NAMES, type FieldName, type Fields, type Tensor } from "./fields.js";
 export { FOOTER_BYTES, type IndexEntry, indexEntries, indexOffset } from "./fileIndex.js";
@@ -11,14 +11,5 @@ export { type Camera, difference, type Period, type Similarity, type StreamHeade
 export { unpackedHeader } from "./initRecord.js";
 export { Playback, type PlaybackOptions } from "./playback.js";
 export { type PacketInfo, type ReaderState, readStream, type StoredSound, StreamReader } from "./reader.js";
-export {
-  CHECKSUM_BYTES,
-  checkPrefix,
-  HEAD_BYTES,
-  PREFIX_BYTES,
-  RecordType,
-  recordBytes,
-  recordIn,
-  type StreamRecord,
-} from "./records.js";
+export { HEAD_BYTES, RecordType, recordBytes, recordIn } from "./records.js";
 export { type FrameSound, PACKET_SAMPLES, SOUND_RATE, type SoundFormat, soundOf } from "./sound.js";

@@ -6,22 +6,9 @@ import { Search } from "../src/damage.ts";
 import { StreamError } from "../src/errors.ts";
 import { readStream, StreamReader } from "../src/reader.ts";
 import { crc32, RecordType, viewOf } from "../src/records.ts";
-import { bytesOf, expectSame, joined, piecesOf, record, VECTORS } from "./streams.ts";
+import { bytesOf, expectSame, flipped, inPieces, joined, piecesOf, record, VECTORS } from "./streams.ts";
 
 const STREAMS = { raw: bytesOf(VECTORS, "version-2.sgs"), compact: bytesOf(VECTORS, "version-2-compact.sgs") };
-
-function flipped(stream: Uint8Array, ...bits: number[]): Uint8Array {
-  const damaged = stream.slice();
-  for (const bit of bits) damaged[bit >> 3]! ^= 1 << (bit & 7);
-  return damaged;
-}
-
-function inPieces(stream: Uint8Array, size: number): StreamReader {
-  const reader = new StreamReader();
-  for (let at = 0; at < stream.length; at += size) reader.push(stream.subarray(at, at + size));
-  reader.finish();
-  return reader;
-}
 
 describe.each(Object.entries(STREAMS))("a %s stream", (codec, stream) => {
   const whole = readStream(stream);

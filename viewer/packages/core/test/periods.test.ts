@@ -3,9 +3,9 @@
 
 import { expect, test } from "vitest";
 import { indexEntries } from "../src/fileIndex.ts";
-import { readStream, StreamReader } from "../src/reader.ts";
+import { readStream, type StreamReader } from "../src/reader.ts";
 import { PREFIX_BYTES, RecordType } from "../src/records.ts";
-import { bytesOf, expectSame, joined, piecesOf, record, VECTORS } from "./streams.ts";
+import { bytesOf, expectSame, flipped, inPieces, joined, piecesOf, record, VECTORS } from "./streams.ts";
 
 const STREAM = bytesOf(VECTORS, "version-2-periods.sgs");
 const PIECES = piecesOf(STREAM);
@@ -19,12 +19,6 @@ const OFFSETS = PIECES.map((_, i) => PIECES.slice(0, i).reduce((sum, piece) => s
 const INIT = 2 + LATER;
 /** Key packets are 0, 3, 4 and 7. */
 const GROUP_ENDS = [3, 3, 3, 4, 7, 7, 7, 8];
-
-function flipped(bit: number): Uint8Array {
-  const bytes = STREAM.slice();
-  bytes[bit >> 3]! ^= 1 << (bit & 7);
-  return bytes;
-}
 
 function shown(reader: StreamReader): number[] {
   const found: number[] = [];
@@ -60,9 +54,7 @@ test("frames come in any order, each with the header of its period", () => {
 
 test("in pieces of any size it is the same", () => {
   for (const size of [1, 7, 100, 1000]) {
-    const reader = new StreamReader();
-    for (let at = 0; at < STREAM.length; at += size) reader.push(STREAM.subarray(at, at + size));
-    reader.finish();
+    const reader = inPieces(STREAM, size);
     expect([reader.state, shown(reader)]).toEqual(["complete", without(0, 0)]);
   }
 });
@@ -74,10 +66,7 @@ test("a flipped bit costs a packet's group, or an init record's period, also whi
     const lost = at === INIT ? without(LATER, FRAMES) : without(frame, GROUP_ENDS[frame]!);
     const start = 8 * OFFSETS[at]!;
     for (let bit = start; bit < start + 8 * piece.length; bit += bit < start + 160 ? 23 : 4999) {
-      const reader = new StreamReader();
-      const bytes = flipped(bit);
-      for (let i = 0; i < bytes.length; i += 997) reader.push(bytes.subarray(i, i + 997));
-      reader.finish();
+      const reader = inPieces(flipped(STREAM, bit), 997);
       expect(shown(reader), `bit ${bit}`).toEqual(lost);
       expect(reader.damage.length).toBe(1);
     }

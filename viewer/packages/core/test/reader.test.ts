@@ -4,7 +4,7 @@ import { describe, expect, test } from "vitest";
 import { indexEntries, indexOffset } from "../src/fileIndex.ts";
 import { readStream, StreamReader } from "../src/reader.ts";
 import { RecordType } from "../src/records.ts";
-import { bytesOf, expectSame, FIXTURES, joined, piecesOf, record, VECTORS } from "./streams.ts";
+import { bytesOf, expectSame, FIXTURES, inPieces, joined, piecesOf, record, VECTORS } from "./streams.ts";
 
 const RAW = bytesOf(VECTORS, "version-2.sgs");
 const COMPACT = bytesOf(FIXTURES, "paper.sgs");
@@ -25,10 +25,7 @@ describe.each([
   const whole = readStream(stream);
 
   test.each([1, 7, 1000])("in pieces of %i bytes is the same as at once", (size) => {
-    const reader = new StreamReader();
-    for (let at = 0; at < stream.length; at += size) reader.push(stream.subarray(at, at + size));
-    reader.finish();
-    expectSameReaders(reader, whole);
+    expectSameReaders(inPieces(stream, size), whole);
   });
 
   test("shows every frame as soon as its last byte is there", () => {

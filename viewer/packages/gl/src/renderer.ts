@@ -73,7 +73,7 @@ export class SplatRenderer implements Renderer {
 
   get resources(): ResourceCounts {
     const none = { textures: 0, buffers: 0, programs: 0, framebuffers: 0 };
-    return { ...(this.pipeline?.resources.counts ?? none), workers: this.destroyed ? 0 : 1 };
+    return { ...(this.pipeline?.counts ?? none), workers: this.destroyed ? 0 : 1 };
   }
 
   load(header: StreamHeader, goesOn = false): void {
@@ -158,7 +158,7 @@ export class SplatRenderer implements Renderer {
     this.canvas.removeEventListener("webglcontextrestored", this.restored);
     this.orders.close();
     this.pace.stop();
-    this.pipeline?.resources.deleteAll();
+    this.pipeline?.delete();
     this.pipeline = undefined;
     this.scene = undefined;
     this.sorted = undefined;

@@ -5,8 +5,6 @@ import type { StreamHeader } from "@structgstream/core";
 import { center, rigCamera } from "./cameraMath.js";
 import { along, length, mean, type Vector } from "./vectors.js";
 
-/** Numbers of a training camera: three rows of four. */
-export const CAMERA_NUMBERS = 12;
 /** Low-pass of the trainer's rasterizer: square training pixels. */
 export const TRAINING_LOW_PASS = 0.3;
 

@@ -18,13 +18,8 @@ import {
   RenderComponentSystem,
   TextureHandler,
 } from "playcanvas";
-import { exportedStage } from "../../gl/test/support/exportedPage.ts";
+import { exportedStage, sortedPicture } from "../../gl/test/support/exportedPage.ts";
 import type { EngineCamera } from "../../gl/test/support/ownPictures.ts";
-import { pixelsOf } from "../../gl/test/support/pixels.ts";
-
-/** Pictures that must be the same one after the other: sorting has ended. */
-const SAME_PICTURES = 1;
-const PAUSE_MILLISECONDS = 1500;
 
 async function loaded(app: AppBase, url: string): Promise<Entity> {
   const type = url.endsWith(".glb") ? "container" : "gsplat";
@@ -65,21 +60,15 @@ async function picture(url: string, yDown: boolean, view: EngineCamera, settings
   camera.setLocalPosition(toWorld.getTranslation());
   camera.setLocalEulerAngles(toWorld.getEulerAngles());
   app.root.addChild(camera);
-  let last: Uint8ClampedArray = new Uint8ClampedArray();
-  for (let same = 0; same < SAME_PICTURES; ) {
+  const found = await sortedPicture(() => {
     app.renderNextFrame = true;
-    const png = await new Promise<Blob>((resolve) => {
+    return new Promise((resolve) => {
       app.once("postrender", () => canvas.toBlob((blob) => resolve(blob!)));
     });
-    const next = await pixelsOf(png);
-    const black = next.every((value, i) => i % 4 === 3 || value === 0);
-    same = !black && next.length === last.length && next.every((value, i) => value === last[i]) ? same + 1 : 0;
-    last = next;
-    await new Promise((resolve) => setTimeout(resolve, PAUSE_MILLISECONDS));
-  }
+  });
   app.destroy();
   canvas.remove();
-  return last;
+  return found;
 }
 
 Object.assign(globalThis, { stage: exportedStage(picture) });

@@ -2,31 +2,18 @@
 /** Engine, decoder and fetcher together, without a browser. */
 
 import { readStream, type Tensor } from "@structgstream/core";
-import { afterEach, describe, expect, test, vi } from "vitest";
+import { describe, expect, test, vi } from "vitest";
 import { expectSame } from "../../core/test/streams.ts";
-import { CLIP, type Playing, playing, ServedFile, URL_OF_CLIP } from "./served.ts";
+import type { FromDecoder } from "../src/decode/messages.ts";
+import { Engine } from "../src/engine/engine.ts";
+import type { Pipeline } from "../src/engine/pipeline.ts";
+import { CLIP, playing, playingFile, ServedFile } from "./served.ts";
 
 vi.setConfig({ testTimeout: 60_000 });
 
 const WHOLE = readStream(CLIP);
 const PACKETS = WHOLE.packets;
 const KEYS = PACKETS.filter(({ isKey }) => isKey).map(({ index }) => index);
-let open: Playing[] = [];
-
-afterEach(() => {
-  for (const { engine, close } of open) {
-    engine.destroy();
-    close();
-  }
-  open = [];
-});
-
-function opened(file: ServedFile, startSeconds = 0, options = {}): Playing {
-  const found = playing(file.fetch as typeof fetch, options);
-  open.push(found);
-  found.engine.load({ kind: "url", url: URL_OF_CLIP, name: "clip.sgs" }, startSeconds);
-  return found;
-}
 
 /** Whether what was given, update after update, adds up to a frame of the file. */
 function expectFrame(fields: Map<string, Tensor>, index: number): void {
@@ -43,7 +30,7 @@ test("the clip has groups", () => {
 
 test("the first picture takes head, tail, header and one key packet", async () => {
   const file = new ServedFile(CLIP);
-  const play = opened(file);
+  const play = playingFile(file);
   await play.until(() => play.shown.length > 0);
   expect(play.shown).toEqual([0]);
   const key = PACKETS[0]!;
@@ -58,7 +45,7 @@ test("the first picture takes head, tail, header and one key packet", async () =
 
 test("opened elsewhere, the packets from the key on are read, and no others", async () => {
   const file = new ServedFile(CLIP);
-  const play = opened(file, PACKETS[8]!.ptsSeconds);
+  const play = playingFile(file, PACKETS[8]!.ptsSeconds);
   await play.until(() => play.shown.at(-1) === 8);
   expect(play.shown).toEqual([6, 8]);
   expect(file.requests.slice(2)).toEqual([
@@ -69,18 +56,13 @@ test("opened elsewhere, the packets from the key on are read, and no others", as
 
 test("seeking back and forth gives exact frames and fetches what is not there", async () => {
   const file = new ServedFile(CLIP);
-  const play = opened(file);
+  const play = playingFile(file);
   await play.settled();
   const before = file.requests.length;
   const fields = new Map<string, Tensor>();
   for (const index of [7, 1, 11, 5, 7, 0]) {
     play.engine.seekFrame(index);
-    for (let last = -1; last !== index; ) {
-      const update = play.engine.tick();
-      for (const [name, tensor] of update?.fields ?? []) fields.set(name, tensor);
-      last = update?.index ?? last;
-      await new Promise((resolve) => setTimeout(resolve, 1));
-    }
+    await play.given(index, fields);
     expectFrame(fields, index);
   }
   expect(file.requests.slice(before)).toEqual([
@@ -92,19 +74,14 @@ test("seeking back and forth gives exact frames and fetches what is not there", 
 });
 
 test("a seek that is overtaken by another loses no field", async () => {
-  const play = opened(new ServedFile(CLIP));
+  const play = playingFile(new ServedFile(CLIP));
   await play.settled();
   const fields = new Map<string, Tensor>();
   for (const index of [4, 10, 2, 8]) {
     play.engine.seekFrame(index);
     await new Promise((resolve) => setTimeout(resolve, index));
   }
-  for (let last = -1; last !== 8; ) {
-    const update = play.engine.tick();
-    for (const [name, tensor] of update?.fields ?? []) fields.set(name, tensor);
-    last = update?.index ?? last;
-    await new Promise((resolve) => setTimeout(resolve, 1));
-  }
+  await play.given(8, fields);
   // What an update leaves out is what the first frame had, which was taken before.
   const first = readStream(CLIP).frame(0).fields;
   for (const [name, tensor] of first) if (!fields.has(name)) fields.set(name, tensor);
@@ -112,7 +89,7 @@ test("a seek that is overtaken by another loses no field", async () => {
 });
 
 test("plays to the end, every frame in order, and again from the start", async () => {
-  const play = opened(new ServedFile(CLIP));
+  const play = playingFile(new ServedFile(CLIP));
   await play.settled();
   let ended = 0;
   play.engine.on("ended", () => ended++);
@@ -130,7 +107,7 @@ test("plays to the end, every frame in order, and again from the start", async (
 });
 
 test("loops, at another rate", async () => {
-  const play = opened(new ServedFile(CLIP));
+  const play = playingFile(new ServedFile(CLIP));
   await play.settled();
   play.engine.loop = true;
   play.engine.playbackRate = 2;
@@ -146,7 +123,7 @@ test("loops, at another rate", async () => {
 });
 
 test("late frames are dropped, and playback continues at the next key", async () => {
-  const play = opened(new ServedFile(CLIP));
+  const play = playingFile(new ServedFile(CLIP));
   await play.settled();
   play.engine.play();
   await play.until(() => play.engine.stored.times[0]?.[1] === play.engine.frames.duration, "buffer");
@@ -157,8 +134,75 @@ test("late frames are dropped, and playback continues at the next key", async ()
   expect(play.engine.stalled).toBe(false);
 });
 
+describe("on a network that is slower than the stream", () => {
+  /** Plays the first frame; no other packets arrive yet. */
+  async function starved() {
+    const file = new ServedFile(CLIP);
+    const play = playingFile(file);
+    await play.settled();
+    file.heldFrom = PACKETS[1]!.offset;
+    play.engine.play();
+    return { file, play };
+  }
+
+  /** Lets all packets arrive; every frame is shown. */
+  async function goesOn({ file, play }: Awaited<ReturnType<typeof starved>>) {
+    file.heldFrom = Number.POSITIVE_INFINITY;
+    await play.until(() => {
+      // No frame is late from now on.
+      if (play.shown.at(-1) === play.engine.frameIndex) play.seconds += 1 / 240;
+      return play.engine.ended;
+    }, "end");
+    expect(play.shown).toEqual(PACKETS.map(({ index }) => index));
+    expect(play.errors).toEqual([]);
+  }
+
+  test("a picture that takes as long as the rest of the stream does not end it", async () => {
+    const { file, play } = await starved();
+    play.seconds += 1;
+    play.engine.tick();
+    expect([play.engine.ended, play.engine.stalled, play.engine.frameIndex]).toEqual([false, true, 0]);
+    await goesOn({ file, play });
+  });
+
+  test("frames that have arrived and are not decoded yet do not let the clock run past the missing ones", async () => {
+    const { file, play } = await starved();
+    const decoded = play.holdFrames();
+    file.heldFrom = PACKETS[2]!.offset;
+    await play.until(() => play.engine.stored.has(1), "packet");
+    play.seconds += 0.3;
+    let ticks = 0;
+    await play.until(() => ++ticks > 5);
+    decoded();
+    await goesOn({ file, play });
+  });
+
+  test("frames that were dropped as late, and have left memory since, are not waited for", () => {
+    const pipeline: Pipeline = { send: () => undefined, onmessage: undefined, close: () => undefined };
+    let now = 0;
+    const engine = new Engine(pipeline, () => now);
+    const hear = (message: FromDecoder) => pipeline.onmessage!(message);
+    const ptsSeconds = Float64Array.from({ length: 30 }, (_, i) => i / 30);
+    const facts = { first: 0, count: 30, ptsSeconds, keys: Uint32Array.of(0, 10, 20), lost: [], complete: true };
+    hear({ type: "catalog", facts });
+    const update = { index: 0, ptsSeconds: 0, fields: new Map() };
+    hear({ type: "frame", serial: 1, update, exact: true, packets: [], decodeMilliseconds: 0 });
+    hear({ type: "stored", ranges: [[0, 20]], fetchedBytes: 0 });
+    engine.play();
+    now = 0.5;
+    engine.tick();
+    hear({ type: "stored", ranges: [[10, 20]], fetchedBytes: 0 });
+    engine.tick();
+    expect([engine.stalled, engine.frameIndex]).toEqual([false, 15]);
+    now = 0.8;
+    engine.tick();
+    expect([engine.stalled, engine.frameIndex]).toEqual([true, 19]);
+    engine.destroy();
+  });
+});
+
 test("steps", async () => {
-  const play = opened(new ServedFile(CLIP));
+  const play = playingFile(new ServedFile(CLIP));
   await play.settled();
   for (const [by, at] of [
     [1, 1],
@@ -175,7 +219,7 @@ test("steps", async () => {
 
 test("a starved clock waits with the last frame, and says so", async () => {
   const file = new ServedFile(CLIP);
-  const play = opened(file, 0, { aheadSeconds: 0.01 });
+  const play = playingFile(file, 0, { aheadSeconds: 0.01 });
   await play.settled();
   const stalls: boolean[] = [];
   play.engine.on("stall", ({ stalled }) => stalls.push(stalled));
@@ -190,10 +234,7 @@ test("a starved clock waits with the last frame, and says so", async () => {
   expect(play.errors).toEqual(["The server answered the request for clip.sgs with 503."]);
   file.status = undefined;
   play.engine.play();
-  await play.until(() => {
-    play.seconds += 1 / 120;
-    return play.engine.ended;
-  }, "end");
+  await play.toEnd(1 / 120);
   expect(stalls.slice(0, 2)).toEqual([true, false]);
   expect(play.shown.at(-1)).toBe(11);
 });
@@ -202,7 +243,7 @@ describe("a server without ranges", () => {
   test("is read whole, once, and said so", async () => {
     const file = new ServedFile(CLIP);
     file.ranges = false;
-    const play = opened(file);
+    const play = playingFile(file);
     await play.settled();
     await play.until(() => play.engine.frames.complete);
     play.engine.seekFrame(10);
@@ -214,7 +255,7 @@ describe("a server without ranges", () => {
   test("packets that left memory are read again", async () => {
     const file = new ServedFile(CLIP);
     file.ranges = false;
-    const play = opened(file, 0, { budgetBytes: 3000 });
+    const play = playingFile(file, 0, { budgetBytes: 3000 });
     await play.until(() => play.engine.frames.complete);
     for (const index of [11, 0, 6]) {
       play.engine.seekFrame(index);
@@ -226,7 +267,7 @@ describe("a server without ranges", () => {
 
 test("packets take no more bytes than they may", async () => {
   const file = new ServedFile(CLIP);
-  const play = opened(file, 0, { budgetBytes: 4000 });
+  const play = playingFile(file, 0, { budgetBytes: 4000 });
   await play.settled();
   play.engine.loop = true;
   play.engine.play();
@@ -252,7 +293,7 @@ describe("a growing file", () => {
   test("is followed, and its pace is reported", async () => {
     const cut = (frames: number) => CLIP.subarray(0, PACKETS[frames - 1]!.offset + PACKETS[frames - 1]!.bytes + 5);
     const file = new ServedFile(cut(2));
-    const play = opened(file);
+    const play = playingFile(file);
     await play.until(() => play.engine.frames.count === 2 && play.engine.edge.grows);
     play.engine.play();
     const ticking = () => {
@@ -276,20 +317,17 @@ describe("a growing file", () => {
   test("that no longer grows comes to an end", async () => {
     const file = new ServedFile(CLIP.subarray(0, PACKETS[5]!.offset + 20));
     file.lastModified = new Date(Date.now() - 3_600_000).toUTCString();
-    const play = opened(file);
+    const play = playingFile(file);
     await play.until(() => play.engine.frames.complete);
     expect(play.engine.frames.count).toBe(5);
     play.engine.play();
-    await play.until(() => {
-      play.seconds += 1 / 60;
-      return play.engine.ended;
-    });
+    await play.toEnd();
     expect(play.shown.at(-1)).toBe(4);
   });
 
   test("that was replaced by a shorter one is refused", async () => {
     const file = new ServedFile(CLIP.subarray(0, PACKETS[5]!.offset));
-    const play = opened(file);
+    const play = playingFile(file);
     await play.until(() => play.engine.edge.grows);
     file.bytes = CLIP.subarray(0, 9000);
     await play.until(() => play.errors.length > 0);
@@ -301,13 +339,10 @@ describe("damage", () => {
   test("in a packet costs its group, and is reported", async () => {
     const bytes = CLIP.slice();
     bytes[PACKETS[4]!.offset + 30]! ^= 4;
-    const play = opened(new ServedFile(bytes));
+    const play = playingFile(new ServedFile(bytes));
     await play.settled();
     play.engine.play();
-    await play.until(() => {
-      play.seconds += 1 / 120;
-      return play.engine.ended;
-    });
+    await play.toEnd(1 / 120);
     expect([...new Set(play.shown)]).toEqual([0, 1, 2, 3, 6, 7, 8, 9, 10, 11]);
     expect(play.errors).toEqual([`Frames 4 to 5 are lost: its record at byte ${PACKETS[4]!.offset} is damaged.`]);
     expect(play.engine.frames.lost).toEqual([[4, 6]]);
@@ -319,7 +354,7 @@ describe("damage", () => {
   test("in the index is got around by reading all", async () => {
     const bytes = CLIP.slice();
     bytes[bytes.length - 30]! ^= 1;
-    const play = opened(new ServedFile(bytes));
+    const play = playingFile(new ServedFile(bytes));
     await play.settled();
     await play.until(() => play.engine.frames.count === 12);
     expect(play.errors).toEqual([]);
@@ -332,7 +367,7 @@ describe("damage", () => {
     const payload = bytes.slice(offset + 8, offset + size - 4);
     payload.fill(255, 30);
     bytes.set(record(3, payload), offset);
-    const play = opened(new ServedFile(bytes));
+    const play = playingFile(new ServedFile(bytes));
     await play.settled();
     play.engine.seekFrame(5);
     await play.settled();
@@ -342,7 +377,7 @@ describe("damage", () => {
   test("that leaves no frame is reported", async () => {
     const file = new ServedFile(CLIP.subarray(0, PACKETS[0]!.offset + 20));
     file.lastModified = new Date(0).toUTCString();
-    const play = opened(file);
+    const play = playingFile(file);
     await play.until(() => play.errors.length > 0);
     expect(play.errors).toEqual(["clip.sgs has a header and no whole frame to show."]);
   });
@@ -357,7 +392,7 @@ describe("damage", () => {
       [newer, "has format version 9.0; this program reads 2.x. Use a newer one."],
       [new TextEncoder().encode("<html>"), "its first bytes are not the format's signature"],
     ] as const) {
-      const play = opened(new ServedFile(bytes));
+      const play = playingFile(new ServedFile(bytes));
       await play.until(() => play.errors.length > 0);
       expect(play.errors[0]).toContain(sentence);
     }
@@ -371,7 +406,7 @@ test.each([
 ])("status %i", async (status, sentence) => {
   const file = new ServedFile(CLIP);
   file.status = status;
-  const play = opened(file);
+  const play = playingFile(file);
   await play.until(() => play.errors.length > 0);
   expect(play.errors).toEqual([sentence]);
 });
@@ -379,10 +414,10 @@ test.each([
 test("a server that does not answer is reported at once; one that stops answering is asked again", async () => {
   const file = new ServedFile(CLIP);
   file.failures = 1;
-  const never = opened(file);
+  const never = playingFile(file);
   await never.until(() => never.errors.length > 0);
   expect(never.errors[0]).toContain("Access-Control-Allow-Origin");
-  const play = opened(file);
+  const play = playingFile(file);
   await play.settled();
   file.failures = 2;
   play.engine.seekFrame(11);
@@ -397,21 +432,19 @@ test("files of the user's and base64", async () => {
     { kind: "base64", text: `\n${Buffer.from(CLIP).toString("base64")}\n`, name: "a page" },
   ] as const) {
     const play = playing(fetch);
-    open.push(play);
     play.engine.load(source);
     await play.settled();
     play.engine.seekFrame(8);
     await play.until(() => play.shown.at(-1) === 8);
   }
   const play = playing(fetch);
-  open.push(play);
   play.engine.load({ kind: "base64", text: "*", name: "a page" });
   await play.until(() => play.errors.length > 0);
   expect(play.errors[0]).toContain("a page is no base64 text");
 });
 
 test("what a packet took is known by field", async () => {
-  const play = opened(new ServedFile(CLIP));
+  const play = playingFile(new ServedFile(CLIP));
   await play.settled();
   play.engine.seekFrame(4);
   await play.settled();
@@ -421,7 +454,7 @@ test("what a packet took is known by field", async () => {
 });
 
 test("a refresh has every dynamic field", async () => {
-  const play = opened(new ServedFile(CLIP));
+  const play = playingFile(new ServedFile(CLIP));
   await play.settled();
   play.engine.refresh();
   let fields: string[] = [];

@@ -32,7 +32,6 @@ async function played(bytes: Uint8Array, ranges: boolean): Promise<boolean> {
     }, "end");
     return play.shown.length > 0;
   } finally {
-    play.engine.destroy();
     play.close();
   }
 }

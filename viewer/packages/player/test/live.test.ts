@@ -13,16 +13,8 @@ import { CLIP, type Playing, playing } from "./served.ts";
 vi.setConfig({ testTimeout: 60_000 });
 
 const ADDRESS = "http://test/manifest.json";
-let open: Playing[] = [];
 
-afterEach(() => {
-  vi.restoreAllMocks();
-  for (const { engine, close } of open) {
-    engine.destroy();
-    close();
-  }
-  open = [];
-});
+afterEach(() => void vi.restoreAllMocks());
 
 function run(frames: number, options: RunOptions = {}): LiveRun {
   return new LiveRun(CLIP, options).write(frames);
@@ -30,7 +22,6 @@ function run(frames: number, options: RunOptions = {}): LiveRun {
 
 function opened(host: Host, startSeconds?: number, url = ADDRESS, own = true, options = {}): Playing {
   const found = playing(host.fetch as typeof fetch, options);
-  open.push(found);
   found.engine.load({ kind: "segments", url, name: "manifest.json", own }, startSeconds);
   return found;
 }
@@ -76,12 +67,7 @@ test("frames are exact, those of parts too", async () => {
   const fields = new Map<string, Tensor>(expected.frame(0).fields);
   for (const index of [0, 9, 4, 9, 2]) {
     play.engine.seekFrame(index);
-    for (let last = -1; last !== index; ) {
-      const update = play.engine.tick();
-      for (const [name, tensor] of update?.fields ?? []) fields.set(name, tensor);
-      last = update?.index ?? last;
-      await new Promise((resolve) => setTimeout(resolve, 1));
-    }
+    await play.given(index, fields);
     const { fields: right } = expected.frame(index);
     for (const name of expected.header!.dynamic) expectSame(fields.get(name), right.get(name)!);
   }
@@ -227,8 +213,7 @@ test("every frame of a long recording can be reached over pages of pages", async
   }
   play.engine.seekFrame(225);
   play.engine.play();
-  const on = goingOn(play);
-  await play.until(() => on() && play.engine.ended, "end");
+  await play.toEnd();
   expect(play.shown.at(-1)).toBe(239);
   expect(play.errors).toEqual([]);
 });
@@ -315,8 +300,7 @@ describe("a host in trouble", () => {
     const play = opened(host, 0.2);
     await play.settled();
     play.engine.play();
-    const on = goingOn(play);
-    await play.until(() => on() && play.engine.ended, "end");
+    await play.toEnd();
     expect(play.shown.filter((index) => index >= 9 && index < 12)).toEqual([]);
     expect(play.errors.length).toBeGreaterThan(0);
     expect(play.errors.join()).toMatch(/Frames? 9.* lost/);
@@ -330,8 +314,7 @@ describe("a host in trouble", () => {
     const play = opened(host, 0.2);
     await play.settled();
     play.engine.play();
-    const on = goingOn(play);
-    await play.until(() => on() && play.engine.ended, "end");
+    await play.toEnd();
     expect(host.asked(gone)).toBe(3);
     expect(play.errors).toEqual([
       `Frames 9 to 11 are lost: ${gone} was not found on the server (404). Check the address.`,
@@ -550,8 +533,7 @@ describe("qualities", () => {
     await play.settled();
     play.engine.chooseQuality(1);
     play.engine.play();
-    const on = goingOn(play);
-    await play.until(() => on() && play.engine.ended, "end");
+    await play.toEnd();
     expect(play.notices).toEqual(["high/manifest.json was not found on the server (404). Check the address."]);
     expect(play.engine.qualities.at).toBe(0);
     expect(play.shown.at(-1)).toBe(29);

@@ -2,7 +2,7 @@
 /** A stream file of several periods, made of a stream that is repeated. */
 
 import { PREFIX_BYTES, RecordType } from "../../core/src/records.ts";
-import { joined, record } from "../../core/test/streams.ts";
+import { type IndexRow, indexOf, joined } from "../../core/test/streams.ts";
 import { partsOf, renumbered } from "./liveRun.ts";
 
 export interface PeriodFile {
@@ -16,7 +16,7 @@ export interface PeriodFile {
 /** `frames` frames of each of `streams`, one period after the other, with index and footer. */
 export function periodFile(streams: readonly Uint8Array[], frames: number, fps = 30): PeriodFile {
   const pieces: Uint8Array[] = [];
-  const entries: [frame: number, type: number, offset: number][] = [];
+  const entries: IndexRow[] = [];
   const inits: [number, number][] = [];
   let [at, frame] = [0, 0];
   const add = (bytes: Uint8Array) => {
@@ -36,17 +36,7 @@ export function periodFile(streams: readonly Uint8Array[], frames: number, fps =
       add(renumbered(piece, frame, frame / fps, period));
     }
   }
-  const payload = new DataView(new ArrayBuffer(13 * entries.length));
-  for (const [i, [number, type, offset]] of entries.entries()) {
-    payload.setUint32(13 * i, number, true);
-    payload.setUint8(13 * i + 4, type);
-    payload.setBigUint64(13 * i + 5, BigInt(offset), true);
-  }
-  const footer = new DataView(new ArrayBuffer(16));
-  footer.setBigUint64(0, BigInt(at), true);
-  for (const [i, letter] of [..."SGSINDEX"].entries()) footer.setUint8(8 + i, letter.charCodeAt(0));
-  add(record(RecordType.index, new Uint8Array(payload.buffer)));
-  add(new Uint8Array(footer.buffer));
+  add(indexOf(entries, at));
   const packets = entries.filter(([, type]) => type !== RecordType.init).map(([, , offset]) => offset);
   return { bytes: joined(...pieces), inits, packets };
 }

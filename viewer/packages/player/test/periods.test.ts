@@ -2,10 +2,10 @@
 /** A file of several periods, played and sought: engine, decoder and fetcher together, without a browser. */
 
 import { readStream, type StreamHeader, type Tensor } from "@structgstream/core";
-import { afterEach, expect, test, vi } from "vitest";
+import { expect, test, vi } from "vitest";
 import { expectSame } from "../../core/test/streams.ts";
 import { periodFile } from "./periodFile.ts";
-import { CLIP, type Playing, playing, ServedFile, URL_OF_CLIP } from "./served.ts";
+import { CLIP, type Playing, playingFile, ServedFile } from "./served.ts";
 
 vi.setConfig({ testTimeout: 60_000 });
 
@@ -13,22 +13,6 @@ const PERIODS = 5;
 const EACH = 6;
 const FILE = periodFile(Array<Uint8Array>(PERIODS).fill(CLIP), EACH);
 const WHOLE = readStream(CLIP);
-let open: Playing[] = [];
-
-afterEach(() => {
-  for (const { engine, close } of open) {
-    engine.destroy();
-    close();
-  }
-  open = [];
-});
-
-function opened(file: ServedFile, startSeconds = 0): Playing {
-  const found = playing(file.fetch as typeof fetch);
-  open.push(found);
-  found.engine.load({ kind: "url", url: URL_OF_CLIP, name: "clip.sgs" }, startSeconds);
-  return found;
-}
 
 /** Draws what is due, and records at which frames another header came; all that was given is in `fields`. */
 function watching(play: Playing) {
@@ -69,7 +53,7 @@ async function playedOut(play: Playing, take: () => number | undefined): Promise
 
 test("periods of a file are crossed without a break, and each init record is fetched once, before it is needed", async () => {
   const file = new ServedFile(FILE.bytes);
-  const play = opened(file);
+  const play = playingFile(file);
   await play.settled();
   const { headers, fields, take } = watching(play);
   const stalls: boolean[] = [];
@@ -88,7 +72,7 @@ test("periods of a file are crossed without a break, and each init record is fet
 
 test("any frame is sought, in any order, with the header of its period", async () => {
   const file = new ServedFile(FILE.bytes);
-  const play = opened(file, 14 / 30);
+  const play = playingFile(file, 14 / 30);
   await play.settled();
   const { fields, take } = watching(play);
   take();
@@ -103,7 +87,7 @@ test("any frame is sought, in any order, with the header of its period", async (
 test("without an index, and while the file grows, it is the same", async () => {
   const cut = FILE.packets[3 * EACH + 2]!;
   const file = new ServedFile(FILE.bytes.subarray(0, cut));
-  const play = opened(file);
+  const play = playingFile(file);
   await play.settled();
   const { headers, fields, take } = watching(play);
   play.engine.play();
@@ -129,7 +113,7 @@ test.each([true, false])("a damaged init record costs its period (with an index:
   const bytes = FILE.bytes.slice();
   bytes[FILE.inits[1]![0] + 100]! ^= 1;
   const file = new ServedFile(indexed ? bytes : bytes.subarray(0, -16));
-  const play = opened(file);
+  const play = playingFile(file);
   await play.settled();
   const { headers, fields, take } = watching(play);
   play.engine.play();

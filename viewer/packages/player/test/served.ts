@@ -2,6 +2,8 @@
 /** Streams as tests see them: a server that is a function, and an engine with its workers in this very thread. */
 
 import { readFileSync } from "node:fs";
+import type { Tensor } from "@structgstream/core";
+import { afterEach } from "vitest";
 import { Decoding } from "../src/decode/decoding.ts";
 import type { FromDecoder, ToDecoder } from "../src/decode/messages.ts";
 import { Engine } from "../src/engine/engine.ts";
@@ -31,6 +33,8 @@ export class ServedFile {
   failures = 0;
   lastModified = new Date().toUTCString();
   chunkBytes = 5000;
+  /** Bytes from this one on do not arrive until it is raised. */
+  heldFrom = Number.POSITIVE_INFINITY;
 
   constructor(public bytes: Uint8Array) {}
 
@@ -61,14 +65,20 @@ export class ServedFile {
 
   private body(start: number, end: number): ReadableStream<Uint8Array> {
     let at = start;
+    let cancelled = false;
     const { bytes, chunkBytes } = this;
     return new ReadableStream({
-      async pull(controller) {
-        await new Promise((resolve) => setTimeout(resolve, 0));
+      pull: async (controller) => {
+        do await new Promise((resolve) => setTimeout(resolve, 0));
+        while (!cancelled && at < end && at >= this.heldFrom);
+        if (cancelled) return;
         if (at >= end) return controller.close();
-        const next = Math.min(at + chunkBytes, end);
+        const next = Math.min(at + chunkBytes, end, this.heldFrom);
         controller.enqueue(bytes.slice(at, next));
         at = next;
+      },
+      cancel: () => {
+        cancelled = true;
       },
     });
   }
@@ -82,11 +92,31 @@ export interface Playing {
   /** Frames given by `tick`, in order. */
   readonly shown: number[];
   seconds: number;
+  /** Decoded frames do not reach the engine until the function that it gives back is called. */
+  holdFrames(): () => void;
   /** Ticks, letting workers work in between, until `reached`. */
   until(reached: () => boolean, what?: string): Promise<void>;
   /** Until the stream is there and nothing is sought; what was found has been given. */
   settled(): Promise<void>;
+  /** Plays on to the end, so many seconds a tick. */
+  toEnd(step?: number): Promise<void>;
+  /** Ticks until a frame is given, and takes what is given into `fields`. */
+  given(index: number, fields: Map<string, Tensor>): Promise<void>;
   close(): void;
+}
+
+let open: Playing[] = [];
+
+afterEach(() => {
+  for (const play of open) play.close();
+  open = [];
+});
+
+/** An engine that opens a file, which is closed after the test. */
+export function playingFile(file: ServedFile, startSeconds = 0, options: EngineOptions = {}): Playing {
+  const play = playing(file.fetch as typeof fetch, options);
+  play.engine.load({ kind: "url", url: URL_OF_CLIP, name: "clip.sgs" }, startSeconds);
+  return play;
 }
 
 export function playing(request: typeof fetch, options: EngineOptions = {}): Playing {
@@ -97,18 +127,21 @@ export function playing(request: typeof fetch, options: EngineOptions = {}): Pla
     fetchLine.port2 as unknown as Port<ReadRequest, ReadReply>,
     () => new Promise((resolve) => setImmediate(resolve)),
   );
-  const close = () => {
-    for (const { port1, port2 } of [engineLine, fetchLine]) {
-      port1.close();
-      port2.close();
-    }
-  };
   const pipeline = {
     onmessage: undefined as ((message: FromDecoder) => void) | undefined,
     send: (message: ToDecoder) => engineLine.port2.postMessage(message),
-    close,
+    close: () => {
+      for (const { port1, port2 } of [engineLine, fetchLine]) {
+        port1.close();
+        port2.close();
+      }
+    },
   };
-  engineLine.port2.onmessage = ({ data }: MessageEvent<FromDecoder>) => pipeline.onmessage?.(data);
+  let held: FromDecoder[] | undefined;
+  engineLine.port2.onmessage = ({ data }: MessageEvent<FromDecoder>) => {
+    if (held && data.type === "frame") held.push(data);
+    else pipeline.onmessage?.(data);
+  };
   const found: Playing = {
     engine: new Engine(pipeline, () => found.seconds, options),
     errors: [],
@@ -123,12 +156,35 @@ export function playing(request: typeof fetch, options: EngineOptions = {}): Pla
         await new Promise((resolve) => setTimeout(resolve, 1));
       }
     },
+    holdFrames() {
+      const late: FromDecoder[] = [];
+      held = late;
+      return () => {
+        held = undefined;
+        for (const message of late) pipeline.onmessage?.(message);
+      };
+    },
     async settled() {
       await found.until(() => found.engine.frames.count > 0 && !found.engine.seeking, "frame that was sought");
       found.engine.tick();
     },
-    close,
+    toEnd(step = 1 / 60) {
+      return found.until(() => {
+        found.seconds += step;
+        return found.engine.ended;
+      }, "end");
+    },
+    async given(index, fields) {
+      for (let last = -1; last !== index; ) {
+        const update = found.engine.tick();
+        for (const [name, tensor] of update?.fields ?? []) fields.set(name, tensor);
+        last = update?.index ?? last;
+        await new Promise((resolve) => setTimeout(resolve, 1));
+      }
+    },
+    close: () => found.engine.destroy(),
   };
+  open.push(found);
   found.engine.on("error", ({ message }) => found.errors.push(message));
   found.engine.on("notice", ({ message }) => found.notices.push(message));
   found.engine.on("frame", ({ index }) => found.shown.push(index));

@@ -2,13 +2,14 @@
 /** Sound without a browser: a faked AudioContext, whose time a test moves, and the engine that feeds it. */
 
 import { recordBytes } from "@structgstream/core";
-import { afterEach, describe, expect, test, vi } from "vitest";
+import { describe, expect, test, vi } from "vitest";
+import type { EngineOptions } from "../src/engine/options.ts";
 import { Player } from "../src/player.ts";
 import { AudioClock } from "../src/sound/audioClock.ts";
 import { oggOf } from "../src/sound/ogg.ts";
 import { Sound } from "../src/sound/sound.ts";
 import { QualityControl } from "../src/view/quality.ts";
-import { CLIP, type Playing, playing, ServedFile } from "./served.ts";
+import { CLIP, playingFile, ServedFile } from "./served.ts";
 import { CLAP_SECONDS, clapping, clappingFile, FPS } from "./soundFile.ts";
 
 vi.setConfig({ testTimeout: 30_000 });
@@ -319,20 +320,11 @@ describe("the sound", () => {
 });
 
 describe("an engine with sound", () => {
-  const open: Playing[] = [];
-  afterEach(() => {
-    for (const { engine, close } of open.splice(0)) {
-      engine.destroy();
-      close();
-    }
-  });
-
-  function opened(bytes: Uint8Array, given = sounding()) {
+  function opened(bytes: Uint8Array, options: EngineOptions = {}) {
+    const given = sounding();
     const file = new ServedFile(bytes);
-    const play = playing(file.fetch as typeof fetch, { sound: given.sound });
-    open.push(play);
+    const play = playingFile(file, 0, { ...options, sound: given.sound });
     Object.defineProperty(play, "seconds", { get: () => given.sound.now() });
-    play.engine.load({ kind: "url", url: "http://test/claps.sgs", name: "claps.sgs" }, 0);
     return { play, file, ...given };
   }
 
@@ -405,14 +397,8 @@ describe("an engine with sound", () => {
   });
 
   test("what is evicted is fetched again with its sound", async () => {
-    const bytes = clappingFile(8);
-    const file = new ServedFile(bytes);
-    const given = sounding();
-    const play = playing(file.fetch as typeof fetch, { sound: given.sound, budgetBytes: 4000 });
-    open.push(play);
-    Object.defineProperty(play, "seconds", { get: () => given.sound.now() });
-    play.engine.load({ kind: "url", url: "http://test/claps.sgs", name: "claps.sgs" }, 0);
-    const it = { play, file, ...given };
+    const it = opened(clappingFile(8), { budgetBytes: 4000 });
+    const { play } = it;
     await play.settled();
     play.engine.play();
     expect((await played(it, 1)).length).toBeGreaterThan(0);

@@ -2,14 +2,12 @@
 /** The golden stream with sound, of a second with a clap and a white picture in its middle, as often as a test wants. */
 
 import { HEAD_BYTES, RecordType, viewOf } from "../../core/src/records.ts";
-import { bytesOf, joined, piecesOf, record, VECTORS } from "../../core/test/streams.ts";
+import { bytesOf, type IndexRow, indexOf, joined, piecesOf, record, VECTORS } from "../../core/test/streams.ts";
 
 export const FPS = 12;
 /** In each second, of the clap and of the white picture. */
 export const CLAP_SECONDS = 0.5;
 export const CLAP_FRAME = 6;
-const FOOTER_BYTES = 16;
-const ENTRY_BYTES = 13;
 
 export const SOUND_VECTOR = bytesOf(VECTORS, "version-2-sound.sgs");
 
@@ -36,19 +34,13 @@ export function clapping(seconds: number): { head: Uint8Array; frames: (readonly
 /** A file of so many seconds, with its index. */
 export function clappingFile(seconds: number): Uint8Array {
   const { head, frames } = clapping(seconds);
-  const entries = new Uint8Array(frames.length * ENTRY_BYTES);
-  const view = viewOf(entries);
-  let offset = head.length;
-  for (const [index, [packet, sound]] of frames.entries()) {
-    view.setUint32(index * ENTRY_BYTES, index, true);
-    view.setUint8(index * ENTRY_BYTES + 4, packet[0]!);
-    view.setBigUint64(index * ENTRY_BYTES + 5, BigInt(offset), true);
-    offset += packet.length + sound.length;
-  }
-  const footer = new Uint8Array(FOOTER_BYTES);
-  viewOf(footer).setBigUint64(0, BigInt(offset), true);
-  footer.set(new TextEncoder().encode("SGSINDEX"), 8);
-  return joined(head, ...frames.flat(), record(RecordType.index, entries), footer);
+  let at = head.length;
+  const entries = frames.map(([packet, sound], index): IndexRow => {
+    const offset = at;
+    at += packet.length + sound.length;
+    return [index, packet[0]!, offset];
+  });
+  return joined(head, ...frames.flat(), indexOf(entries, at));
 }
 
 function payload(piece: Uint8Array): Uint8Array {

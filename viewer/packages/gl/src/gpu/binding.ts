@@ -29,12 +29,6 @@ export function bindTextures(
 
 /** Makes `program` current with the inputs of the MLPs. */
 export function bindInputs(gl: WebGL2RenderingContext, program: Program, scene: SceneTextures, eye: Vector): void {
-  bindTextures(gl, program, {
-    positions: scene.positions.texture,
-    features: scene.features.texture,
-    appearance: scene.appearance.texture,
-    weights: scene.weights.texture,
-    anchors: scene.anchors.texture,
-  });
+  bindTextures(gl, program, scene.textures("positions", "features", "appearance", "weights", "anchors"));
   gl.uniform3f(program.at("eye"), ...eye);
 }

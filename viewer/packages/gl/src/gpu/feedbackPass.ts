@@ -71,13 +71,6 @@ export class FeedbackPass implements MlpPass {
     return this.passRows * WIDTH;
   }
 
-  delete(): void {
-    for (const { program } of this.passes) this.resources.deleteProgram(program.handle);
-    this.resources.deleteFeedback(this.feedback);
-    if (this.buffer) this.resources.deleteBuffer(this.buffer);
-    if (this.texture) this.resources.deleteTexture(this.texture);
-  }
-
   /** Allocates memory for the outputs of `count` anchors, with a reserve when it grows. */
   private reserve(count: number): void {
     if (count <= this.room) return;

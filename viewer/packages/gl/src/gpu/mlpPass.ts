@@ -17,5 +17,4 @@ export interface MlpPass {
   };
   /** Its uniform of this name. */
   readonly passTexels: number;
-  delete(): void;
 }

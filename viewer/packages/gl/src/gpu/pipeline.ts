@@ -5,7 +5,7 @@ import type { Fields } from "@structgstream/core";
 import { center, resized } from "../cameraMath.js";
 import { type Shape, sameShape, shapeOf } from "../scene.js";
 import type { Sorted } from "../sorting/orders.js";
-import type { Camera, MlpPath } from "../types.js";
+import type { Camera, MlpPath, ResourceCounts } from "../types.js";
 import { chosenPath, type Device } from "./device.js";
 import { FeedbackPass } from "./feedbackPass.js";
 import type { MlpPass } from "./mlpPass.js";
@@ -30,7 +30,9 @@ const NOTHING = new Float32Array(0);
 const CANVAS: Target = { framebuffer: null, x: 0, y: 0, transparent: false };
 
 export class Pipeline {
-  readonly resources: Resources;
+  private readonly resources: Resources;
+  /** Those of the stage, which are deleted with it. */
+  private readonly ofStage: Resources;
   readonly path: MlpPath;
   private readonly splats: SplatPass;
   private readonly picture: PicturePass;
@@ -45,6 +47,7 @@ export class Pipeline {
   ) {
     this.path = chosenPath(device, askedPath);
     this.resources = new Resources(device.gl);
+    this.ofStage = new Resources(device.gl);
     this.splats = new SplatPass(this.resources, device);
     this.picture = new PicturePass(this.resources);
   }
@@ -72,12 +75,24 @@ export class Pipeline {
 
   /** The scene of a stream played before. */
   forget(): void {
-    this.stage?.scene.delete();
-    this.stage?.sampling.delete();
-    this.stage?.mlp.delete();
-    this.stage?.projection.delete();
+    this.ofStage.deleteAll();
     this.stage = undefined;
     this.fields = undefined;
+  }
+
+  get counts(): Omit<ResourceCounts, "workers"> {
+    const [own, stage] = [this.resources.counts, this.ofStage.counts];
+    return {
+      textures: own.textures + stage.textures,
+      buffers: own.buffers + stage.buffers,
+      programs: own.programs + stage.programs,
+      framebuffers: own.framebuffers + stage.framebuffers,
+    };
+  }
+
+  delete(): void {
+    this.forget();
+    this.resources.deleteAll();
   }
 
   evaluate(camera: Camera): void {
@@ -101,7 +116,7 @@ export class Pipeline {
   }
 
   private stageFor(shape: Shape): Stage {
-    const { resources, device } = this;
+    const { ofStage: resources, device } = this;
     const most = device.splatsPerPass[this.path];
     const Pass = this.path === "mrt" ? TargetsPass : FeedbackPass;
     const sampling = new SamplingPass(resources, device);

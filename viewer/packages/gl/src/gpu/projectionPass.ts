@@ -44,12 +44,7 @@ export class ProjectionPass {
       gl,
       program,
       {
-        positions: scene.positions.texture,
-        offsetScales: scene.offsetScales.texture,
-        baseScales: scene.baseScales.texture,
-        offsets: scene.offsets.texture,
-        free: scene.free.texture,
-        anchors: scene.anchors.texture,
+        ...scene.textures("positions", "offsetScales", "baseScales", "offsets", "free", "anchors"),
         intervals: this.intervals.texture,
         ...textures,
       },
@@ -73,13 +68,6 @@ export class ProjectionPass {
     gl.viewport(0, 0, 1 << TABLE_WIDTH_BITS, Math.ceil(count / (1 << TABLE_WIDTH_BITS)));
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-  }
-
-  delete(): void {
-    this.resources.deleteProgram(this.program.handle);
-    this.resources.deleteFramebuffer(this.framebuffer);
-    this.first.delete();
-    this.second.delete();
   }
 
   private reserve(count: number): void {

@@ -112,14 +112,6 @@ export class Resources {
     if (this.programs.delete(program)) this.gl.deleteProgram(program);
   }
 
-  deleteFramebuffer(framebuffer: WebGLFramebuffer): void {
-    if (this.framebuffers.delete(framebuffer)) this.gl.deleteFramebuffer(framebuffer);
-  }
-
-  deleteFeedback(feedback: WebGLTransformFeedback): void {
-    if (this.feedbacks.delete(feedback)) this.gl.deleteTransformFeedback(feedback);
-  }
-
   deleteAll(): void {
     const { gl } = this;
     for (const texture of this.textures) gl.deleteTexture(texture);

@@ -49,11 +49,7 @@ export class SamplingPass {
       gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.attached!, 0);
     }
     const { program } = this;
-    bindTextures(gl, program, {
-      positions: scene.positions.texture,
-      free: scene.free.texture,
-      cameras: this.cameras.texture,
-    });
+    bindTextures(gl, program, { ...scene.textures("positions", "free"), cameras: this.cameras.texture });
     gl.uniform1i(program.at("anchors"), anchors);
     gl.uniform1i(program.at("count"), count);
     gl.uniform1i(program.at("cameraCount"), training.count);
@@ -63,12 +59,5 @@ export class SamplingPass {
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     this.written = training;
     this.seen.splice(0, 2, ...given);
-  }
-
-  delete(): void {
-    this.resources.deleteProgram(this.program.handle);
-    this.resources.deleteFramebuffer(this.framebuffer);
-    this.intervals.delete();
-    this.cameras.delete();
   }
 }

@@ -6,26 +6,33 @@ import { type Shape, type Sizes, type Snapshot, sizesOf } from "../scene.js";
 import type { Order } from "../sorting/messages.js";
 import type { Device } from "./device.js";
 import type { Resources } from "./resources.js";
-import { Table } from "./table.js";
+import { Table, type TexelFormat } from "./table.js";
 import { packedWeights, paddedRows } from "./weights.js";
 
 /** Fields that contain the weights. */
 const MLP_FIELDS: readonly FieldName[] = ["opacity_mlp", "color_mlp", "covariance_mlp", "appearance_basis"];
 
+/** By the names of the shaders' samplers: the format of a table, and its name in messages. */
+const TABLES = {
+  positions: ["RGB32F", "anchor_positions"],
+  offsetScales: ["RGB32F", "offset_scales"],
+  baseScales: ["RGB32F", "base_scales"],
+  offsets: ["RGB32F", "anchor_offsets"],
+  features: ["RGBA32F", "anchor_features"],
+  appearance: ["RGBA32F", "appearance"],
+  free: ["RG32F", "free"],
+  weights: ["RGBA32F", "MLP weights"],
+  anchors: ["R32UI", "visible anchors"],
+  slots: ["R32UI", "the splats' order"],
+} as const satisfies Record<string, readonly [TexelFormat, string]>;
+
+type TableName = keyof typeof TABLES;
+
 export class SceneTextures {
-  readonly positions: Table;
-  readonly offsetScales: Table;
-  readonly baseScales: Table;
-  readonly offsets: Table;
-  readonly features: Table;
-  readonly appearance: Table;
-  readonly free: Table;
-  readonly weights: Table;
-  readonly anchors: Table;
-  readonly slots: Table;
   sizes: Sizes = { anchors: 0, offsetsPerAnchor: 1, free: 0 };
   anchorCount = 0;
   splats = 0;
+  private readonly tables: Readonly<Record<TableName, Table>>;
   private readonly written = new Map<FieldName, Tensor>();
 
   constructor(
@@ -33,43 +40,34 @@ export class SceneTextures {
     device: Device,
     private readonly shape: Shape,
   ) {
-    const table = (format: Table["format"], name: string) => new Table(resources, device, format, name);
-    this.positions = table("RGB32F", "anchor_positions");
-    this.offsetScales = table("RGB32F", "offset_scales");
-    this.baseScales = table("RGB32F", "base_scales");
-    this.offsets = table("RGB32F", "anchor_offsets");
-    this.features = table("RGBA32F", "anchor_features");
-    this.appearance = table("RGBA32F", "appearance");
-    this.free = table("RG32F", "free");
-    this.weights = table("RGBA32F", "MLP weights");
-    this.anchors = table("R32UI", "visible anchors");
-    this.slots = table("R32UI", "the splats' order");
+    this.tables = Object.fromEntries(
+      Object.entries(TABLES).map(([key, [format, name]]) => [key, new Table(resources, device, format, name)]),
+    ) as Record<TableName, Table>;
+  }
+
+  /** Textures of tables, for `bindTextures`. */
+  textures(...names: readonly TableName[]): Record<string, WebGLTexture | undefined> {
+    return Object.fromEntries(names.map((name) => [name, this.tables[name].texture]));
   }
 
   /** A scene and the order that belongs to it. @throws GlError too large for this device */
   adopt({ fields }: Snapshot, order: Order): void {
+    const { tables, shape } = this;
     const changed = (name: FieldName) => this.written.get(name) !== fields.get(name);
     const floats = (name: FieldName) => fields.get(name)!.data as Float32Array;
-    for (const [name, table] of [
-      ["anchor_positions", this.positions],
-      ["offset_scales", this.offsetScales],
-      ["base_scales", this.baseScales],
-      ["anchor_offsets", this.offsets],
-      ["free", this.free],
-    ] as const) {
-      if (changed(name)) table.write(floats(name));
+    for (const key of ["positions", "offsetScales", "baseScales", "offsets", "free"] as const) {
+      const [, name] = TABLES[key];
+      if (changed(name)) tables[key].write(floats(name));
     }
-    if (changed("anchor_features")) {
-      this.features.write(paddedRows(floats("anchor_features"), this.shape.features));
+    if (changed("anchor_features")) tables.features.write(paddedRows(floats("anchor_features"), shape.features));
+    if (shape.appearance && changed("appearance")) {
+      tables.appearance.write(paddedRows(floats("appearance"), shape.appearance));
     }
-    if (this.shape.appearance && changed("appearance")) {
-      this.appearance.write(paddedRows(floats("appearance"), this.shape.appearance));
-    }
-    if (MLP_FIELDS.some(changed)) this.weights.write(packedWeights(fields, this.shape));
+    if (MLP_FIELDS.some(changed)) tables.weights.write(packedWeights(fields, shape));
     for (const [name, tensor] of fields) this.written.set(name, tensor);
     this.sizes = sizesOf(fields);
-    this.anchors.write(order.anchors, order.anchorCount);
-    this.slots.write(order.slots, order.splats);
+    tables.anchors.write(order.anchors, order.anchorCount);
+    tables.slots.write(order.slots, order.splats);
     this.anchorCount = order.anchorCount;
     this.splats = order.splats;
   }
@@ -77,22 +75,5 @@ export class SceneTextures {
   /** Number of slots that the order may contain: those of visible anchors, then all free Gaussians. */
   get slotCount(): number {
     return this.anchorCount * this.sizes.offsetsPerAnchor + this.sizes.free;
-  }
-
-  delete(): void {
-    for (const table of [
-      this.positions,
-      this.offsetScales,
-      this.baseScales,
-      this.offsets,
-      this.features,
-      this.appearance,
-      this.free,
-      this.weights,
-      this.anchors,
-      this.slots,
-    ]) {
-      table.delete();
-    }
   }
 }

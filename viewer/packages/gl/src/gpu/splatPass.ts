@@ -44,7 +44,7 @@ export class SplatPass {
     gl.clear(gl.COLOR_BUFFER_BIT);
     if (scene && projected) {
       bindTextures(gl, program, {
-        slots: scene.slots.texture,
+        ...scene.textures("slots"),
         first: projected.first.texture,
         second: projected.second.texture,
       });

@@ -56,7 +56,14 @@ export class Table {
     const texels = Math.ceil(count / channels);
     this.reserve(texels);
     const { gl } = this.resources;
-    const format = this.format === "R32UI" ? gl.RED_INTEGER : this.format === "RG32F" ? gl.RG : this.colours();
+    const formats = {
+      R32UI: gl.RED_INTEGER,
+      RG32F: gl.RG,
+      RGB32F: gl.RGB,
+      RGBA32F: gl.RGBA,
+      RGBA32UI: gl.RGBA_INTEGER,
+    };
+    const format = formats[this.format];
     const type = data instanceof Uint32Array ? gl.UNSIGNED_INT : gl.FLOAT;
     gl.bindTexture(gl.TEXTURE_2D, this.texture!);
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 4);
@@ -64,18 +71,6 @@ export class Table {
     if (full) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, full, format, type, data, 0);
     const rest = texels - full * WIDTH;
     if (rest) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, full, rest, 1, format, type, data, full * WIDTH * channels);
-  }
-
-  private colours(): number {
-    const { gl } = this.resources;
-    if (this.format === "RGBA32UI") return gl.RGBA_INTEGER;
-    return this.format === "RGB32F" ? gl.RGB : gl.RGBA;
-  }
-
-  delete(): void {
-    if (this.texture) this.resources.deleteTexture(this.texture);
-    this.texture = undefined;
-    this.rows = 0;
   }
 }
 

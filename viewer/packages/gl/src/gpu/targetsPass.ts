@@ -70,14 +70,6 @@ export class TargetsPass implements MlpPass {
     return { textures: {}, arrays: { outputs: this.texture } };
   }
 
-  delete(): void {
-    for (const { program, framebuffer } of this.passes) {
-      this.resources.deleteProgram(program.handle);
-      this.resources.deleteFramebuffer(framebuffer);
-    }
-    if (this.texture) this.resources.deleteTexture(this.texture);
-  }
-
   private reserve(rows: number): void {
     if (rows <= this.rows) return;
     const { gl } = this.resources;

@@ -2,12 +2,11 @@
 /** A headless browser with WebGL2 in software, and a server on this machine for what it shows. */
 
 import { readFile } from "node:fs/promises";
-import { createServer, type Server } from "node:http";
-import type { AddressInfo } from "node:net";
 import { fileURLToPath } from "node:url";
 import { build } from "esbuild";
 import type { Browser, Page } from "playwright-core";
-import { launched } from "./chromium.ts";
+import { complaintsOf, launched } from "./chromium.ts";
+import { TestServer } from "./server.ts";
 
 /** One page with the renderer in it, and what went wrong on it. */
 export interface Stage {
@@ -35,47 +34,31 @@ export async function openStage(
 ): Promise<Stage> {
   const sorterScript = new URL("../../src/sorter.worker.ts", import.meta.url);
   const [page, sorter] = await Promise.all([script, sorterScript].map((url) => bundled(fileURLToPath(url))));
-  const content: Record<string, Uint8Array | string> = {
-    "/": '<!doctype html><meta charset="utf-8"><title>stage</title><link rel="icon" href="data:,"><script type="module" src="/page.js"></script>',
-    "/page.js": page,
-    "/sorter.js": sorter,
-    "/sorter.worker.js": sorter,
-  };
-  const server = createServer(async (request, response) => {
-    const name = new URL(request.url ?? "/", "http://localhost").pathname;
-    const path = files[name.slice(1)];
-    const body = content[name] ?? (path === undefined ? undefined : await readFile(path));
-    const type = name === "/" ? "text/html" : name.endsWith(".js") ? "text/javascript" : "application/octet-stream";
-    response.writeHead(body === undefined ? 404 : 200, { "content-type": type });
-    response.end(body);
-  });
-  await new Promise<void>((resolve) => server.listen(0, "127.0.0.1", resolve));
+  const server = await TestServer.started();
+  server.put(
+    "/",
+    '<!doctype html><meta charset="utf-8"><title>stage</title><link rel="icon" href="data:,"><script type="module" src="/page.js"></script>',
+    { type: "text/html" },
+  );
+  server.put("/page.js", page!, { type: "text/javascript" });
+  for (const path of ["/sorter.js", "/sorter.worker.js"]) server.put(path, sorter!, { type: "text/javascript" });
+  for (const [name, path] of Object.entries(files)) server.put(`/${name}`, await readFile(path));
   let browser: Browser | undefined;
+  const close = async () => {
+    await browser?.close();
+    await server.stop();
+  };
   try {
     browser = await launched(executablePath);
     const opened = await browser.newPage(viewport ? { viewport } : {});
-    const complaints: string[] = [];
-    opened.on("pageerror", (error) => complaints.push(error.message));
-    opened.on("console", (message) => {
-      const text = message.text();
-      // The page has no icon, and software GL says so of itself when pixels are read.
-      const usual = text.includes("favicon") || text.includes("GPU stall due to ReadPixels");
-      if (["error", "warning"].includes(message.type()) && !usual) complaints.push(text);
-    });
-    await opened.goto(`http://127.0.0.1:${(server.address() as AddressInfo).port}/${query}`);
+    const complaints = complaintsOf(opened);
+    await opened.goto(`${server.origin}/${query}`);
     await opened.waitForFunction("globalThis.stage !== undefined");
-    const running = browser;
-    return { page: opened, complaints, close: () => closed(running, server) };
+    return { page: opened, complaints, close };
   } catch (error) {
-    await closed(browser, server);
+    await close();
     throw error;
   }
-}
-
-async function closed(browser: Browser | undefined, server: Server): Promise<void> {
-  await browser?.close();
-  server.closeAllConnections();
-  await new Promise<void>((resolve) => server.close(() => resolve()));
 }
 
 async function bundled(entry: string): Promise<string> {

@@ -2,7 +2,7 @@
 /** A headless Chromium with WebGL2 in software, where there is one. */
 
 import { existsSync } from "node:fs";
-import { type Browser, chromium } from "playwright-core";
+import { type Browser, chromium, type Page } from "playwright-core";
 
 const USUAL_PLACES = [
   "/usr/bin/chromium-headless-shell",
@@ -30,4 +30,17 @@ export function chromiumPath(): string | undefined {
 /** @param flags more of them */
 export function launched(executablePath: string, ...flags: string[]): Promise<Browser> {
   return chromium.launch({ executablePath, args: [...FLAGS, ...flags] });
+}
+
+/** What a page and its console complain of, from now on. */
+export function complaintsOf(page: Page): string[] {
+  const complaints: string[] = [];
+  page.on("pageerror", (error) => complaints.push(error.message));
+  page.on("console", (message) => {
+    const text = message.text();
+    // Software GL says so of itself.
+    const usual = text.includes("GPU stall due to ReadPixels");
+    if (["error", "warning"].includes(message.type()) && !usual) complaints.push(text);
+  });
+  return complaints;
 }

@@ -3,7 +3,10 @@
 
 import { readStream } from "@structgstream/core";
 import { type EngineCamera, engineCamera, OwnPictures } from "./ownPictures.js";
-import { base64 } from "./pixels.js";
+import { base64, pixelsOf } from "./pixels.js";
+
+/** Between two pictures of an engine, which sorts in the meantime. */
+const PAUSE_MILLISECONDS = 1500;
 
 /** Draws a file in an engine. @param yDown whether the file has the axes of the capture instead of y up */
 type Draw = (url: string, yDown: boolean, view: EngineCamera, settings: object) => Promise<Uint8ClampedArray>;
@@ -33,4 +36,15 @@ export function exportedStage(draw: Draw): ExportedStage {
       return { engine, own, width: view.own.width, height: view.own.height };
     },
   };
+}
+
+/** RGBA of the first picture that is like the one before, and not black: sorting has ended. */
+export async function sortedPicture(draw: () => Promise<Blob>): Promise<Uint8ClampedArray> {
+  for (let last: Uint8ClampedArray | undefined; ; ) {
+    const next = await pixelsOf(await draw());
+    const black = next.every((value, i) => i % 4 === 3 || value === 0);
+    if (!black && next.length === last?.length && next.every((value, i) => value === last![i])) return next;
+    last = next;
+    await new Promise((resolve) => setTimeout(resolve, PAUSE_MILLISECONDS));
+  }
 }

@@ -32,7 +32,7 @@ export interface Lesser {
   readonly withoutWebGL2?: boolean;
 }
 
-export function cameraOf(plain: PlainCamera): Camera {
+function cameraOf(plain: PlainCamera): Camera {
   return { ...plain, viewmat: Float64Array.from(plain.viewmat) };
 }
 
@@ -115,13 +115,15 @@ export class Play {
   }
 }
 
-export async function open(url: string, options: PlainOptions = {}): Promise<Play> {
+async function open(url: string, options: PlainOptions = {}): Promise<Play> {
   const answer = await fetch(url);
-  return new Play(readStream(new Uint8Array(await answer.arrayBuffer())), options);
+  const play = new Play(readStream(new Uint8Array(await answer.arrayBuffer())), options);
+  api.plays.push(play);
+  return play;
 }
 
 /** Milliseconds on this thread of each of `repeats` frames in a row, from update to settled picture. */
-export async function played(play: Play, camera: Camera, repeats: number): Promise<{ calls: number[]; shown: number }> {
+async function played(play: Play, camera: Camera, repeats: number): Promise<{ calls: number[]; shown: number }> {
   const frames = play.reader.packets.length;
   const updates = Array.from({ length: Math.min(frames, 8) }, (_, index) => play.reader.frame(index));
   const calls: number[] = [];
@@ -170,11 +172,12 @@ function lessen(canvas: HTMLCanvasElement, device: Lesser): void {
   canvas.getContext = lesser as unknown as typeof canvas.getContext;
 }
 
-export async function pngPixels(url: string): Promise<string> {
+async function pngPixels(url: string): Promise<string> {
   return base64(await pixelsOf(await (await fetch(url)).blob()));
 }
 
-const api = { open, pngPixels, timed, played, plays: [] as Play[] };
+/** `plays` are all that were opened. */
+const api = { open, cameraOf, pngPixels, timed, played, plays: [] as Play[] };
 declare global {
   var stage: typeof api;
 }

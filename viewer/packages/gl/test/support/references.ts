@@ -52,7 +52,7 @@ export async function* compared(
   const outputs = readFileSync(join(folder, "outputs.bin"));
   await page.evaluate(
     async ([url, path, lesser]) => {
-      globalThis.stage.plays = [await globalThis.stage.open(url, { mlpPath: path, device: lesser })];
+      await globalThis.stage.open(url, { mlpPath: path, device: lesser });
     },
     [stream, mlpPath, device] as const,
   );

@@ -90,7 +90,7 @@ export async function timed(url: string, cameraName: string, path: MlpPath, repe
     take("show", () => pipeline.show(moved, look));
     [anchors, splats] = [order.anchorCount, order.splats];
   }
-  pipeline.resources.deleteAll();
+  pipeline.delete();
   const median = (values: number[]) => values.sort((a, b) => a - b)[values.length >> 1]!;
   const medians = Object.fromEntries(Object.entries(found).map(([name, values]) => [name, median(values)]));
   return { anchors, splats, ...(medians as Record<keyof typeof found, number>) };

@@ -36,36 +36,30 @@ export class ByteClient {
 
   /** Starts reading; returns the number for {@link cancel}. `of` is a file next to a manifest instead of the source. */
   read(start: number, end: number, wholeIfNeeded: boolean, events: ReadingEvents, of?: StoredPlace): number {
-    const id = this.remember(events);
-    this.port.postMessage({ type: "read", id, start, end, wholeIfNeeded, of }, []);
-    return id;
+    return this.ask(events, (id) => ({ type: "read", id, start, end, wholeIfNeeded, of }));
   }
 
   manifests(url: string, name: string, events: ReadingEvents): number {
-    const id = this.remember(events);
-    this.port.postMessage({ type: "manifests", id, url, name }, []);
-    return id;
+    return this.ask(events, (id) => ({ type: "manifests", id, url, name }));
   }
 
   page(url: string, entry: PageEntry, events: ReadingEvents): number {
-    const id = this.remember(events);
-    this.port.postMessage({ type: "page", id, url, entry }, []);
-    return id;
+    return this.ask(events, (id) => ({ type: "page", id, url, entry }));
   }
 
   follow(start: number, events: ReadingEvents): number {
-    const id = this.remember(events);
-    this.port.postMessage({ type: "follow", id, start }, []);
-    return id;
+    return this.ask(events, (id) => ({ type: "follow", id, start }));
   }
 
   cancel(id: number): void {
     if (this.readings.delete(id)) this.port.postMessage({ type: "cancel", id }, []);
   }
 
-  private remember(events: ReadingEvents): number {
-    this.readings.set(++this.made, events);
-    return this.made;
+  private ask(events: ReadingEvents, request: (id: number) => ReadRequest): number {
+    const id = ++this.made;
+    this.readings.set(id, events);
+    this.port.postMessage(request(id), []);
+    return id;
   }
 
   private hear(reply: ReadReply): void {

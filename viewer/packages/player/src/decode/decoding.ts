@@ -12,7 +12,7 @@ import { ByteClient } from "./byteClient.js";
 import { FileStream } from "./fileStream.js";
 import type { Demand, FromDecoder, PacketFacts, ToDecoder } from "./messages.js";
 import { SegmentedStreams } from "./segmentedStreams.js";
-import type { Chapter, Stream } from "./stream.js";
+import type { Chapter, Stream, StreamEvents } from "./stream.js";
 import { Throttle } from "./throttle.js";
 
 /** Longest interval between pictures on a machine that decodes too slowly. */
@@ -68,17 +68,17 @@ export class Decoding {
 
   private open({ source, fromStart, budgetBytes }: ToDecoder & { type: "open" }): void {
     this.client.open(source);
-    const common = {
+    const common: StreamEvents = {
+      changed: () => this.catalogChanged(),
       stored: () => this.storeChanged(),
-      waiting: (seconds: number, problem: string | undefined) => this.post({ type: "waiting", seconds, problem }),
-      failed: (message: string, fatal: boolean) => this.post({ type: "failed", message, fatal }),
+      lost: (first, end, reason) => this.lose(first, end, reason),
+      waiting: (seconds, problem) => this.post({ type: "waiting", seconds, problem }),
+      failed: (message, fatal) => this.post({ type: "failed", message, fatal }),
     };
     if (source.kind === "segments") {
       this.segmented = new SegmentedStreams(this.client, source.url, source.name, budgetBytes, {
         ...common,
         begun: (stream) => this.begin(stream),
-        changed: () => this.catalogChanged(),
-        lost: (first, end, reason) => this.lose(first, end, reason),
         notice: (message) => this.post({ type: "notice", message }),
         qualities: (names, at) => this.post({ type: "qualities", names, at }),
       });
@@ -92,8 +92,6 @@ export class Decoding {
         this.announced = stream.chapter(0, 0);
         this.post({ type: "header", header, ranged });
       },
-      changed: () => this.catalogChanged(),
-      lost: (first, end, reason) => this.lose(first, end, reason),
       wanted: () => (this.demand && this.stream ? this.stream.catalog.groupStart(this.demand.at) : 0),
     });
   }

@@ -19,21 +19,12 @@ import { FileCatalog } from "./fileCatalog.js";
 import { Opening } from "./opening.js";
 import { PacketLoader } from "./packetLoader.js";
 import { PacketStore } from "./packetStore.js";
-import { type Chapter, Chapters, type Stream } from "./stream.js";
+import { type Chapter, Chapters, type Stream, type StreamEvents } from "./stream.js";
 
-export interface FileEvents {
+export interface FileEvents extends StreamEvents {
   opening(loadedBytes: number, totalBytes: number | undefined, ended: boolean): void;
   /** The header is available. */
   begun(stream: FileStream, header: StreamHeader, ranged: boolean): void;
-  /** Further packets are known. */
-  changed(): void;
-  /** Packets have arrived. */
-  stored(): void;
-  /** Frames up to before `end`, or all that need the first one, are damaged. */
-  lost(first: number, end: number | undefined, reason: string): void;
-  waiting(seconds: number, problem: string | undefined): void;
-  /** Unless it is fatal, the next demand tries again. */
-  failed(message: string, fatal: boolean): void;
   /** The first packet that is needed at present. */
   wanted(): number;
 }

@@ -15,7 +15,7 @@ import {
   StreamReader,
 } from "@structgstream/core";
 import { joined } from "../source/joined.js";
-import type { ByteClient } from "./byteClient.js";
+import type { ByteClient, ReadingEvents } from "./byteClient.js";
 
 const HEAD_BYTES = 4096;
 const TAIL_BYTES = 4096;
@@ -44,6 +44,10 @@ export class Opening {
   private lookedForIndex = false;
   private announced = false;
   private reading: number | undefined;
+  private readonly troubles: Pick<ReadingEvents, "failed" | "waiting"> = {
+    failed: (message) => this.events.failed(message),
+    waiting: (seconds, problem) => this.events.waiting(seconds, problem),
+  };
 
   constructor(
     private readonly client: ByteClient,
@@ -71,8 +75,7 @@ export class Opening {
       },
       bytes: (bytes) => this.take(bytes),
       end: then,
-      failed: (message) => this.events.failed(message),
-      waiting: (seconds, problem) => this.events.waiting(seconds, problem),
+      ...this.troubles,
     });
   }
 
@@ -81,8 +84,7 @@ export class Opening {
     this.client.read(start, fileBytes, false, {
       bytes: (bytes) => parts.push(bytes),
       end: () => this.lookAtTail(joined(parts), start, fileBytes),
-      failed: (message) => this.events.failed(message),
-      waiting: (seconds, problem) => this.events.waiting(seconds, problem),
+      ...this.troubles,
     });
   }
 
@@ -124,7 +126,7 @@ export class Opening {
       },
       bytes: (bytes) => this.take(bytes),
       end: () => this.finish(),
-      failed: (message) => this.events.failed(message),
+      ...this.troubles,
       waiting: (seconds, problem) => {
         if (!this.announced && problem === undefined) this.events.opening(this.loaded, undefined, true);
         this.events.waiting(seconds, problem);

@@ -8,23 +8,16 @@ import type { Place } from "./catalog.js";
 import { PacketLoader } from "./packetLoader.js";
 import { PacketStore } from "./packetStore.js";
 import { SegmentCatalog } from "./segmentCatalog.js";
-import { type Chapter, Chapters, type Stream } from "./stream.js";
+import { type Chapter, Chapters, type Stream, type StreamEvents } from "./stream.js";
 
 /** Seconds to wait after a file could not be fetched. */
 const AGAIN_MILLISECONDS = 1000;
 /** Number of requests of a file that is missing or wrong. */
 const ATTEMPTS = 3;
 
-export interface SegmentEvents {
-  /** There is a new manifest, or a new page of it. */
-  changed(): void;
-  /** Packets have arrived, or can be requested again. */
-  stored(): void;
+export interface SegmentEvents extends Omit<StreamEvents, "failed"> {
   qualities(qualities: readonly Quality[]): void;
-  /** Frames up to before `end`, or all that need the first one, are not available. */
-  lost(first: number, end: number | undefined, reason: string): void;
   notice(message: string): void;
-  waiting(seconds: number, problem: string | undefined): void;
   /** A `temporary` failure may disappear without action. */
   failed(message: string, temporary?: boolean): void;
 }

@@ -7,17 +7,12 @@ import { AbrController } from "./abrController.js";
 import type { ByteClient } from "./byteClient.js";
 import type { Demand } from "./messages.js";
 import { type SegmentEvents, SegmentStream } from "./segmentStream.js";
+import type { StreamEvents } from "./stream.js";
 
-export interface SegmentedEvents {
+export interface SegmentedEvents extends StreamEvents {
   /** The first manifest is available. */
   begun(stream: SegmentStream): void;
-  changed(): void;
-  stored(): void;
-  lost(first: number, end: number | undefined, reason: string): void;
   notice(message: string): void;
-  waiting(seconds: number, problem: string | undefined): void;
-  /** Unless it is fatal, the next demand tries again. */
-  failed(message: string, fatal: boolean): void;
   /** Names of the renditions, and the one in use. */
   qualities(names: readonly string[], at: number): void;
 }

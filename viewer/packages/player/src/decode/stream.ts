@@ -41,6 +41,19 @@ export class Chapters {
   }
 }
 
+/** What the streams of a file and of segments folders report. */
+export interface StreamEvents {
+  /** Further packets are known. */
+  changed(): void;
+  /** Packets have arrived. */
+  stored(): void;
+  /** Frames up to before `end`, or all that need the first one, are damaged or not available. */
+  lost(first: number, end: number | undefined, reason: string): void;
+  waiting(seconds: number, problem: string | undefined): void;
+  /** Unless it is fatal, the next demand tries again. */
+  failed(message: string, fatal: boolean): void;
+}
+
 export interface Stream {
   readonly catalog: Catalog;
   readonly store: PacketStore;

@@ -115,7 +115,7 @@ export class Edge {
     if (this.sparse && this.seconds > seconds) return { to: timeline.count - 1 };
     const behind = this.seconds - this.distance - seconds;
     if (behind > JUMP_SECONDS && timeline.ptsOf(this.start) > seconds + MIN_GAIN_SECONDS)
-      return { to: this.start, why: "Playback was too slow and continues with the newest frames." };
+      return { to: this.start, why: "Playback fell behind and continues with the newest frames." };
     this.catching = behind > (this.catching ? 0 : SLACK_SECONDS);
     return { rate: this.catching ? Math.min(1 + behind / 10, FASTEST) : 1 };
   }

@@ -240,12 +240,25 @@ export class Engine extends Emitter<EngineEvents> {
       clock.start(now);
     }
     if (!clock.running) return;
-    if (time >= timeline.duration) this.stopAtEnd(now);
-    else if (timeline.frameAt(time) > progress.reached && !this.stored.has(progress.reached + 1)) {
+    const missing = this.missingAt(timeline.frameAt(time));
+    if (missing !== undefined) {
       clock.stop(now);
-      clock.set(Math.min(time, Math.max(timeline.endOf(Math.max(progress.reached, 0)) - 1e-3, 0)), now);
+      clock.set(Math.min(time, Math.max(timeline.endOf(Math.max(missing - 1, 0)) - 1e-3, 0)), now);
       this.setStalled(true);
-    }
+    } else if (time >= timeline.duration) this.stopAtEnd(now);
+  }
+
+  /**
+   * The frame that a clock at `frame` has to wait for, as it has not arrived; undefined if there is none.
+   *
+   * However late a picture is, the clock does not pass such a frame: the decoder sends no frames before those that were
+   * demanded, so a clock that had to go back would wait for them for ever.
+   */
+  private missingAt(frame: number): number | undefined {
+    const { progress, demanded } = this;
+    if (frame <= progress.reached) return undefined;
+    const missing = this.stored.missing(Math.max(progress.reached + 1, demanded?.at ?? 0));
+    return missing <= frame ? missing : undefined;
   }
 
   private stopAtEnd(now: number): void {

@@ -16,6 +16,12 @@ export class StoredFrames {
     return this.ranges.some(([first, end]) => index >= first && index < end);
   }
 
+  /** The first frame from `index` on that was neither fetched nor lost. */
+  missing(index: number): number {
+    const known = [...this.ranges, ...this.timeline.lost].sort(([a], [b]) => a - b);
+    return known.reduce((at, [first, end]) => (first <= at ? Math.max(at, end) : at), index);
+  }
+
   /** Intervals of their times. */
   get times(): readonly TimeRange[] {
     const { timeline } = this;

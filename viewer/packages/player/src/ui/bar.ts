@@ -5,7 +5,7 @@ import type { Player } from "../player.js";
 import type { XrMode } from "../xr/session.js";
 import { made, setText } from "./dom.js";
 import { timeText } from "./format.js";
-import { button, type IconName, icon } from "./icons.js";
+import { button, type IconName, icon, relabel } from "./icons.js";
 import { RATES } from "./keyboard.js";
 import { TimelineBar } from "./timelineBar.js";
 
@@ -114,8 +114,7 @@ export class Bar {
       this.face = face;
       const label = { play: "Play", pause: "Pause", again: "Play again" }[face as "play"];
       this.play.replaceChildren(icon(face));
-      this.play.setAttribute("aria-label", label);
-      this.play.title = label;
+      relabel(this.play, label);
     }
     this.updateSound();
     this.updateEdge();
@@ -133,8 +132,7 @@ export class Bar {
     if (label === this.hearing) return;
     this.hearing = label;
     this.mute.replaceChildren(icon(sound.muted || sound.waits || off ? "silent" : "sound"));
-    this.mute.setAttribute("aria-label", label);
-    this.mute.title = label;
+    relabel(this.mute, label);
   }
 
   private updateEdge(): void {
@@ -148,8 +146,7 @@ export class Bar {
     this.edge.classList.toggle("at", engine.edge.following && !engine.paused);
     const title = behind ? `Go to the newest frames: ${distance} behind them` : "At the newest frame";
     if (this.edge.title === title) return;
-    this.edge.title = title;
-    this.edge.setAttribute("aria-label", live ? `Live. ${title}` : title);
+    relabel(this.edge, title, live ? `Live. ${title}` : title);
   }
 
   private updateTime(): void {

@@ -34,17 +34,14 @@ export function icon(name: IconName): SVGSVGElement {
 }
 
 export function button(face: IconName, label: string, action: () => void, extra = ""): HTMLButtonElement {
-  const element = made(
-    "button",
-    {
-      type: "button",
-      part: "button",
-      "aria-label": label,
-      title: label,
-      class: extra,
-    },
-    icon(face),
-  );
+  const element = made("button", { type: "button", part: "button", class: extra }, icon(face));
+  relabel(element, label);
   element.addEventListener("click", action);
   return element;
+}
+
+/** @param spoken what screen readers say instead of the label */
+export function relabel(element: HTMLElement, label: string, spoken = label): void {
+  element.title = label;
+  element.setAttribute("aria-label", spoken);
 }

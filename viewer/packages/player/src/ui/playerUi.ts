@@ -12,7 +12,7 @@ import { Compare } from "./compare.js";
 import { made } from "./dom.js";
 import { bytesText } from "./format.js";
 import { Gestures } from "./gestures.js";
-import { button } from "./icons.js";
+import { button, relabel } from "./icons.js";
 import { Keyboard } from "./keyboard.js";
 import { Notes } from "./notes.js";
 import { Overlay } from "./overlay.js";
@@ -130,9 +130,7 @@ export class PlayerUi {
   /** Shows which session runs, if one does. */
   set xr(running: XrMode | undefined) {
     for (const [mode, button] of Object.entries(this.bar.xr)) {
-      const label = button.title.replace(/^\w+/, mode === running ? "Leave" : "Enter");
-      button.title = label;
-      button.setAttribute("aria-label", label);
+      relabel(button, button.title.replace(/^\w+/, mode === running ? "Leave" : "Enter"));
       button.setAttribute("aria-pressed", String(mode === running));
     }
   }

@@ -6,7 +6,18 @@
  * are those of a view.
  */
 
-import { along, axes, type Camera, center, length, type Rotation, type Vector, viewmatOf } from "@structgstream/gl";
+import {
+  along,
+  axes,
+  type Camera,
+  center,
+  cross,
+  length,
+  type Rotation,
+  unit,
+  type Vector,
+  viewmatOf,
+} from "@structgstream/gl";
 import type { View } from "./navigator.js";
 
 const FAR = 1e6;
@@ -64,18 +75,12 @@ export function linkTo(page: URL, src: string | undefined, seconds: number, view
 
 /** The camera of a linked view on a picture like that of `like`. */
 export function viewFrom({ eye, forward, down, distance, focal }: LinkedView, like: Camera): View {
-  const right = crossed(down, forward);
-  const size = Math.hypot(...right);
-  const x = right.map((value) => value / size) as unknown as Vector;
-  const rotation: Rotation = [x, crossed(forward, x), forward];
+  const x = unit(cross(down, forward));
+  const rotation: Rotation = [x, cross(forward, x), forward];
   const [width, height] = [like.width, like.height];
   const K = { fx: focal * width, fy: focal * width, cx: width / 2, cy: height / 2 };
   const camera = { viewmat: viewmatOf(eye, rotation), K, width, height, near: like.near };
   return { camera, pivot: along(eye, forward, distance) };
-}
-
-function crossed(a: Vector, b: Vector): Vector {
-  return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 }
 
 function textOf({ camera, pivot }: View): string {
@@ -91,12 +96,11 @@ function linkedView(text: string): LinkedView | undefined {
   if (numbers.length !== 11 || !numbers.every((value) => Math.abs(value) < FAR)) return undefined;
   const [eye, forward, down] = [0, 3, 6].map((at) => numbers.slice(at, at + 3) as unknown as Vector);
   const [distance, focal] = [numbers[9]!, numbers[10]!];
-  const sine = Math.hypot(...crossed(down!, forward!));
-  const lengths = [forward!, down!].map((vector) => Math.hypot(...vector));
+  const sine = length(cross(down!, forward!));
+  const lengths = [forward!, down!].map(length);
   if (!lengths.every((value) => Math.abs(value - 1) < 0.01) || sine < 0.9) return undefined;
   if (distance <= 0 || focal < FOCAL[0] || focal > FOCAL[1]) return undefined;
-  const exact = forward!.map((value) => value / lengths[0]!) as unknown as Vector;
-  return { eye: eye!, forward: exact, down: down!, distance, focal };
+  return { eye: eye!, forward: unit(forward!), down: down!, distance, focal };
 }
 
 function secondsOf(text: string): number | undefined {

@@ -8,8 +8,8 @@ import {
   center,
   focusPoint,
   length,
+  mean,
   rigCameras,
-  scaled,
   upAxis,
   type Vector,
 } from "@structgstream/gl";
@@ -49,10 +49,7 @@ export function rigOf(header: StreamHeader): Rig {
   const found = rigCameras(header);
   const cameras = header.cameras.map(({ name, heldOut }, i) => ({ name, heldOut, camera: found[i]! }));
   const centers = found.map(center);
-  const middle = scaled(
-    centers.reduce((sum, eye) => along(sum, eye), [0, 0, 0] as Vector),
-    1 / centers.length,
-  );
+  const middle = mean(centers);
   const distances = centers.map((eye) => length(along(eye, middle, -1)));
   const first = cameras[distances.indexOf(Math.min(...distances))]!;
   return { cameras, focus: focusPoint(found), up: upAxis(found), radius: Math.max(...distances), first };

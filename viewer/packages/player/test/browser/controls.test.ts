@@ -4,9 +4,9 @@
 import { readFileSync } from "node:fs";
 import { readStream } from "@structgstream/core";
 import { describe, expect, test, vi } from "vitest";
+import { TestServer } from "../../../gl/test/support/server.ts";
 import { CLIP } from "../served.ts";
-import { TestServer } from "./server.ts";
-import { ask, StagedTests, shows } from "./stage.ts";
+import { ask, expectSteady, StagedTests, shows } from "./stage.ts";
 
 vi.setConfig({ testTimeout: 60_000, hookTimeout: 60_000 });
 
@@ -31,7 +31,6 @@ describe.skipIf(StagedTests.skipped)("controls in a browser", () => {
       () => document.querySelector("structgstream-player")!.shadowRoot!.querySelector("canvas")!.width === 180,
     );
     expect(await size()).toEqual([180, 300]);
-    stage.expectQuiet();
   });
 
   test("keyboard, mouse and wheel", async () => {
@@ -78,7 +77,6 @@ describe.skipIf(StagedTests.skipped)("controls in a browser", () => {
     });
     await moved(() => page.mouse.wheel(0, 200));
     expect(await ask(page, (player) => player.paused)).toBe(true);
-    stage.expectQuiet();
   });
 
   test("who comes closer does not push the capture's near plane along", async () => {
@@ -92,7 +90,6 @@ describe.skipIf(StagedTests.skipped)("controls in a browser", () => {
     for (let i = 0; i < 12; i++) await page.keyboard.press("+");
     await expect.poll(near).toBeLessThan(0.02 * capture);
     await shows(page, 0);
-    stage.expectQuiet();
   });
 
   test("touch: one finger turns, two come closer, a tap plays", async () => {
@@ -120,7 +117,6 @@ describe.skipIf(StagedTests.skipped)("controls in a browser", () => {
     await touch("touchStart", [150, 40]);
     await touch("touchEnd");
     await page.waitForFunction(() => !document.querySelector("structgstream-player")!.paused);
-    stage.expectQuiet();
   });
 
   test("the rig's cameras: list, keys, frusta", async () => {
@@ -150,7 +146,6 @@ describe.skipIf(StagedTests.skipped)("controls in a browser", () => {
     await page.keyboard.press("r");
     await page.getByRole("button", { name: "Cameras" }).click();
     expect(await page.locator(".list [aria-current]").count()).toBe(1);
-    stage.expectQuiet();
   });
 
   test("flies smoothly unless motion is to be reduced", async () => {
@@ -169,7 +164,6 @@ describe.skipIf(StagedTests.skipped)("controls in a browser", () => {
     });
     expect(new Set(places).size).toBeGreaterThan(2);
     expect(places.at(-1)).toBe(places.at(-2));
-    stage.expectQuiet();
   });
 
   describe("links", () => {
@@ -197,7 +191,6 @@ describe.skipIf(StagedTests.skipped)("controls in a browser", () => {
       expect(Math.abs(first.length - second.length) / first.length).toBeLessThan(0.02);
       const near = await ask(again, (player) => [...player.camera!.viewmat]);
       expect(near.every(Number.isFinite)).toBe(true);
-      stage.expectQuiet();
     });
 
     // Which addresses and numbers are refused: view.test.ts. Here, that what is refused has no effect on a page.
@@ -217,7 +210,6 @@ describe.skipIf(StagedTests.skipped)("controls in a browser", () => {
         .getByText(/was not taken/)
         .first()
         .waitFor();
-      stage.expectQuiet();
     });
 
     test("cannot be led away by a redirection", async () => {
@@ -228,7 +220,7 @@ describe.skipIf(StagedTests.skipped)("controls in a browser", () => {
         const page = await stage.open('src="clip.sgs"', "?src=away.sgs");
         await page.getByRole("alert").waitFor();
         expect(elsewhere.requests).toEqual([]);
-        stage.expectQuiet(/ERR_FAILED|redirect|CORS/i);
+        stage.expectComplaints(/ERR_FAILED|redirect|CORS/i);
       } finally {
         await elsewhere.stop();
       }
@@ -242,7 +234,6 @@ describe.skipIf(StagedTests.skipped)("controls in a browser", () => {
       await shows(page, 9);
       expect(await page.getByRole("button", { name: "Cameras" }).isVisible()).toBe(false);
       expect(await page.getByRole("button", { name: "Play", exact: true }).first().isVisible()).toBe(true);
-      stage.expectQuiet();
     });
   });
 
@@ -268,7 +259,6 @@ describe.skipIf(StagedTests.skipped)("controls in a browser", () => {
     await page.locator(".stage").focus();
     await page.keyboard.press("-");
     await slider.waitFor({ state: "hidden" });
-    stage.expectQuiet();
   });
 
   test("an element that is removed while it loads leaves nothing behind", async () => {
@@ -287,7 +277,6 @@ describe.skipIf(StagedTests.skipped)("controls in a browser", () => {
     await shows(page, 0);
     await page.evaluate(() => document.querySelector("structgstream-player")!.destroy());
     await expect.poll(() => page.workers().length).toBe(0);
-    stage.expectQuiet();
   });
 
   test("150 frames take no more memory than 50, nor workers, nor textures", async () => {
@@ -296,21 +285,12 @@ describe.skipIf(StagedTests.skipped)("controls in a browser", () => {
     const page = await stage.open('src="few.sgs" loop autoplay controls="off"', "", {
       viewport: { width: 160, height: 120 },
     });
-    const client = await page.context().newCDPSession(page);
-    const state = async () => {
-      await client.send("HeapProfiler.collectGarbage");
-      const { usedSize } = await client.send("Runtime.getHeapUsage");
-      const counts = await ask(page, (player) => player.resources);
-      return { usedSize, workers: page.workers().length, ...counts };
-    };
     const reach = (count: number) =>
       page.waitForFunction((wanted) => heard.frames.length >= wanted, count, { timeout: 55_000, polling: 200 });
-    await reach(50);
-    const before = await state();
-    await reach(150);
-    const after = await state();
-    expect({ ...after, usedSize: 0 }).toEqual({ ...before, usedSize: 0 });
-    expect(after.usedSize).toBeLessThan(before.usedSize * 1.1 + 2e5);
-    stage.expectQuiet();
+    await expectSteady(
+      page,
+      () => reach(50),
+      () => reach(150),
+    );
   });
 });

@@ -2,18 +2,15 @@
 /** What a real browser plays: each clap is heard when its white picture is drawn. Skipped where there is no browser. */
 
 import type { Page } from "playwright-core";
-import { afterAll, beforeAll, describe, expect, test, vi } from "vitest";
-import { chromiumPath, launched } from "../../../gl/test/support/chromium.ts";
+import { beforeAll, describe, expect, test, vi } from "vitest";
 import { LiveRun } from "../liveRun.ts";
 import { clappingFile, FPS } from "../soundFile.ts";
 import { emulatedHeadset } from "./headset.ts";
-import { TestServer } from "./server.ts";
-import { builtPlayer, pageWith } from "./stage.ts";
+import { StagedTests } from "./stage.ts";
 
 vi.setConfig({ testTimeout: 120_000, hookTimeout: 60_000 });
 
 const MINUTES = 10;
-const FLAGS = ["--disable-gpu-compositing", "--disable-gpu-rasterization"];
 /** Claps and white pictures are a second apart, so a difference is less than half of that. */
 const MOST_MILLISECONDS = 40;
 
@@ -92,26 +89,14 @@ function expectInStep(found: readonly number[], where: string): void {
   expect(Math.abs(middle ?? Number.NaN)).toBeLessThan(MOST_MILLISECONDS);
 }
 
-describe.skipIf(!chromiumPath())("sound in a browser", () => {
-  let browser: Awaited<ReturnType<typeof launched>>;
-  let server: TestServer;
+describe.skipIf(StagedTests.skipped)("sound in a browser", () => {
+  const stage = new StagedTests();
 
-  beforeAll(async () => {
-    [browser, server] = await Promise.all([launched(chromiumPath()!, ...FLAGS), TestServer.started()]);
-    server.put("/player.js", builtPlayer(), { type: "text/javascript" });
-    server.put("/claps.sgs", clappingFile(60 * MINUTES + 10));
-  });
-  afterAll(async () => {
-    await browser.close();
-    await server.stop();
-  });
+  beforeAll(() => void stage.server.put("/claps.sgs", clappingFile(60 * MINUTES + 10)));
 
-  async function opened(attributes: string, script?: string): Promise<Page> {
-    server.put("/page.html", pageWith(attributes), { type: "text/html" });
-    const page = await (await browser.newContext({ viewport: { width: 96, height: 72 } })).newPage();
-    await page.addInitScript(tap);
-    if (script) await page.addInitScript({ content: script });
-    await page.goto(`${server.origin}/page.html`);
+  async function opened(attributes: string, script = ""): Promise<Page> {
+    const options = { viewport: { width: 96, height: 72 } };
+    const page = await stage.open(attributes, "", options, `(${tap.toString()})();${script}`);
     await page.waitForFunction(() => heard.frames.length > 0);
     await page.evaluate(watch);
     return page;
@@ -124,21 +109,19 @@ describe.skipIf(!chromiumPath())("sound in a browser", () => {
     expectInStep(await differences(page, 4), "after a seek");
     await page.evaluate((seconds) => document.querySelector("structgstream-player")!.seek(seconds), 60 * MINUTES - 1);
     expectInStep(await differences(page, 4), "after ten minutes");
-    await page.close();
   });
 
   test("is in step at the edge of a live stream", async () => {
     const live = new LiveRun(clappingFile(60), { fps: FPS }).write(4 * FPS);
-    server.publish("/live/", live.files);
+    stage.server.publish("/live/", live.files);
     const writing = setInterval(() => {
       live.write(1);
-      server.publish("/live/", live.files);
+      stage.server.publish("/live/", live.files);
     }, 1000 / FPS);
     try {
       const page = await opened('src="live/manifest.json" autoplay');
       expect(await page.evaluate(() => document.querySelector("structgstream-player")!.live)).toBe(true);
       expectInStep(await differences(page, 5), "live");
-      await page.close();
     } finally {
       clearInterval(writing);
     }
@@ -150,7 +133,6 @@ describe.skipIf(!chromiumPath())("sound in a browser", () => {
     expectInStep(await differences(page, 4), "in a headset");
     await page.evaluate(() => document.querySelector("structgstream-player")!.exitXr());
     expectInStep(await differences(page, 2), "after it");
-    await page.close();
   });
 
   test("is muted by attribute, property, button and key, and loud as its volume says", async () => {
@@ -185,6 +167,5 @@ describe.skipIf(!chromiumPath())("sound in a browser", () => {
       document.querySelector("structgstream-player")!.playbackRate = 2;
     });
     await page.getByRole("button", { name: "Mute (off at other speeds)" }).waitFor();
-    await page.close();
   });
 });

@@ -4,10 +4,10 @@
 import { readFileSync } from "node:fs";
 import type { Browser, BrowserContextOptions, Page } from "playwright-core";
 import { afterAll, afterEach, beforeAll, expect } from "vitest";
-import { chromiumPath, launched } from "../../../gl/test/support/chromium.ts";
+import { chromiumPath, complaintsOf, launched } from "../../../gl/test/support/chromium.ts";
+import { TestServer } from "../../../gl/test/support/server.ts";
 import type { StructgstreamPlayer } from "../../src/element.ts";
 import { CLIP } from "../served.ts";
-import { TestServer } from "./server.ts";
 
 declare global {
   /** What `pageWith` gathers in the page. */
@@ -17,35 +17,51 @@ declare global {
   }
 }
 
-export function builtPlayer(): string {
+function builtPlayer(): string {
   return readFileSync(new URL("../../dist/player.js", import.meta.url), "utf8");
 }
 
 /** Pages are composited without software GL, which takes twice as long for them; WebGL still has it. */
-const FLAGS = ["--js-flags=--expose-gc", "--disable-gpu-compositing", "--disable-gpu-rasterization"];
+const FLAGS = ["--disable-gpu-compositing", "--disable-gpu-rasterization"];
 const VIEWPORT = { width: 320, height: 240 };
 
-export interface Opened {
+interface Opened {
   readonly page: Page;
   /** What the console and the page complained of. */
   readonly complaints: string[];
 }
 
-/** One browser, whose garbage can be collected when a test asks for it, and one server for a file of tests. */
-export class Stage {
+/** One browser and one server for a file of tests; a page is closed after its test. */
+export class StagedTests {
+  server!: TestServer;
+  private browser!: Browser;
   /** The page of all tests that ask for no options of their own. */
   private usual: Opened | undefined;
+  private opened: Opened | undefined;
+  /** What its pages may complain of. */
+  private expected: RegExp | undefined;
 
-  private constructor(
-    readonly browser: Browser,
-    readonly server: TestServer,
-  ) {}
+  /** Without a browser the tests that use this are to be skipped. */
+  static readonly skipped = !chromiumPath();
 
-  static async opened(executablePath: string): Promise<Stage> {
-    const [browser, server] = await Promise.all([launched(executablePath, ...FLAGS), TestServer.started()]);
-    server.put("/player.js", builtPlayer(), { type: "text/javascript" });
-    server.put("/clip.sgs", CLIP);
-    return new Stage(browser, server);
+  constructor() {
+    beforeAll(async () => {
+      [this.browser, this.server] = await Promise.all([launched(chromiumPath()!, ...FLAGS), TestServer.started()]);
+      this.server.put("/player.js", builtPlayer(), { type: "text/javascript" });
+      this.server.put("/clip.sgs", CLIP);
+    });
+    afterAll(async () => {
+      await this.browser.close();
+      await this.server.stop();
+    });
+    afterEach(async () => {
+      try {
+        await this.close();
+      } finally {
+        this.server.put("/clip.sgs", CLIP);
+        this.expected = undefined;
+      }
+    });
   }
 
   /**
@@ -60,19 +76,29 @@ export class Stage {
     query = "",
     options?: BrowserContextOptions,
     script?: string,
-  ): Promise<Opened> {
+  ): Promise<Page> {
     this.server.put("/page.html", pageWith(attributes), { type: "text/html" });
     this.server.requests.length = 0;
-    const opened = options ? await this.newPage(options) : await this.usualPage();
-    if (script) await opened.page.addInitScript({ content: script });
-    await opened.page.goto(`${this.server.origin}/page.html${query}`);
-    return opened;
+    this.opened = options ? await this.newPage(options) : await this.usualPage();
+    const { page } = this.opened;
+    if (script) await page.addInitScript({ content: script });
+    await page.goto(`${this.server.origin}/page.html${query}`);
+    return page;
   }
 
-  /** Ends what the page does. */
-  async leave(opened: Opened): Promise<void> {
+  /** Ends what the page does, which must not have complained, but of what the test expects. */
+  async close(): Promise<void> {
+    const { opened, expected } = this;
+    this.opened = undefined;
+    if (!opened) return;
+    const left = opened.complaints.filter((text) => !expected?.test(text));
     if (opened === this.usual) await opened.page.goto("about:blank");
     else await opened.page.context().close();
+    expect(left).toEqual([]);
+  }
+
+  expectComplaints(expected: RegExp): void {
+    this.expected = expected;
   }
 
   private async usualPage(): Promise<Opened> {
@@ -85,60 +111,30 @@ export class Stage {
   private async newPage(options: BrowserContextOptions): Promise<Opened> {
     const context = await this.browser.newContext({ viewport: VIEWPORT, ...options });
     const page = await context.newPage();
-    const complaints: string[] = [];
-    page.on("pageerror", (error) => complaints.push(`page: ${error.message}`));
-    page.on("console", (message) => {
-      const text = message.text();
-      const usual = text.includes("GPU stall due to ReadPixels");
-      if (["error", "warning"].includes(message.type()) && !usual) complaints.push(text);
-    });
-    return { page, complaints };
-  }
-
-  async close(): Promise<void> {
-    await this.browser.close();
-    await this.server.stop();
+    return { page, complaints: complaintsOf(page) };
   }
 }
 
-/** The stage of a file of tests, which begins and ends with them; a page is closed after its test. */
-export class StagedTests {
-  private stageOfAll: Stage | undefined;
-  private opened: Opened | undefined;
+/** Waits until playback has reached the end. */
+export async function ended(page: Page, timeout = 30_000): Promise<void> {
+  await page.waitForFunction(() => heard.reported.some(([name]) => name === "ended"), undefined, { timeout });
+}
 
-  /** Without a browser the tests that use this are to be skipped. */
-  static readonly skipped = !chromiumPath();
-
-  constructor() {
-    beforeAll(async () => {
-      this.stageOfAll = await Stage.opened(chromiumPath()!);
-    });
-    afterAll(() => this.stageOfAll?.close());
-    afterEach(async () => {
-      await this.close();
-      this.server.put("/clip.sgs", CLIP);
-    });
-  }
-
-  get server(): TestServer {
-    return this.stageOfAll!.server;
-  }
-
-  async open(...given: Parameters<Stage["open"]>): Promise<Page> {
-    this.opened = await this.stageOfAll!.open(...given);
-    return this.opened.page;
-  }
-
-  async close(): Promise<void> {
-    if (this.opened) await this.stageOfAll!.leave(this.opened);
-    this.opened = undefined;
-  }
-
-  /** Everything went without a complaint, but for those that a test expects. */
-  expectQuiet(...expected: RegExp[]): void {
-    const left = this.opened!.complaints.filter((text) => !expected.some((one) => one.test(text)));
-    expect(left).toEqual([]);
-  }
+/** What a page takes must be the same before and after something: garbage aside, memory, workers and textures. */
+export async function expectSteady(page: Page, before: () => Promise<unknown>, after: () => Promise<unknown>) {
+  const client = await page.context().newCDPSession(page);
+  const state = async () => {
+    await client.send("HeapProfiler.collectGarbage");
+    const { usedSize } = await client.send("Runtime.getHeapUsage");
+    const counts = await ask(page, (player) => player.resources);
+    return { usedSize, workers: page.workers().length, ...counts };
+  };
+  await before();
+  const first = await state();
+  await after();
+  const last = await state();
+  expect({ ...last, usedSize: 0 }).toEqual({ ...first, usedSize: 0 });
+  expect(last.usedSize).toBeLessThan(first.usedSize * 1.1 + 2e5);
 }
 
 /** The messages of an event that the player has reported. */
@@ -195,7 +191,7 @@ export async function darkest(page: Page, first: number, last: number): Promise<
     },
     [first, last] as const,
   );
-  await page.waitForFunction(() => heard.reported.some(([name]) => name === "ended"), undefined, { timeout: 50_000 });
+  await ended(page, 50_000);
   return (await page.evaluate("least")) as { light: number; pictures: number };
 }
 

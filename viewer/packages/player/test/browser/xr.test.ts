@@ -167,13 +167,11 @@ describe.skipIf(StagedTests.skipped)("the player in a headset", () => {
     });
     await later(page);
     await expectDots(page, inRoom);
-    stage.expectQuiet();
   });
 
   test("a device that does not know its floor has one below the eyes", async () => {
     const page = await entered(undefined, "immersive-vr", { floor: false });
     await expectDots(page, inRoom);
-    stage.expectQuiet();
   });
 
   test("a context that the headset's GPU needs anew draws the same, and one that is lost ends the session", async () => {
@@ -200,13 +198,12 @@ describe.skipIf(StagedTests.skipped)("the player in a headset", () => {
     await page.waitForFunction(() => document.querySelector("structgstream-player")!.xr === undefined);
     await shows(page, 0);
     // The emulator clears the lost context until the page hears of it.
-    stage.expectQuiet(/CONTEXT_LOST_WEBGL|WebGL context was lost|reading '0'/);
+    stage.expectComplaints(/CONTEXT_LOST_WEBGL|WebGL context was lost|reading '0'/);
   });
 
   test("the attribute metres is the size of the capture's unit", async () => {
     const page = await entered('src="dots.sgs" metres="2"');
     await expectDots(page, (dot) => inRoom(dot, 2));
-    stage.expectQuiet();
   });
 
   test("a trigger plays and pauses, a stick turns and moves, a grip pulls", async () => {
@@ -303,7 +300,6 @@ describe.skipIf(StagedTests.skipped)("the player in a headset", () => {
     for (let n = 0; n < 3; n++) await later(page); // a picture moves it by 0.15 m at most
     await stick(0, 0);
     expect(await disparity()).toBeGreaterThan(before + 0.5);
-    stage.expectQuiet();
   });
 
   test("a button enters and leaves; the page's picture, size and camera are as before", async () => {
@@ -346,7 +342,6 @@ describe.skipIf(StagedTests.skipped)("the player in a headset", () => {
     await later(page);
     await ask(page, (player) => player.destroy());
     await page.waitForFunction(() => headset.activeSession === undefined);
-    stage.expectQuiet();
   });
 
   test("pictures that come late cost splats, until the session ends", async () => {
@@ -370,7 +365,6 @@ describe.skipIf(StagedTests.skipped)("the player in a headset", () => {
     await ask(page, (player) => player.exitXr());
     await shows(page, 0);
     expect(await ask(page, (player) => player.stats!.splats)).toBeGreaterThan(0.8 * first);
-    stage.expectQuiet();
   });
 
   test("in front of the camera's picture nothing is behind the scene", async () => {
@@ -378,7 +372,6 @@ describe.skipIf(StagedTests.skipped)("the player in a headset", () => {
     expect(await ask(page, (player) => player.xr)).toBe("immersive-ar");
     const eyes = await expectDots(page, inRoom);
     for (const { corner } of eyes) expect(corner).toEqual([0, 0, 0, 0]);
-    stage.expectQuiet();
   });
 
   test("errors are sentences", async () => {
@@ -424,13 +417,11 @@ describe.skipIf(StagedTests.skipped)("the player in a headset", () => {
     expect(await refusal()).toMatch(/^Error: This browser has no WebXR/);
     expect(await reported(page)).toEqual([]);
     expect(await ask(page, (player) => player.xr)).toBeUndefined();
-    stage.expectQuiet();
   });
 
   test("without a headset there is no button", async () => {
     const page = await stage.open('src="dots.sgs"');
     await shows(page, 0);
     for (const name of ["Enter VR", "Enter AR"]) expect(await page.getByRole("button", { name }).count()).toBe(0);
-    stage.expectQuiet();
   });
 });

@@ -4,14 +4,15 @@
 import { createServer, type IncomingMessage, type ServerResponse } from "node:http";
 import type { AddressInfo } from "node:net";
 
-/** A file; `bytes` may be replaced while it is served. */
+/** A file; all of it may be replaced while it is served, and its pace also while a body is sent. */
 export interface Served {
   bytes: Uint8Array;
   type?: string;
   ranges?: boolean;
-  /** Bytes of the body in a second, from byte `slowFrom` of the file on. */
-  bytesPerSecond?: number;
-  slowFrom?: number;
+  /** Bytes of a body in a second. */
+  bytesPerSecond?: number | undefined;
+  /** A body does not go on at these bytes of the file. */
+  held?: readonly [start: number, end: number] | undefined;
   cors?: boolean;
   status?: number;
   location?: string;
@@ -103,13 +104,15 @@ export class TestServer {
 }
 
 async function pour(response: ServerResponse, file: Served, start: number, end: number): Promise<void> {
-  const { bytes, bytesPerSecond, slowFrom = 0 } = file;
-  const slow = bytesPerSecond ? Math.min(Math.max(slowFrom, start), end) : end;
-  response.write(bytes.subarray(start, slow));
-  const step = bytesPerSecond ? Math.max(Math.round(bytesPerSecond / 20), 1) : 0;
-  for (let at = slow; at < end && !response.destroyed; at += step) {
-    response.write(bytes.subarray(at, Math.min(at + step, end)));
-    await new Promise((resolve) => setTimeout(resolve, 50));
+  const { bytes } = file;
+  for (let at = start; at < end && !response.destroyed; ) {
+    const { bytesPerSecond, held = [end, end] } = file;
+    const isHeld = at >= held[0] && at < held[1];
+    const step = bytesPerSecond ? Math.max(Math.round(bytesPerSecond / 20), 1) : end;
+    const next = isHeld ? at : Math.min(at + step, end, at < held[0] ? held[0] : end);
+    if (next > at) response.write(bytes.subarray(at, next));
+    at = next;
+    if (isHeld || bytesPerSecond) await new Promise((resolve) => setTimeout(resolve, 50));
   }
   response.end();
 }
