@@ -20,6 +20,7 @@ from structgstream.data.roving import (
     WithRoving,
     differs,
     frame_points,
+    hull_points,
     joined,
     most_frequent,
     passes_through,
@@ -44,14 +45,20 @@ def ball(camera: Camera, *, radius: float, factor: float = 1.0) -> NDArray[np.bo
     return np.asarray(np.linalg.norm(np.cross(rays, camera.center.numpy()), axis=-1) < factor * radius)
 
 
-@pytest.mark.parametrize("near", [0.5, 0.04, 0.001])
-def test_rays_through_what_moves_before_the_still_cameras_do_not_count(near: float) -> None:
+def ball_rig(*, radius: float) -> tuple[CameraRig, dict[str, NDArray[np.bool_]]]:
+    """Six cameras that look at a ball in the origin, and the pixels of each that it covers."""
     rig = arc_rig(6, width=160, height=120)
     rig = rig.mapped(
         {name: replace(own, K=own.K * torch.tensor([[3.3], [3.3], [1.0]])) for name, own in rig.cameras.items()}
     )
     rig = rig.mapped({name: replace(own, K=_centred(own)) for name, own in rig.cameras.items()})
-    changed = {name: ball(rig[name], radius=0.3) for name in rig.training}
+    changed = {name: ball(rig[name], radius=radius) for name in rig.training}
+    return rig, changed
+
+
+@pytest.mark.parametrize("near", [0.5, 0.04, 0.001])
+def test_rays_through_what_moves_before_the_still_cameras_do_not_count(near: float) -> None:
+    rig, changed = ball_rig(radius=0.3)
     eye = torch.tensor([0.6, -1.4, -2.2], dtype=torch.float64)
     camera = replace(rig["cam00"], viewmat=look_at(eye, torch.zeros(3, dtype=torch.float64)), near=near)
     moving = passes_through(camera, rig, changed)
@@ -60,6 +67,20 @@ def test_rays_through_what_moves_before_the_still_cameras_do_not_count(near: flo
     assert not passes_through(camera, rig, {}).any()
     one = {name: mask if name == rig.training[0] else np.zeros_like(mask) for name, mask in changed.items()}
     assert not passes_through(camera, rig, one).any()  # the others see that nothing moves there
+
+
+def test_each_pixel_of_what_moves_has_a_point_on_the_side_that_its_camera_sees() -> None:
+    rig, changed = ball_rig(radius=0.3)
+    points = hull_points(rig, changed)
+    pixels = sum(int(mask.sum()) for mask in changed.values())
+    assert 1000 < 0.98 * pixels <= len(points) <= pixels  # rays at the rim may pass all other cameras' pixels
+    away = np.linalg.norm(points, axis=1)
+    assert (away > 0.2).all()
+    assert (away < 0.7).all()  # cameras on one side alone: the hull is longer than the ball
+    assert np.median(away) < 0.4
+    cameras = np.mean([rig[name].center.numpy() for name in changed], axis=0)
+    assert (points @ cameras > -0.05 * np.linalg.norm(cameras)).mean() > 0.95
+    assert not len(hull_points(rig, {}))
 
 
 def _centred(camera: Camera) -> torch.Tensor:
@@ -130,7 +151,9 @@ def test_a_capture_has_its_roving_pictures(tmp_path: Path) -> None:
     assert more.masks["roving/0"] is pictures[0].mask or (more.masks["roving/0"] == pictures[0].mask).all()
 
 
-def test_what_moves_has_the_points_of_the_still_cameras_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_moves_has_the_points_of_the_still_cameras_and_of_its_hull(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write_capture(tmp_path)
     source = open_capture(tmp_path)
     moving, still, behind = np.array([[0.0, 0.0, 0.0]]), np.array([[0.5, 0.5, 0.5]]), np.array([[0.1, 0.2, 3.0]])
@@ -140,8 +163,10 @@ def test_what_moves_has_the_points_of_the_still_cameras_alone(tmp_path: Path, mo
 
     monkeypatch.setattr(roving_module, "initial_points", found)
     monkeypatch.setattr(WithRoving, "moving", lambda self, points, frame: (points == 0).all(1))
+    hull = np.array([[0.1, 0.0, 0.0]])
+    monkeypatch.setattr(WithRoving, "hull", lambda self, frame: hull)
     frame = next(source.frames())
-    np.testing.assert_array_equal(frame_points(source, frame), np.concatenate([behind, moving]))
+    np.testing.assert_array_equal(frame_points(source, frame), np.concatenate([behind, moving, hull]))
     np.testing.assert_array_equal(frame_points(source, replace(frame, index=1)), np.concatenate([moving, still]))
     alone = open_capture(tmp_path, roving=False)
     np.testing.assert_array_equal(frame_points(alone, frame), np.concatenate([moving, still]))

@@ -76,6 +76,10 @@ class WithRoving(SourceWrapper):
         """Which points ``[P, 3]`` are of what moves in ``frame``."""
         return moving_places(points, self.rig, self._changed(frame))
 
+    def hull(self, frame: MultiViewFrame) -> Floats:
+        """Points ``[P, 3]`` on the surface of what may move in ``frame``."""
+        return hull_points(self.rig, self._changed(frame))
+
     def _picture(
         self,
         file: Path,
@@ -157,14 +161,15 @@ def frame_points(
     """Initial points ``[P, 3]`` of a frame; of frame 0 from the roving pictures, too.
 
     Roving pictures are closer to a still camera than its neighbours are, and have nothing of what moves. So what moves
-    has the points of the still cameras alone.
+    has the points of the still cameras alone; these hardly match between cameras that are far apart, so the surface of
+    the hull is added. Between four cameras 90 degrees apart 3 points of people were found, and the hull has 12,000.
     """
     config, roving = config or PointsConfig(), roving_of(source)
     found = initial_points(frame, source.rig, config=config, seed=seed).positions
     if roving is None or frame.index > 0:
         return found
     still = initial_points(*joined(source.rig, frame, roving.roving(frame)), config=config, seed=seed).positions
-    return np.concatenate([still, found[roving.moving(found, frame)]])
+    return np.concatenate([still, found[roving.moving(found, frame)], roving.hull(frame)])
 
 
 def joined(
@@ -210,15 +215,41 @@ def passes_through(camera: Camera, rig: CameraRig, changed: Mapping[str, NDArray
     small = camera.scaled(min(1.0, REDUCED_SIDE / max(camera.width, camera.height)))
     found = np.zeros((small.height, small.width), bool)
     if changed:
-        across, down = np.meshgrid(np.arange(small.width) + 0.5, np.arange(small.height) + 0.5)
-        flat = np.stack([across, down, np.ones_like(across)], -1) @ np.linalg.inv(small.K.numpy()).T
-        rays, eye = flat @ small.viewmat[:3, :3].numpy(), small.center.numpy()
-        apart = max(float((rig[name].center - small.center).norm()) for name in changed)
-        for depth in np.geomspace(small.near, max(FAR_NEARS * small.near, 2 * apart), DEPTHS):
+        eye, rays = _rays(small)
+        for depth in _depths(eye, small.near, rig, changed):
             found |= moving_places(eye + depth * rays, rig, changed)
     # Its pixels are areas of the picture's.
     whole = opencv().resize(found.astype(np.uint8), (camera.width, camera.height), interpolation=opencv().INTER_NEAREST)
     return np.asarray(whole, bool)
+
+
+def _rays(camera: Camera) -> tuple[Floats, Floats]:
+    """Centre ``[3]`` of ``camera``, and for each pixel ``[H, W, 3]`` the way from it to depth 1."""
+    across, down = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    flat = np.stack([across, down, np.ones_like(across)], -1) @ np.linalg.inv(camera.K.numpy()).T
+    return camera.center.numpy(), flat @ camera.viewmat[:3, :3].numpy()
+
+
+def _depths(eye: Floats, near: float, rig: CameraRig, changed: Mapping[str, NDArray[np.bool_]]) -> Floats:
+    """Depths ``[D]`` of the places on a ray from ``eye`` in which what moves is looked for."""
+    apart = max(float(np.linalg.norm(rig[name].center.numpy() - eye)) for name in changed)
+    return np.geomspace(near, max(FAR_NEARS * near, 2 * apart), DEPTHS)
+
+
+def hull_points(rig: CameraRig, changed: Mapping[str, NDArray[np.bool_]]) -> Floats:
+    """Points ``[P, 3]``: on the ray of each pixel that differs, the nearest place that all still cameras which see it
+    take for moving."""
+    found = [np.zeros((0, 3))]
+    for name, mask in changed.items():
+        camera = rig[name].resized(mask.shape[1], mask.shape[0])
+        eye, rays = _rays(camera)
+        rays = rays[mask]
+        for depth in _depths(eye, camera.near, rig, changed):
+            places = eye + depth * rays
+            moving = moving_places(places, rig, changed)
+            found.append(places[moving])
+            rays = rays[~moving]
+    return np.concatenate(found)
 
 
 def moving_places(points: Floats, rig: CameraRig, changed: Mapping[str, NDArray[np.bool_]]) -> NDArray[np.bool_]:

@@ -341,10 +341,10 @@ COMPACT = replace(
     codec="compact",
     online=replace(
         MOTION.online,
-        iterations=140,
+        iterations=128,
         mean_of_last=0.25,
         rates=OnlineRates(final_share=0.4),
-        patching=replace(MOTION.online.patching, spawn="off"),
+        patching=replace(MOTION.online.patching, spawn="off", iteration=46),
         dynamic=MOTION.online.dynamic.difference(["covariance_mlp"]).union(["base_scales", "appearance", "color_mlp"]),
         exposure=ExposureConfig(enabled=True),
         motion=replace(
@@ -378,7 +378,7 @@ FINE = replace(
         medium_iterations=1000,
         growth=replace(COMPACT.initial.growth, stop=4400, room_until=3200),
     ),
-    online=replace(COMPACT.online, iterations=280),
+    online=replace(COMPACT.online, iterations=256),
 )
 """As COMPACT with twice the iterations, for a GPU or for patience."""
 
