@@ -188,7 +188,7 @@ def counted_gpu(
         recorder=lambda: _Recorder(counts),
         iterations=partial(_counted_iterations, plain, counts) if native else None,
     ).with_functions(
-        **native_functions(library, draw),
+        **native_functions(library),
         adam_step=cuda.adam_step,
         generate_structured=partial(cuda_anchors.generate_structured, library),
         l1_ssim=partial(cuda.l1_ssim, library),

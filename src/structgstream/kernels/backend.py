@@ -36,7 +36,7 @@ from structgstream.kernels.cuda_graph import GraphMemory, Recorder
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.cuda_tiles import PairBudget
 from structgstream.kernels.reference_views import ORACLE, ViewByView
-from structgstream.kernels.values import FitFrame, Rasterizer
+from structgstream.kernels.values import FitFrame
 
 _log = logging.getLogger(__name__)
 
@@ -86,7 +86,7 @@ class Backend:
     recorder: Callable[[], Recorder[Any]] | None = None
     iterations: Callable[[FitFrame], Callable[[int, int], None]] | None = None
 
-    rasterize = Operation(reference_raster.rasterize)  # cuda: gsplat; own kernels without gradients
+    rasterize = Operation(reference_raster.rasterize)  # cuda: gsplat, or own kernels
     blending_weights = Operation(reference_raster.blending_weights)  # cuda: own kernels, or gsplat's gradients
     generate_views = Operation(ORACLE.generate_views)  # cuda: own kernels, or view by view; as the four below
     draw_views = Operation(ORACLE.draw_views)
@@ -162,8 +162,8 @@ def cuda_backend(*, native: bool = False) -> Backend:
     """An NVIDIA GPU: gsplat's rasteriser, this package's kernels, and torch for the rest.
 
     Args:
-        native: run iterations of later frames, and draw without gradients, in this package's kernels; gsplat may then
-            be missing. Not the default until it has run on a GPU (``benchmarks.gpu`` measures it).
+        native: run iterations of later frames, and draw, in this package's kernels; gsplat may then be missing. Not
+            the default until it has run on a GPU (``benchmarks.gpu`` measures it).
 
     Raises:
         BackendError: no GPU, or gsplat is not installed or does not load; with ``native``, the kernels do not compile.
@@ -201,20 +201,16 @@ def cuda_backend(*, native: bool = False) -> Backend:
     if not native:
         return backend
     return replace(backend, iterations=partial(cuda_fit.iterations, library)).with_functions(
-        **native_functions(library, rasterize)
+        **native_functions(library)
     )
 
 
-def native_functions(library: KernelLibrary, rasterize: Rasterizer) -> dict[str, Callable[..., Any]]:
-    """The functions of a cuda back-end that draws without gradients in this package's kernels; ``rasterize`` has
-    gradients."""
+def native_functions(library: KernelLibrary) -> dict[str, Callable[..., Any]]:
+    """The functions of a cuda back-end that draws in this package's kernels."""
     from structgstream.kernels import cuda, cuda_anchors, cuda_picture
 
-    functions = functions_of(cuda_picture)
-    del functions["rasterize"]
-    functions |= {"generate_views": cuda_anchors.generate_views, "lift": cuda.lift}
-    of_library = {name: partial(function, library) for name, function in functions.items()}
-    return {**of_library, "rasterize": partial(cuda_picture.rasterize, library, rasterize)}
+    functions = functions_of(cuda_picture) | {"generate_views": cuda_anchors.generate_views, "lift": cuda.lift}
+    return {name: partial(function, library) for name, function in functions.items()}
 
 
 def on_processor(*tensors: Tensor) -> list[Tensor]:

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The GPU's rasteriser with gradients beside the cpu back-end's and the float64 reference: its kernels run on the
+processor, with threads and blocks in both orders, and on a GPU where there is one.
+"""
+
+import resource
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import pytest
+import torch
+from torch import Tensor
+
+from structgstream.errors import BackendError
+from structgstream.kernels import cpu_raster, cuda_picture, reference_raster
+from structgstream.kernels.cuda_library import KernelLibrary
+from structgstream.kernels.native import native_reason
+from structgstream.kernels.values import TileSelection
+from tests.parity.test_raster import (
+    COLOURED,
+    HEIGHT,
+    NAMES,
+    WIDTH,
+    camera,
+    check_against_reference,
+    gaussians,
+    intervals_at,
+    run,
+    run_tiles,
+    some_tiles,
+)
+from tests.support.splats import splats_of
+
+pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.needs_cuda)]
+EVERYWHERE = torch.ones(HEIGHT, WIDTH)
+Emulation = Callable[[int], KernelLibrary]
+
+
+def scene(name: str) -> list[Tensor]:
+    """Means, rotations, scales, opacities, colours and screen offsets, float32."""
+    values = [value.float().clone() for value in gaussians(1500 if name == "dark" else 300)]
+    if name == "dark":  # Many pixels stop early, most Gaussians are hidden.
+        values[3] = 0.9 + 0.1 * values[3]
+    elif name == "needles":
+        values[2][:] = 0.004
+        values[2][:, 0] = 0.5
+    elif name == "walls":  # Larger than the picture.
+        values[2] *= 500.0
+    elif name == "moved":
+        values[5] = torch.randn(300, 2, generator=torch.Generator().manual_seed(5)) * 8.0
+    return values
+
+
+def in_both_orders(emulation: Emulation, inputs: Sequence[Tensor], **options: Tensor | None) -> list[Tensor]:
+    """Picture, coverage, radii and gradients, after a check that the order of threads does not matter."""
+    results = []
+    for order in (0, 1):
+        rasterize = partial(cuda_picture.rasterize, emulation(order))
+        image, alpha, gradients, radii = run(rasterize, tuple(inputs), away=EVERYWHERE, **options)
+        results.append([image, alpha, radii, *gradients])
+    assert all(torch.equal(one, two) for one, two in zip(*results, strict=True))
+    return results[0]
+
+
+@pytest.mark.parametrize("name", ["plain", "dark", "needles", "walls", "moved"])
+@pytest.mark.parametrize("background", [None, COLOURED], ids=["black", "coloured"])
+@pytest.mark.parametrize("share", [None, 0.4])
+def test_pictures_and_gradients_are_those_of_the_cpu(
+    emulation: Emulation, name: str, background: Tensor | None, share: float | None
+) -> None:
+    inputs = scene(name)
+    intervals = None if share is None else intervals_at(share)[:1].expand(len(inputs[0]))
+    options = {"background": background, "intervals": intervals}
+    image, alpha, radii, *gradients = in_both_orders(emulation, inputs, **options)
+    exact, exact_alpha, exact_gradients, exact_radii = run(
+        cpu_raster.rasterize, tuple(inputs), away=EVERYWHERE, **options
+    )
+    # In pixels where an alpha is at a limit, the last bit decides. Conics of needles have large roundings.
+    apart = torch.maximum((image - exact).abs().amax(-1), (alpha - exact_alpha).abs())
+    assert (apart < (3e-5 if name == "needles" else 1e-6)).float().mean() > 0.999
+    torch.testing.assert_close(radii, exact_radii, rtol=1e-4, atol=1e-4)
+    for ours, theirs, attribute in zip(gradients, exact_gradients, NAMES, strict=True):
+        assert theirs.any(), attribute
+        assert (ours - theirs).norm() <= 1e-3 * theirs.norm(), attribute
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("background", [None, COLOURED], ids=["black", "coloured"])
+@pytest.mark.parametrize("share", [None, 0.0, 0.4, 1.0, 3.0])
+def test_the_reference(
+    kernels_on: Callable[[str], KernelLibrary], device: str, background: Tensor | None, share: float | None
+) -> None:
+    rasterize = partial(cuda_picture.rasterize, kernels_on(device))
+    check_against_reference(rasterize, reference_raster.rasterize, background=background, device=device, share=share)
+
+
+@pytest.mark.parametrize("trained", [None, 0, 120])
+@pytest.mark.parametrize("tiles", [None, some_tiles()], ids=["whole", "tiles"])
+def test_tiles_and_trained_rows(emulation: Emulation, trained: int | None, tiles: TileSelection | None) -> None:
+    inputs = tuple(value.float() for value in gaussians())
+    results = []
+    for rasterize in (cpu_raster.rasterize, *(partial(cuda_picture.rasterize, emulation(order)) for order in (0, 1))):
+        onto = None if tiles is None else torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1))
+        output, gradients = run_tiles(rasterize, inputs, tiles, onto, trained)
+        assert onto is None or output.image.data_ptr() == onto.data_ptr()
+        assert onto is None or not onto.requires_grad
+        results.append([output.image.detach(), output.alpha.detach(), output.radii, *gradients])
+    exact, ours, again = results
+    assert all(torch.equal(one, two) for one, two in zip(ours, again, strict=True))
+    for found, theirs in zip(ours[:3], exact[:3], strict=True):
+        torch.testing.assert_close(found, theirs, rtol=1e-4, atol=2e-6)
+    for found, theirs in zip(ours[3:], exact[3:], strict=True):
+        assert (found - theirs).norm() <= 1e-3 * theirs.norm()
+        assert trained is None or not found[trained:].any()
+        assert theirs.any() or trained == 0
+
+
+@pytest.mark.parametrize("part", ["image", "alpha"])
+def test_only_the_picture_or_only_coverage_has_a_gradient(emulation: Emulation, part: str) -> None:
+    inputs = [value.float() for value in gaussians()[:5]]
+    found = []
+    for rasterize in (cpu_raster.rasterize, partial(cuda_picture.rasterize, emulation(0))):
+        leaves = [value.clone().requires_grad_() for value in inputs]
+        output = rasterize(splats_of(*leaves), camera(torch.float32), background=COLOURED)
+        assert not output.radii.requires_grad
+        found.append(torch.autograd.grad(getattr(output, part).square().sum(), leaves))
+    for theirs, ours in zip(*found, strict=True):
+        assert (ours - theirs).norm() <= 1e-4 * theirs.norm()
+    assert found[0][0].any()
+
+
+def test_nothing_to_draw_and_what_is_broken_or_hidden(emulation: Emulation) -> None:
+    empty = [value[:0].float() for value in gaussians()]
+    image, alpha, radii, *gradients = in_both_orders(emulation, empty, background=COLOURED)
+    assert torch.equal(image, COLOURED.expand(HEIGHT, WIDTH, 3))
+    assert not alpha.any()
+    assert [len(value) for value in (radii, *gradients)] == [0] * 7
+    inputs = [value[:7].float().clone() for value in gaussians()]
+    inputs[0][0] = torch.nan
+    inputs[0][1] = torch.tensor([0.0, 0.0, -5.0])
+    inputs[1][2] = torch.inf
+    inputs[2][3] = torch.tensor([1e9, 1e9, 1e9])
+    inputs[4][4, 1] = torch.nan
+    image, _, radii, *gradients = in_both_orders(emulation, inputs)
+    assert radii[:5].tolist() == [0.0] * 5
+    assert torch.isfinite(image).all()
+    assert all(torch.isfinite(gradient).all() and not gradient[:5].any() for gradient in gradients)
+
+
+def test_what_gradients_need_is_freed_without_a_backward_pass(emulation: Emulation) -> None:
+    inputs = [value.float().requires_grad_() for value in gaussians(3000)[:5]]
+    view = camera(torch.float32)._replace(width=320, height=240)
+    peaks = []
+    for _ in range(3):
+        for _ in range(40):
+            cuda_picture.rasterize(emulation(0), splats_of(*inputs), view)
+        peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    assert peaks[2] - peaks[0] < 20_000  # kB; 80 pictures that leaked would hold more than 40,000
+
+
+def test_another_precision_is_refused_and_a_changed_input_is_found(emulation: Emulation) -> None:
+    leaves = [value.requires_grad_() for value in map(torch.clone, gaussians(3)[:5])]
+    with pytest.raises(BackendError, match="reference back-end"):
+        cuda_picture.rasterize(emulation(0), splats_of(*leaves), camera())
+    single = [value.detach().float().requires_grad_() for value in leaves]
+    output = cuda_picture.rasterize(emulation(0), splats_of(*single), camera(torch.float32))
+    with torch.no_grad():
+        single[3].mul_(0.5)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        output.image.sum().backward()
+
+
+def test_weights_are_gradients_of_colours(emulation: Emulation) -> None:
+    given = splats_of(*(value.float() for value in gaussians()[:5]))
+    maps = torch.rand(HEIGHT, WIDTH, 5, generator=torch.Generator().manual_seed(3))
+    rasterize = partial(cuda_picture.rasterize, emulation(0))
+    weights = cuda_picture.blending_weights(emulation(0), given, camera(torch.float32), maps)
+    again = reference_raster.weights_by_gradient(rasterize, given, camera(torch.float32), maps)
+    assert (weights - again).norm() <= 1e-6 * weights.norm()
