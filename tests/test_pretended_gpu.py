@@ -9,10 +9,10 @@ import pytest
 import torch
 
 import structgstream
-from structgstream.kernels import cpu_raster, cuda, cuda_library, reference_raster
+from structgstream.kernels import cpu_raster, reference_raster
 from structgstream.kernels.native import native_reason
 from structgstream.session.presets import PRESETS
-from tests.support.pretended_gpu import DEVICE, pretended_device, pretended_gpu, rasterize
+from tests.support.pretended_gpu import DEVICE, pretended_device, pretended_gpu
 from tests.support.small_clip import small_clip_path
 from tests.support.small_presets import FEW_POINTS
 
@@ -21,10 +21,8 @@ DRAWN_BY = cpu_raster.rasterize if native_reason() is None else reference_raster
 
 
 @pytest.fixture
-def backend(monkeypatch: pytest.MonkeyPatch) -> Iterator[structgstream.Backend]:
-    """Iterations are those that wait for nothing, with gsplat's place taken."""
-    monkeypatch.setattr(cuda_library, "kernel_library", lambda: (None, "nothing is compiled here"))
-    monkeypatch.setattr(cuda, "rasterize", lambda *args, **options: rasterize(DRAWN_BY, *args, **options))
+def backend() -> Iterator[structgstream.Backend]:
+    """Drawing is the processor's."""
     with pretended_device():
         yield pretended_gpu(DRAWN_BY)
 

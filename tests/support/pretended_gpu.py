@@ -20,9 +20,8 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 from structgstream.cameras import Viewport
 from structgstream.gaussians import Gaussians
-from structgstream.kernels import reference_anchors
+from structgstream.kernels import reference_anchors, reference_raster
 from structgstream.kernels.backend import Backend, functions_of, reference_backend
-from structgstream.kernels.cuda_tiles import PairBudget
 from structgstream.kernels.reference_views import ViewByView
 from structgstream.kernels.values import Rasterizer, RasterOutput, TileSelection
 
@@ -183,8 +182,6 @@ def rasterize(
     tiles: TileSelection | None = None,
     onto: Tensor | None = None,
     trained: int | None = None,
-    budget: PairBudget | None = None,
-    library: None = None,
 ) -> RasterOutput:
     """See ``reference_raster.rasterize``; what draws is ``on_processor``, all the rest lies on ``DEVICE``."""
     here = torch.device("cpu")
@@ -205,6 +202,16 @@ def rasterize(
 def pretended_gpu(on_processor: Rasterizer) -> Backend:
     """The torch parts of the cuda back-end on ``DEVICE``, with the rasteriser ``on_processor``."""
     there = partial(rasterize, on_processor)
-    return replace(reference_backend(), name="cuda", device=DEVICE).with_functions(
-        **functions_of(ViewByView.by_drawing(reference_anchors.generate_structured, there)),
+
+    def projected_radii(gaussians: Gaussians, viewport: Viewport) -> Tensor:
+        with torch.no_grad():
+            return there(gaussians, viewport).radii
+
+    views = ViewByView(
+        reference_anchors.generate_structured,
+        there,
+        projected_radii,
+        partial(reference_raster.weights_by_gradient, there),
+        partial(reference_raster.picture_and_weights_by_gradient, there),
     )
+    return replace(reference_backend(), name="cuda", device=DEVICE).with_functions(**functions_of(views))
