@@ -300,7 +300,7 @@ class Measurement:
 
 
 def racecheck(seconds: float) -> dict[str, Any]:
-    """NVIDIA's check for missing barriers, of one iteration of a small world."""
+    """NVIDIA's check for missing barriers, of one iteration and one picture with gradients of a small world."""
     tool = shutil.which("compute-sanitizer") or "/usr/local/cuda/bin/compute-sanitizer"
     command = [tool, "--tool", "racecheck", sys.executable, "-m", "benchmarks.gpu", "--one-iteration"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=seconds, check=False)
@@ -357,9 +357,10 @@ def main() -> None:
     small = {"small": {"anchors": 2_000, "width": 160, "height": 96, "cameras": 3}}
     if options.one_iteration:
         measurement = Measurement(cuda_backend(), small, torch.cuda.synchronize)
-        frame = fit_frame(measurement.worlds["small"], measurement.backend)
-        measurement.begin(frame)(0, 1)
-        measurement.rasteriser()
+        world, backend = measurement.worlds["small"], measurement.backend
+        measurement.begin(fit_frame(world, backend))(0, 1)
+        scene, camera = moved(world.before, backend.device), next(iter(world.rig.cameras.values()))
+        drawn_with_gradients(backend.rasterize, scene.gaussians(camera, backend), camera)
         return
     if options.out is None:
         parser.error("name the file to write")
