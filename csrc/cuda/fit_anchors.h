@@ -221,12 +221,8 @@ struct DecodeGaussiansBackward {
         const float opacity = m.opacities[row], *scale = m.scales + 3 * row;
         const Splat& s = m.splats[row];
         if (s.tiles[0] < s.tiles[2]) {
-            float sums[kMoments] = {};
-            int64_t slot = slots[row];
-            for (int y = s.tiles[1]; y < s.tiles[3]; ++y)
-                for (int x = s.tiles[0]; x < s.tiles[2]; ++x, ++slot)
-                    if (drawn[y * camera.columns() + x])
-                        for (int j = 0; j < kMoments; ++j) sums[j] += moments[slot * kMoments + j];
+            float sums[kMoments];
+            sum_moments(s, drawn, camera.columns(), slots[row], moments, sums);
             g = projected_backward(camera, s, sums, m.means + 3 * row, m.quats + 4 * row, scale, opacity);
         }
         if (volume != 0.0f) {

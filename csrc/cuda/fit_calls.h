@@ -239,7 +239,7 @@ class Fit {
         if (const int error = for_blocks(sort, camera.tiles(), stream_)) return error;
         if (const int error = for_blocks(Draw{tiles, v.image, transmittance_}, camera.tiles(), stream_)) return error;
         if (const int error = compare(v, drawn)) return error;
-        const DrawBackward backward = {tiles, slots_, v.image, transmittance_, to_image_, moments_};
+        const DrawBackward backward = {tiles, slots_, v.image, transmittance_, to_image_, nullptr, moments_};
         if (const int error = for_blocks(backward, camera.tiles(), stream_)) return error;
         if (const int error = generate_backward(camera, drawn)) return error;
         if (const int error = update(i)) return error;

@@ -38,6 +38,16 @@ SGS_ELEMENT int slot_in(const Splat& s, int tile, int columns) {
     return (tile / columns - s.tiles[1]) * (s.tiles[2] - s.tiles[0]) + tile % columns - s.tiles[0];
 }
 
+// A splat's moments over its tiles that are drawn; drawn null: all are.
+SGS_ELEMENT void sum_moments(
+    const Splat& s, const uint8_t* drawn, int columns, int64_t slot, const float* moments, float (&sums)[kMoments]) {
+    for (float& sum : sums) sum = 0.0f;
+    for (int y = s.tiles[1]; y < s.tiles[3]; ++y)
+        for (int x = s.tiles[0]; x < s.tiles[2]; ++x, ++slot)
+            if (drawn == nullptr || drawn[y * columns + x])
+                for (int j = 0; j < kMoments; ++j) sums[j] += moments[slot * kMoments + j];
+}
+
 // Adds a splat to the number of entries of each tile that is drawn; drawn null: all are.
 SGS_LANES_FN void count_tiles(const Splat& s, const uint8_t* drawn, int columns, int32_t* counts) {
     for (int y = s.tiles[1]; y < s.tiles[3]; ++y)

@@ -18,7 +18,20 @@ constexpr int64_t kMostPairs = INT32_MAX;  // lists and slots have 32-bit indice
 
 #ifdef __CUDACC__
 
+// Freed memory that the device's pool keeps, bytes: by default every wait returns all of it to the driver.
+constexpr uint64_t kKeptBytes = uint64_t{1} << 30;
+inline int keep_freed_memory() {
+    int device = 0;
+    cudaMemPool_t pool;
+    uint64_t bytes = kKeptBytes;
+    if (const cudaError_t error = cudaGetDevice(&device)) return static_cast<int>(error);
+    if (const cudaError_t error = cudaDeviceGetDefaultMemPool(&pool, device)) return static_cast<int>(error);
+    return static_cast<int>(cudaMemPoolSetAttribute(pool, cudaMemPoolAttrReleaseThreshold, &bytes));
+}
+
 inline int allocate(void** memory, size_t bytes, void* stream) {
+    static const int error = keep_freed_memory();
+    if (error) return error;
     return static_cast<int>(cudaMallocAsync(memory, bytes ? bytes : 1, static_cast<cudaStream_t>(stream)));
 }
 inline int release(void* memory, void* stream) {

@@ -77,10 +77,10 @@ struct Footprint {
 };
 
 // interval: the size of a training pixel at the Gaussian, or null: the low-pass is that of the picture. radius, if it is not
-// null: pixels, 0 out of the picture.
+// null: pixels, 0 out of the picture. offset: pixels that are added to the projected mean, or null.
 SGS_ELEMENT Splat projected(
     const Camera& c, const float* mean, const float* quat, const float* scale, float opacity, const float* color,
-    const float* interval, float* radius = nullptr) {
+    const float* interval, float* radius = nullptr, const float* offset = nullptr) {
     Splat s = {};
     if (radius != nullptr) *radius = 0.0f;
     float finite = opacity * 0.0f;
@@ -106,7 +106,8 @@ SGS_ELEMENT Splat projected(
     float xx = low_pass, xy = 0.0f, yy = low_pass;
     for (int j = 0; j < 3; ++j) xx += f.a[j] * f.a[j], xy += f.a[j] * f.b[j], yy += f.b[j] * f.b[j];
     const float determinant = xx * yy - xy * xy;
-    const float x = f.fx * f.point[0] * f.inverse + f.cx, y = f.fy * f.point[1] * f.inverse + f.cy;
+    float x = f.fx * f.point[0] * f.inverse + f.cx, y = f.fy * f.point[1] * f.inverse + f.cy;
+    if (offset != nullptr) x += offset[0], y += offset[1];
     // The exact box of alpha = 1/255, which shrinks with the opacity.
     const float log2_opacity = log2f(fmaxf(opacity, kMinAlpha)), rise = fmaxf(0.0f, log2_opacity - kLog2MinAlpha);
     const float half_x = sqrtf(rise * (2.0f / kLog2E) * xx), half_y = sqrtf(rise * (2.0f / kLog2E) * yy);
@@ -138,7 +139,7 @@ SGS_ELEMENT Splat projected(
 }
 
 struct AttributeGradients {
-    float mean[3], quat[4], scale[3], opacity, color[3];
+    float mean[3], quat[4], scale[3], opacity, color[3], offset[2];
 };
 
 // From the sums of a splat's moments.
@@ -188,6 +189,7 @@ SGS_ELEMENT AttributeGradients projected_backward(
     const float along = dq[0] * w + dq[1] * x + dq[2] * y + dq[3] * z;
     for (int j = 0; j < 4; ++j) out.quat[j] = f.inverse_norm * (dq[j] - along * f.unit[j]);
     out.opacity = m[0] / opacity;
+    out.offset[0] = gx, out.offset[1] = gy;
     for (int j = 0; j < 3; ++j) out.color[j] = m[6 + j];
     return out;
 }

@@ -216,7 +216,7 @@ struct DrawBackward {
     };
     Tiles tiles;
     const int32_t* slots;
-    const float *image, *transmittance, *gradient;
+    const float *image, *transmittance, *gradient, *alpha_gradient;  // the last one or null
     float* moments;
 
     SGS_LANES_FN void begin(int tile, int w, Warp& warp) const {
@@ -226,7 +226,7 @@ struct DrawBackward {
         warp.coverage_gradient = warp.rest = splat(0.0f);
         tiles.each_pixel(tile, w, [&](int l, int64_t pixel) {
             const float T = transmittance[pixel];
-            float coverage = 0.0f, rest = 0.0f;
+            float coverage = alpha_gradient == nullptr ? 0.0f : alpha_gradient[pixel], rest = 0.0f;
             for (int k = 0; k < 3; ++k) {
                 const float g = gradient[3 * pixel + k], behind = back == nullptr ? 0.0f : back[k];
                 set(warp.gradient[k], l, g);

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Several views without gradients on a GPU, each kernel once for all of them. Plain pointers to its memory, but for the array of
- * views, which lies in that of the host; `stream` is a cudaStream_t. Both return 0, or CUDA's error number. */
+/* Several views without gradients on a GPU, each kernel once for all of them, or one with gradients. Plain pointers to its memory,
+ * but for structures, which lie in that of the host; `stream` is a cudaStream_t. All return 0, or CUDA's error number. */
 #pragma once
 
 #include <stdint.h>
@@ -9,9 +9,9 @@
 extern "C" {
 #endif
 
-/* Gaussians of a view, as in sgs_raster_forward of structgstream.h. ids [count] int64. colors, intervals and ids may be null. */
+/* Gaussians of a view, as in sgs_raster_forward of structgstream.h. ids [count] int64. Those from colors on may be null. */
 struct sgs_cuda_gaussians {
-    const float *means, *quats, *scales, *opacities, *colors, *intervals;
+    const float *means, *quats, *scales, *opacities, *colors, *intervals, *screen_offsets;
     const int64_t* ids;
     int64_t count;
 };
@@ -28,6 +28,20 @@ struct sgs_cuda_view {
 };
 /* Waits once, for the numbers of pairs. */
 int sgs_cuda_views(const struct sgs_cuda_view* views, int count, void* stream);
+
+/* Draws one view, whose image and alpha are not null. Out: raster, what gradients need, to be freed in any case; what the view points
+ * to, its image, too, must live as long. Waits once. */
+int sgs_cuda_raster_new(const struct sgs_cuda_view* view, void** raster, void* stream);
+/* Of both sets of Gaussians, those of the statics zero: means [.,3], quats [.,4], scales [.,3], opacities, colors [.,3] and
+ * screen_offsets [.,2], the last one may be null. */
+struct sgs_cuda_gradients {
+    float *means, *quats, *scales, *opacities, *colors, *screen_offsets;
+};
+/* image_gradient [H,W,3], alpha_gradient [H,W] or null. All gradients are written, in a fixed order of sums. Waits for nothing. */
+int sgs_cuda_raster_backward(
+    void* raster, const float* image_gradient, const float* alpha_gradient, const struct sgs_cuda_gradients* gradients,
+    void* stream);
+void sgs_cuda_raster_free(void* raster);
 
 /* The tiles that Gaussians reach (reference_raster.reached_tiles): K of the picture, reduced_K of the one on which extents are
  * measured, visible: a byte for each id. Out: tiles, a byte each, 1 where one is reached, else what they are. */

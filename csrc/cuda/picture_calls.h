@@ -37,7 +37,8 @@ struct Project {
         const float black[3] = {};
         return projected(
             camera, g.means + 3 * i, g.quats + 4 * i, g.scales + 3 * i, g.opacities[i],
-            g.colors == nullptr ? black : g.colors + 3 * i, g.intervals == nullptr ? nullptr : g.intervals + i, radius);
+            g.colors == nullptr ? black : g.colors + 3 * i, g.intervals == nullptr ? nullptr : g.intervals + i, radius,
+            g.screen_offsets == nullptr ? nullptr : g.screen_offsets + 2 * i);
     }
 
     // A splat between pixel centres reaches none, and counts.
@@ -109,11 +110,38 @@ struct SumWeights {
 struct Cover {
     const uint8_t* drawn;
     int width, columns;
-    float* values;
+    const float* transmittance;
+    float* alpha;  // may be the same memory
 
     SGS_ELEMENT void operator()(int64_t i) const {
         const int64_t tile = i / width / kTilePixels * columns + i % width / kTilePixels;
-        values[i] = drawn == nullptr || drawn[tile] ? 1.0f - values[i] : 0.0f;
+        alpha[i] = drawn == nullptr || drawn[tile] ? 1.0f - transmittance[i] : 0.0f;
+    }
+};
+
+// From the moments of a Gaussian's slots to its gradients; those of static ones, from `count` on, are zero.
+struct ProjectBackward {
+    Camera camera;
+    sgs_cuda_gaussians given;
+    const uint8_t* drawn;
+    const Splat* splats;
+    const int32_t* slots;
+    const float* moments;
+    sgs_cuda_gradients to;
+
+    SGS_ELEMENT void operator()(int64_t i) const {
+        AttributeGradients g = {};
+        if (i < given.count && splats[i].tiles[0] < splats[i].tiles[2]) {
+            float sums[kMoments];
+            sum_moments(splats[i], drawn, camera.columns(), slots[i], moments, sums);
+            g = projected_backward(
+                camera, splats[i], sums, given.means + 3 * i, given.quats + 4 * i, given.scales + 3 * i, given.opacities[i]);
+        }
+        for (int j = 0; j < 3; ++j)
+            to.means[3 * i + j] = g.mean[j], to.scales[3 * i + j] = g.scale[j], to.colors[3 * i + j] = g.color[j];
+        for (int j = 0; j < 4; ++j) to.quats[4 * i + j] = g.quat[j];
+        to.opacities[i] = g.opacity;
+        for (int j = 0; j < 2 && to.screen_offsets != nullptr; ++j) to.screen_offsets[2 * i + j] = g.offset[j];
     }
 };
 
@@ -179,7 +207,7 @@ struct EachBlock {
     }
 };
 
-// Runs the kernels of all views in one launch.
+// Runs the kernels of all views in one launch, whose arguments are copied to the device if there are several.
 template <typename Kernel, typename Launch>
 int launch(const std::vector<Counted<Kernel>>& kernels, void* stream, const Launch& run) {
     int64_t most = 0;
@@ -195,21 +223,24 @@ int launch(const std::vector<Counted<Kernel>>& kernels, void* stream, const Laun
 }
 template <typename Kernel>
 int each_element(const std::vector<Counted<Kernel>>& kernels, void* stream) {
+    if (kernels.size() == 1) return for_each(kernels[0].kernel, kernels[0].count, stream);
     return launch(kernels, stream, [&](const Counted<Kernel>* on_device, int64_t most, int64_t all) {
         return for_each(EachElement<Kernel>{on_device, most}, all, stream);
     });
 }
 template <typename Kernel>
 int each_block(const std::vector<Counted<Kernel>>& kernels, void* stream) {
+    if (kernels.size() == 1) return for_blocks(kernels[0].kernel, kernels[0].count, stream);
     return launch(kernels, stream, [&](const Counted<Kernel>* on_device, int64_t most, int64_t all) {
         return for_blocks(EachBlock<Kernel>{on_device, most}, all, stream);
     });
 }
 
-// The memory of several views, which is released in the end.
+// The memory of several views, which is released in the end. differentiable: what the gradients need is kept.
 class Views {
   public:
-    Views(const sgs_cuda_view* views, int count, void* stream) : stream_(stream) {
+    Views(const sgs_cuda_view* views, int count, bool differentiable, void* stream)
+        : stream_(stream), differentiable_(differentiable) {
         for (int v = 0; v < count; ++v) views_.push_back({views[v]});
     }
     ~Views() {
@@ -227,9 +258,10 @@ class Views {
         for (const Of& o : views_) {
             const sgs_cuda_view& v = o.view;
             if (v.image != nullptr)
-                draws.push_back({{o.lists(), v.image, v.alpha == nullptr ? o.transmittance : v.alpha}, o.camera().tiles()});
+                draws.push_back({{o.lists(), v.image, o.transmittance}, o.camera().tiles()});
             if (v.alpha != nullptr)
-                covers.push_back({{v.tiles, v.width, o.camera().columns(), v.alpha}, int64_t{v.width} * v.height});
+                covers.push_back(
+                    {{v.tiles, v.width, o.camera().columns(), o.transmittance, v.alpha}, int64_t{v.width} * v.height});
             if (v.channels > 0)
                 sums.push_back({{o.splats, o.slots, v.gaussians.ids, o.sums, v.channels, v.sums}, v.gaussians.count});
             channels = std::max(channels, v.channels);
@@ -249,12 +281,30 @@ class Views {
         return each_element(sums, stream_);
     }
 
+    // Gradients of the Gaussians of the only view, after draw.
+    int backward(const float* to_image, const float* to_alpha, const sgs_cuda_gradients& to, void* stream) {
+        const Of& o = views_[0];
+        const sgs_cuda_view& v = o.view;
+        const Camera camera = o.camera();
+        void* moments = nullptr;
+        if (const int error = allocate(&moments, sizeof(float) * kMoments * o.slot_count, stream)) return error;
+        float* sums = static_cast<float*>(moments);
+        int error = for_blocks(
+            DrawBackward{o.lists(), o.slots, v.image, o.transmittance, to_image, to_alpha, sums}, camera.tiles(), stream);
+        if (error == 0)
+            error = for_each(
+                ProjectBackward{camera, v.gaussians, v.tiles, o.splats, o.slots, sums, to}, o.count(), stream);
+        const int released = release(moments, stream);
+        return error ? error : released;
+    }
+
   private:
     struct Of {
         sgs_cuda_view view;
         Splat* splats = nullptr;
         int32_t *slots = nullptr, *counts = nullptr, *starts = nullptr, *cursors = nullptr, *rows = nullptr;
         int64_t* totals = nullptr;  // entries of lists, and slots
+        int64_t slot_count = 0;
         uint64_t* keys = nullptr;
         float *transmittance = nullptr, *sums = nullptr;
 
@@ -279,7 +329,8 @@ class Views {
                     if (counts != nullptr) counts += tiles;
                     o.splats = a.take<Splat>(o.count()), o.slots = a.take<int32_t>(o.count());
                     o.starts = a.take<int32_t>(tiles + 1), o.cursors = a.take<int32_t>(tiles);
-                    if (o.view.image != nullptr && o.view.alpha == nullptr)
+                    o.transmittance = o.view.alpha;
+                    if (o.view.image != nullptr && (differentiable_ || o.view.alpha == nullptr))
                         o.transmittance = a.take<float>(int64_t{o.view.width} * o.view.height);
                 }
             }))
@@ -291,7 +342,7 @@ class Views {
             const sgs_cuda_view& v = o.view;
             const int64_t first = v.gaussians.count;
             projects.push_back({{o.camera(), v.gaussians, v.tiles, o.splats, o.counts, o.slots, v.radii}, first});
-            projects.push_back(
+            if (v.statics.count > 0) projects.push_back(
                 {{o.camera(), v.statics, v.tiles, o.splats + first, o.counts, o.slots + first,
                   v.radii == nullptr ? nullptr : v.radii + first},
                  v.statics.count});
@@ -310,8 +361,9 @@ class Views {
         if (const int error = lay_out(&pair_memory_, [&](Arena& a) {
                 for (size_t n = 0; n < count; ++n) {
                     Of& o = views_[n];
+                    o.slot_count = totals[2 * n + 1];
                     o.keys = a.take<uint64_t>(totals[2 * n]), o.rows = a.take<int32_t>(totals[2 * n]);
-                    o.sums = a.take<float>(totals[2 * n + 1] * o.view.channels);
+                    o.sums = a.take<float>(o.slot_count * o.view.channels);
                 }
             }))
             return error;
@@ -342,6 +394,7 @@ class Views {
     }
 
     void* stream_;
+    bool differentiable_;
     std::vector<Of> views_;
     void *memory_ = nullptr, *pair_memory_ = nullptr;
     int32_t* counts_ = nullptr;
@@ -355,10 +408,31 @@ class Views {
 extern "C" {
 
 int sgs_cuda_views(const sgs_cuda_view* views, int count, void* stream) try {
-    return structgstream::cuda::fit::Views(views, count, stream).draw();
+    return structgstream::cuda::fit::Views(views, count, false, stream).draw();
 } catch (const std::bad_alloc&) {
     return structgstream::cuda::fit::kNoMemory;
 }
+
+int sgs_cuda_raster_new(const sgs_cuda_view* view, void** raster, void* stream) {
+    using structgstream::cuda::fit::Views;
+    *raster = nullptr;
+    try {
+        Views* made = new Views(view, 1, true, stream);
+        *raster = made;
+        return made->draw();
+    } catch (const std::bad_alloc&) {
+        return structgstream::cuda::fit::kNoMemory;
+    }
+}
+
+int sgs_cuda_raster_backward(
+    void* raster, const float* image_gradient, const float* alpha_gradient, const sgs_cuda_gradients* gradients,
+    void* stream) {
+    return static_cast<structgstream::cuda::fit::Views*>(raster)->backward(
+        image_gradient, alpha_gradient, *gradients, stream);
+}
+
+void sgs_cuda_raster_free(void* raster) { delete static_cast<structgstream::cuda::fit::Views*>(raster); }
 
 int sgs_cuda_reached_tiles(const sgs_cuda_reach* views, int count, void* stream) try {
     using namespace structgstream::cuda::fit;

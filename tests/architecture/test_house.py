@@ -34,7 +34,7 @@ def loaded_by(imports: str, among: tuple[str, ...]) -> list[str]:
 
 
 def test_importing_the_package_is_light() -> None:
-    heavy = ("torch", "numpy", "av", "cv2", "matplotlib", "tyro", "rich", "gsplat")
+    heavy = ("torch", "numpy", "av", "cv2", "matplotlib", "tyro", "rich")
     assert not loaded_by("structgstream, structgstream.cli", heavy)
 
 

@@ -19,7 +19,7 @@ def test_parts_are_measured_and_one_that_fails_ends_none(tmp_path: Path, capsys:
 
     sizes = {"tiny": {"anchors": 120, "width": 48, "height": 32, "cameras": 3}}
     measurement = Measurement(cpu_backend(), sizes, lambda: None)
-    names = ("correctness", "iterations", "pictures", "frames")
+    names = ("rasteriser", "correctness", "iterations", "pictures", "frames")
     parts = {"fails": fails, **{name: getattr(measurement, name) for name in names}}
     out = tmp_path / "out.json"
     found = measured(parts, out, until=float("inf"))
@@ -29,5 +29,7 @@ def test_parts_are_measured_and_one_that_fails_ends_none(tmp_path: Path, capsys:
     }
     assert found["correctness"]["tiny"]["gradient error"] == 0.0
     assert found["correctness"]["tiny"]["equal bits"]
+    assert found["rasteriser"]["tiny"]["gradient error"] == 0.0
+    assert found["rasteriser"]["tiny"]["equal bits"]
     assert "(predicted: " in capsys.readouterr().out
     assert "skipped" in measured(parts, out, until=0.0)["pictures"]

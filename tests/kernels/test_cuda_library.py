@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from structgstream.errors import BackendError
-from structgstream.kernels import cuda_library
+from structgstream.kernels import cuda, cuda_library
 from structgstream.kernels.cuda_library import CUDA_PROTOTYPES
 
 SOURCES = Path(__file__).parents[2] / "csrc" / "cuda"
@@ -105,9 +105,9 @@ def test_without_kernels_it_says_why(found: bool, tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(cuda_library, "source_folder", lambda: SOURCES)
     monkeypatch.setattr(cuda_library, "cache_folder", lambda environment: tmp_path / "cache")
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (9, 0))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     cuda_library.kernel_library.cache_clear()
-    library, sentence = cuda_library.kernel_library()
-    cuda_library.kernel_library.cache_clear()
-    assert library is None
-    assert sentence.startswith("L1, SSIM, anchors, sweeps and tile lists run in torch")
-    assert ("no host compiler" if found else "put nvcc on PATH") in sentence
+    with pytest.raises(BackendError, match="no host compiler" if found else "put nvcc on PATH"):
+        cuda_library.kernel_library()
+    reason = cuda.cuda_reason()
+    assert reason is None if found else "put nvcc on PATH" in str(reason)

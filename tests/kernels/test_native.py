@@ -76,7 +76,7 @@ SOURCES = Path(__file__).parents[2] / "csrc"
 HEADERS = {"structgstream.h": PROTOTYPES, "cuda": CUDA_PROTOTYPES}
 FILES = {
     "structgstream.h": ["include/structgstream.h"],
-    "cuda": [f"cuda/{name}.h" for name in ("anchors", "fit", "lift", "picture", "ssim", "sweep", "tiles")],
+    "cuda": [f"cuda/{name}.h" for name in ("anchors", "fit", "lift", "picture", "ssim", "sweep")],
 }
 LETTERS = {"int": "i", "int64_t": "l", "float": "f", "double": "d", "void": "v"}
 

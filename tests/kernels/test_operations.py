@@ -12,10 +12,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from structgstream.kernels import cuda, cuda_anchors, cuda_library
-from structgstream.kernels.backend import Backend, cpu_backend, cuda_backend, nonblocking, reference_backend
+from structgstream.kernels import cuda, cuda_library
+from structgstream.kernels.backend import Backend, cpu_backend, cuda_backend, reference_backend
 from structgstream.kernels.cuda_library import CUDA_PROTOTYPES, KernelLibrary
-from structgstream.kernels.cuda_tiles import PairBudget
 from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import TileSelection, tile_grid
 from tests.support.rigs import arc_rig, random_scene
@@ -41,16 +40,12 @@ def refused_by_the_type_checker(backend: Backend, opacities: Tensor) -> None:
 def pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     functions: Any = SimpleNamespace(**{name: SimpleNamespace() for name in CUDA_PROTOTYPES})
     library = KernelLibrary(functions, "cuda", lambda device: 0)
-    monkeypatch.setattr(cuda, "cuda_reason", lambda **_: None)
-    monkeypatch.setattr(cuda_library, "kernel_library", lambda: (library, "compiled"))
-
-
-def cuda_without_waiting() -> Backend:
-    return nonblocking(cuda_backend(), PairBudget.of(1, torch.device("cpu")))
+    monkeypatch.setattr(cuda, "cuda_reason", lambda: None)
+    monkeypatch.setattr(cuda_library, "kernel_library", lambda: library)
 
 
 @pytest.mark.usefixtures("pretended_gpu")
-@pytest.mark.parametrize("build", [*BUILDERS, cuda_backend, cuda_without_waiting])
+@pytest.mark.parametrize("build", [*BUILDERS, cuda_backend])
 def test_signatures_are_those_of_the_table(build: Callable[[], Backend]) -> None:
     backend = build()
     assert len(Backend.operations()) == 20
@@ -106,10 +101,9 @@ def test_a_picture_to_draw_onto_needs_tiles(build: Callable[[], Backend]) -> Non
         build().rasterize(gaussians, camera.viewport(gaussians.means), onto=torch.rand(32, 48, 3))
 
 
-@pytest.mark.parametrize("build", [*BUILDERS, pytest.param(None, id="nonblocking")])
-def test_anchors_that_were_looked_at_are_ascending_indices(build: Callable[[], Backend] | None) -> None:
-    backend = reference_backend().with_functions(generate_structured=cuda_anchors.generate_all_in_torch)
-    backend = backend if build is None else build()
+@pytest.mark.parametrize("build", BUILDERS)
+def test_anchors_that_were_looked_at_are_ascending_indices(build: Callable[[], Backend]) -> None:
+    backend = build()
     scene, camera = random_scene(300, seed=3), next(iter(arc_rig(radius=0.6).cameras.values()))
     found = scene.structured(camera, backend)
     assert found.anchors.dtype == found.gaussians.ids.dtype == torch.int64

@@ -30,21 +30,6 @@ def test_a_gradient_laid_out_otherwise(device: str) -> None:
     assert torch.allclose(ours[0].double(), exact[0], rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("device", DEVICES)
-def test_numbers_in_tensors(device: str) -> None:
-    """A recorded step reads its rate and its number when it runs."""
-    param, gradient = torch.randn(9, 4, device=device), torch.randn(9, 4, device=device)
-    exact = steps(cuda, param, [gradient, gradient])
-    found = [param.clone(), torch.zeros_like(param), torch.zeros_like(param)]
-    rate, number = torch.tensor(OPTIONS["lr"], device=device), torch.zeros((), device=device)
-    for _ in range(2):
-        number += 1
-        options = {**OPTIONS, "lr": rate}
-        cuda.adam_step(found[0], gradient, found[1], found[2], step=number, **options)
-    for a, b in zip(found, exact, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)
-
-
 def test_nothing_to_move() -> None:
     assert steps(cuda, torch.zeros(0, 3), [torch.zeros(0, 3)])[0].shape == (0, 3)
 

@@ -11,14 +11,43 @@ import pytest
 import torch
 from torch import Tensor
 
+from structgstream.cameras import Viewport
 from structgstream.errors import BackendError
 from structgstream.kernels import cuda_anchors, reference_anchors
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.values import Anchors, HeadWeights, MLPWeights, StructuredGaussians, TileSelection, tile_grid
-from tests.parity.test_cuda_anchors import ATTRIBUTES, HEIGHT, WIDTH, K, M, camera, tensors
+from tests.support.splats import viewport_of
 
+M, K, D, HIDDEN = 60, 5, 12, 16
+WIDTH, HEIGHT = 53, 41
+ATTRIBUTES = ("means", "quats", "scales", "opacities", "colors")
 ONLINE = (0, 1, 2, 4, 9, 10, 11, 12)  # positions, both scales, features and F_c
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.needs_cuda)]
+
+
+def tensors(*, distance_input: bool) -> list[Tensor]:
+    """Positions, two log scales, offsets, features and the weights of three heads, float64."""
+    inputs = D + 3 + distance_input
+    depths = torch.linspace(1.5, 4.0, M)[torch.randperm(M)]  # well apart
+    spread = (torch.rand(M, 2) * 3.0 - 1.5) * depths[:, None]  # about half of them out of sight
+    values = [
+        torch.cat([spread, depths[:, None]], dim=1),
+        torch.randn(M, 3) * 0.2 - 1.5,
+        torch.randn(M, 3) * 0.2 - 2.0,
+        torch.randn(M, K, 3) * 0.3,
+        torch.randn(M, D),
+    ]
+    for outputs in (K, 3 * K, 7 * K):
+        values += [torch.randn(HIDDEN, inputs), torch.randn(HIDDEN), torch.randn(outputs, HIDDEN), torch.randn(outputs)]
+        values[-2] *= 0.2
+    return [value.double() for value in values]
+
+
+def camera(like: Tensor) -> Viewport:
+    viewmat = torch.eye(4).to(like)
+    viewmat[0, 3] = 0.1
+    K = torch.tensor([[40.0, 0, WIDTH / 2], [0, 42.0, HEIGHT / 2], [0, 0, 1]]).to(like)
+    return viewport_of(viewmat, K, width=WIDTH, height=HEIGHT, near=0.2)
 
 
 @pytest.fixture(params=DEVICES)
@@ -68,25 +97,6 @@ def test_the_drawn_set_is_the_references(library: KernelLibrary, tiled: bool, di
         assert torch.allclose(ours, wanted, rtol=1e-4, atol=1e-5), name
 
 
-def test_all_of_them_are_the_drawn_and_others_that_leave_no_trace(library: KernelLibrary) -> None:
-    values = on_device(tensors(distance_input=True), library)
-    everything = generate(partial(cuda_anchors.generate_structured, library, every=True), values)
-    drawn = generate(partial(cuda_anchors.generate_structured, library), values)
-    g = everything.gaussians
-    assert g.means.shape == (M * K, 3)
-    assert torch.equal(everything.anchors.cpu(), torch.arange(M))
-    assert torch.equal(g.ids.cpu(), torch.arange(M * K))
-    positive = g.opacities > 0
-    assert torch.equal(g.ids[positive], drawn.gaussians.ids)
-    for name in ATTRIBUTES:
-        assert torch.equal(getattr(g, name)[positive], getattr(drawn.gaussians, name)), name
-    assert not g.scales[~positive].any()
-    assert not g.opacities[~positive].any()
-    assert (everything.raw_opacities[drawn.anchors] > -1).all()
-    assert int((everything.raw_opacities > -1).any(1).sum()) == len(drawn.anchors) < M
-    assert not everything.raw_opacities.requires_grad
-
-
 @pytest.mark.parametrize("trained", [ONLINE, tuple(range(17))], ids=["online", "all"])
 @pytest.mark.parametrize("distance_input", [True, False])
 def test_gradients(library: KernelLibrary, trained: tuple[int, ...], distance_input: bool) -> None:
@@ -96,10 +106,8 @@ def test_gradients(library: KernelLibrary, trained: tuple[int, ...], distance_in
         values[i].requires_grad_()
         ours[i].requires_grad_()
     exact = generate(reference_anchors.generate_structured, values, distance_input=distance_input).gaussians
-    found = generate(
-        partial(cuda_anchors.generate_structured, library, every=True), ours, distance_input=distance_input
-    ).gaussians
-    rows = exact.ids.to(library.device_type)
+    found = generate(partial(cuda_anchors.generate_structured, library), ours, distance_input=distance_input).gaussians
+    assert torch.equal(found.ids.cpu(), exact.ids)
     cotangents = {name: torch.randn_like(getattr(exact, name)) for name in ATTRIBUTES}
     wanted = torch.autograd.grad(
         [getattr(exact, name) for name in ATTRIBUTES],
@@ -107,9 +115,9 @@ def test_gradients(library: KernelLibrary, trained: tuple[int, ...], distance_in
         [cotangents[name] for name in ATTRIBUTES],
     )
     got = torch.autograd.grad(
-        [getattr(found, name)[rows] for name in ATTRIBUTES],
+        [getattr(found, name) for name in ATTRIBUTES],
         [ours[i] for i in trained],
-        [cotangents[name].to(rows.device, torch.float32) for name in ATTRIBUTES],
+        [cotangents[name].to(found.ids.device, torch.float32) for name in ATTRIBUTES],
     )
     for i, a, b in zip(trained, got, wanted, strict=True):
         assert b.norm() > 0, i
@@ -143,7 +151,7 @@ def test_elements_need_no_order(emulation: Callable[[int], KernelLibrary]) -> No
     for order in (0, 1):
         leaves = [value.clone().requires_grad_() for value in values]
         g = generate(
-            partial(cuda_anchors.generate_structured, emulation(order), every=True), leaves, tiles=some_tiles_once()
+            partial(cuda_anchors.generate_structured, emulation(order)), leaves, tiles=some_tiles_once()
         ).gaussians
         total = sum((getattr(g, name) * (1 + i)).sum() for i, name in enumerate(ATTRIBUTES))
         found.append([g.means.detach(), *torch.autograd.grad(total, leaves)])  # type: ignore[arg-type]
@@ -164,18 +172,3 @@ def test_what_the_kernels_cannot_read(emulation: Callable[[int], KernelLibrary])
     elsewhere[3] = elsewhere[3].to("meta")
     with pytest.raises(BackendError, match="not on meta"):
         generate(generator, elsewhere)
-
-
-@pytest.mark.needs_cuda
-def test_nothing_waits_for_the_gpu(kernels_on: Callable[[str], KernelLibrary]) -> None:
-    library = kernels_on("cuda")
-    values = [value.requires_grad_() for value in on_device(tensors(distance_input=True), library)]
-    mlps, view = MLPWeights(*(HeadWeights(*values[i : i + 4]) for i in (5, 9, 13))), camera(values[0])
-    torch.cuda.set_sync_debug_mode("error")
-    try:
-        g = cuda_anchors.generate_structured(
-            library, Anchors(*values[:5]), mlps, view, distance_input=True, every=True
-        ).gaussians
-        torch.autograd.grad(sum(getattr(g, name).sum() for name in ATTRIBUTES), values)  # type: ignore[arg-type]
-    finally:
-        torch.cuda.set_sync_debug_mode("default")

@@ -16,7 +16,7 @@ from structgstream.training.online.preprocess import preprocess
 from structgstream.training.residuals import residual_floor
 from structgstream.training.result import FitResult
 from structgstream.training.views import training_views
-from tests.support.counted_gpu import counted_gpu
+from tests.support.counted_gpu import Counts, counted_gpu
 from tests.support.pretended_gpu import DEVICE, moved
 from tests.support.worlds import moving_world
 
@@ -25,16 +25,17 @@ pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_r
 MAX_OPERATIONS = {4: 1_190, 27: 1_340}
 """By number of views, of the frame below: what it takes now, with little room. Whoever needs fewer lowers them."""
 MAX_WAITS = 20
+MAX_OF_ITERATION = 132, 3
+"""Operations and waits of one iteration that runs in torch: for the anchors in view, their Gaussians, and the pairs."""
 
 
-@pytest.mark.parametrize("views", MAX_OPERATIONS)
-def test_an_online_frame(
-    emulation: Callable[[int], KernelLibrary], monkeypatch: pytest.MonkeyPatch, views: int
-) -> None:
-    """The second of a stream: its first one uploads the cameras."""
+def second_frame(
+    emulation: KernelLibrary, monkeypatch: pytest.MonkeyPatch, *, views: int, iterations: int, native: bool = True
+) -> Counts:
+    """Counts of the second frame of a stream: its first one uploads the cameras."""
     world = moving_world(3, movers=20, cameras=views + 1)
-    config = replace(COMPACT.online, iterations=40)
-    with counted_gpu(emulation(0).library, monkeypatch) as (backend, counts):
+    config = replace(COMPACT.online, iterations=iterations)
+    with counted_gpu(emulation.library, monkeypatch, native=native) as (backend, counts):
         scene = moved(world.scene, DEVICE)
         with counts.paused():
             first = training_views(world.frames[0], world.rig, DEVICE)
@@ -69,5 +70,22 @@ def test_an_online_frame(
             last = fit_frame(1, scene, scene).scene
         fit = fit_frame(2, last, scene)
     assert fit.moving > 0
+    return counts
+
+
+@pytest.mark.parametrize("views", MAX_OPERATIONS)
+def test_an_online_frame(
+    emulation: Callable[[int], KernelLibrary], monkeypatch: pytest.MonkeyPatch, views: int
+) -> None:
+    counts = second_frame(emulation(0), monkeypatch, views=views, iterations=40)
     assert counts.operations.total() <= MAX_OPERATIONS[views], counts.operations.most_common(20)
     assert counts.waits.total() <= MAX_WAITS, counts.waits.most_common(10)
+
+
+def test_an_iteration_in_torch(emulation: Callable[[int], KernelLibrary], monkeypatch: pytest.MonkeyPatch) -> None:
+    few, many = (
+        second_frame(emulation(0), monkeypatch, views=4, iterations=iterations, native=False) for iterations in (20, 40)
+    )
+    operations = (many.operations - few.operations).total() / 20
+    assert operations <= MAX_OF_ITERATION[0], (many.operations - few.operations).most_common(20)
+    assert (many.waits - few.waits).total() / 20 <= MAX_OF_ITERATION[1]

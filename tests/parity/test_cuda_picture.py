@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from structgstream.gaussians import Gaussians
-from structgstream.kernels import cpu_raster, cuda_anchors, cuda_picture
+from structgstream.kernels import cuda_anchors, cuda_picture
 from structgstream.kernels.backend import Backend, cpu_backend
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.native import native_reason
@@ -95,7 +95,7 @@ def test_drawings(emulation: Callable[[int], KernelLibrary], tiled: bool, onto: 
     for ours, theirs in zip(found, drawn(cpu.draw_views), strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-6)
     (one,) = cuda_picture.draw_views(emulation(0), gaussians[:1], VIEWPORTS[:1])
-    single = cuda_picture.rasterize(emulation(0), cpu_raster.rasterize, gaussians[0], VIEWPORTS[0])
+    single = cuda_picture.rasterize(emulation(0), gaussians[0], VIEWPORTS[0])
     assert torch.equal(single.image, one.image)
 
 

@@ -1,227 +1,196 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands between this package and gsplat's kernels, with kernels pretended in torch that keep to the interface of
-gsplat 1.5.3 as its sources state it; and, where there is a GPU, the same with the kernels themselves.
+"""The GPU's rasteriser with gradients beside the cpu back-end's and the float64 reference: its kernels run on the
+processor, with threads and blocks in both orders, and on a GPU where there is one.
 """
 
-import sys
+import resource
+from collections.abc import Callable, Sequence
 from functools import partial
-from types import ModuleType
 
 import pytest
 import torch
 from torch import Tensor
 
-from structgstream.cameras import Viewport
-from structgstream.kernels import cuda, reference_raster
-from structgstream.kernels.cuda_library import kernel_library
-from structgstream.kernels.cuda_tiles import PairBudget
-from structgstream.kernels.values import TILE_PIXELS, Rasterizer, TileSelection, tile_grid
-from tests.support.splats import splats_of, viewport_of
+from benchmarks.gpu import apart, drawn_with_gradients, rasterize_by_gsplat
+from structgstream.cameras import Camera
+from structgstream.errors import BackendError
+from structgstream.kernels import cpu_raster, cuda_picture, reference_raster
+from structgstream.kernels.cuda_library import KernelLibrary
+from structgstream.kernels.native import native_reason
+from structgstream.kernels.values import TileSelection
+from tests.parity.test_raster import (
+    COLOURED,
+    HEIGHT,
+    NAMES,
+    NEAR,
+    WIDTH,
+    camera,
+    check_against_reference,
+    gaussians,
+    intervals_at,
+    run,
+    run_tiles,
+    some_tiles,
+)
+from tests.support.splats import splats_of
 
-WIDTH, HEIGHT, NEAR, COUNT = 41, 35, 0.2, 30
-PAIRS = 700
-
-
-def projection(means, covars, quats, scales, viewmats, Ks, width, height, *, opacities, near_plane, eps2d, packed):
-    assert (covars, eps2d, packed) == (None, 0.3, False)
-    assert viewmats.shape == (1, 4, 4)
-    assert Ks.shape == (1, 3, 3)
-    view = viewport_of(viewmats[0], Ks[0], width=width, height=height, near=near_plane)
-    p = reference_raster._project(splats_of(means, quats, scales, opacities, means), view, None)
-    count = means.shape[0]
-
-    def whole(values: Tensor, rest: float) -> Tensor:
-        return values.new_full((count, *values.shape[1:]), rest).index_put((p.rows,), values)[None]
-
-    rubbish = 1e30  # gsplat leaves what it culls as it finds it
-    radii = whole(p.extents.ceil(), 0.0).to(torch.int32)
-    return radii, whole(p.means2d, rubbish), whole(p.depths, rubbish), whole(p.conics, rubbish), None
-
-
-def isect_tiles(means2d, radii, depths, tile_size, tile_width, tile_height, *, packed, n_images):
-    assert (tile_size, packed, n_images) == (TILE_PIXELS, False, 1)
-    means2d, depths = means2d.detach(), depths.detach()
-    pairs = []
-    for i in range(radii.shape[1]):
-        if (radii[0, i] <= 0).any():
-            continue
-        low, high = ((means2d[0, i] + sign * radii[0, i]) / tile_size for sign in (-1, 1))
-        x0, y0 = (max(0, int(edge)) for edge in low.floor())
-        x1, y1 = (min(size, int(edge)) for edge, size in zip(high.ceil(), (tile_width, tile_height)))
-        pairs += [(y * tile_width + x, float(depths[0, i]), i) for y in range(y0, y1) for x in range(x0, x1)]
-    pairs.sort()
-    return None, torch.tensor([tile for tile, _, _ in pairs]), torch.tensor([i for *_, i in pairs], dtype=torch.int32)
+pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.needs_cuda)]
+EVERYWHERE = torch.ones(HEIGHT, WIDTH)
+Emulation = Callable[[int], KernelLibrary]
 
 
-def isect_offset_encode(tile_ids, n_images, tile_width, tile_height):
-    return torch.searchsorted(tile_ids, torch.arange(tile_width * tile_height), out_int32=True)
+def scene(name: str) -> list[Tensor]:
+    """Means, rotations, scales, opacities, colours and screen offsets, float32."""
+    values = [value.float().clone() for value in gaussians(1500 if name == "dark" else 300)]
+    if name == "dark":  # Many pixels stop early, most Gaussians are hidden.
+        values[3] = 0.9 + 0.1 * values[3]
+    elif name == "needles":
+        values[2][:] = 0.004
+        values[2][:, 0] = 0.5
+    elif name == "walls":  # Larger than the picture.
+        values[2] *= 500.0
+    elif name == "moved":
+        values[5] = torch.randn(300, 2, generator=torch.Generator().manual_seed(5)) * 8.0
+    return values
 
 
-def rasterize_to_pixels(
-    means2d, conics, colors, opacities, width, height, tile_size, starts, ids, *, backgrounds, masks, packed
-):
-    assert starts.dtype == ids.dtype == torch.int32
-    assert masks is None or masks.shape == starts.shape
-    rows, columns = starts.shape[1:]
-    assert rows * tile_size >= height
-    assert columns * tile_size >= width
-    bounds = [*starts.flatten().tolist(), len(ids)]
-    lines = []
-    for row in range(rows):
-        parts = []
-        for column in range(columns):
-            tile = row * columns + column
-            listed = ids[bounds[tile] : bounds[tile + 1]].long()
-            if masks is not None and not masks[0, row, column]:
-                listed = listed[:0]
-            y, x = torch.meshgrid(torch.arange(tile_size), torch.arange(tile_size), indexing="ij")
-            pixels = torch.stack([column * tile_size + x + 0.5, row * tile_size + y + 0.5], dim=-1).to(means2d)
-            delta = pixels[:, :, None] - means2d[0, listed]
-            a, b, c = conics[0, listed].unbind(1)
-            power = 0.5 * (a * delta[..., 0] ** 2 + c * delta[..., 1] ** 2) + b * delta[..., 0] * delta[..., 1]
-            alpha = (opacities[0, listed] * torch.exp(-power)).clamp(max=reference_raster.MAX_ALPHA)
-            alpha = torch.where(alpha < reference_raster.MIN_ALPHA, 0.0, alpha)
-            light = torch.cat([alpha.new_ones(tile_size, tile_size, 1), (1 - alpha).cumprod(-1)], dim=-1)
-            image = (alpha * light[..., :-1]) @ colors[0, listed]
-            if backgrounds is not None:
-                image = image + light[..., -1:] * backgrounds[0]
-            parts.append(torch.cat([image, 1 - light[..., -1:]], dim=-1))
-        lines.append(torch.cat(parts, dim=1))
-    whole = torch.cat(lines)[None, :height, :width]
-    return whole[..., :3], whole[..., 3:]
+def in_both_orders(emulation: Emulation, inputs: Sequence[Tensor], **options: Tensor | None) -> list[Tensor]:
+    """Picture, coverage, radii and gradients, after a check that the order of threads does not matter."""
+    results = []
+    for order in (0, 1):
+        rasterize = partial(cuda_picture.rasterize, emulation(order))
+        image, alpha, gradients, radii = run(rasterize, tuple(inputs), away=EVERYWHERE, **options)
+        results.append([image, alpha, radii, *gradients])
+    assert all(torch.equal(one, two) for one, two in zip(*results, strict=True))
+    return results[0]
 
 
-@pytest.fixture
-def pretended(monkeypatch: pytest.MonkeyPatch) -> None:
-    names = ("gsplat", "gsplat.cuda", "gsplat.cuda._wrapper")
-    for name in names:
-        monkeypatch.setitem(sys.modules, name, ModuleType(name))
-    wrapper = sys.modules[names[-1]]
-    wrapper.fully_fused_projection = projection  # type: ignore[attr-defined]
-    wrapper.isect_tiles = isect_tiles  # type: ignore[attr-defined]
-    wrapper.isect_offset_encode = isect_offset_encode  # type: ignore[attr-defined]
-    wrapper.rasterize_to_pixels = rasterize_to_pixels  # type: ignore[attr-defined]
+@pytest.mark.parametrize("name", ["plain", "dark", "needles", "walls", "moved"])
+@pytest.mark.parametrize("background", [None, COLOURED], ids=["black", "coloured"])
+@pytest.mark.parametrize("share", [None, 0.4])
+def test_pictures_and_gradients_are_those_of_the_cpu(
+    emulation: Emulation, name: str, background: Tensor | None, share: float | None
+) -> None:
+    inputs = scene(name)
+    intervals = None if share is None else intervals_at(share)[:1].expand(len(inputs[0]))
+    options = {"background": background, "intervals": intervals}
+    image, alpha, radii, *gradients = in_both_orders(emulation, inputs, **options)
+    exact, exact_alpha, exact_gradients, exact_radii = run(
+        cpu_raster.rasterize, tuple(inputs), away=EVERYWHERE, **options
+    )
+    # In pixels where an alpha is at a limit, the last bit decides. Conics of needles have large roundings.
+    apart = torch.maximum((image - exact).abs().amax(-1), (alpha - exact_alpha).abs())
+    assert (apart < (3e-5 if name == "needles" else 1e-6)).float().mean() > 0.999
+    torch.testing.assert_close(radii, exact_radii, rtol=1e-4, atol=1e-4)
+    for ours, theirs, attribute in zip(gradients, exact_gradients, NAMES, strict=True):
+        assert theirs.any(), attribute
+        assert (ours - theirs).norm() <= 1e-3 * theirs.norm(), attribute
 
 
-def splats(device: str) -> list[Tensor]:
-    """Means, rotations, scales, opacities, colours and screen offsets; no pixel gets dark enough to stop early."""
-    depths = torch.linspace(1.0, 4.0, COUNT)[torch.randperm(COUNT)]
-    means = torch.cat([(torch.rand(COUNT, 2) * 1.6 - 0.8) * depths[:, None], depths[:, None]], dim=1)
-    opacities = torch.rand(COUNT) * 0.3 + 0.1
-    opacities[::7] = 0.0  # as structured Gaussians that are not drawn
-    scales = torch.exp(torch.randn(COUNT, 3) * 0.3 - 2.5)
-    scales[::7] = 0.0
-    values = [means, torch.randn(COUNT, 4), scales, opacities, torch.rand(COUNT, 3), torch.zeros(COUNT, 2)]
-    return [value.to(device, torch.float32 if device == "cuda" else torch.float64) for value in values]
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("background", [None, COLOURED], ids=["black", "coloured"])
+@pytest.mark.parametrize("share", [None, 0.0, 0.4, 1.0, 3.0])
+def test_the_reference(
+    kernels_on: Callable[[str], KernelLibrary], device: str, background: Tensor | None, share: float | None
+) -> None:
+    rasterize = partial(cuda_picture.rasterize, kernels_on(device))
+    check_against_reference(rasterize, background=background, device=device, share=share)
 
 
-def camera(like: Tensor) -> Viewport:
-    K = torch.tensor([[30.0, 0, 20.0], [0, 31.0, 17.0], [0, 0, 1]])
-    return viewport_of(torch.eye(4).to(like), K.to(like), width=WIDTH, height=HEIGHT, near=NEAR)
+@pytest.mark.parametrize("trained", [None, 0, 120])
+@pytest.mark.parametrize("tiles", [None, some_tiles()], ids=["whole", "tiles"])
+def test_tiles_and_trained_rows(emulation: Emulation, trained: int | None, tiles: TileSelection | None) -> None:
+    inputs = tuple(value.float() for value in gaussians())
+    results = []
+    for rasterize in (cpu_raster.rasterize, *(partial(cuda_picture.rasterize, emulation(order)) for order in (0, 1))):
+        onto = None if tiles is None else torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1))
+        output, gradients = run_tiles(rasterize, inputs, tiles, onto, trained)
+        assert onto is None or output.image.data_ptr() == onto.data_ptr()
+        assert onto is None or not onto.requires_grad
+        results.append([output.image.detach(), output.alpha.detach(), output.radii, *gradients])
+    exact, ours, again = results
+    assert all(torch.equal(one, two) for one, two in zip(ours, again, strict=True))
+    for found, theirs in zip(ours[:3], exact[:3], strict=True):
+        torch.testing.assert_close(found, theirs, rtol=1e-4, atol=2e-6)
+    for found, theirs in zip(ours[3:], exact[3:], strict=True):
+        assert (found - theirs).norm() <= 1e-3 * theirs.norm()
+        assert trained is None or not found[trained:].any()
+        assert theirs.any() or trained == 0
 
 
-def run(rasterize: Rasterizer, values: list[Tensor], **options) -> tuple[list[Tensor], list[Tensor]]:
-    """Picture, coverage and radii, and the gradients of all inputs for fixed cotangents."""
-    leaves = [value.clone().requires_grad_() for value in values]
-    output = rasterize(splats_of(*leaves[:5]), camera(values[0]), screen_offsets=leaves[5], **options)
-    generator = torch.Generator().manual_seed(3)
-    v_image = torch.rand(HEIGHT, WIDTH, 3, generator=generator).to(values[0])
-    gradients = torch.autograd.grad((output.image * v_image).sum() + output.alpha.sum(), leaves)
-    return [output.image.detach(), output.alpha.detach(), output.radii], list(gradients)
+@pytest.mark.parametrize("part", ["image", "alpha"])
+def test_only_the_picture_or_only_coverage_has_a_gradient(emulation: Emulation, part: str) -> None:
+    inputs = [value.float() for value in gaussians()[:5]]
+    found = []
+    for rasterize in (cpu_raster.rasterize, partial(cuda_picture.rasterize, emulation(0))):
+        leaves = [value.clone().requires_grad_() for value in inputs]
+        output = rasterize(splats_of(*leaves), camera(torch.float32), background=COLOURED)
+        assert not output.radii.requires_grad
+        found.append(torch.autograd.grad(getattr(output, part).square().sum(), leaves))
+    for theirs, ours in zip(*found, strict=True):
+        assert (ours - theirs).norm() <= 1e-4 * theirs.norm()
+    assert found[0][0].any()
 
 
-def asked(device: str) -> TileSelection:
-    mask = torch.ones(tile_grid(WIDTH, HEIGHT), dtype=torch.bool, device=device)
-    mask[0, 1] = mask[2, 0] = False
-    return TileSelection(mask, WIDTH, HEIGHT)
+def test_nothing_to_draw_and_what_is_broken_or_hidden(emulation: Emulation) -> None:
+    empty = [value[:0].float() for value in gaussians()]
+    image, alpha, radii, *gradients = in_both_orders(emulation, empty, background=COLOURED)
+    assert torch.equal(image, COLOURED.expand(HEIGHT, WIDTH, 3))
+    assert not alpha.any()
+    assert [len(value) for value in (radii, *gradients)] == [0] * 7
+    inputs = [value[:7].float().clone() for value in gaussians()]
+    inputs[0][0] = torch.nan
+    inputs[0][1] = torch.tensor([0.0, 0.0, -5.0])
+    inputs[1][2] = torch.inf
+    inputs[2][3] = torch.tensor([1e9, 1e9, 1e9])
+    inputs[4][4, 1] = torch.nan
+    image, _, radii, *gradients = in_both_orders(emulation, inputs)
+    assert radii[:5].tolist() == [0.0] * 5
+    assert torch.isfinite(image).all()
+    assert all(torch.isfinite(gradient).all() and not gradient[:5].any() for gradient in gradients)
 
 
-@pytest.mark.usefixtures("pretended")
-@pytest.mark.parametrize("budgeted", [False, True])
-@pytest.mark.parametrize("case", ["plain", "background", "tiles", "onto", "trained"])
-def test_the_picture_and_its_gradients_are_the_references(budgeted: bool, case: str) -> None:
-    values = splats("cpu")
-    options = {
-        "plain": {},
-        "background": {"background": torch.tensor([0.2, 0.5, 0.1], dtype=torch.float64)},
-        "tiles": {"tiles": asked("cpu")},
-        "onto": {"tiles": asked("cpu")},
-        "trained": {"trained": 20},
-    }[case]
-    budget = PairBudget.of(PAIRS, torch.device("cpu")) if budgeted else None
-    pictures = torch.rand(HEIGHT, WIDTH, 3, dtype=torch.float64).expand(2, HEIGHT, WIDTH, 3).clone()
-    ontos = [{"onto": picture} if case == "onto" else {} for picture in pictures]
-    exact, exact_gradients = run(reference_raster.rasterize, values, **options, **ontos[0])
-    ours, gradients = run(partial(cuda.rasterize, budget=budget), values, **options, **ontos[1])
-    assert exact[1].amax() > 0.3
-    for got, truth in zip(ours[:2], exact[:2], strict=True):
-        assert torch.allclose(got, truth, rtol=0, atol=1e-9)
-    for i, (got, truth) in enumerate(zip(gradients, exact_gradients, strict=True)):
-        assert (got - truth).norm() <= 1e-8 * (truth.norm() + 1e-3), i
-    if budget is not None:
-        assert 30 < int(budget.needed) < PAIRS
-        assert budget.shortage() == 0
+def test_what_gradients_need_is_freed_without_a_backward_pass(emulation: Emulation) -> None:
+    inputs = [value.float().requires_grad_() for value in gaussians(3000)[:5]]
+    view = camera(torch.float32)._replace(width=320, height=240)
+    peaks = []
+    for _ in range(3):
+        for _ in range(40):
+            cuda_picture.rasterize(emulation(0), splats_of(*inputs), view)
+        peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    assert peaks[2] - peaks[0] < 20_000  # kB; 80 pictures that leaked would hold more than 40,000
 
 
-@pytest.mark.usefixtures("pretended")
-def test_with_tiles_who_reaches_none_counts_as_not_drawn_and_the_picture_is_drawn_onto() -> None:
-    values = splats("cpu")
-    tiles = asked("cpu")
-    tiles.mask[1:] = False
-    pictures = [torch.rand(HEIGHT, WIDTH, 3, dtype=torch.float64) for _ in range(2)]
-    outputs = [
-        rasterize(splats_of(*values[:5]), camera(values[0]), tiles=tiles, onto=picture)
-        for rasterize, picture in zip((reference_raster.rasterize, cuda.rasterize), pictures, strict=True)
-    ]
-    for output, picture in zip(outputs, pictures, strict=True):
-        assert output.image.data_ptr() == picture.data_ptr()
-    pixels = tiles.pixels()[..., None].expand(-1, -1, 1).double()
-    shown = reference_raster.blending_weights(splats_of(*values[:5]), camera(values[0]), pixels)
-    everything = cuda.rasterize(splats_of(*values[:5]), camera(values[0]))
-    assert 0 < (shown > 0).sum() <= (outputs[1].radii > 0).sum() < (everything.radii > 0).sum()
-    assert (outputs[1].radii[shown[:, 0] > 0] > 0).all()
+def test_another_precision_is_refused_and_a_changed_input_is_found(emulation: Emulation) -> None:
+    leaves = [value.requires_grad_() for value in map(torch.clone, gaussians(3)[:5])]
+    with pytest.raises(BackendError, match="reference back-end"):
+        cuda_picture.rasterize(emulation(0), splats_of(*leaves), camera())
+    single = [value.detach().float().requires_grad_() for value in leaves]
+    output = cuda_picture.rasterize(emulation(0), splats_of(*single), camera(torch.float32))
+    with torch.no_grad():
+        single[3].mul_(0.5)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        output.image.sum().backward()
 
 
-@pytest.mark.usefixtures("pretended")
-def test_a_budget_that_is_too_small_says_so() -> None:
-    budget = PairBudget.of(20, torch.device("cpu"))
-    run(partial(cuda.rasterize, budget=budget), splats("cpu"))
-    missing = budget.shortage()
-    assert missing > 0
-    assert PairBudget.of(20 + missing, torch.device("cpu")).shortage() == 0
+def test_weights_are_gradients_of_colours(emulation: Emulation) -> None:
+    given = splats_of(*(value.float() for value in gaussians()[:5]))
+    maps = torch.rand(HEIGHT, WIDTH, 5, generator=torch.Generator().manual_seed(3))
+    rasterize = partial(cuda_picture.rasterize, emulation(0))
+    weights = cuda_picture.blending_weights(emulation(0), given, camera(torch.float32), maps)
+    again = reference_raster.weights_by_gradient(rasterize, given, camera(torch.float32), maps)
+    assert (weights - again).norm() <= 1e-6 * weights.norm()
 
 
 @pytest.mark.needs_cuda
-@pytest.mark.parametrize("tiled", [False, True])
-@pytest.mark.parametrize("kernels", [False, True])
-def test_with_a_budget_gsplat_draws_the_same(tiled: bool, kernels: bool) -> None:
-    values, budget = splats("cuda"), PairBudget.of(PAIRS, torch.device("cuda"))
-    options = {"tiles": asked("cuda")} if tiled else {}
-    library = kernel_library()[0] if kernels else None
-    assert (library is not None) is kernels
-    plain, plain_gradients = run(cuda.rasterize, values, **options)
-    ours, gradients = run(partial(cuda.rasterize, budget=budget, library=library), values, **options)
-    assert 30 < int(budget.needed) < PAIRS
-    assert all(torch.equal(a, b) for a, b in zip(ours, plain, strict=True))
-    for got, truth in zip(gradients, plain_gradients, strict=True):  # gsplat adds gradients in any order
-        assert torch.allclose(got, truth, rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.needs_cuda
-def test_with_a_budget_nothing_waits_for_the_gpu() -> None:
-    values, budget = splats("cuda"), PairBudget.of(PAIRS, torch.device("cuda"))
-    leaves = [value.requires_grad_() for value in values]
-    splats_, view, tiles = splats_of(*leaves[:5]), camera(values[0]), asked("cuda")
-
-    def once() -> None:
-        output = cuda.rasterize(
-            splats_, view, screen_offsets=leaves[5], budget=budget, library=kernel_library()[0], tiles=tiles, trained=20
-        )
-        torch.autograd.grad(output.image.sum(), leaves)
-
-    once()  # the kernels are loaded
-    torch.cuda.set_sync_debug_mode("error")
-    try:
-        once()
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
+def test_gsplat_draws_the_same(kernels_on: Callable[[str], KernelLibrary]) -> None:
+    pytest.importorskip("gsplat")
+    given, view = splats_of(*(value.float().cuda() for value in gaussians()[:5])), camera()
+    ours, theirs = (
+        drawn_with_gradients(rasterize, given, Camera(view.viewmat, view.K, WIDTH, HEIGHT, NEAR))
+        for rasterize in (partial(cuda_picture.rasterize, kernels_on("cuda")), rasterize_by_gsplat)
+    )
+    picture, gradient = apart(ours, theirs)
+    assert picture < 1e-4
+    assert gradient < 0.02  # gsplat has gradients where hardly any light arrives, too.

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from structgstream.cameras import Viewport
-from structgstream.kernels import cpu_raster, cuda, reference_raster
+from structgstream.kernels import cpu_raster, reference_raster
 from structgstream.kernels.native import native_reason
 from structgstream.kernels.reference_raster import rasterize as reference
 from structgstream.kernels.values import TileSelection, tile_grid
@@ -54,13 +54,6 @@ def gaussians(count: int = 300, *, opaque: float = 0.7) -> tuple[Tensor, ...]:
         torch.rand(count, 3, generator=g, dtype=torch.float64),
         torch.zeros(count, 2, dtype=torch.float64),
     )
-
-
-def all_gradients(*args, **options):
-    """gsplat gives gradients to Gaussians that hardly any light reaches, too."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reference_raster, "MIN_GRADIENT_TRANSMITTANCE", 0.0)
-        return reference(*args, **options)
 
 
 def run(
@@ -116,13 +109,13 @@ def usual_safe_pixels() -> Tensor:
 
 
 @cache
-def runs_of_reference(exact, background: Tensor | None, share: float | None):
+def runs_of_reference(background: Tensor | None, share: float | None):
     """Pixels that are compared, and the results of the reference in float64 and in float32: as good as it gets."""
     inputs, intervals = gaussians(), None if share is None else intervals_at(share)
     away = safe_pixels(inputs, intervals)
     single = tuple(value.float() for value in inputs)
     options = {"background": background, "intervals": intervals, "away": away}
-    return away, run(exact, inputs, **options), run(exact, single, **options)
+    return away, run(reference, inputs, **options), run(reference, single, **options)
 
 
 def relative_errors(got: Tensor, truth: Tensor) -> Tensor:
@@ -133,9 +126,9 @@ def relative_errors(got: Tensor, truth: Tensor) -> Tensor:
 
 
 def check_against_reference(
-    rasterize, exact, *, background: Tensor | None, device: str = "cpu", share: float | None = None
+    rasterize, *, background: Tensor | None, device: str = "cpu", share: float | None = None
 ) -> None:
-    safe, (image, alpha, gradients, radii), (_, _, torch32, _) = runs_of_reference(exact, background, share)
+    safe, (image, alpha, gradients, radii), (_, _, torch32, _) = runs_of_reference(background, share)
     away, intervals = safe.bool(), None if share is None else intervals_at(share)
     assert away.float().mean() > 0.5
     single = tuple(value.float() for value in gaussians())
@@ -145,9 +138,7 @@ def check_against_reference(
     # Float32 sums of some tens of terms of size one: 1e-5 is 80 units in the last place.
     assert (image32 - image).abs()[away].max() < 1e-5
     assert (alpha32 - alpha).abs()[away].max() < 1e-5
-    # A box may miss the picture by a rounding; gsplat's are whole pixels, so that more of them reach it.
-    assert ((radii32 > 0) | (radii == 0)).float().mean() > 0.99
-    assert ((radii32 > 0) == (radii > 0)).float().mean() > (0.99 if device == "cpu" else 0.95)
+    assert ((radii32 > 0) == (radii > 0)).float().mean() > 0.99  # A box may miss the picture by a rounding.
     for name, got, single, truth in zip(NAMES, gradients32, torch32, gradients):
         errors, autograd = relative_errors(got, truth), relative_errors(single, truth)
         # As good as torch's own float32 autograd on the same input, give or take the order of its sums.
@@ -158,7 +149,7 @@ def check_against_reference(
 @native
 @pytest.mark.parametrize("background", [None, COLOURED], ids=["black", "coloured"])
 def test_cpu(isa: int, background: Tensor | None) -> None:
-    check_against_reference(cpu_raster.rasterize, reference, background=background)
+    check_against_reference(cpu_raster.rasterize, background=background)
 
 
 def intervals_at(share: float) -> Tensor:
@@ -174,7 +165,7 @@ def intervals_at(share: float) -> Tensor:
 def test_the_low_pass_of_the_training_pictures_on_the_cpu(isa: int, share: float) -> None:
     """Pictures without training pixels, much smaller than the training pictures, as large, and three times as large."""
     intervals = intervals_at(share)
-    check_against_reference(cpu_raster.rasterize, reference, background=COLOURED, share=share)
+    check_against_reference(cpu_raster.rasterize, background=COLOURED, share=share)
     plain, filtered = (
         cpu_raster.rasterize(
             splats_of(*(v.float() for v in gaussians()[:5]), intervals=given), camera(torch.float32)
@@ -182,12 +173,6 @@ def test_the_low_pass_of_the_training_pictures_on_the_cpu(isa: int, share: float
         for given in (None, intervals.float())
     )
     assert (plain - filtered).abs().max() > 0.01
-
-
-@pytest.mark.needs_cuda
-@pytest.mark.parametrize("share", [0.4, 1.0, 3.0])
-def test_the_low_pass_of_the_training_pictures_on_a_gpu(share: float) -> None:
-    check_against_reference(cuda.rasterize, all_gradients, background=None, device="cuda", share=share)
 
 
 @native
@@ -223,11 +208,6 @@ def test_no_pixel_of_a_needle_is_skipped(isa: int, faint: bool) -> None:
     assert image[away].max() > (0.02 if faint else 0.5)
     # Conics of needles are large, and so are their roundings.
     assert (drawn - image).abs()[away].max() < 1e-3
-
-
-@pytest.mark.needs_cuda
-def test_cuda() -> None:
-    check_against_reference(cuda.rasterize, all_gradients, background=None, device="cuda")
 
 
 @native

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cuda back-end on the pretended device, which counts what a host queues for it and what it waits for.
 
-Its own kernels run in their emulation; gsplat's place is taken by the CPU rasteriser and by an estimate of its
-launches. Recorded iterations are counted when they are recorded; a replay is one operation.
+Its own kernels run in their emulation.
 """
 
 import ctypes
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
@@ -19,11 +18,11 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
 from structgstream.kernels import backend as backends
-from structgstream.kernels import cpu_raster, cuda, cuda_anchors, cuda_fit, cuda_library
-from structgstream.kernels.backend import Backend, native_functions, reference_backend
+from structgstream.kernels import cuda_fit
+from structgstream.kernels.backend import Backend, kernel_functions, reference_backend
 from structgstream.kernels.cuda_library import KernelLibrary
-from structgstream.kernels.values import FitFrame, RasterOutput
-from tests.support.pretended_gpu import DEVICE, lies_there, pretended_device, rasterize, values_of
+from structgstream.kernels.values import FitFrame
+from tests.support.pretended_gpu import DEVICE, lies_there, pretended_device, values_of
 
 _VIEWS = (
     "view _unsafe_view expand permute t transpose select slice unsqueeze squeeze alias detach as_strided split "
@@ -33,8 +32,6 @@ _VIEWS = (
 _WAITS = frozenset(("_local_scalar_dense", "nonzero", "masked_select", "equal", "_unique2", "unique_dim"))
 _LAUNCHES = {"sort": 6, "argsort": 6, "cumsum": 2, "nonzero": 4, "_unique2": 10, "unique_dim": 14, "median": 4}
 """Launches of operations that have more than one."""
-_GSPLAT_FORWARD, _GSPLAT_BACKWARD = 12, 12  # launches without tile lists; those of the lists are 12 more
-_GSPLAT_LISTS = 12
 
 
 @dataclass
@@ -85,8 +82,11 @@ class _Library(KernelLibrary):
             "sgs_cuda_l1_ssim": 2,
             "sgs_cuda_reached_tiles": 2,
             "sgs_cuda_views": 16,
+            "sgs_cuda_raster_new": 8,  # with statics
+            "sgs_cuda_raster_backward": 2,
         }
-        self.counts.add(name, several.get(name, 1), waits=int(name == "sgs_cuda_views"))
+        waits = name in ("sgs_cuda_views", "sgs_cuda_raster_new")
+        self.counts.add(name, several.get(name, 1), waits=int(waits))
         super().call(name, *(values_of(argument) for argument in arguments), device=device)
 
     def addresses(self, *tensors: Tensor | None) -> list[int | None]:
@@ -118,50 +118,6 @@ def _counted_iterations(library: KernelLibrary, counts: Counts, frame: FitFrame)
     return counted
 
 
-class _Recorder:
-    """Runs what it has recorded, and counts it once."""
-
-    def __init__(self, counts: Counts) -> None:
-        self.replays = 0
-        self._counts, self._works, self._counted = counts, dict[Hashable, Callable[[], Any]](), set[Hashable]()
-
-    def __len__(self) -> int:
-        return len(self._works)
-
-    def __contains__(self, key: Hashable) -> bool:
-        return key in self._works
-
-    def record(self, key: Hashable, work: Callable[[], Any]) -> None:
-        self._works[key] = work
-
-    def replay(self, key: Hashable) -> Any:
-        self.replays += 1
-        self._counts.add("replay")
-        if key not in self._counted:
-            self._counted.add(key)
-            return self._works[key]()
-        with self._counts.paused():
-            return self._works[key]()
-
-
-def _counted_rasterizer(counts: Counts) -> Callable[..., RasterOutput]:
-    def draw(*args: Any, budget: Any = None, library: Any = None, **options: Any) -> RasterOutput:
-        del library
-        counts.add("gsplat", _GSPLAT_FORWARD + _GSPLAT_LISTS, waits=int(budget is None))
-        with counts.paused():
-            output = rasterize(cpu_raster.rasterize, *args, **options)
-
-        def backward(gradient: Tensor) -> Tensor:
-            counts.add("gsplat backward", _GSPLAT_BACKWARD)
-            return gradient
-
-        if output.image.requires_grad:
-            output.image.register_hook(backward)
-        return output
-
-    return draw
-
-
 @contextmanager
 def counted_gpu(
     emulation: ctypes.CDLL, patch: pytest.MonkeyPatch, *, native: bool = True
@@ -170,29 +126,19 @@ def counted_gpu(
 
     Args:
         emulation: the kernels on the processor.
-        patch: to replace gsplat's rasteriser.
-        native: with the iterations of ``kernels.cuda_fit``.
+        patch: to count where the host waits.
+        native: with the iterations of ``kernels.cuda_fit``; else they run in torch.
     """
     counts = Counts()
     library = _Library(emulation, DEVICE.type, lambda device: 0)
     object.__setattr__(library, "counts", counts)
-    draw = _counted_rasterizer(counts)
-    patch.setattr(cuda_library, "kernel_library", lambda: (library, "emulated"))
-    patch.setattr(cuda, "rasterize", draw)
     patch.setattr(backends, "wait_for", lambda device: counts.add("wait", 0, waits=int(device == DEVICE)))
     plain = KernelLibrary(emulation, "cpu", lambda device: 0)
     backend = replace(
         reference_backend(),
         name="cuda",
         device=DEVICE,
-        recorder=lambda: _Recorder(counts),
         iterations=partial(_counted_iterations, plain, counts) if native else None,
-    ).with_functions(
-        **native_functions(library, draw),
-        adam_step=cuda.adam_step,
-        generate_structured=partial(cuda_anchors.generate_structured, library),
-        l1_ssim=partial(cuda.l1_ssim, library),
-        sweep=partial(cuda.sweep, library),
-    )
+    ).with_functions(**kernel_functions(library))
     with pretended_device(counts.see):
         yield backend, counts

@@ -10,21 +10,12 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
-from functools import partial
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
-
-from structgstream.cameras import Viewport
-from structgstream.gaussians import Gaussians
-from structgstream.kernels import reference_anchors
-from structgstream.kernels.backend import Backend, functions_of, reference_backend
-from structgstream.kernels.cuda_tiles import PairBudget
-from structgstream.kernels.reference_views import ViewByView
-from structgstream.kernels.values import Rasterizer, RasterOutput, TileSelection
 
 # Autograd has no threads for a GPU that is not there; for this device it works on the calling one.
 DEVICE = torch.device("meta")
@@ -171,40 +162,3 @@ def moved(value: Value, device: torch.device) -> Value:
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         return type(value)(*(moved(part, device) for part in value))  # type: ignore[return-value]
     return value
-
-
-def rasterize(
-    on_processor: Rasterizer,
-    gaussians: Gaussians,
-    viewport: Viewport,
-    *,
-    background: Tensor | None = None,
-    screen_offsets: Tensor | None = None,
-    tiles: TileSelection | None = None,
-    onto: Tensor | None = None,
-    trained: int | None = None,
-    budget: PairBudget | None = None,
-    library: None = None,
-) -> RasterOutput:
-    """See ``reference_raster.rasterize``; what draws is ``on_processor``, all the rest lies on ``DEVICE``."""
-    here = torch.device("cpu")
-    optional = [t for t in (background, screen_offsets, onto, None if tiles is None else tiles.mask) if t is not None]
-    assert all(t.device == DEVICE for t in (gaussians.means, gaussians.colors, viewport.viewmat, viewport.K, *optional))
-    output = on_processor(
-        moved(gaussians, here),
-        moved(viewport, here),
-        background=moved(background, here),
-        screen_offsets=moved(screen_offsets, here),
-        tiles=moved(tiles, here),
-        onto=None if onto is None else onto.detach().cpu().clone(),
-        trained=trained,
-    )
-    return moved(output, DEVICE)
-
-
-def pretended_gpu(on_processor: Rasterizer) -> Backend:
-    """The torch parts of the cuda back-end on ``DEVICE``, with the rasteriser ``on_processor``."""
-    there = partial(rasterize, on_processor)
-    return replace(reference_backend(), name="cuda", device=DEVICE).with_functions(
-        **functions_of(ViewByView.by_drawing(reference_anchors.generate_structured, there)),
-    )

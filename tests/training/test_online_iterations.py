@@ -188,32 +188,3 @@ def test_prices_are_added_to_the_loss() -> None:
     priced = replace(plain, rate_term=cast(Any, SimpleNamespace(value=lambda values, backend: torch.tensor(0.5))))
     loss, unpriced = priced.loss(1, VIEWS[0]), plain.loss(1, VIEWS[0]).total
     torch.testing.assert_close(loss.total, unpriced + 0.5)
-
-
-def test_visits_of_the_same_tiles_repeat_and_the_last_ones_are_not_worth_a_recording() -> None:
-    hooks = replace(hooks_of(focused(selection(1)), rest_every=3), iterations=14)
-    hooks.free_set.config = replace(hooks.free_set.config, spawn="off")
-    keys = []
-    for iteration in range(1, 15):  # Seven visits of each of two views.
-        keys.append(hooks.repeats(iteration, VIEWS[(iteration + 1) % 2]))
-        iterate(hooks, iteration, (iteration + 1) % 2)
-    changed, whole = (VIEWS[0].index, True, 0), (VIEWS[0].index, False, 0)
-    assert keys[::2] == [changed, changed, whole, changed, changed, whole, changed]
-    assert replace(hooks, recorded=set()).repeats(14, VIEWS[0]) is None
-    hooks.visits[VIEWS[0].index] = 2  # The next visit is of all tiles, and the one after it three visits later.
-    assert replace(hooks, recorded=set()).repeats(10, VIEWS[0]) is None
-    assert replace(hooks, recorded=set()).repeats(8, VIEWS[0]) == whole
-
-
-def test_nothing_repeats_while_gradients_are_collected_nor_across_rows_that_come_or_go() -> None:
-    hooks = replace(hooks_of(started(random_scene(60, free=5, cameras=4, seed=4)), patch_at=3), iterations=99)
-    assert [hooks.repeats(iteration, VIEWS[0]) is None for iteration in (1, 3, 4)] == [True, True, False]
-    hooks.free_set.config = replace(hooks.free_set.config, spawn="off")
-    before = hooks.repeats(3, VIEWS[0])
-    assert before is not None
-    iterate(hooks, 3)  # Nothing is faint enough to die.
-    assert hooks.repeats(4, VIEWS[0]) == before
-    hooks.patch_at = 5
-    hooks.parameters.values["free_logit_opacities"].data[2] = -9.0
-    iterate(hooks, 5)
-    assert hooks.repeats(6, VIEWS[0]) not in (None, before)

@@ -15,7 +15,6 @@ from structgstream.training.parameters import FREE_ROWS, Parameters, parameters_
 from structgstream.training.result import Step, Stopwatch
 from structgstream.training.views import View
 from tests.support.backends import quickest_backend
-from tests.support.recorders import Repeater
 from tests.support.rigs import arc_rig, random_scene
 
 CPU = torch.device("cpu")
@@ -53,13 +52,6 @@ class Parabola(Hooks[float, Loss]):
         return 3, 4
 
 
-class Repeating(Parabola):
-    """Iterations of a sample repeat, but for those of the last two."""
-
-    def repeats(self, iteration: int, sample: float) -> float | None:
-        return sample if iteration <= 7 else None
-
-
 def run(iterations: int, **stages: int) -> tuple[int, Parabola, list[Step]]:
     adam = Adam(quickest_backend(), leaves({"x": torch.zeros(1)}))
     hooks, steps = Parabola(adam), []
@@ -78,21 +70,6 @@ def test_each_iteration_takes_a_sample_steps_and_tells_the_hooks() -> None:
     assert after[1] - after[0] == pytest.approx(0.2, rel=0.1)
     assert steps[0] == Step(1, 3, 1.0, 3, 4)
     assert [step.iteration for step in steps] == [1, 2, 3]
-
-
-def test_iterations_that_are_recorded_take_the_steps_of_their_time() -> None:
-    """Rates and the numbers of steps differ from one to the next, and are read when a recording is run."""
-    found = []
-    for recorder in (None, Repeater()):
-        adam = Adam(quickest_backend(), {**leaves({"x": torch.zeros(1)}), "fixed": torch.ones(1)})
-        hooks = Repeating(adam)
-        schedule: Schedule[str] = Schedule(9, lambda iteration: {"x": 0.1 * iteration, "fixed": 0.0})
-        minimize(adam, cycle([1.0, 2.0]), schedule, hooks, watch=Stopwatch(), recorder=recorder)
-        found.append([x for what, _, x in hooks.seen if what == "after"])
-        if recorder is not None:
-            assert recorder.keys == [2.0, 1.0, 2.0, 1.0, 2.0, 1.0]  # The first iteration is not recorded.
-            assert adam.steps["x"] == 9
-    assert found[0] == pytest.approx(found[1], rel=1e-6)
 
 
 def test_progress_counts_all_stages_of_a_frame() -> None:

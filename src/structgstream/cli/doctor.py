@@ -25,7 +25,6 @@ OPTIONAL = (
     ("fourdgs", "fourdgs", "export", "export to .4dgs"),
     ("s3fs", "s3fs", "cloud", "publish segments to S3"),
     ("anywidget", "anywidget", "notebook", "player in notebooks"),
-    ("gsplat", "gsplat", "cuda", "back-end cuda"),
 )
 
 
@@ -60,16 +59,16 @@ def main(arguments: list[str]) -> None:
 def diagnose() -> dict[str, Any]:
     """Machine, back-ends and optional packages as plain values: ``environment``, ``backends``, ``packages``."""
     from structgstream.evaluation.environment import environment
-    from structgstream.kernels.backend import backend_reasons, backend_remarks
+    from structgstream.kernels.backend import backend_reasons
 
-    reasons, remarks = backend_reasons(), backend_remarks()
+    reasons = backend_reasons()
     chosen = next(name for name, reason in reasons.items() if reason is None)
     backends = [
         {
             "name": name,
             "available": reason is None,
             "state": "missing" if reason else "chosen by --device auto" if name == chosen else "available",
-            "advice": reason or remarks.get(name, ""),
+            "advice": reason or "",
         }
         for name, reason in reasons.items()
     ]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute back-ends: the table of their operations, and the function of each back-end for each of them.
 
-``reference`` is pure torch and runs anywhere, ``cpu`` is this package's C++, ``cuda`` is gsplat and this package's CUDA
-kernels. An operation is defined by its function in ``reference_*``: the signature, the contract, and the results that
+``reference`` is pure torch and runs anywhere, ``cpu`` is this package's C++, ``cuda`` is this package's CUDA kernels.
+An operation is defined by its function in ``reference_*``: the signature, the contract, and the results that
 parity tests compare other back-ends with.
 
 Note [Ownership]
@@ -32,11 +32,9 @@ from torch import Tensor
 
 from structgstream.errors import BackendError
 from structgstream.kernels import reference_anchors, reference_losses, reference_motion, reference_raster
-from structgstream.kernels.cuda_graph import GraphMemory, Recorder
 from structgstream.kernels.cuda_library import KernelLibrary
-from structgstream.kernels.cuda_tiles import PairBudget
 from structgstream.kernels.reference_views import ORACLE, ViewByView
-from structgstream.kernels.values import FitFrame, Rasterizer
+from structgstream.kernels.values import FitFrame
 
 _log = logging.getLogger(__name__)
 
@@ -69,13 +67,12 @@ class Backend:
     """The operations that rendering and training need, and how one back-end computes them.
 
     The cpu back-end has a C++ function for each. The cuda back-end runs the reference's function unless a comment
-    states otherwise; without NVIDIA's compiler it also runs the reference's in place of its own kernels.
+    states otherwise.
 
     Args:
         name: ``reference``, ``cpu`` or ``cuda``.
         device: device of its tensors.
         functions: function of each operation by name, with the signature of the oracle.
-        recorder: creates a recorder of iterations (``kernels.cuda_graph``); None if operations are queued one by one.
         iterations: runs those of a frame in which only anchors and free Gaussians are trained (``kernels.cpu_fit``,
             ``kernels.cuda_fit``); None: they are run in torch.
     """
@@ -83,18 +80,17 @@ class Backend:
     name: str
     device: torch.device
     functions: Mapping[str, Callable[..., Any]]
-    recorder: Callable[[], Recorder[Any]] | None = None
     iterations: Callable[[FitFrame], Callable[[int, int], None]] | None = None
 
-    rasterize = Operation(reference_raster.rasterize)  # cuda: gsplat; own kernels without gradients
-    blending_weights = Operation(reference_raster.blending_weights)  # cuda: own kernels, or gsplat's gradients
-    generate_views = Operation(ORACLE.generate_views)  # cuda: own kernels, or view by view; as the four below
+    rasterize = Operation(reference_raster.rasterize)  # cuda: own kernels; as the eight below
+    blending_weights = Operation(reference_raster.blending_weights)
+    generate_views = Operation(ORACLE.generate_views)
     draw_views = Operation(ORACLE.draw_views)
     weigh_views = Operation(ORACLE.weigh_views)
     draw_and_weigh_views = Operation(ORACLE.draw_and_weigh_views)
     reached_tiles = Operation(ORACLE.reached_tiles)
-    generate_structured = Operation(reference_anchors.generate_structured)  # cuda: own kernels
-    l1_ssim = Operation(reference_losses.l1_ssim)  # cuda: own kernels
+    generate_structured = Operation(reference_anchors.generate_structured)
+    l1_ssim = Operation(reference_losses.l1_ssim)
     volume = Operation(reference_losses.volume)
     excess = Operation(reference_losses.excess)
     neighbour_difference = Operation(reference_losses.neighbour_difference)
@@ -158,63 +154,37 @@ def processor_backend() -> Backend:
     return cpu_backend() if native_reason() is None else reference_backend()
 
 
-def cuda_backend(*, native: bool = False) -> Backend:
-    """An NVIDIA GPU: gsplat's rasteriser, this package's kernels, and torch for the rest.
-
-    Args:
-        native: run iterations of later frames, and draw without gradients, in this package's kernels; gsplat may then
-            be missing. Not the default until it has run on a GPU (``benchmarks.gpu`` measures it).
+def cuda_backend() -> Backend:
+    """An NVIDIA GPU: this package's kernels, compiled on first use, and torch for the rest.
 
     Raises:
-        BackendError: no GPU, or gsplat is not installed or does not load; with ``native``, the kernels do not compile.
+        BackendError: there is no GPU or no compiler, or the kernels do not compile.
     """
-    from structgstream.kernels import cuda, cuda_anchors, cuda_fit, cuda_library
+    from structgstream.kernels import cuda, cuda_fit, cuda_library
 
-    reason = cuda.cuda_reason(needs_gsplat=not native)
+    reason = cuda.cuda_reason()
     if reason is not None:
         raise BackendError(reason)
-    library, sentence = cuda_library.kernel_library()
-    if native and library is None:
-        raise BackendError(f"The cuda back-end has no iterations of its own here: {sentence}")
-    _log.log(logging.WARNING if library is None else logging.INFO, sentence)
-    processor, rasterize = processor_backend(), partial(cuda.rasterize, library=library)
-    generate = reference_anchors.generate_structured
-    if library is not None:
-        generate = partial(cuda_anchors.generate_structured, library)
-    backend = replace(
+    library, processor = cuda_library.kernel_library(), processor_backend()
+    return replace(
         reference_backend(),
         name="cuda",
         device=torch.device("cuda"),
-        recorder=GraphMemory(torch.device("cuda")).recorder,
+        iterations=partial(cuda_fit.iterations, library),
     ).with_functions(
-        **functions_of(ViewByView.by_drawing(generate, rasterize)),
-        adam_step=cuda.adam_step,
+        **kernel_functions(library),
         confident_flow=processor.confident_flow,
         plane_scores=processor.plane_scores,
     )
-    if library is None:
-        return backend
-    backend = backend.with_functions(
-        l1_ssim=partial(cuda.l1_ssim, library),
-        sweep=partial(cuda.sweep, library),
-    )
-    if not native:
-        return backend
-    return replace(backend, iterations=partial(cuda_fit.iterations, library)).with_functions(
-        **native_functions(library, rasterize)
-    )
 
 
-def native_functions(library: KernelLibrary, rasterize: Rasterizer) -> dict[str, Callable[..., Any]]:
-    """The functions of a cuda back-end that draws without gradients in this package's kernels; ``rasterize`` has
-    gradients."""
+def kernel_functions(library: KernelLibrary) -> dict[str, Callable[..., Any]]:
+    """The functions of the cuda back-end that do not run in torch's own operations, or on the processor."""
     from structgstream.kernels import cuda, cuda_anchors, cuda_picture
 
-    functions = functions_of(cuda_picture)
-    del functions["rasterize"]
-    functions |= {"generate_views": cuda_anchors.generate_views, "lift": cuda.lift}
-    of_library = {name: partial(function, library) for name, function in functions.items()}
-    return {**of_library, "rasterize": partial(cuda_picture.rasterize, library, rasterize)}
+    functions = functions_of(cuda_picture, cuda_anchors, cuda)
+    adam_step = functions.pop("adam_step")
+    return {**{name: partial(function, library) for name, function in functions.items()}, "adam_step": adam_step}
 
 
 def on_processor(*tensors: Tensor) -> list[Tensor]:
@@ -230,43 +200,12 @@ def wait_for(device: torch.device) -> None:
         torch.cuda.current_stream(device).synchronize()
 
 
-def nonblocking(backend: Backend, budget: PairBudget) -> Backend:
-    """The cuda back-end with shapes that do not depend on data, so that an iteration has no host synchronisation.
-
-    ``generate_structured`` returns all Gaussians (``kernels.cuda_anchors``, Note [Shapes without waiting]). It and the
-    tile lists run in this package's kernels if those were compiled, else in torch. A picture has at most
-    ``budget.capacity`` (Gaussian, tile) pairs (``kernels.cuda_tiles``, Note [Pairs without waiting]); check
-    ``budget.shortage()`` at the end.
-
-    Raises:
-        BackendError: ``backend`` is not the cuda one.
-    """
-    from structgstream.kernels import cuda, cuda_anchors, cuda_library
-
-    if backend.name != "cuda":
-        raise BackendError(f"Only the cuda back-end runs asynchronously, not {backend.name}; use it as it is.")
-    library, _ = cuda_library.kernel_library()
-    return backend.with_functions(
-        rasterize=partial(cuda.rasterize, budget=budget, library=library),
-        generate_structured=cuda_anchors.generate_all_in_torch
-        if library is None
-        else partial(cuda_anchors.generate_structured, library, every=True),
-    )
-
-
 def backend_reasons() -> dict[str, str | None]:
     """For each back-end the reason why it is not available here; None if it is."""
     from structgstream.kernels.cuda import cuda_reason
     from structgstream.kernels.native import native_reason
 
     return {"cuda": cuda_reason(), "cpu": native_reason(), "reference": None}
-
-
-def backend_remarks() -> dict[str, str]:
-    """Remarks about available back-ends for the user: whether the cuda back-end has its own kernels."""
-    from structgstream.kernels.cuda_library import kernel_plan
-
-    return {"cuda": kernel_plan()[1]}
 
 
 def select_backend(name: BackendName | Backend) -> Backend:

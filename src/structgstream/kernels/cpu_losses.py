@@ -210,8 +210,8 @@ def adam_step(
     exp_avg: Tensor,
     exp_avg_sq: Tensor,
     *,
-    lr: float | Tensor,
-    step: int | Tensor,
+    lr: float,
+    step: int,
     betas: tuple[float, float],
     eps: float,
 ) -> None:
@@ -227,5 +227,5 @@ def adam_step(
                 f"got {tensor.dtype} {tuple(tensor.shape)}; take the reference back-end for others."
             )
     grad = grad.to(torch.float32).contiguous()
-    numbers = (param.numel(), float(lr), int(step), *betas, eps)
+    numbers = (param.numel(), lr, step, *betas, eps)
     native_library().sgs_adam_step(param, grad, exp_avg, exp_avg_sq, *numbers, torch.get_num_threads())

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Anchors to Gaussians on a GPU: this package's kernels around torch's matrix products, or torch alone.
-
-An online iteration is bound by the host, which queues each operation: about 190 forward and 130 backward in torch, and
-about 30 with the kernels.
+"""Anchors to Gaussians on a GPU: this package's kernels around torch's matrix products.
 
 Note [Shapes without waiting]
 ~~~~~~~~~~~~~~~~~~~~~~~~~~~~~
@@ -23,45 +20,7 @@ from structgstream.cameras import Viewport
 from structgstream.errors import BackendError
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.cuda_library import KernelLibrary
-from structgstream.kernels.reference_anchors import visible_anchor_mask
 from structgstream.kernels.values import Anchors, MLPWeights, StructuredGaussians, TileSelection
-
-
-def generate_all_in_torch(
-    anchors: Anchors,
-    mlps: MLPWeights,
-    viewport: Viewport,
-    *,
-    distance_input: bool,
-    tiles: TileSelection | None = None,
-    sampling_intervals: Tensor | None = None,
-) -> StructuredGaussians:
-    """See ``reference_anchors.generate_structured``: ``N = M * K`` Gaussians of all anchors.
-
-    Those with a positive opacity equal the reference's; ``raw_opacities`` of anchors out of view are -1 (Note [Shapes
-    without waiting]).
-    """
-    positions, log_offset_scales, log_base_scales, offsets, features = anchors
-    count, k = offsets.shape[:2]
-    seen = visible_anchor_mask(anchors, viewport, tiles, sampling_intervals)
-    to_anchor = positions - viewport.center
-    distance = to_anchor.norm(dim=1, keepdim=True).clamp_min(1e-12)
-    parts = [features, to_anchor / distance]
-    inputs = torch.cat([*parts, distance] if distance_input else parts, dim=1)
-    opacity, color, covariance = head_outputs(mlps, inputs)
-    raw = torch.where(seen[:, None], torch.tanh(opacity), -1.0)  # [M, K]
-    drawn = raw > 0
-    covariance = covariance.reshape(count, k, 7)
-    scales = log_base_scales.exp()[:, None] * torch.sigmoid(covariance[..., :3])
-    gaussians = Gaussians(
-        means=(positions[:, None] + offsets * log_offset_scales.exp()[:, None]).reshape(-1, 3),
-        quats=torch.nn.functional.normalize(covariance[..., 3:], dim=2).reshape(-1, 4),
-        scales=torch.where(drawn[..., None], scales, 0.0).reshape(-1, 3),
-        opacities=torch.where(drawn, raw, 0.0).reshape(-1),
-        colors=torch.sigmoid(color).reshape(-1, 3),
-        ids=torch.arange(count * k, device=positions.device),
-    )
-    return StructuredGaussians(gaussians, torch.arange(count, device=positions.device), raw.detach())
 
 
 def head_outputs(mlps: MLPWeights, inputs: Tensor) -> list[Tensor]:
@@ -173,11 +132,8 @@ def generate_structured(
     distance_input: bool,
     tiles: TileSelection | None = None,
     sampling_intervals: Tensor | None = None,
-    every: bool = False,
 ) -> StructuredGaussians:
     """See ``reference_anchors.generate_structured``; float32. The host waits for the number of Gaussians.
-
-    With ``every`` it returns all ``N = M * K`` Gaussians, as :func:`generate_all_in_torch` does, without waiting.
 
     Raises:
         BackendError: a precision or device that the kernels do not support.
@@ -197,8 +153,6 @@ def generate_structured(
     outputs = [value.contiguous() for value in head_outputs(mlps, inputs)]
     means, quats, scales, opacities, colors, raw, ids = _Outputs.apply(library, seen, *values[:4], *outputs)  # type: ignore[misc]
     gaussians = Gaussians(means, quats, scales, opacities, colors, ids)
-    if every:
-        return StructuredGaussians(gaussians, torch.arange(len(raw), device=raw.device), raw)
     drawn, visible = (opacities.detach() > 0).nonzero()[:, 0], seen.nonzero()[:, 0]
     return StructuredGaussians(gaussians.select(drawn), visible, raw[visible])
 

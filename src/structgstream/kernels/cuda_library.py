@@ -30,6 +30,9 @@ CUDA_PROTOTYPES: Mapping[str, tuple[str, str]] = {
     "sgs_cuda_lift": ("i", "pp"),
     "sgs_cuda_views": ("i", "pip"),
     "sgs_cuda_reached_tiles": ("i", "pip"),
+    "sgs_cuda_raster_new": ("i", "ppp"),
+    "sgs_cuda_raster_backward": ("i", "ppppp"),
+    "sgs_cuda_raster_free": ("v", "p"),
     "sgs_cuda_fit_new": ("i", "plpp"),
     "sgs_cuda_fit_run": ("i", "pii"),
     "sgs_cuda_fit_free": ("v", "p"),
@@ -38,17 +41,13 @@ CUDA_PROTOTYPES: Mapping[str, tuple[str, str]] = {
     "sgs_cuda_anchor_outputs": ("i", "ppppiiipppppppppppp"),
     "sgs_cuda_anchor_outputs_backward": ("i", "pppiipppppppppppppppp"),
     "sgs_cuda_sweep": ("i", "piippiiifpppp"),
-    "sgs_cuda_tile_depths": ("i", "ppipp"),
-    "sgs_cuda_tile_counts": ("i", "pppiiipp"),
-    "sgs_cuda_tile_fill": ("i", "ppppiiilppp"),
-    "sgs_cuda_tile_starts": ("i", "pppliippp"),
-    "sgs_cuda_tile_reached": ("i", "ppipiipp"),
 }
 """For each function of csrc/cuda: result type, argument types in order (``native.TYPES``)."""
 FLAGS = ("-O3", "-std=c++17", "-shared", "-Xcompiler", "-fPIC", "--threads", "0")
 SHARED_HEADERS = ("include", "cpu")
 """Folders next to that of the sources, with the headers of the C interface of the CPU kernels."""
-_OPERATIONS = "L1, SSIM, anchors, sweeps and tile lists"
+NO_COMPILER = "nvcc was not found; install NVIDIA's CUDA toolkit and put nvcc on PATH or set CUDA_HOME."
+"""Why there are no kernels, where there is no compiler."""
 _NO_MEMORY = 2  # cudaErrorMemoryAllocation
 _LAST_LINES = 5  # of a failing compiler's output that an error quotes
 
@@ -174,26 +173,24 @@ def _output(command: list[str]) -> str:
     return result.stdout
 
 
-def kernel_plan() -> tuple[Path | None, str]:
-    """NVIDIA's compiler or None, and a sentence on what runs the back-end's own operations. Compiles nothing."""
-    nvcc = find_nvcc(os.environ)
-    if nvcc is None:
-        return None, (
-            f"{_OPERATIONS} run in torch, which is slower than this package's kernels: nvcc was not found; install "
-            "NVIDIA's CUDA toolkit and put nvcc on PATH or set CUDA_HOME."
-        )
-    return nvcc, f"{_OPERATIONS} run in this package's kernels, compiled by {nvcc}."
+def compiler_reason() -> str | None:
+    """Why the kernels cannot be compiled on this machine and how to change that; None if they can."""
+    return NO_COMPILER if find_nvcc(os.environ) is None else None
 
 
 @cache
-def kernel_library() -> tuple[KernelLibrary | None, str]:
-    """The kernels for this machine's GPU or None, and the sentence of :func:`kernel_plan`. The first call compiles."""
-    nvcc, sentence = kernel_plan()
+def kernel_library() -> KernelLibrary:
+    """The kernels for this machine's GPU. The first call compiles.
+
+    Raises:
+        BackendError: there is no compiler, it fails, or the library does not load.
+    """
+    nvcc = find_nvcc(os.environ)
     if nvcc is None:
-        return None, sentence
+        raise BackendError(NO_COMPILER)
     major, minor = torch.cuda.get_device_capability()
+    path = compiled(f"sm_{major}{minor}", nvcc=nvcc, sources=source_folder(), cache=cache_folder(os.environ))
     try:
-        path = compiled(f"sm_{major}{minor}", nvcc=nvcc, sources=source_folder(), cache=cache_folder(os.environ))
-        return KernelLibrary(ctypes.CDLL(str(path)), "cuda", cuda_stream), sentence
-    except (BackendError, OSError) as error:
-        return None, f"{_OPERATIONS} run in torch, which is slower than this package's kernels: {error}"
+        return KernelLibrary(ctypes.CDLL(str(path)), "cuda", cuda_stream)
+    except OSError as error:
+        raise BackendError(f"The CUDA kernels do not load ({error}); take the cpu back-end, or report this.") from error

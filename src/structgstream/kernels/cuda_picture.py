@@ -1,26 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Views drawn without gradients on a GPU by this package's kernels (csrc/cuda/picture_calls.h), in one call for all."""
+"""Views drawn on a GPU by this package's kernels (csrc/cuda/picture_calls.h): several without gradients in one call, or
+one with gradients.
+"""
 
 import ctypes
+import weakref
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from structgstream.cameras import Viewport
+from structgstream.errors import BackendError
 from structgstream.gaussians import Gaussians
 from structgstream.kernels.cpu_raster import shape_arguments
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.native import constant, members
-from structgstream.kernels.values import Rasterizer, RasterOutput, TileSelection, tile_grid
+from structgstream.kernels.values import RasterOutput, TileSelection, tile_grid
 
 # The structures below mirror csrc/cuda/picture.h, member by member.
 
 
 class _Gaussians(ctypes.Structure):
     _fields_ = (
-        *members(ctypes.c_void_p, "means quats scales opacities colors intervals ids"),
+        *members(ctypes.c_void_p, "means quats scales opacities colors intervals screen_offsets ids"),
         ("count", ctypes.c_int64),
     )
 
@@ -32,6 +38,10 @@ class _View(ctypes.Structure):
         *members(ctypes.c_int32, "width height channels"),
         ("near_plane", ctypes.c_float),
     )
+
+
+class _Gradients(ctypes.Structure):
+    _fields_ = members(ctypes.c_void_p, "means quats scales opacities colors screen_offsets")
 
 
 class _Reach(ctypes.Structure):
@@ -60,7 +70,7 @@ class _Call:
         if given is None:
             return _Gaussians()
         ids = given.ids.contiguous()
-        tensors = *shape_arguments(given), constant(given.colors), constant(given.sampling_intervals), ids
+        tensors = *shape_arguments(given), constant(given.colors), constant(given.sampling_intervals), None, ids
         return _Gaussians(*self.at(*tensors), len(given))
 
     def run(self, name: str, views: Sequence[ctypes.Structure], device: torch.device) -> None:
@@ -180,39 +190,126 @@ def reached_tiles(
     return found
 
 
+class _Raster:
+    """Owns what the kernels keep of a drawing for its gradients, and the memory that they read."""
+
+    def __init__(self, call: _Call, view: _View, device: torch.device) -> None:
+        self.call, self.address = call, ctypes.c_void_p()
+        weakref.finalize(self, call.library.library.sgs_cuda_raster_free, self.address)
+        places = ctypes.addressof(view), ctypes.addressof(self.address)
+        call.library.call("sgs_cuda_raster_new", *places, device=device)
+
+
+@dataclass(frozen=True)
+class _Scenery:
+    """The arguments of a drawing except Gaussians."""
+
+    library: KernelLibrary
+    viewport: Viewport
+    background: Tensor | None
+    tiles: Tensor | None
+    intervals: Tensor | None
+    trained: int
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, scenery: _Scenery, onto: Tensor | None, screen_offsets: Tensor | None, *gaussians: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """``gaussians``: means, quaternions, scales, opacities and colours."""
+        means, viewport, trained = gaussians[0], scenery.viewport, scenery.trained
+        size = viewport.height, viewport.width
+        new = means.new_empty if scenery.tiles is None else means.new_zeros
+        image = new(*size, 3) if onto is None else onto
+        alpha, radii = means.new_empty(size), means.new_empty(len(means))
+        if onto is not None:
+            ctx.mark_dirty(onto)
+        call, rows = _Call(scenery.library), (*gaussians, scenery.intervals, screen_offsets)
+        sets = [
+            _Gaussians(*call.at(*(None if tensor is None else tensor[part] for tensor in rows), None), count)
+            for part, count in ((slice(trained), trained), (slice(trained, None), len(means) - trained))
+        ]
+        camera = constant(viewport.viewmat), constant(viewport.K)
+        # Not the results themselves, which refer to this function.
+        results = image.detach(), alpha.detach(), radii.detach()
+        view = _View(
+            *sets,
+            *call.at(*camera, scenery.background, None, scenery.tiles, *results, None),
+            *(viewport.width, viewport.height, 0, viewport.near),
+        )
+        ctx.raster, ctx.tracked = _Raster(call, view, means.device), screen_offsets is not None
+        ctx.save_for_backward(image, *gaussians)
+        ctx.mark_non_differentiable(radii)
+        ctx.set_materialize_grads(False)
+        return image, alpha, radii
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *gradients: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
+        to_image, to_alpha, _ = gradients
+        image, *gaussians = ctx.saved_tensors
+        to_image = torch.zeros_like(image) if to_image is None else to_image.contiguous()
+        to_alpha = None if to_alpha is None else to_alpha.contiguous()
+        found = [torch.empty_like(tensor) for tensor in gaussians]
+        offsets = image.new_empty(len(gaussians[0]), 2) if ctx.tracked else None
+        library = ctx.raster.call.library
+        written = _Gradients(*library.addresses(*found, offsets))
+        given = ctx.raster.address, to_image, to_alpha, ctypes.addressof(written)
+        library.call("sgs_cuda_raster_backward", *given, device=image.device)
+        return None, None, offsets, *found
+
+
 def rasterize(
     library: KernelLibrary,
-    with_gradients: Rasterizer,
     gaussians: Gaussians,
     viewport: Viewport,
     *,
     background: Tensor | None = None,
-    **options: Any,
+    screen_offsets: Tensor | None = None,
+    tiles: TileSelection | None = None,
+    onto: Tensor | None = None,
+    trained: int | None = None,
 ) -> RasterOutput:
     """See ``reference_raster.rasterize``; waits once for the GPU. Results repeat bit for bit.
 
-    Args:
-        library: the kernels.
-        with_gradients: draws where a gradient is needed.
-        gaussians: to draw.
-        viewport: the camera.
-        background: ``[3]``, black when None.
-        options: the others of ``reference_raster.rasterize``.
+    Raises:
+        BackendError: a tensor that needs a gradient is not float32.
+        OutOfMemoryError: the GPU has no memory for the tiles' lists of Gaussians, or for the gradients of their pairs.
     """
+    assert tiles is None or (tiles.width, tiles.height) == (viewport.width, viewport.height), tiles
+    assert onto is None or tiles is not None, "a picture to draw onto needs tiles"
     tensors = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
     needed = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-    if needed or options.get("screen_offsets") is not None:
-        return with_gradients(gaussians, viewport, background=background, **options)
-    tiles, onto = options.get("tiles"), options.get("onto")
-    (output,) = draw_views(
+    if not needed and screen_offsets is None:
+        (output,) = draw_views(
+            library,
+            [gaussians],
+            [viewport],
+            backgrounds=None if background is None else background[None],
+            tiles=None if tiles is None else [tiles],
+            onto=None if onto is None else [onto],
+        )
+        return output
+    given = tensors if screen_offsets is None else (*tensors, screen_offsets)
+    if any(tensor.dtype != torch.float32 for tensor in given):
+        raise BackendError("The cuda back-end draws float32 Gaussians; convert them, or take the reference back-end.")
+    if onto is not None:
+        assert onto.is_contiguous()
+        onto = onto.detach()  # An alias, because autograd marks the tensor it is given as the function's result.
+    count = len(gaussians)
+    scenery = _Scenery(
         library,
-        [gaussians],
-        [viewport],
-        backgrounds=None if background is None else background[None],
-        tiles=None if tiles is None else [tiles],
-        onto=None if onto is None else [onto],
+        viewport,
+        constant(background),
+        None if tiles is None else tiles.mask.contiguous(),
+        constant(gaussians.sampling_intervals),
+        count if trained is None else min(trained, count),
     )
-    return output
+    offsets = None if screen_offsets is None else screen_offsets.contiguous()
+    return RasterOutput(*_Rasterize.apply(scenery, onto, offsets, *(tensor.contiguous() for tensor in tensors)))  # type: ignore[misc]
 
 
 def blending_weights(library: KernelLibrary, gaussians: Gaussians, viewport: Viewport, maps: Tensor) -> Tensor:

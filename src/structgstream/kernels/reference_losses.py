@@ -166,8 +166,8 @@ def adam_step(
     exp_avg: Tensor,
     exp_avg_sq: Tensor,
     *,
-    lr: float | Tensor,
-    step: int | Tensor,
+    lr: float,
+    step: int,
     betas: tuple[float, float],
     eps: float,
 ) -> None:
@@ -178,12 +178,11 @@ def adam_step(
         grad: like ``param``.
         exp_avg: first moment, updated in place.
         exp_avg_sq: second moment, updated in place.
-        lr: learning rate; on a GPU also ``[]`` float32 there, read when the work runs (``cuda_graph``).
-        step: number of this step, from 1; likewise.
+        lr: learning rate.
+        step: number of this step, from 1.
         betas: decay of the moments.
         eps: added to the root of the corrected second moment.
     """
-    lr, step = float(lr), int(step)
     exp_avg.mul_(betas[0]).add_(grad, alpha=1.0 - betas[0])
     exp_avg_sq.mul_(betas[1]).addcmul_(grad, grad, value=1.0 - betas[1])
     denominator = (exp_avg_sq / (1.0 - betas[1] ** step)).sqrt_().add_(eps)

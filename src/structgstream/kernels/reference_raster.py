@@ -120,8 +120,8 @@ def rasterize(
 ) -> RasterOutput:
     """Draw ``N`` Gaussians (paper, equations for mu_2D, Sigma_2D and alpha blending).
 
-    A Gaussian behind a transmittance below 1/255 is drawn in that pixel, but gets no gradient from it; with gsplat
-    (``cuda``) it does. The low-pass is :func:`screen_low_pass`; it counts as a constant.
+    A Gaussian behind a transmittance below 1/255 is drawn in that pixel, but gets no gradient from it. The low-pass is
+    :func:`screen_low_pass`; it counts as a constant.
 
     Args:
         gaussians: to draw; their ids are not read.
@@ -229,12 +229,6 @@ def picture_and_weights(
         background: ``[3]``, black when None.
     """
     return picture_and_weights_by_gradient(rasterize, gaussians, viewport, maps, background=background)
-
-
-def radii_by_drawing(rasterizer: Rasterizer, gaussians: Gaussians, viewport: Viewport) -> Tensor:
-    """:func:`projected_radii` of any rasteriser."""
-    with torch.no_grad():
-        return rasterizer(gaussians, viewport).radii
 
 
 def weights_by_gradient(rasterizer: Rasterizer, gaussians: Gaussians, viewport: Viewport, maps: Tensor) -> Tensor:

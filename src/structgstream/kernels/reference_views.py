@@ -7,7 +7,6 @@ Before and after the iterations of a frame every view is drawn once. A GPU does 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -49,17 +48,6 @@ class ViewByView:
     projected_radii: Callable[[Gaussians, Viewport], Tensor]
     blending_weights: Callable[[Gaussians, Viewport, Tensor], Tensor]
     picture_and_weights: Callable[..., tuple[Tensor, Tensor]]
-
-    @classmethod
-    def by_drawing(cls, generate_structured: Callable[..., StructuredGaussians], rasterize: Rasterizer) -> "ViewByView":
-        """With extents and blending weights by any rasteriser that has gradients."""
-        return cls(
-            generate_structured,
-            rasterize,
-            partial(reference_raster.radii_by_drawing, rasterize),
-            partial(reference_raster.weights_by_gradient, rasterize),
-            partial(reference_raster.picture_and_weights_by_gradient, rasterize),
-        )
 
     def generate_views(
         self,

@@ -7,9 +7,8 @@ Fits differ in their hooks: the loss of a view, and the actions between steps (g
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Generic, TypeVar
 
 import torch
@@ -17,7 +16,6 @@ from torch import Tensor
 
 from structgstream.gaussians import row_indices
 from structgstream.kernels.backend import Backend
-from structgstream.kernels.cuda_graph import Recorder
 from structgstream.scene.state import ParameterName
 from structgstream.training.losses import Loss, ViewLoss
 from structgstream.training.result import Step, StepListener, Stopwatch
@@ -70,13 +68,12 @@ class Adam(Generic[Name]):
     eps: float = EPS
     first: dict[Name, Tensor] = field(default_factory=dict)
     second: dict[Name, Tensor] = field(default_factory=dict)
-    steps: dict[Name, int | Tensor] = field(default_factory=dict)
+    steps: dict[Name, int] = field(default_factory=dict)
 
-    def step(self, gradients: Mapping[Name, Tensor], rates: Mapping[Name, float | Tensor]) -> None:
-        """Update every leaf that has a gradient and a positive learning rate; one in a tensor counts as positive."""
+    def step(self, gradients: Mapping[Name, Tensor], rates: Mapping[Name, float]) -> None:
+        """Update every leaf that has a gradient and a positive learning rate."""
         for name, gradient in gradients.items():
-            rate = rates[name]
-            if not isinstance(rate, Tensor) and rate <= 0.0:
+            if rates[name] <= 0.0:
                 continue
             value = self.values[name]
             self.begin(name)
@@ -86,17 +83,11 @@ class Adam(Generic[Name]):
                 gradient,
                 self.first[name],
                 self.second[name],
-                lr=rate,
+                lr=rates[name],
                 step=self.steps[name],
                 betas=BETAS,
                 eps=self.eps,
             )
-
-    def count_on_device(self, names: Iterable[Name]) -> None:
-        """From now on the numbers of the steps of ``names`` are tensors, so that steps can be recorded."""
-        for name in names:
-            self.begin(name)
-            self.steps[name] = torch.full((), float(self.steps[name]), device=self.values[name].device)
 
     def begin(self, name: Name) -> None:
         """Set the moments of a leaf that was never updated to zero."""
@@ -154,19 +145,13 @@ class Hooks(ABC, Generic[SampleT, LossT]):
     @abstractmethod
     def loss(self, iteration: int, sample: SampleT) -> LossT:
         """The loss of a sample, which usually is a view of the frame; what else there is to do belongs in
-        :meth:`after_step`, since this may be recorded."""
+        :meth:`after_step`."""
 
     def after_step(self, iteration: int, sample: SampleT, loss: LossT, screen_gradient: Tensor | None) -> None:
         """Called after the step: statistics, spawning, pruning.
 
         ``screen_gradient`` ``[N, 2]`` is the view-space gradient in pixels; None if it was not tracked.
         """
-
-    def repeats(self, iteration: int, sample: SampleT) -> Hashable | None:
-        """Key of the iterations that run the same operations on the same tensors as this one; None if no later one
-        does. On a GPU these are recorded, without what the hooks do between steps.
-        """
-        return None
 
     def counts(self) -> tuple[int, int]:
         """Anchors and free Gaussians, for progress."""
@@ -181,7 +166,6 @@ def minimize(
     *,
     watch: Stopwatch,
     on_step: StepListener | None = None,
-    recorder: Recorder[tuple[LossT, Tensor | None]] | None = None,
 ) -> int:
     """Minimise the losses of ``samples`` over the leaves of ``adam``; returns the number of iterations done.
 
@@ -192,26 +176,14 @@ def minimize(
         hooks: the loss, and the actions between steps.
         watch: gets the seconds of stages ``backward`` and ``optimise``.
         on_step: called after every iteration; on a GPU, where reading the loss synchronises, after every tenth.
-        recorder: records iterations that repeat (``kernels.cuda_graph``); None: all are run one by one.
     """
     report_interval = 1 if adam.backend.device.type == "cpu" else 10
     total = schedule.before + schedule.iterations + schedule.after
     iteration = schedule.done
-    recorded = None if recorder is None else RecordedRates.of(schedule, adam)
     while iteration < schedule.iterations:
         iteration += 1
         sample = next(samples)
-        rates = schedule.rates(iteration) if recorded is None else recorded.at(iteration)
-        take = partial(_take_step, adam, hooks, iteration, sample, rates, watch)
-        # The first iteration is never recorded: libraries set themselves up in it.
-        key = None if recorder is None or iteration == schedule.done + 1 else hooks.repeats(iteration, sample)
-        if recorder is None or key is None:
-            loss, screen_gradient = take()
-        else:
-            if key not in recorder:
-                recorder.record(key, take)
-            with watch.stage("replay"):
-                loss, screen_gradient = recorder.replay(key)
+        loss, screen_gradient = _take_step(adam, hooks, iteration, sample, schedule.rates(iteration), watch)
         hooks.after_step(iteration, sample, loss, screen_gradient)
         if on_step is not None and iteration % report_interval == 0:
             on_step(Step(schedule.before + iteration, total, float(loss.total.detach()), *hooks.counts()))
@@ -223,7 +195,7 @@ def _take_step(
     hooks: Hooks[SampleT, LossT],
     iteration: int,
     sample: SampleT,
-    rates: Mapping[Name, float | Tensor],
+    rates: Mapping[Name, float],
     watch: Stopwatch,
 ) -> tuple[LossT, Tensor | None]:
     """One iteration: the loss, without its gradient graph, and the view-space gradient if it was tracked."""
@@ -232,39 +204,6 @@ def _take_step(
     with watch.stage("optimise"):
         adam.step(gradients, rates)
     return loss.detached(), screen_gradient
-
-
-@dataclass(frozen=True)
-class RecordedRates(Generic[Name]):
-    """Learning rates of all iterations of a schedule, for steps that are recorded.
-
-    Args:
-        first: the iteration of the first row of ``table``.
-        table: ``[iterations, P]`` float32 on the device.
-        current: ``[P]``, a row of the table; recorded steps read it.
-        rates: views of ``current`` by name; 0 for leaves that are not trained.
-    """
-
-    first: int
-    table: Tensor
-    current: Tensor
-    rates: Mapping[Name, float | Tensor]
-
-    @classmethod
-    def of(cls, schedule: Schedule[Name], adam: Adam[Name]) -> "RecordedRates[Name]":
-        """The rates of the leaves that ``schedule`` trains, whose steps are counted on the device from now on."""
-        first = schedule.done + 1
-        rows = [schedule.rates(iteration) for iteration in range(first, schedule.iterations + 1)]
-        names = tuple(name for name, value in adam.values.items() if value.requires_grad and any(r[name] for r in rows))
-        adam.count_on_device(names)
-        table = torch.tensor([[row[name] for name in names] for row in rows], device=adam.backend.device)
-        current = table.new_zeros(len(names))
-        return cls(first, table, current, {**dict.fromkeys(adam.values, 0.0), **dict(zip(names, current, strict=True))})
-
-    def at(self, iteration: int) -> Mapping[Name, float | Tensor]:
-        """Writes the rates of ``iteration`` into ``current``."""
-        self.current.copy_(self.table[iteration - self.first])
-        return self.rates
 
 
 def gradients_of(
@@ -344,8 +283,7 @@ class LastPass:
     def add(self, iteration: int, loss: ViewLoss, view: View, *, comparable: bool = True) -> None:
         """Record a view's result, replacing its earlier one; its loss terms only if they are ``comparable``."""
         error = loss.squared_error(view) if iteration > self.after else None
-        # Copies: the next recorded iteration writes over the tensors of this one.
-        terms = {name: value.detach().clone() for name, value in loss.terms.items()}
+        terms = {name: value.detach() for name, value in loss.terms.items()}
         self.add_results(iteration, view.index, terms, error, comparable=comparable)
 
     def add_results(

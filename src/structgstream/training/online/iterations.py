@@ -6,7 +6,7 @@ trained, without view-space gradients, :func:`minimize_natively` takes the back-
 (``Backend.iterations``; csrc/cpu/fit.cpp, csrc/cuda/fit_calls.h), without Python between them.
 """
 
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import islice, pairwise
 
@@ -107,13 +107,6 @@ class StartingPoint:
             else [view for view in self.views if view.index in self.active_tiles]
         )
 
-    def with_own_pictures(self) -> "StartingPoint":
-        """The same with copies of the pictures that iterations draw into."""
-        if self.active_tiles is None:
-            return self
-        copies = {i: replace(active, picture=active.picture.clone()) for i, active in self.active_tiles.items()}
-        return replace(self, active_tiles=copies)
-
 
 @dataclass
 class OnlineHooks(Hooks[View, SceneLoss]):
@@ -134,8 +127,6 @@ class OnlineHooks(Hooks[View, SceneLoss]):
         rest_every: tiles in which nothing has changed are drawn every this many times that a view is.
         visits: by view index, how often it was drawn.
         average: gets the leaves of each iteration; None for none.
-        iterations: of the frame, at most; to know which of them are worth recording. 0: none is.
-        recorded: keys that :meth:`repeats` has given.
     """
 
     start: StartingPoint
@@ -152,8 +143,6 @@ class OnlineHooks(Hooks[View, SceneLoss]):
     rest_every: int = 1
     visits: dict[int, int] = field(default_factory=dict)
     average: MeanOfSteps | None = None
-    iterations: int = 0
-    recorded: set[Hashable] = field(default_factory=set)
 
     def loss(self, iteration: int, sample: View) -> SceneLoss:
         active = self.active_tiles_of(sample)
@@ -196,22 +185,6 @@ class OnlineHooks(Hooks[View, SceneLoss]):
     def _tracks_screen(self, iteration: int) -> bool:
         patching = self.free_set.config
         return patching.spawn != "off" and patching.collect_from < iteration <= self.patch_at
-
-    def repeats(self, iteration: int, sample: View) -> Hashable | None:
-        """Visits of a view that draw the same tiles, until rows of free Gaussians come or go."""
-        active, alternates, rests = self.active_tiles_of(sample), self._alternates(sample), self._rests(sample)
-        key = sample.index, rests, self.free_set.version
-        if key not in self.recorded:
-            # The other visits of a view follow each other; those of all tiles are ``rest_every`` visits apart.
-            visits_left = (self.iterations - iteration) // len(self.start.seen)
-            visits_apart = self.rest_every if alternates and not rests else 1
-            if self._tracks_screen(iteration) or visits_left < visits_apart:
-                return None
-            for tiles in () if active is None else (active.tiles, active.changed):
-                if tiles is not None:
-                    tiles.pixels()  # Masks are made at their first use, which must not be part of a recording.
-            self.recorded.add(key)
-        return key
 
     def after_step(self, iteration: int, sample: View, loss: SceneLoss, screen_gradient: Tensor | None) -> None:
         self.last_pass.add(iteration, loss, sample, comparable=not self.visit(sample))

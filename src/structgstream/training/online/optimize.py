@@ -19,8 +19,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from structgstream.codec.fields.quantization import RateTerm
-from structgstream.kernels.backend import Backend, nonblocking
-from structgstream.kernels.cuda_tiles import PairBudget, run_with_pair_budget
+from structgstream.kernels.backend import Backend
 from structgstream.scene.free import FreeGaussians
 from structgstream.scene.scene import Scene
 from structgstream.scene.state import FieldName, ParameterName, fields_of
@@ -67,33 +66,7 @@ class FrameOptimizer:
     on_step: StepListener | None = None
 
     def run(self, start: StartingPoint) -> FitResult[Scene]:
-        """The scene of ``start``, fitted to its pictures; in torch on a GPU again if memory was short."""
-        if self.backend.name != "cuda" or self._runs_natively(start):
-            return self._run(start, self.backend)
-        random = self.generator.get_state()
-        whole = start.scene if start.split is None else start.split.whole
-        slots = slot_count(whole) + _length(start.new_free)
-
-        def attempt(budget: PairBudget) -> FitResult[Scene]:
-            # What an attempt has drawn and counted must not reach the next one.
-            self.generator.set_state(random)
-            return self._run(start.with_own_pictures(), nonblocking(self.backend, budget))
-
-        # The host can run ahead of a GPU because no iteration synchronises.
-        return run_with_pair_budget(attempt, capacity=max(1 << 18, 8 * slots), device=self.backend.device)
-
-    def _runs_natively(self, start: StartingPoint) -> bool:
-        """Whether the back-end's own iterations can run these."""
-        patching = self.config.patching
-        tracks_screen = patching.spawn != "off" and patching.collect_from < self._patch_at(start)
-        splits = None not in (start.active_tiles, start.split)
-        fits = splits and not tracks_screen and not unknown_natively(self.config, start.scene)
-        return self.backend.iterations is not None and fits
-
-    def _patch_at(self, start: StartingPoint) -> int:
-        return math.ceil(self.config.patching.iteration * len(start.seen) / len(start.views))
-
-    def _run(self, start: StartingPoint, backend: Backend) -> FitResult[Scene]:
+        """The scene of ``start``, fitted to its pictures."""
         config, seen, split = self.config, start.seen, start.split
         if (sampling := start.scene.sampling) is not None:
             held = sampling.intervals(start.scene.anchors.positions + start.displacements[: len(start.scene.anchors)])
@@ -131,20 +104,18 @@ class FrameOptimizer:
             patch_at=self._patch_at(start),
             patches="free" in config.dynamic,
             last_pass=last_pass,
-            backend=backend,
+            backend=self.backend,
             watch=self.watch,
             rest_every=rests,
-            iterations=iterations,
             average=average,
         )
         schedule = Schedule(iterations, lambda iteration: online_rates(config, (iteration - 1) / iterations))
         samples = shuffled_views(seen, self.generator)
-        recorder = None
-        if backend.iterations is not None and self._runs_natively(start):
-            done = minimize_natively(adam, samples, schedule, hooks, begin=backend.iterations, on_step=self.on_step)
+        begin = self.backend.iterations
+        if begin is not None and self._runs_natively(start):
+            done = minimize_natively(adam, samples, schedule, hooks, begin=begin, on_step=self.on_step)
         else:
-            recorder = None if backend.recorder is None else backend.recorder()
-            done = minimize(adam, samples, schedule, hooks, watch=self.watch, on_step=self.on_step, recorder=recorder)
+            done = minimize(adam, samples, schedule, hooks, watch=self.watch, on_step=self.on_step)
         if average is not None:
             average.apply(parameters.values)
         return FitResult(
@@ -154,10 +125,20 @@ class FrameOptimizer:
             moving=len(start.scene.anchors),
             spawned=free_set.spawned,
             pruned=free_set.pruned,
-            counts={} if recorder is None else {"recorded": len(recorder), "replayed": recorder.replays},
             seconds=self.watch.seconds,
             losses=last_pass.terms,
         )
+
+    def _runs_natively(self, start: StartingPoint) -> bool:
+        """Whether the back-end's own iterations can run these."""
+        patching = self.config.patching
+        tracks_screen = patching.spawn != "off" and patching.collect_from < self._patch_at(start)
+        splits = None not in (start.active_tiles, start.split)
+        fits = splits and not tracks_screen and not unknown_natively(self.config, start.scene)
+        return self.backend.iterations is not None and fits
+
+    def _patch_at(self, start: StartingPoint) -> int:
+        return math.ceil(self.config.patching.iteration * len(start.seen) / len(start.views))
 
     def _parameters(self, start: StartingPoint) -> tuple[Parameters, RateTerm | None]:
         """The leaves of the scene, and the rate term of changes since it or since ``start.reference``."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stream is made, and read, with tensors on another device than the processor: no two devices meet."""
+"""A stream is made, and read, by the cuda back-end with its kernels run on the processor: no two devices meet."""
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,28 +9,22 @@ import pytest
 import torch
 
 import structgstream
-from structgstream.kernels import cpu_raster, cuda, cuda_library, reference_raster
+from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.native import native_reason
 from structgstream.session.presets import PRESETS
-from tests.support.pretended_gpu import DEVICE, pretended_device, pretended_gpu, rasterize
+from tests.support.counted_gpu import counted_gpu
+from tests.support.pretended_gpu import DEVICE, pretended_device
 from tests.support.small_clip import small_clip_path
 from tests.support.small_presets import FEW_POINTS
 
 FRAMES, SCALE = 2, 0.25
-DRAWN_BY = cpu_raster.rasterize if native_reason() is None else reference_raster.rasterize
 
 
-@pytest.fixture
-def backend(monkeypatch: pytest.MonkeyPatch) -> Iterator[structgstream.Backend]:
-    """Iterations are those that wait for nothing, with gsplat's place taken."""
-    monkeypatch.setattr(cuda_library, "kernel_library", lambda: (None, "nothing is compiled here"))
-    monkeypatch.setattr(cuda, "rasterize", lambda *args, **options: rasterize(DRAWN_BY, *args, **options))
-    with pretended_device():
-        yield pretended_gpu(DRAWN_BY)
-
-
+@pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 @pytest.mark.parametrize("preset", ["compact", "paper-n3dv"])
-def test_a_stream_on_another_device(preset: str, backend: structgstream.Backend, tmp_path: Path) -> None:
+def test_a_stream_on_another_device(
+    preset: str, emulation: Callable[[int], KernelLibrary], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     config = PRESETS[preset]
     growth = replace(config.initial.growth, collect_from=2, start=2, stop=6, interval=2)
     patching = replace(config.online.patching, iteration=2)
@@ -41,11 +35,15 @@ def test_a_stream_on_another_device(preset: str, backend: structgstream.Backend,
         online=replace(config.online, iterations=3, patching=patching),
     )
     path = tmp_path / "out.sgs"
-    reports = structgstream.reconstruct(
-        small_clip_path(), path, preset=config, scale=SCALE, frames=FRAMES, backend=backend
-    )
-    assert [report.moving > 0 for report in reports] == [False, True]
-    found = structgstream.evaluate(path, small_clip_path(), metrics="basic", backend=backend)
+    with counted_gpu(emulation(0).library, monkeypatch) as (backend, counts):
+        reports = structgstream.reconstruct(
+            small_clip_path(), path, preset=config, scale=SCALE, frames=FRAMES, backend=backend
+        )
+        assert [report.moving > 0 for report in reports] == [False, True]
+        found = structgstream.evaluate(path, small_clip_path(), metrics="basic", backend=backend)
+    # Frame 0 is fitted in torch, and so is the frame after it where free Gaussians are spawned by their gradients.
+    assert bool(counts.operations["iterations"]) is (preset == "compact")
+    assert counts.operations["sgs_cuda_raster_backward"] > 0
     assert 10.0 < found.mean.psnr < 40.0
 
 

@@ -1,4 +1,0 @@
-// SPDX-License-Identifier: Apache-2.0
-// The interface of tiles.h on a GPU.
-
-#include "tile_calls.h"
