@@ -9,8 +9,10 @@ import pytest
 import torch
 
 import structgstream
+from structgstream.kernels.backend import cpu_backend
 from structgstream.kernels.cuda_library import KernelLibrary
 from structgstream.kernels.native import native_reason
+from structgstream.kernels.self_check import disagreement
 from structgstream.session.presets import PRESETS
 from tests.support.counted_gpu import counted_gpu
 from tests.support.pretended_gpu import DEVICE, pretended_device
@@ -45,6 +47,14 @@ def test_a_stream_on_another_device(
     assert bool(counts.operations["iterations"]) is (preset == "compact")
     assert counts.operations["sgs_cuda_raster_backward"] > 0
     assert 10.0 < found.mean.psnr < 40.0
+
+
+@pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
+def test_the_check_before_use_passes(
+    emulation: Callable[[int], KernelLibrary], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with counted_gpu(emulation(0).library, monkeypatch) as (backend, _):
+        assert disagreement(backend.rasterize, cpu_backend().rasterize, backend.device) is None
 
 
 def test_two_devices_that_meet_are_found() -> None:

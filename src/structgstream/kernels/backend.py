@@ -158,15 +158,17 @@ def cuda_backend() -> Backend:
     """An NVIDIA GPU: this package's kernels, compiled on first use, and torch for the rest.
 
     Raises:
-        BackendError: there is no GPU or no compiler, or the kernels do not compile.
+        BackendError: there is no GPU or no compiler, the kernels do not compile, or they draw otherwise than the
+            processor does.
     """
     from structgstream.kernels import cuda, cuda_fit, cuda_library
+    from structgstream.kernels.self_check import disagreement
 
     reason = cuda.cuda_reason()
     if reason is not None:
         raise BackendError(reason)
     library, processor = cuda_library.kernel_library(), processor_backend()
-    return replace(
+    backend = replace(
         reference_backend(),
         name="cuda",
         device=torch.device("cuda"),
@@ -176,6 +178,12 @@ def cuda_backend() -> Backend:
         confident_flow=processor.confident_flow,
         plane_scores=processor.plane_scores,
     )
+    if differs := disagreement(backend.rasterize, processor.rasterize, backend.device):
+        raise BackendError(
+            f"The GPU's kernels draw otherwise than the processor: {differs}. Use --device cpu, and report it with "
+            "what structgstream doctor prints."
+        )
+    return backend
 
 
 def kernel_functions(library: KernelLibrary) -> dict[str, Callable[..., Any]]:
