@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from structgstream.cli import progress
-from structgstream.cli.progress import Bars, Lines, display, human_bytes, summary
+from structgstream.cli.progress import display, human_bytes, summary
 from structgstream.training.result import Step
 from tests.support.reports import frame_report
 
@@ -33,11 +33,6 @@ def console(*, terminal: bool) -> Console:
 def text(of: Console) -> str:
     assert isinstance(of.file, io.StringIO)
     return of.file.getvalue()
-
-
-def test_the_place_decides_how_progress_looks() -> None:
-    assert isinstance(display(3, console=console(terminal=False)), Lines)
-    assert isinstance(display(3, console=console(terminal=True)), Bars)
 
 
 def test_a_line_for_each_frame() -> None:

@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """FLIP against its authors' package, on natural pictures and on those that are hard."""
 
-import sys
-
 import cv2
 import numpy as np
 import pytest
 from flip_evaluator import evaluate
 
 from structgstream.data.dataset_layouts import bundled_clip
-from structgstream.errors import MissingExtraError
 from structgstream.evaluation.flip import PIXELS_PER_DEGREE, features_of, flip_map, flip_of
 
 OF_A_PIXEL, OF_THE_MEAN = 5e-4, 5e-5  # of the package's values; the largest seen were 8.9e-5 and 1.4e-5
@@ -101,9 +98,3 @@ def test_results_do_not_depend_on_where_the_memory_lies() -> None:
     for size in range(1, 40):
         held.append(bytearray(97 * size))
         np.testing.assert_array_equal(flip_map(features_of(noise(0)), features_of(noise(1))), expected)
-
-
-def test_without_opencv_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(MissingExtraError, match=r"structgstream\[eval\]"):
-        features_of(noise(0))

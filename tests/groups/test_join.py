@@ -32,13 +32,6 @@ def test_the_result_is_an_ordinary_stream(tmp_path: Path) -> None:
     assert [*tmp_path.iterdir()] == [path]
 
 
-def test_it_depends_on_the_segments_alone(tmp_path: Path) -> None:
-    one, other = tmp_path / "a.sgs", tmp_path / "b.sgs"
-    join_segments(made().segments, one)
-    join_segments(made().segments[1:] + made().segments[:1], other)
-    assert one.read_bytes() == other.read_bytes()
-
-
 def test_gaps_overlaps_and_damage_are_refused_and_nothing_is_written(tmp_path: Path) -> None:
     first, second, third = made().segments
     path = tmp_path / "a.sgs"

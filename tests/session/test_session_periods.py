@@ -11,8 +11,7 @@ import pytest
 
 from structgstream.codec.container.records import RecordType, scan_records
 from structgstream.codec.reader import StreamReader
-from structgstream.codec.segments.stored_bytes import write_archive
-from structgstream.codec.sinks import FileSink, MemorySink, resume_segments
+from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.frames import MultiViewFrame
 from structgstream.scene.scene import Scene
 from structgstream.session import struct_gstream as method
@@ -25,7 +24,6 @@ from tests.session.test_session_compact import CONFIG as COMPACT_CONFIG
 from tests.session.test_session_compact import WORLD
 from tests.support.backends import quickest_backend
 from tests.support.memory_captures import MemoryCapture
-from tests.support.segment_streams import Hands, Killed, KilledStore, folder
 from tests.support.streams import same
 
 FRAMES = 8
@@ -107,20 +105,6 @@ def test_stopped_it_goes_on_to_the_same_bytes(case: str, tmp_path: Path) -> None
         sink, resumed = FileSink.resume(path)
         run(sink, CONFIGS[case][0], resumed=resumed)
         assert path.read_bytes() == data, cut
-
-
-def test_a_killed_writer_of_segments_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
-    """Killed when the second period is named and has no frame; other operations: codec/segments/test_periods.py."""
-    store = folder(tmp_path / "store")
-    with pytest.raises(Killed):
-        run(
-            resume_segments(KilledStore(store, at="put part-00000006", done=False), clocks=Hands().clocks())[0],
-            BY_RESIDUAL,
-        )
-    sink, resumed = resume_segments(store)
-    run(sink, BY_RESIDUAL, resumed=resumed)
-    write_archive(store, tmp_path / "out.sgs")
-    assert (tmp_path / "out.sgs").read_bytes() == whole("residual")[0]
 
 
 def test_each_frame_starts_from_what_a_reader_sees() -> None:
