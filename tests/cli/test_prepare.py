@@ -13,7 +13,7 @@ import pytest
 from structgstream.cli.app import main
 from structgstream.preparation.calibration.board import Board
 from structgstream.preparation.options import Distance, PrepareOptions
-from structgstream.preparation.output_folder import lock_output, mark_output
+from structgstream.preparation.output_folder import mark_output
 from tests.support.quick_preparation import quicken
 from tests.support.quick_streams import error_of
 from tests.support.rooms import write_room
@@ -166,11 +166,3 @@ def test_a_board_that_cannot_be_is_reported_before_anything_takes_time(
     message = capsys.readouterr()
     assert said in message.err
     assert "synchronize" not in message.out
-
-
-def test_two_at_once_on_one_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_room(tmp_path / "videos")
-    command = ["prepare", str(tmp_path / "videos"), "-o", str(tmp_path / "out"), "--synchronize", "none"]
-    mark_output(tmp_path / "out", tmp_path / "videos")
-    with lock_output(tmp_path / "out"):
-        assert f"Another process prepares {tmp_path / 'out'} now; wait" in error_of(command, capsys, status=1)

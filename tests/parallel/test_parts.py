@@ -124,15 +124,6 @@ def test_a_folder_that_is_not_of_parts_is_refused(tmp_path: Path) -> None:
     assert not (folder / MARKER).exists()
 
 
-def test_a_lock_that_is_a_link_is_not_followed(parts: Parts, tmp_path: Path) -> None:
-    (tmp_path / "mine").write_text("mine")
-    (parts.folder / ".driver").unlink()
-    (parts.folder / ".driver").symlink_to(tmp_path / "mine")
-    with pytest.raises(StorageError, match=".driver in it is a link, which is not followed"), parts.locked():
-        pass
-    assert (tmp_path / "mine").read_text() == "mine"
-
-
 def test_a_run_that_begins_anew_has_another_name(parts: Parts) -> None:
     parts.use_plan({"capture": "a"})
     first = parts.run
@@ -142,12 +133,3 @@ def test_a_run_that_begins_anew_has_another_name(parts: Parts) -> None:
         parts.clear()
     parts.use_plan({"capture": "a"})
     assert parts.run not in ("", first)
-
-
-def test_a_folder_that_cannot_be_made_is_reported(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with (
-        pytest.raises(StorageError, match="cannot be used for the parts of a parallel run"),
-        Parts(tmp_path / "file" / "parts").locked(),
-    ):
-        pass

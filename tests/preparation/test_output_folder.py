@@ -131,16 +131,6 @@ def test_who_fails_leaves_the_capture_free(tmp_path: Path, videos: Path) -> None
         assert (tmp_path / "capture" / FOLDER / LOCK).exists()
 
 
-def test_a_file_system_without_locks_has_none(tmp_path: Path, videos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def unknown(file: object, how: int) -> None:
-        raise OSError(errno.ENOLCK, "No locks available")
-
-    mark_output(tmp_path / "capture", videos)
-    monkeypatch.setattr("fcntl.flock", unknown)
-    with lock_output(tmp_path / "capture"), lock_output(tmp_path / "capture"):
-        pass
-
-
 def test_a_folder_that_was_not_claimed_cannot_be_held(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="cannot be written"):
         lock_output(tmp_path / "capture").__enter__()
@@ -188,13 +178,6 @@ def test_folders_come_file_by_file(tmp_path: Path) -> None:
         (tmp_path / "cam" / f"{number}.png").write_text(str(number))
     link(tmp_path / "cam", tmp_path / "out" / "cam", how="hard")
     assert sorted(file.name for file in (tmp_path / "out" / "cam").iterdir()) == ["0.png", "1.png", "2.png"]
-
-
-def test_no_room_is_reported(tmp_path: Path) -> None:
-    (tmp_path / "a").write_text("film")
-    (tmp_path / "file").write_text("")
-    with pytest.raises(StorageError, match=r"cannot be linked or copied to .*--link symlink"):
-        link(tmp_path / "a", tmp_path / "file" / "a", how="hard")
 
 
 @pytest.mark.parametrize("kind", [OSError(28, "No space left on device"), KeyboardInterrupt()])
@@ -317,12 +300,6 @@ def test_killed_at_any_step_of_writing_it_is_done_again_or_was_done(tmp_path: Pa
         for value in (3, 5, 3):
             assert run(Steps(folder, Silent()), "a", value, []) == value
         assert sorted(path.name for path in (folder / FOLDER).iterdir()) == ["a.json", "a.npz"]
-
-
-def test_a_full_disk_is_reported(tmp_path: Path) -> None:
-    (tmp_path / FOLDER).write_text("")
-    with pytest.raises(StorageError, match=r"step 'a' cannot be written .* it goes on from there"):
-        run(Steps(tmp_path, Silent()), "a", 1, [])
 
 
 def test_a_fingerprint_is_of_content_and_time(tmp_path: Path) -> None:
