@@ -14,7 +14,7 @@ from structgstream.data.undistortion import rectilinear
 from structgstream.errors import CalibrationError
 from structgstream.preparation.solvers import find_calibration, require_calibration
 from tests.support.calibrations import WRITERS, truths, write_anipose, write_transforms
-from tests.support.captures import small_rig, write_immersive, write_text_model
+from tests.support.captures import small_rig, write_text_model
 
 RIG = small_rig(3)
 
@@ -75,11 +75,6 @@ def test_the_file_that_is_named_is_taken_and_of_a_folder_the_first(tmp_path: Pat
     assert find_calibration(tmp_path) is None
 
 
-def test_models_of_fisheyes(tmp_path: Path) -> None:
-    write_immersive(tmp_path, cameras=3, frames=1)
-    assert len(require_calibration(tmp_path).cameras) == 3
-
-
 def test_where_there_is_none(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("")
     write_cameras(tmp_path)
@@ -88,12 +83,6 @@ def test_where_there_is_none(tmp_path: Path) -> None:
         require_calibration(tmp_path / "notes.txt")
     with pytest.raises(CalibrationError, match=r"nothing\.json does not exist"):
         require_calibration(tmp_path / "nothing.json")
-
-
-def test_a_pickle_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "cameras.pkl").write_bytes(b"")
-    with pytest.raises(CalibrationError, match="is a pickle"):
-        find_calibration(tmp_path / "cameras.pkl")
 
 
 @pytest.mark.parametrize("tool", ["anipose", "multical", "cmu_panoptic", "kalibr", "qualisys"])

@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.codec.segments.manifest import history_name, init_name, part_name, segment_name
-from structgstream.errors import StreamError
 from structgstream.serve.streams import hash_in_name, is_plain_path, is_stream_name, open_below
 from tests.support.properties import examples
 
@@ -107,17 +106,6 @@ def test_the_stamp_changes_when_a_file_grows_or_is_replaced(tmp_path: Path) -> N
         stamps.append(opened.stamp)
         opened.close()
     assert len(set(stamps)) == 3
-
-
-def test_bytes_of_a_file_that_becomes_shorter(tmp_path: Path) -> None:
-    (tmp_path / "file").write_bytes(bytes(range(100)))
-    opened = open_below(tmp_path, "file")
-    assert opened is not None
-    with opened:
-        os.truncate(tmp_path / "file", 10)
-        assert len(opened) == 100
-        with pytest.raises(StreamError, match="file: it has become shorter"):
-            opened[5:55]
 
 
 PLAIN = string.ascii_letters + string.digits + "._-"

@@ -101,40 +101,6 @@ def test_the_corners_of_what_positions_may_be() -> None:
         encode_fields(row(anchor_positions=apart), STEPS)
 
 
-def test_ordered_positions_take_fewer_bits() -> None:
-    g = torch.Generator().manual_seed(0)
-    places = torch.randperm(32**3, generator=g)[:2000]
-    bins = torch.stack([places % 32, places // 32 % 32, places // 32**2], dim=1)
-    positions = bins * STEPS["anchor_positions"]
-    order = morton_order(positions, step=STEPS["anchor_positions"])
-    fields = fields_of(2000) | round_to_bins({"anchor_positions": positions[order]}, STEPS)
-    check(fields)
-    size = len(encode_fields(fields, STEPS)["anchor_positions"])
-    # 2000 of 32768 places, in no particular order: log2 of the binomial is 10.7 kbit.
-    assert 10_700 / 8 < size < 1.25 * 10_700 / 8
-    shuffled = fields["anchor_positions"][torch.randperm(2000, generator=g)]
-    mixed: dict[FieldName, torch.Tensor] = {**fields, "anchor_positions": shuffled}
-    assert len(encode_fields(mixed, STEPS)["anchor_positions"]) > 2 * size
-
-
-def test_a_coarse_row_takes_the_bits_of_its_precision() -> None:
-    """Half of the anchors on bins 8 times as coarse: nearly 3 bits less for each of their numbers."""
-    g = torch.Generator().manual_seed(1)
-    fine = torch.randint(-20, 21, (1000, 16), generator=g)
-    coarse = torch.randint(-2, 3, (1000, 16), generator=g) * 8
-    mixed = torch.where(torch.rand(1000, 1, generator=g) < 0.5, fine, coarse)
-
-    def size(bins: torch.Tensor) -> int:
-        fields: dict[FieldName, torch.Tensor] = {**fields_of(1000), "anchor_features": bins.float()}
-        del fields["appearance"], fields["appearance_basis"]
-        steps: dict[FieldName, float] = {**STEPS, "anchor_features": 1.0}
-        return 8 * len(encode_fields(fields, steps)["anchor_features"])
-
-    wanted = 1000 * (1 + 16 * (np.log2(41) + np.log2(5)) / 2)
-    assert size(mixed) < 1.1 * wanted
-    assert size(fine) > 1.2 * wanted
-
-
 def test_shifts_and_large_numbers() -> None:
     g = torch.Generator().manual_seed(2)
     for power in (0, 3, 8):
