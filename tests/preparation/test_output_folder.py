@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whose folder a capture is, and who works on it."""
 
-import errno
 import os
 import shutil
 from collections.abc import Callable
@@ -82,25 +81,6 @@ def test_the_videos_own_folder_is_no_capture(videos: Path) -> None:
         mark_output(videos / ".." / "take", videos)
 
 
-def test_a_folder_that_cannot_be_made_is_reported(tmp_path: Path, videos: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(StorageError, match="cannot be written"):
-        mark_output(tmp_path / "file" / "capture", videos)
-
-
-def test_a_full_disk_leaves_the_folder_free_for_the_next_time(
-    tmp_path: Path, videos: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(descriptor: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("os.fsync", full)
-        with pytest.raises(StorageError, match=r"cannot be written \(No space left on device\)"):
-            mark_output(tmp_path / "capture", videos)
-    mark_output(tmp_path / "capture", videos)
-
-
 def test_killed_at_any_step_it_leaves_the_folder_free_for_the_next_time(tmp_path: Path, videos: Path) -> None:
     killed = folders_of_the_killed(
         tmp_path,
@@ -129,11 +109,6 @@ def test_who_fails_leaves_the_capture_free(tmp_path: Path, videos: Path) -> None
         raise KeyError
     with lock_output(tmp_path / "capture"):
         assert (tmp_path / "capture" / FOLDER / LOCK).exists()
-
-
-def test_a_folder_that_was_not_claimed_cannot_be_held(tmp_path: Path) -> None:
-    with pytest.raises(StorageError, match="cannot be written"):
-        lock_output(tmp_path / "capture").__enter__()
 
 
 def test_each_kind_of_link(tmp_path: Path) -> None:
@@ -277,17 +252,6 @@ def test_what_was_cut_is_done_again(tmp_path: Path, damage: Callable[[Path], obj
     damage(tmp_path / FOLDER)
     assert run(Steps(tmp_path, Silent()), "a", 3, done) == 3
     assert done == ["a", "a"]
-
-
-def test_an_interruption_leaves_no_result(tmp_path: Path) -> None:
-    def interrupted() -> int:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        Steps(tmp_path, Silent()).run(
-            "a", {}, interrupted, pack=lambda _: Stored(), unpack=lambda _: 0, summary=lambda _: ""
-        )
-    assert not list(tmp_path.rglob("a.*"))
 
 
 def test_killed_at_any_step_of_writing_it_is_done_again_or_was_done(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ from functools import cache
 from itertools import count
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from structgstream.codec.container.records import RecordType, scan_records
@@ -120,17 +119,3 @@ def test_without_periods_nothing_is_measured_and_nothing_changes(monkeypatch: py
     data = sink.data
     assert {record.period for record in scan_records(data)} == {0}
     assert "period" not in StreamReader(data).header.config
-
-
-def test_a_new_period_shows_the_changed_scene_better() -> None:
-    """The mean error of the last frame, with and without: the reason that there are periods."""
-    with_period = whole("residual")[0]
-    run(sink := MemorySink(), BASE)
-    errors = [error_of(StreamReader(data)) for data in (sink.data, with_period)]
-    assert errors[1] < 0.8 * errors[0]
-
-
-def error_of(reader: StreamReader) -> float:
-    frame = frames()[FRAMES - 1]
-    pictures = {name: reader.render(FRAMES - 1, name, backend=quickest_backend()) for name in WORLD.rig.training}
-    return float(np.mean([np.abs(image.astype(float) - frame.images[name]).mean() for name, image in pictures.items()]))

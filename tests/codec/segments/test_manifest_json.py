@@ -15,6 +15,7 @@ from structgstream.codec.packets import PacketKind
 from structgstream.codec.segments.manifest import (
     MAX_MANIFEST_BYTES,
     Edge,
+    Fields,
     HistoryEntry,
     Manifest,
     PartEntry,
@@ -147,6 +148,21 @@ def test_what_contradicts_the_format_is_refused_in_words(path: tuple[Any, ...], 
     place[path[-1]] = value
     with pytest.raises(StreamError, match=message):
         read(json.dumps(plain).encode())
+
+
+@pytest.mark.parametrize(
+    "name", ["", ".a", "..", "a/b", "a\\b", "a b", "a\n", "A" * 129, "é", "http:x", "%2e", None, 1, ["a"]]
+)
+def test_names_that_lead_elsewhere(name: object) -> None:
+    with pytest.raises(StreamError, match="plain name of a file"):
+        Fields({"file": name}, "it").file()
+
+
+@pytest.mark.parametrize("digest", ["0" * 63, "0" * 65, "A" * 64, "g" * 64, "0" * 63 + "\n", None, 0])
+def test_what_is_no_hash(digest: object) -> None:
+    with pytest.raises(StreamError, match="64 hex digits"):
+        Fields({"sha256": digest}, "it").sha256()
+    assert Fields({"sha256": "0f" * 32}, "it").sha256() == "0f" * 32
 
 
 def test_a_manifest_that_has_ended_has_no_parts_and_what_is_missing_is_named() -> None:
