@@ -63,15 +63,6 @@ def test_killed_at_any_step_of_a_note_the_notes_are_those_before_or_one_more(tmp
         assert set(read_completed(folder)) == {"header", "track"}
 
 
-def test_a_note_after_one_that_was_cut_is_not_lost(parts: Parts) -> None:
-    """As earlier versions may have left them."""
-    path = parts.folder / "done.jsonl"
-    path.write_text(path.read_text() + '{"name": "track", "ke')
-    again = Parts(parts.folder)
-    again.record(TaskResult("join", 0, 1.0), "key", parts.header, frames=5)
-    assert set(read_completed(parts.folder)) == {"header", "join"}
-
-
 def test_killed_at_any_step_of_clearing_what_is_left_is_refused_as_before_or_nothing(
     tmp_path: Path, parts: Parts
 ) -> None:
