@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cameras and queues on a terminal, and in lines."""
 
-import io
 from dataclasses import replace
 from pathlib import Path
-
-from rich.console import Console
 
 from structgstream.cli.live_run import Dashboard, live_display
 from structgstream.data.live.status import CameraStatus, LiveStatus
 from structgstream.recorder import RunMetrics
 from structgstream.training.result import Step
+from tests.support.consoles import console, text
 from tests.support.reports import frame_report
 
 STATUS = LiveStatus(
@@ -20,15 +18,6 @@ STATUS = LiveStatus(
     delay_seconds=0.25,
 )
 REPORT = frame_report(4, bytes=2000, train_psnr=31.2, anchors=10, moving=10, free=0, seconds={"fit": 2.0, "total": 3.0})
-
-
-def console(*, terminal: bool) -> Console:
-    return Console(file=io.StringIO(), force_terminal=terminal, width=150, height=30, color_system=None)
-
-
-def text(of: Console) -> str:
-    assert isinstance(of.file, io.StringIO)
-    return of.file.getvalue()
 
 
 def metrics(folder: Path) -> RunMetrics:
@@ -89,7 +78,7 @@ def test_between_iterations_the_dashboard_tells_what_is_done(tmp_path: Path) -> 
 
 
 def test_on_a_narrow_terminal_no_value_is_broken(tmp_path: Path) -> None:
-    out = Console(file=io.StringIO(), force_terminal=True, width=48, height=40, color_system=None)
+    out = console(terminal=True, width=48, height=40)
     with live_display(metrics(tmp_path).values, console=out) as shown:
         shown.frame(REPORT)
     lines = text(out).splitlines()
