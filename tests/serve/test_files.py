@@ -33,16 +33,6 @@ def test_a_file_at_any_depth(tmp_path: Path) -> None:
     assert content(tmp_path, "file") == b"shallow"
 
 
-def test_slices_are_those_of_the_bytes(tmp_path: Path) -> None:
-    whole = bytes(range(100))
-    (tmp_path / "file").write_bytes(whole)
-    opened = open_below(tmp_path, "file")
-    assert opened is not None
-    with opened:
-        for part in (slice(None), slice(5, 20), slice(-7, None), slice(90, 200), slice(30, 10), slice(200, 300)):
-            assert opened[part] == whole[part]
-
-
 def test_nothing_that_is_no_file_is_opened(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_bytes(b"x")
