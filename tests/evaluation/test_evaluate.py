@@ -13,11 +13,9 @@ import torch
 
 from structgstream.cameras import Similarity
 from structgstream.codec.packets import PacketKind, StreamHeader
-from structgstream.errors import BackendError, ConfigError
 from structgstream.evaluation.evaluate import evaluate
 from structgstream.evaluation.lpips import ENVIRONMENT
 from structgstream.evaluation.metrics import PSNR_OF_EQUALS
-from structgstream.evaluation.recording import to_device
 from structgstream.evaluation.report import as_json
 from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians
@@ -283,20 +281,6 @@ def test_another_methods_file_is_scored_alike(world: World) -> None:
     report = run(reader, MemoryCapture(world.rig, world.frames))
     assert [(frame.anchors, frame.free) for frame in report.frames] == [(0, 1)] * 4
     assert 5 < report.mean.psnr < 40
-    with pytest.raises(BackendError, match="Ball cannot be drawn on meta"):
-        to_device(Ball(1.0), torch.device("meta"))
-
-
-def test_a_stream_without_held_out_cameras_says_what_to_do(world: World) -> None:
-    reader = in_the_stream(world, similarity=Similarity(), follow=True)
-    reader.header = replace(reader.header, rig=world.rig.with_held_out(frozenset()))
-    source = MemoryCapture(world.rig, world.frames)
-    with pytest.raises(ConfigError, match="--cameras"):
-        run(reader, source)
-    report = run(reader, source, cameras=("cam02",))
-    assert report.stream["cameras"] == {"cam02": "training"}
-    with pytest.raises(ConfigError, match="no camera 'cam99'"):
-        run(reader, source, cameras=("cam99",))
 
 
 def test_other_sizes_and_the_worst_frames_are_in_the_report(world: World) -> None:

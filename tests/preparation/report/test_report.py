@@ -56,20 +56,6 @@ def test_an_earlier_report_goes_and_nothing_else(tmp_path: Path) -> None:
     assert not (tmp_path / "camera_old.png").exists()
 
 
-@pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
-    """Calls a function that draws, and returns its figure."""
-
-    def draw(function: Callable[..., None], *arguments: Any, **keywords: Any) -> Any:
-        kept: list[Any] = []
-        monkeypatch.setattr(charts, "save_figure", lambda figure, path: kept.append(figure))
-        function(Path("unused.png"), *arguments, **keywords)
-        (figure,) = kept
-        return figure
-
-    return draw
-
-
 def report_of(cameras: dict[str, CameraCheck], pairs: tuple[PairCheck, ...] = ()) -> CheckReport:
     return CheckReport("take", 0, cameras, pairs, Coverage(0, 0.0, 0.0), (), 1.0, 0.1, None)
 
