@@ -17,7 +17,10 @@ from pathlib import Path
 import pytest
 
 from structgstream.cli import main
-from tests.support.streams import small_stream
+from structgstream.codec.sinks import FileSink
+from structgstream.data.dataset_layouts import bundled_clip_path
+from tests.support.rigs import random_scene
+from tests.support.streams import header_for, small_stream, write_stream
 
 STREAM = small_stream()
 PATIENCE_SECONDS = 60.0
@@ -142,6 +145,14 @@ def test_what_cannot_be_played(
     if content is not None:
         file.write_bytes(content)
     assert words in error_of([str(file), "--no-browser", *extra], capsys, status=status)
+
+
+def test_the_capture_of_another_stream_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "s.sgs"
+    scene = random_scene(5)
+    write_stream(FileSink(file), [scene], header=header_for(scene))
+    error = error_of([str(file), "--no-browser", "--capture", str(bundled_clip_path())], capsys, status=1)
+    assert "of the capture clip" in error or "in the capture clip" in error
 
 
 @pytest.mark.parametrize("missing", ["starlette", "uvicorn"])

@@ -123,6 +123,17 @@ def test_what_is_no_folder_of_streams(folder: Path, capsys: pytest.CaptureFixtur
     assert "is a file; serve takes a folder" in output_of(["serve", str(file)], capsys, expected=1)
 
 
+def test_a_missing_extra_is_reported(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in [name for name in sys.modules if name.startswith("structgstream.serve")]:
+        monkeypatch.delitem(sys.modules, name)
+    for name in [name for name in sys.modules if name.split(".")[0] == "uvicorn"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "uvicorn", None)  # type: ignore[arg-type]
+    assert "pip install 'structgstream[serve]'" in output_of(["serve", str(folder)], capsys, expected=1)
+
+
 def test_the_server_needs_no_torch(folder: Path) -> None:
     code = (
         "import sys; import structgstream.serve.listening; print(*{'torch', 'numpy', 'av', 'cv2'} & set(sys.modules))"

@@ -62,3 +62,12 @@ def test_a_terminal_shows_the_running_step_and_what_it_is_at() -> None:
         assert not display._bar.tasks
         display.progress(4, 8, "cam08")  # nobody's: the step has ended
     assert "calibrate    done" in text(to)
+
+
+def test_a_step_that_is_skipped_or_begun_anew_has_no_bar_of_the_last() -> None:
+    with StepDisplay(console(terminal=True)) as display:
+        display.begin("one", skipped=False)
+        display.begin("two", skipped=False)
+        assert [task.description for task in display._bar.tasks] == ["two"]
+        display.begin("three", skipped=True)
+        assert not display._bar.tasks

@@ -82,6 +82,12 @@ def test_an_unreadable_picture_is_named_after_the_frames_before_it(
         next(frames)
 
 
+def test_the_extra_is_named_when_opencv_is_absent(source: ImageSource, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(MissingExtraError, match=r"structgstream\[capture\]"):
+        next(source.frames())
+
+
 def test_pictures_are_matched_by_name_not_by_count() -> None:
     files = {
         "a": {name: Path(f"a/{name}.png") for name in ("8", "9", "10")},

@@ -124,6 +124,17 @@ def test_numbers_that_cannot_be_name_the_camera(tmp_path: Path, column: int, val
         open_n3dv(tmp_path)
 
 
+@pytest.mark.parametrize("content", [b"", b"junk", None])
+def test_a_file_that_is_something_else(tmp_path: Path, content: bytes | None) -> None:
+    write_n3dv(tmp_path)
+    if content is None:
+        np.save(tmp_path / "poses_bounds.npy", np.zeros((4, 3)))
+    else:
+        (tmp_path / "poses_bounds.npy").write_bytes(content)
+    with pytest.raises(CalibrationError, match=r"poses_bounds\.npy (cannot be read|has shape \(4, 3\))"):
+        open_n3dv(tmp_path)
+
+
 @pytest.mark.parametrize("as_text", [True, False])
 def test_the_pictures_tell_the_order_of_rows(tmp_path: Path, as_text: bool) -> None:
     """LLFF sorts cam1, cam10, cam2 as text; others by number."""

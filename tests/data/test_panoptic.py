@@ -73,6 +73,14 @@ def test_size_of_the_metadata_must_be_the_pictures(tmp_path: Path) -> None:
         next(open_panoptic(tmp_path).frames())
 
 
+@pytest.mark.parametrize("text", ["{", "[]", '{"w": 64, "h": 48}'])
+def test_metadata_that_is_something_else(tmp_path: Path, text: str) -> None:
+    write_panoptic(tmp_path)
+    (tmp_path / TRAIN).write_text(text)
+    with pytest.raises(CaptureError, match=r"train_meta\.json cannot be read \(.*expected w, h, k, w2c"):
+        open_panoptic(tmp_path)
+
+
 def test_a_camera_cannot_be_trained_and_held_out(tmp_path: Path) -> None:
     write_panoptic(tmp_path)
     (tmp_path / TEST).write_text((tmp_path / TRAIN).read_text())

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import logging
+import sys
 from itertools import pairwise
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 from structgstream.data.timeline import Clock
 from structgstream.data.video import VideoSource, measured_fps, synchronised
 from structgstream.data.video_index import VideoTrack, scan_videos
-from structgstream.errors import CalibrationError, CaptureError
+from structgstream.errors import CalibrationError, CaptureError, MissingExtraError
 from tests.support.captures import FULL, LIMITED, all_numbers, numbers, picture, small_rig, write_video, write_videos
 
 RIG = small_rig(3)
@@ -303,6 +304,12 @@ def test_closing_releases_the_files(tmp_path: Path) -> None:
     assert len(open_files()) == 3
     frames.close()  # type: ignore[attr-defined]
     assert not open_files()
+
+
+def test_the_extra_is_named_when_the_reader_is_absent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(MissingExtraError, match=r"structgstream\[capture\]"):
+        scan_videos({"a": tmp_path / "a.mp4"})
 
 
 def test_stamps_ascend(tmp_path: Path) -> None:

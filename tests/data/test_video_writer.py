@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from structgstream.data.video_writer import VideoWriter
+from structgstream.errors import StorageError
 
 
 def gradient(number: int, *, height: int = 48, width: int = 64) -> np.ndarray:
@@ -57,3 +58,9 @@ def test_an_error_leaves_no_half_written_file(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="stop"):
         interrupted()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_made_is_said(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match=r"v\.mp4 cannot be written"):
+        VideoWriter(tmp_path / "file" / "v.mp4", fps=30)

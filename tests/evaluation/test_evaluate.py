@@ -13,9 +13,13 @@ import torch
 
 from structgstream.cameras import Similarity
 from structgstream.codec.packets import PacketKind, StreamHeader
+from structgstream.data.images import ImageSource
+from structgstream.data.source import section
+from structgstream.errors import CaptureError
 from structgstream.evaluation.evaluate import evaluate
 from structgstream.evaluation.lpips import ENVIRONMENT
 from structgstream.evaluation.metrics import PSNR_OF_EQUALS
+from structgstream.evaluation.recording import numbers_of
 from structgstream.evaluation.report import as_json
 from structgstream.frames import MultiViewFrame
 from structgstream.gaussians import Gaussians
@@ -260,6 +264,29 @@ def test_the_basic_scores_are_those_of_before(world: World) -> None:
     assert basic.stream["not_available"] == {}
     assert (basic.mean.psnr, basic.mean.ssim) == (every.mean.psnr, every.mean.ssim)
     assert basic.mean.flip is basic.mean.e_warp is basic.mean.ms_ssim is None
+
+
+def test_a_part_that_begins_elsewhere_is_refused(world: World) -> None:
+    reader = in_the_stream(world, similarity=Similarity(), follow=True)
+    reader.header = replace(reader.header, metadata={"start": 2})
+    whole: Any = MemoryCapture(world.rig, world.frames * 2)
+    assert numbers_of(whole) is None
+    assert numbers_of(section(whole, start=1)) is None
+    pictures = ImageSource("world", world.rig, 30.0, {name: (Path("x.png"),) * 8 for name in world.rig})
+    assert numbers_of(pictures) == range(8)
+    assert numbers_of(section(section(pictures, start=1), start=1, frames=4)) == range(2, 6)
+    assert numbers_of(section(section(pictures, start=1, every=2), start=1, frames=2)) == range(3, 7, 2)
+    with pytest.raises(CaptureError, match="begins at frame 2 .* at frame 1.*start=2"):
+        run(reader, section(pictures, start=1))
+
+
+def test_a_part_of_another_step_is_refused(world: World) -> None:
+    reader = in_the_stream(world, similarity=Similarity(), follow=True)
+    pictures = ImageSource("world", world.rig, 30.0, {name: (Path("x.png"),) * 16 for name in world.rig})
+    for stated, step in (({}, 2), ({"every": 2}, 1), ({"every": 2}, 3)):
+        reader.header = replace(reader.header, metadata={"start": 1, **stated})
+        with pytest.raises(CaptureError, match=rf"1 in {stated.get('every', 1)} frames .* 1 in {step}; .*every="):
+            run(reader, section(pictures, start=1, every=step))
 
 
 @dataclass

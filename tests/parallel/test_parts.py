@@ -124,3 +124,12 @@ def test_a_run_that_begins_anew_has_another_name(parts: Parts) -> None:
         parts.clear()
     parts.use_plan({"capture": "a"})
     assert parts.run not in ("", first)
+
+
+def test_a_folder_that_cannot_be_made_is_reported(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with (
+        pytest.raises(StorageError, match="cannot be used for the parts of a parallel run"),
+        Parts(tmp_path / "file" / "parts").locked(),
+    ):
+        pass

@@ -206,3 +206,12 @@ def test_pictures_of_one_moment_by_the_clocks(tmp_path: Path) -> None:
     assert [numbers(image)[1] for image in shots["b"]] == [3, 6, 9]
     assert numbers(shots["b"][1])[1] == 6
     assert len(shots["b"][1:]) == 2
+
+
+def test_videos_shorter_than_the_offset_are_reported(tmp_path: Path) -> None:
+    write_videos(tmp_path, ["a", "b"], frames=10)
+    footage = find_footage(tmp_path)
+    with pytest.raises(
+        CaptureError, match=r"a\.mp4 of camera 'a' ends .* before b\.mp4 of camera 'b' begins.*--without"
+    ):
+        shared_seconds(footage, {"b": Clock(2.0)})

@@ -14,7 +14,7 @@ from structgstream.data.undistortion import rectilinear
 from structgstream.errors import CalibrationError
 from structgstream.preparation.solvers import find_calibration, require_calibration
 from tests.support.calibrations import WRITERS, truths, write_anipose, write_transforms
-from tests.support.captures import small_rig, write_text_model
+from tests.support.captures import small_rig, write_immersive, write_text_model
 
 RIG = small_rig(3)
 
@@ -73,6 +73,11 @@ def test_the_file_that_is_named_is_taken_and_of_a_folder_the_first(tmp_path: Pat
         assert require_calibration(tmp_path).where == where
         shutil.rmtree(tmp_path / "sparse") if file == files[2] else file.unlink()
     assert find_calibration(tmp_path) is None
+
+
+def test_models_of_fisheyes(tmp_path: Path) -> None:
+    write_immersive(tmp_path, cameras=3, frames=1)
+    assert len(require_calibration(tmp_path).cameras) == 3
 
 
 def test_where_there_is_none(tmp_path: Path) -> None:

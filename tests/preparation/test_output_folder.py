@@ -81,6 +81,12 @@ def test_the_videos_own_folder_is_no_capture(videos: Path) -> None:
         mark_output(videos / ".." / "take", videos)
 
 
+def test_a_folder_that_cannot_be_made_is_reported(tmp_path: Path, videos: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match="cannot be written"):
+        mark_output(tmp_path / "file" / "capture", videos)
+
+
 def test_killed_at_any_step_it_leaves_the_folder_free_for_the_next_time(tmp_path: Path, videos: Path) -> None:
     killed = folders_of_the_killed(
         tmp_path,
@@ -109,6 +115,11 @@ def test_who_fails_leaves_the_capture_free(tmp_path: Path, videos: Path) -> None
         raise KeyError
     with lock_output(tmp_path / "capture"):
         assert (tmp_path / "capture" / FOLDER / LOCK).exists()
+
+
+def test_a_folder_that_was_not_claimed_cannot_be_held(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="cannot be written"):
+        lock_output(tmp_path / "capture").__enter__()
 
 
 def test_each_kind_of_link(tmp_path: Path) -> None:
@@ -264,6 +275,12 @@ def test_killed_at_any_step_of_writing_it_is_done_again_or_was_done(tmp_path: Pa
         for value in (3, 5, 3):
             assert run(Steps(folder, Silent()), "a", value, []) == value
         assert sorted(path.name for path in (folder / FOLDER).iterdir()) == ["a.json", "a.npz"]
+
+
+def test_a_full_disk_is_reported(tmp_path: Path) -> None:
+    (tmp_path / FOLDER).write_text("")
+    with pytest.raises(StorageError, match=r"step 'a' cannot be written .* it goes on from there"):
+        run(Steps(tmp_path, Silent()), "a", 1, [])
 
 
 def test_a_fingerprint_is_of_content_and_time(tmp_path: Path) -> None:

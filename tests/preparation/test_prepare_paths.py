@@ -10,13 +10,13 @@ import pytest
 
 from structgstream.data.prepared import PreparedCapture, read_prepared
 from structgstream.data.timeline import Clock
-from structgstream.errors import CaptureError
+from structgstream.errors import CalibrationError, CaptureError
 from structgstream.preparation.footage import find_footage
 from structgstream.preparation.options import Distance, PrepareOptions
 from structgstream.preparation.prepare import Job, Preparation, prepare_capture
 from structgstream.preparation.solvers import first_clocks, matched_pictures
 from tests.support.calibration_errors import calibration_errors
-from tests.support.captures import write_video
+from tests.support.captures import write_video, write_videos
 from tests.support.filmed import Film, noise_texture, ring, room
 from tests.support.footage_made import BOARD, FPS, add_sound, centred, write_board_take, write_take
 from tests.support.rooms import write_room
@@ -139,3 +139,12 @@ def test_dead_cameras_are_reported_once(tmp_path: Path, caplog: pytest.LogCaptur
     (found,) = [finding for finding in made.findings if "ends with frame 3" in finding.sentence]
     assert (found.severity, found.cameras) == ("warning", ("cam02",))
     assert "is absent from the 5 frames after that" in made.report.read_text()
+
+
+def test_a_board_that_is_not_there(tmp_path: Path) -> None:
+    write_videos(tmp_path / "videos", ["a", "b", "c"], frames=2)
+    with pytest.raises(CalibrationError, match=r"No camera shows the board .* in any of its"):
+        prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(NONE, calibration="board"))
+    write_videos(tmp_path / "board", ["a", "b"], frames=2)
+    with pytest.raises(CaptureError, match=r"has no video of camera 'c' of .*film the board with it too"):
+        prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(NONE, board_videos=tmp_path / "board"))

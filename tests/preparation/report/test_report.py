@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
+from structgstream.errors import StorageError
 from structgstream.figure import COLORS
 from structgstream.preparation import report as charts
 from structgstream.preparation.checking.check import (
@@ -54,6 +55,14 @@ def test_an_earlier_report_goes_and_nothing_else(tmp_path: Path) -> None:
     write_report(tmp_path, check_capture(MemoryCapture(rig, [room_frame(rig, textured=False)])))
     assert (tmp_path / "notes.txt").is_file()
     assert not (tmp_path / "camera_old.png").exists()
+
+
+def test_no_room_is_reported(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    rig = room_rig(4)
+    checked = check_capture(MemoryCapture(rig, [room_frame(rig, textured=False)]))
+    with pytest.raises(StorageError, match="cannot be written"):
+        write_report(tmp_path / "file", checked)
 
 
 def report_of(cameras: dict[str, CameraCheck], pairs: tuple[PairCheck, ...] = ()) -> CheckReport:
