@@ -2,6 +2,7 @@
 """The player as a widget, and the example notebook, run in a kernel of its own."""
 
 import json
+import sys
 from pathlib import Path
 
 import nbformat
@@ -9,7 +10,7 @@ import pytest
 import traitlets
 from nbclient import NotebookClient
 
-from structgstream.errors import StreamError
+from structgstream.errors import MissingExtraError, StreamError
 from structgstream.notebook import Player
 from structgstream.serve.pages import bundle
 from tests.support.streams import small_stream
@@ -53,6 +54,13 @@ def test_other_bytes_and_another_height_are_reported_to_the_browser(file: Path) 
 def test_what_cannot_be_shown_is_reported(stream: bytes | str, words: str) -> None:
     with pytest.raises(StreamError, match=words):
         Player(stream)
+
+
+def test_a_missing_extra_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "structgstream.notebook")
+    monkeypatch.setitem(sys.modules, "anywidget", None)  # type: ignore[arg-type]
+    with pytest.raises(MissingExtraError, match=r"pip install 'structgstream\[notebook\]'"):
+        import structgstream.notebook  # noqa: F401
 
 
 def test_the_example_notebook_runs(tmp_path: Path) -> None:

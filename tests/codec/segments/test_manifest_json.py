@@ -130,6 +130,7 @@ BAD: list[tuple[tuple[Any, ...], Any, str]] = [
     (("segments", 0, "frame_bytes"), [1, 2], "expected a list of 3 whole numbers"),
     (("segments", 0, "first_frame"), 7, "begins with frame 7 and segment 2, where frame 6 and segment 2 belong"),
     (("segments", 1, "segment"), 2, "where frame 9 and segment 3 belong"),
+    (("segments", 0, "pts_seconds"), [1.0], "two numbers"),
     (("segments", 0, "pts_seconds"), [1.0, 0.5], "two numbers that do not fall"),
     (("segments", 0, "period"), 1, "names no init record of period 1"),
     (("segments",), {}, "expected a list of at most 4096 objects"),

@@ -85,3 +85,12 @@ def test_one_process_writes_at_a_time(tmp_path: Path) -> None:
     store.lock()
     FolderStore(tmp_path).lock()
     assert store.names() == frozenset()
+
+
+def test_a_lock_that_is_a_link_leaves_the_file_that_it_points_to(tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("mine")
+    (tmp_path / "stream").mkdir()
+    (tmp_path / "stream" / ".writer").symlink_to(tmp_path / "mine")
+    with pytest.raises(StorageError, match=".writer in it is a link, which is not followed"):
+        FolderStore(tmp_path / "stream").lock()
+    assert (tmp_path / "mine").read_text() == "mine"

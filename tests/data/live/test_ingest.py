@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cameras of files at work, and what is reported of those out of step."""
 
+import re
 import threading
 import time
 from pathlib import Path
@@ -172,3 +173,20 @@ def test_others_that_change_are_those_of_other_cameras() -> None:
     bench.ingest.feeds["a"].changed_at = 7.0
     assert bench.ingest.others_changed_at("b") == 7.0
     assert Bench("a").ingest.others_changed_at("a") == -float("inf")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [
+        (-0.125, "are 0.125 s behind those of the others: .* offset_seconds = [+]0.125 in the rig file mends"),
+        (0.25, "are 0.250 s ahead of those of the others: its clock is, which offset_seconds = -0.250"),
+    ],
+)
+def test_a_camera_out_of_step_is_reported_with_its_remedy(
+    seconds: float, said: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    bench = Bench("a", "b")
+    bench.ingest._warn_out_of_step({"b": seconds})
+    (record,) = caplog.records
+    assert "b" in record.getMessage()
+    assert re.search(said, record.getMessage())

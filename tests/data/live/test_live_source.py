@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from itertools import islice, pairwise
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -17,11 +18,14 @@ import pytest
 from structgstream.data.denoising import DenoisingConfig
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.live import recorder as recording
+from structgstream.data.live import source as source_module
 from structgstream.data.live.source import LiveOptions, LiveSource, read_calibration
 from structgstream.data.live.status import FaultLog
+from structgstream.data.live.synchronizer import LivePicture, PictureSet
 from structgstream.data.open import open_capture
 from structgstream.data.prepared import PreparedCamera, PreparedCapture, write_prepared
 from structgstream.data.source import frame_count, is_recording
+from structgstream.data.video import srgb
 from structgstream.errors import CaptureError, ConfigError, StorageError
 from structgstream.opus import PACKET_SECONDS
 from tests.support.rigs import arc_rig
@@ -369,6 +373,37 @@ def test_a_recording_that_cannot_be_written_does_not_end_the_stream(
         frames = list(LiveSource(files(tmp_path), tmp_path / "x.sgs", options).frames())
     assert len(frames) == 4
     assert "camera 'b' is no longer recorded (no room); the stream goes on" in caplog.text
+
+
+def test_a_recording_that_cannot_be_ended_does_not_end_the_others(caplog: pytest.LogCaptureFixture) -> None:
+    class Full:
+        def close(self) -> None:
+            raise OSError(28, "No space left on device")
+
+    recorder = recording.CameraRecorder(Recorded(), "b", FaultLog("rig", now=lambda: 0.0))
+    recorder._output = Full()
+    recorder.close()
+    recorder.close()
+    assert caplog.text.count("camera 'b' is no longer recorded (No space left on device); the stream goes on") == 1
+
+
+def test_a_camera_whose_colours_cannot_be_converted_is_absent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def converted(frame: Any, *rest: Any, width: int, height: int) -> Any:
+        if width == 64:
+            raise ValueError("no such format")
+        return srgb(frame, *rest, width=width, height=height)
+
+    monkeypatch.setattr(source_module, "srgb", converted)
+    sizes = {"a": (128, 96), "b": (64, 48), "c": (128, 96)}
+    monkeypatch.setattr(source_module, "filmed_sizes", lambda calibration: sizes)
+    source = LiveSource(files(tmp_path), tmp_path / "x.sgs", LiveOptions(frames=0))
+    convert = source._converter()
+    pictures = {name: LivePicture(0.5, 0.0, decoded()) for name in NAMES}
+    assert [*convert(PictureSet(0.5, pictures, 0.0)).images] == ["a", "c"]
+    assert "camera 'b' sends pictures whose colours cannot be converted (no such format)" in caplog.text
+    assert source.faults.counts["b"] == {"garbage": 1}
 
 
 def test_a_second_recording_goes_on_in_the_next_part(tmp_path: Path) -> None:
