@@ -10,10 +10,12 @@ import pytest
 
 from structgstream.cli import main
 from structgstream.cli.progress import Lines
+from structgstream.codec.reader import open_stream
 from structgstream.codec.segments.quality_list import QUALITIES
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest
 from structgstream.session.frame_report import FrameReport
+from tests.data.live.test_live_source import files
 from tests.support.quick_streams import CLIP, QUARTER, error_of
 
 pytestmark = pytest.mark.usefixtures("quick_tiny")
@@ -123,3 +125,22 @@ def test_ctrl_c_finishes_the_frame_in_all_and_resume_without_a_word_on_segments_
 
 def live(out: Path, rig: Path, *more: str) -> int:
     return main(["reconstruct", str(rig), "-o", str(out), "--live", *QUARTER[2:], *GIVEN, *more])
+
+
+def test_live_cameras_are_read_once_for_all_and_a_resumed_run_goes_on(tmp_path: Path) -> None:
+    rig, out = files(tmp_path, frames=60), tmp_path / "out"
+    assert live(out, rig, "--frames", "2", "--record", str(tmp_path / "take")) == 0
+    assert live(out, rig, "--frames", "4", "--resume") == 0
+    readers = [open_stream(out / name) for name in NAMES]
+    times = [[(info.index, info.pts_seconds) for info in reader.packets] for reader in readers]
+    assert times[0] == times[1]
+    assert len(times[0]) == 4
+    assert times[0] == sorted(times[0], key=lambda one: one[1])
+    manifests = [read_manifest(FolderStore(out / name)) for name in NAMES]
+    captured = [one.edge.captured_unix_seconds for one in manifests]
+    assert captured[0] == captured[1]
+    assert captured[0] is not None
+    assert len([*(tmp_path / "take").glob("*.ts")]) == 3
+    last = json.loads((tmp_path / "out.log.jsonl").read_text().splitlines()[-1])
+    assert set(last["qualities"]) == set(NAMES)
+    assert set(last["run"]["live"]["cameras"]) == {"a", "b", "c"}
