@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Facts of packets and packets by frame, from offsets alone; damage after opening is never believed."""
 
+from contextlib import suppress
 from functools import cache
 
 import pytest
@@ -11,6 +12,7 @@ from structgstream.codec.container.records import Record, RecordType, packed, sc
 from structgstream.codec.contents import LOST, Packets
 from structgstream.codec.packets import PacketKind
 from structgstream.errors import StreamError
+from tests.support.properties import examples
 from tests.support.streams import small_stream
 
 FRAMES = 5
@@ -77,6 +79,25 @@ def test_packets_after_a_lost_one_are_found_by_their_frame() -> None:
     for ask in (found.at, found.packet):
         with pytest.raises(StreamError, match=r"Packet 2 of a\.sgs, at byte \d+, is damaged\."):
             ask(2)
+
+
+@examples(200)
+@given(st.data())
+def test_any_flipped_bit_of_a_packet_is_noticed_and_facts_are_never_a_crash(choice: st.DataObject) -> None:
+    index = choice.draw(st.integers(0, FRAMES - 1))
+    record = records()[index]
+    # Mostly heads, where facts come from.
+    head = st.integers(8 * record.offset, 8 * (record.offset + 40) - 1)
+    bit = choice.draw(head | st.integers(8 * record.offset, 8 * record.end - 1))
+    data = bytearray(whole())
+    data[bit // 8] ^= 1 << bit % 8
+    found = table(data)
+    with pytest.raises(StreamError):
+        found.packet(index)
+    with suppress(StreamError):
+        assert found.at(index).index == index
+    for other in {*range(FRAMES)} - {index}:
+        assert found.packet(other).payload == records()[other].payload
 
 
 @pytest.mark.parametrize(("kind", "frame"), [(RecordType.INIT, 1), (77, 1), (RecordType.DELTA, 2)])
