@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What all plots share: a figure of a size, axes without ornament, one sentence where it cannot be stored."""
 
-import resource
 import sys
 from pathlib import Path
 
@@ -42,17 +41,3 @@ def test_what_is_in_the_way_is_reported(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(MissingExtraError, match="report"):
         figure_of(1.0, 1.0)
-
-
-def test_where_there_is_no_room_the_picture_before_stays(tmp_path: Path) -> None:
-    file = tmp_path / "x.png"
-    file.write_bytes(b"before")
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
-    try:
-        with pytest.raises(StorageError, match=r"The picture .*x\.png cannot be written \(File too large\)"):
-            save_figure(figure_of(1.0, 1.0), file)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert file.read_bytes() == b"before"
-    assert [entry.name for entry in tmp_path.iterdir()] == ["x.png"]

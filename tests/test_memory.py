@@ -99,15 +99,6 @@ def test_a_mark_that_can_no_longer_be_set_back_is_said_so(monkeypatch: pytest.Mo
     assert [*meter.process_bytes] == ["first", "second", "third"]
 
 
-def test_without_a_status_of_the_process_its_mark_only_rises(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(memory, "_STATUS", tmp_path / "nothing")
-    meter = PeakMeter(CPU)
-    meter.end("read")
-    assert meter.kind is PeakKind.PROCESS
-    assert meter.process_bytes["read"] > 0
-    assert resident_bytes() is None
-
-
 def test_a_gpu_is_measured_beside_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """The two functions of torch stand in for a GPU: a mark that an allocation raises and a reset takes back."""
     mark = {"bytes": 700}

@@ -2,7 +2,7 @@
 """The cameras of each clip: a two-row arc, and camera 0 in its middle as the held-out view."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,12 +60,20 @@ class Rig:
         return out
 
 
+TABLE = Rig(
+    target=(0.02, 0.12, 0.155),
+    radius_metres=1.5,
+    near_metres=0.6,
+    directions=(
+        (0.0, 17.0),
+        (-30.0, 10.0), (-15.0, 10.0), (0.0, 9.0), (15.0, 10.0), (30.0, 10.0),
+        (-23.0, 25.0), (-8.0, 26.0), (8.0, 26.0), (23.0, 25.0),
+    ),
+)  # fmt: skip
 RIGS = {
     # The table as 21 cameras see it, as many and of the size of N3DV's.
-    "n3dv": Rig(
-        target=(0.02, 0.12, 0.155),
-        radius_metres=1.5,
-        near_metres=0.6,
+    "n3dv": replace(
+        TABLE,
         directions=(
             (0.0, 17.0),
             *((-31.5 + 7.0 * step, 10.0) for step in range(10)),
@@ -74,16 +82,7 @@ RIGS = {
         width=1352,
         height=1014,
     ),
-    "table": Rig(
-        target=(0.02, 0.12, 0.155),
-        radius_metres=1.5,
-        near_metres=0.6,
-        directions=(
-            (0.0, 17.0),
-            (-30.0, 10.0), (-15.0, 10.0), (0.0, 9.0), (15.0, 10.0), (30.0, 10.0),
-            (-23.0, 25.0), (-8.0, 26.0), (8.0, 26.0), (23.0, 25.0),
-        ),
-    ),
+    "table": TABLE,
     "throw": Rig(
         target=(0.0, 0.0, 0.82),
         radius_metres=3.6,

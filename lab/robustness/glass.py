@@ -76,7 +76,7 @@ PULL = (
 @contextmanager
 def sending(folder: Path, *options: str) -> Iterator[None]:
     """The cameras, until the end of the block."""
-    command = [sys.executable, str(ROOT / "tools" / "senders" / "send.py"), str(folder), *options]
+    command = [sys.executable, str(ROOT / "tests" / "support" / "senders" / "send.py"), str(folder), *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as running:
         assert running.stdout is not None
         try:

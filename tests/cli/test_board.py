@@ -43,9 +43,3 @@ def test_what_is_printed_names_the_board_for_prepare(tmp_path: Path, capsys: pyt
 def test_what_is_no_board(tmp_path: Path, given: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert words in error_of(["board", "-o", str(tmp_path / "b.pdf"), *given], capsys, status=2)
     assert not (tmp_path / "b.pdf").exists()
-
-
-def test_a_place_that_cannot_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "file").touch()
-    for out in (tmp_path / "file" / "b.pdf", tmp_path):
-        assert f"The board {out} cannot be written" in error_of(["board", "-o", str(out)], capsys, status=1)

@@ -1,17 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cameras and queues on a terminal, and in lines."""
 
-import io
 from dataclasses import replace
 from pathlib import Path
 
-from rich.console import Console
-
 from structgstream.cli.live_run import Dashboard, live_display
-from structgstream.cli.progress import Lines
 from structgstream.data.live.status import CameraStatus, LiveStatus
 from structgstream.recorder import RunMetrics
 from structgstream.training.result import Step
+from tests.support.consoles import console, text
 from tests.support.reports import frame_report
 
 STATUS = LiveStatus(
@@ -23,25 +20,10 @@ STATUS = LiveStatus(
 REPORT = frame_report(4, bytes=2000, train_psnr=31.2, anchors=10, moving=10, free=0, seconds={"fit": 2.0, "total": 3.0})
 
 
-def console(*, terminal: bool) -> Console:
-    return Console(file=io.StringIO(), force_terminal=terminal, width=150, height=30, color_system=None)
-
-
-def text(of: Console) -> str:
-    assert isinstance(of.file, io.StringIO)
-    return of.file.getvalue()
-
-
 def metrics(folder: Path) -> RunMetrics:
     made = RunMetrics(folder / "x.sgs", fps=30.0, live=lambda: STATUS)
     made.frame(REPORT)
     return made
-
-
-def test_the_place_decides_how_a_live_run_looks(tmp_path: Path) -> None:
-    values = metrics(tmp_path).values
-    assert isinstance(live_display(values, console=console(terminal=False)), Lines)
-    assert isinstance(live_display(values, console=console(terminal=True)), Dashboard)
 
 
 def test_a_line_has_cameras_and_skipped_sets(tmp_path: Path) -> None:
@@ -95,35 +77,13 @@ def test_between_iterations_the_dashboard_tells_what_is_done(tmp_path: Path) -> 
     assert "waits for cameras" in lines(Dashboard(alone.values, console=console(terminal=True)))
 
 
-def test_the_panel_leaves_room_for_what_a_terminal_shows_of_ctrl_c(tmp_path: Path) -> None:
-    out = console(terminal=True)
-    out.print(Dashboard(metrics(tmp_path).values, console=out)._drawn())
-    assert max(map(len, text(out).splitlines())) == 148
-
-
 def test_on_a_narrow_terminal_no_value_is_broken(tmp_path: Path) -> None:
-    out = Console(file=io.StringIO(), force_terminal=True, width=48, height=40, color_system=None)
+    out = console(terminal=True, width=48, height=40)
     with live_display(metrics(tmp_path).values, console=out) as shown:
         shown.frame(REPORT)
     lines = text(out).splitlines()
     for part in ("skipped 880", "pictures 0.25 s old", "train 31.20 dB", "10 anchors", "stuck 3"):
         assert any(part in line for line in lines), part
-
-
-def test_of_many_cameras_on_few_lines_the_last_are_cut_off(tmp_path: Path) -> None:
-    many = replace(STATUS, cameras={f"cam{number:02d}": CameraStatus(True, number) for number in range(60)})
-    out = Console(file=io.StringIO(), force_terminal=True, width=100, height=20, color_system=None)
-    made = RunMetrics(tmp_path / "x.sgs", fps=30.0, live=lambda: many)
-    made.frame(REPORT)
-    with live_display(made.values, console=out) as shown:
-        shown.frame(REPORT)
-        out.file.truncate(0)
-        shown._live.refresh()  # type: ignore[union-attr]
-        drawn = text(out)
-    assert "60/60 cameras" in drawn
-    assert "frame 5" in drawn
-    assert "cam00" in drawn
-    assert "cam59" not in drawn
 
 
 def test_each_quality_has_a_row(tmp_path: Path) -> None:

@@ -57,12 +57,6 @@ def test_a_configuration_is_a_preset_with_edits() -> None:
     assert config.initial == PRESETS["tiny"].initial
 
 
-@pytest.mark.parametrize("name", ["a.mov", "a.WEBM", "b/a.gif", "a.jpg", "a.ply", "a.sgs", "a.json"])
-def test_an_output_of_a_kind_that_is_not_written_is_refused(name: str) -> None:
-    with pytest.raises(UsageError, match="-o"):
-        check_ending(Path(name), ".mp4", ".png", command="render")
-
-
 def test_no_command_writes_a_file_of_another_kind(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     for arguments in (
         ["archive", "x", "-o", "a.mp4"],

@@ -5,7 +5,6 @@ import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -121,18 +120,6 @@ def test_ctrl_c_ends_waiting(
     error = capsys.readouterr().err
     assert "Waiting for" in error
     assert "Traceback" not in error
-
-
-def test_a_port_that_is_taken_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = tmp_path / "s.sgs"
-    file.write_bytes(STREAM)
-    with socket.socket() as other:
-        other.bind(("127.0.0.1", 0))
-        other.listen()
-        port = other.getsockname()[1]
-        error = error_of([str(file), "--no-browser", "--port", str(port)], capsys, status=1)
-    assert f"Port {port} cannot be used" in error
-    assert "--port" in error
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,6 @@
 
 import json
 import os
-import signal
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +11,7 @@ import pytest
 from structgstream.cli.app import main
 from structgstream.preparation.calibration.board import Board
 from structgstream.preparation.options import Distance, PrepareOptions
-from structgstream.preparation.output_folder import lock_output, mark_output
+from structgstream.preparation.output_folder import mark_output
 from tests.support.quick_preparation import quicken
 from tests.support.quick_streams import error_of
 from tests.support.rooms import write_room
@@ -52,31 +50,6 @@ def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     capsys.readouterr()
     assert main(["prepare", str(tmp_path / "nowhere"), "-o", str(tmp_path / "out")]) == 1
     assert "is missing; give the folder" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("message", "arguments"),
-    [("prepare.prepare_capture", ["-o", "out"]), ("prepare.check_folder", ["--check"])],
-)
-def test_ctrl_c_that_a_library_loses(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: str, arguments: list[str]
-) -> None:
-    """It comes while one is loaded, which makes an error of its own of it."""
-
-    def lost(*_: object, **__: object) -> None:
-        try:
-            os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(0.1)
-        except KeyboardInterrupt:
-            raise ImportError("cannot be loaded") from None
-
-    monkeypatch.setattr(f"structgstream.preparation.{message}", lost)
-    monkeypatch.chdir(tmp_path)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # Runs in the background may ignore it.
-    try:
-        assert main(["prepare", str(tmp_path), *arguments]) == 130
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def test_every_option_arrives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -146,31 +119,3 @@ def test_what_may_not_be_read_or_written(
     assert error.removeprefix("structgstream: ").startswith(said.format(place=path, folder=tmp_path))
     assert error.count("\n") == 1
     assert {path: path.read_bytes() for path in before} == before
-
-
-@pytest.mark.parametrize(
-    ("board", "said"),
-    [
-        ("7x5:50mm:DICT_9X9_1", "'DICT_9X9_1' is no dictionary of OpenCV's"),
-        ("13x8:50mm:DICT_4X4_50", "needs 52 markers, DICT_4X4_50 has 50"),
-        ("7x5", "A board is COLUMNSxROWS:SQUARE"),
-    ],
-)
-def test_a_board_that_cannot_be_is_reported_before_anything_takes_time(
-    tmp_path: Path, board: str, said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_room(tmp_path / "videos")
-    command = ["prepare", str(tmp_path / "videos"), "-o", str(tmp_path / "out"), "--calibration", "board"]
-    capsys.readouterr()
-    assert main([*command, "--board", board]) in (1, 2)
-    message = capsys.readouterr()
-    assert said in message.err
-    assert "synchronize" not in message.out
-
-
-def test_two_at_once_on_one_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_room(tmp_path / "videos")
-    command = ["prepare", str(tmp_path / "videos"), "-o", str(tmp_path / "out"), "--synchronize", "none"]
-    mark_output(tmp_path / "out", tmp_path / "videos")
-    with lock_output(tmp_path / "out"):
-        assert f"Another process prepares {tmp_path / 'out'} now; wait" in error_of(command, capsys, status=1)

@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plain lines for files, bars for terminals, the same numbers in both."""
 
-import io
 import math
 from dataclasses import replace
 
 import pytest
-from rich.console import Console
 
 from structgstream.cli import progress
-from structgstream.cli.progress import Bars, Lines, display, human_bytes, summary
+from structgstream.cli.progress import display, human_bytes, summary
 from structgstream.training.result import Step
+from tests.support.consoles import console, text
 from tests.support.reports import frame_report
 
 REPORT = frame_report(
@@ -26,20 +25,6 @@ REPORT = frame_report(
 )
 
 
-def console(*, terminal: bool) -> Console:
-    return Console(file=io.StringIO(), force_terminal=terminal, width=120, height=20, color_system=None)
-
-
-def text(of: Console) -> str:
-    assert isinstance(of.file, io.StringIO)
-    return of.file.getvalue()
-
-
-def test_the_place_decides_how_progress_looks() -> None:
-    assert isinstance(display(3, console=console(terminal=False)), Lines)
-    assert isinstance(display(3, console=console(terminal=True)), Bars)
-
-
 def test_a_line_for_each_frame() -> None:
     out = console(terminal=False)
     with display(20, done=1, console=out) as shown:
@@ -53,7 +38,7 @@ def test_a_frame_in_which_nothing_was_trained_has_no_score() -> None:
 
 
 def test_a_line_tells_which_pictures_were_not_believed() -> None:
-    out = Console(file=io.StringIO(), force_terminal=False, width=300)
+    out = console(width=300)
     counts = {"displaced": 40, "views left out": 2, "scene cuts": 0, "spawning refused": 1}
     with display(20, console=out) as shown:
         shown.frame(replace(REPORT, counts=counts))

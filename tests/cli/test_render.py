@@ -76,26 +76,6 @@ def test_time_on_a_path_runs_forth_and_back(count: int, frames: list[int]) -> No
     assert list(render._ping_pong(Reader(), None, count=count)) == frames  # pyright: ignore
 
 
-class Truth:
-    """As many scenes as numbers, for what chooses among them."""
-
-    def __init__(self, count: int) -> None:
-        self.packets = range(count)
-
-    def scenes(self, start: int) -> list[tuple[int, int]]:
-        return [(i, i) for i in self.packets[start:]]
-
-    def scene(self, frame: int) -> int:
-        return frame
-
-
-@pytest.mark.parametrize(("frames", "count"), [(1, 5), (3, 3), (5, 3)])
-def test_a_stream_as_long_as_the_path_plays_straight(frames: int, count: int) -> None:
-    shown = list(render._ping_pong(Truth(frames), None, count=count))  # pyright: ignore
-    assert shown == ([0] * 5 if frames == 1 else [0, 1, 2])
-    assert list(render._ping_pong(Truth(frames), 0, count=count)) == [0] * count  # pyright: ignore
-
-
 @pytest.mark.parametrize(
     ("arguments", "name"),
     [

@@ -101,17 +101,6 @@ def test_a_folder_that_is_there_is_asked_for(tmp_path: Path) -> None:
         assert storage is not None
 
 
-def test_another_programs_manifest_is_never_replaced(tmp_path: Path) -> None:
-    output = tmp_path / "site"
-    output.mkdir()
-    (output / MANIFEST).write_text("{}")
-    options = SegmentOptions(sink="segments")
-    for_another = pytest.raises(StorageError, match="of another program")
-    with for_another, options.storage(output, may_exist=True, report=print):
-        pass
-    assert (output / MANIFEST).read_text() == "{}"
-
-
 def test_each_quality_has_a_folder_of_its_own(tmp_path: Path) -> None:
     options, out = SegmentOptions(sink="segments"), tmp_path / "out"
     found = options.quality_folders(out, ["low", "high"], resume=False, overwrite=False)

@@ -175,17 +175,6 @@ def test_what_cannot_be_heard(
     assert not (tmp_path / "x.sgs").exists()
 
 
-def test_a_shorter_sound_and_a_file_with_an_offset(capture: Path, tmp_path: Path) -> None:
-    reader = open_stream(made(capture, tmp_path / "short.sgs", "--sound", "cam05"))
-    assert stream_heard(reader) == pytest.approx([0.02], abs=MILLISECOND)
-    last = reader.sound(FRAMES - 1)
-    assert last is not None
-    assert last.packets == ()
-    file = write_sound(tmp_path / "long.wav", claps(20.0, 0.05, rate=16_000), rate=16_000)
-    later = made(capture, tmp_path / "long.sgs", "--sound", str(file), "--sound-offset", "0.03")
-    assert stream_heard(open_stream(later)) == pytest.approx([0.08], abs=MILLISECOND)
-
-
 def in_video(path: Path) -> tuple[list[float], list[float]]:
     """When a video has claps, and when its pictures become white."""
     with av.open(str(path)) as container:

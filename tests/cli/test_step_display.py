@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the user sees while a capture is prepared."""
 
-import io
-
 import pytest
-from rich.console import Console
 
 from structgstream.cli import progress as module
 from structgstream.cli.progress import StepDisplay
+from tests.support.consoles import console, text
 
 
 class Clock:
@@ -21,15 +19,6 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     found = Clock()
     monkeypatch.setattr(module.time, "monotonic", lambda: found.seconds)
     return found
-
-
-def console(*, terminal: bool = False) -> Console:
-    return Console(file=io.StringIO(), force_terminal=terminal, width=100, height=20, color_system=None)
-
-
-def text(of: Console) -> str:
-    assert isinstance(of.file, io.StringIO)
-    return of.file.getvalue()
 
 
 def test_a_line_for_each_step_with_its_time(clock: Clock) -> None:
@@ -82,11 +71,3 @@ def test_a_step_that_is_skipped_or_begun_anew_has_no_bar_of_the_last() -> None:
         assert [task.description for task in display._bar.tasks] == ["two"]
         display.begin("three", skipped=True)
         assert not display._bar.tasks
-
-
-def test_the_bar_ends_with_the_block() -> None:
-    display = StepDisplay(console(terminal=True))
-    with display:
-        display.begin("one", skipped=False)
-        assert display._bar.live.is_started
-    assert not display._bar.live.is_started

@@ -77,25 +77,6 @@ def test_a_stream_cut_at_any_byte_plays_up_to_the_cut() -> None:
             assert same(reader.scene(expected - 1), scenes[expected - 1])
 
 
-@pytest.mark.parametrize("damaged", range(5))
-def test_what_comes_before_damage_plays(damaged: int) -> None:
-    data = bytearray(small_stream())
-    record = list(scan_records(bytes(data)))[damaged]
-    data[record.offset + 8 + len(record.payload) // 2] ^= 0x10
-    if damaged == 0:
-        with pytest.raises(StreamError, match="the record at byte 12 .* is damaged"):
-            StreamReader(bytes(data))
-        return
-    reader = StreamReader(bytes(data))
-    assert len(reader) == damaged - 1
-    assert not reader.complete
-    again = f"frame {damaged} can be shown again" if damaged < 4 else "none after it can be shown"
-    assert reader.cut_reason == (
-        f"the record at byte {record.offset} of {len(data)} is damaged; 1 of 4 frames are lost, "
-        f"the first is {damaged - 1}, {again}"
-    )
-
-
 def test_unknown_records_are_skipped() -> None:
     data = small_stream()
     second = list(scan_records(data))[2]

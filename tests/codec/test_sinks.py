@@ -2,7 +2,6 @@
 import errno
 import io
 import struct
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -229,14 +228,6 @@ def test_a_disk_that_is_nearly_full_is_reported_and_the_stream_gets_its_index(
         again.write(packet)
     again.close()
     assert sink.path.read_bytes() == small_stream()
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="/dev/full is Linux's")
-def test_a_device_that_is_full() -> None:
-    sink = FileSink("/dev/full", overwrite=True)
-    with pytest.raises(StorageError, match=r"to /dev/full \(No space left on device\)\. The 0 frames before"):
-        sink.open(header_for(SCENES[0]))
-    sink.close()
 
 
 def test_a_file_cut_anywhere_is_continued(tmp_path: Path) -> None:

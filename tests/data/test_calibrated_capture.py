@@ -13,7 +13,7 @@ from structgstream.data.dataset_layouts import bundled_clip
 from structgstream.data.lenses import LensCamera, Pinhole
 from structgstream.data.open import open_capture
 from structgstream.data.undistortion import UndistortedSource, Undistortion
-from structgstream.errors import CalibrationError, CaptureError
+from structgstream.errors import CalibrationError
 from structgstream.pose_check.check import check_poses
 from tests.support.calibrations import (
     WRITERS,
@@ -21,9 +21,7 @@ from tests.support.calibrations import (
     Truth,
     truths,
     write_anipose,
-    write_cmu,
     write_easymocap,
-    write_opencv,
 )
 from tests.support.captures import HEIGHT, WIDTH, Picture, all_numbers, picture, write_picture, write_videos
 from tests.support.small_clip import CAMERAS
@@ -86,13 +84,6 @@ def test_a_name_may_be_a_word_of_the_files(tmp_path: Path) -> None:
         np.testing.assert_allclose(source.rig[name].center.numpy(), expected[name[-5:]], atol=1e-6)
 
 
-def test_a_calibrated_camera_that_did_not_film_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    write_anipose(tmp_path, truths(names=(*NAMES, "cam03")))
-    write_videos(tmp_path, NAMES, frames=2)
-    assert list(open_capture(tmp_path).rig) == NAMES
-    assert "has no pictures of camera 'cam03' of " in caplog.text
-
-
 def test_a_calibration_of_another_mode(tmp_path: Path) -> None:
     """A uniform reduction is one; a 4:3 calibration of a 16:9 video is a crop that nobody knows."""
     file = write_anipose(tmp_path, truths())
@@ -128,25 +119,11 @@ def test_a_camera_that_is_broken_is_named(tmp_path: Path) -> None:
         open_capture(tmp_path)
 
 
-def test_a_calibration_without_frames(tmp_path: Path) -> None:
-    write_anipose(tmp_path, truths())
-    with pytest.raises(CaptureError, match=r"has the calibration .*calibration\.toml but no frames; expected images/"):
-        open_capture(tmp_path)
-
-
 def test_half_of_easymocap(tmp_path: Path) -> None:
     write_easymocap(tmp_path, truths())
     (tmp_path / "extri.yml").unlink()
     with pytest.raises(CalibrationError, match=r"extri\.yml cannot be read \(No such file or directory"):
         open_capture(tmp_path)
-
-
-def test_the_studio_of_cmu_in_its_folders(tmp_path: Path) -> None:
-    """hd_00_00.mp4 below hdVideos, of hundreds of cameras that are calibrated."""
-    names = ("00_00", "00_01", "00_02")
-    write_cmu(tmp_path, truths(names=names))
-    write_videos(tmp_path / "hdVideos", [f"hd_{name}" for name in names], frames=2)
-    assert list(open_capture(tmp_path).rig) == ["hd_00_00", "hd_00_01", "hd_00_02"]
 
 
 def test_pickles_are_refused(tmp_path: Path) -> None:
@@ -192,24 +169,3 @@ def test_the_clip_through_a_lens(tmp_path: Path) -> None:
     assert check.conclusive
     assert check.share_violating < 0.1
     assert not check.findings
-
-
-def test_a_file_with_camera_to_world_in_place_of_world_to_camera(tmp_path: Path) -> None:
-    """Only the pictures can tell."""
-    clip = bundled_clip()
-    frame = next(clip.frames())
-    cameras = []
-    for name in CAMERAS:
-        camera = clip.rig[name]
-        pose = camera.viewmat.inverse().numpy()
-        cameras.append(Truth(name, camera.K.numpy() - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], (0, 0, 0, 0),
-                             pose[:3, :3], pose[:3, 3]))  # fmt: skip
-        write_picture(tmp_path / "images" / f"{name}.png", frame.images[name])
-    write_opencv(tmp_path, cameras)
-    for name in CAMERAS:
-        file = tmp_path / f"{name}.yml"
-        text = file.read_text().replace(f"image_width: {WIDTH}", "image_width: 320")
-        file.write_text(text.replace(f"image_height: {HEIGHT}", "image_height: 240"))
-    source = open_capture(tmp_path)
-    with pytest.raises(CalibrationError, match="The poses of all cameras look inverted"):
-        check_poses(next(source.frames()), source.rig)

@@ -19,7 +19,6 @@ from structgstream.data.calibration import (
     calibrated_camera,
     calibrated_rig,
     check_names,
-    intrinsics,
     listed,
     rigid,
     rotation_matrix,
@@ -130,16 +129,6 @@ def test_a_pose_takes_a_vector_or_a_matrix(vector: tuple[float, ...], moved: tup
 def test_other_shapes_are_no_pose(turn: object, move: object) -> None:
     with pytest.raises(ValueError, match="a rotation of shape"):
         rigid(turn, move)  # type: ignore[arg-type]
-
-
-def test_what_is_given_is_not_changed() -> None:
-    turn = np.eye(3)
-    rigid(turn, [1, 2, 3])[:3, :3] *= 2
-    assert (turn == np.eye(3)).all()
-
-
-def test_intrinsics() -> None:
-    assert intrinsics(1, 2, 3, 4).tolist() == [[1, 0, 3], [0, 2, 4], [0, 0, 1]]
 
 
 TURNED = Alignment(2.5, rotation_matrix(np.array([0.4, -1.2, 2.0])), np.array([3.0, -1.0, 0.5]))

@@ -148,17 +148,6 @@ def test_a_model_without_frames(tmp_path: Path) -> None:
         open_capture(tmp_path)
 
 
-def test_nan_names_the_camera(tmp_path: Path) -> None:
-    write_pictures(tmp_path, "images/CAM/FRAME.png")
-    write_text_model(tmp_path / "sparse", RIG, [(f"{name}.png", name) for name in RIG])
-    text = (tmp_path / "sparse/images.txt").read_text()
-    line = next(row for row in text.splitlines() if row.endswith("cam01.png"))
-    words = line.split()
-    (tmp_path / "sparse/images.txt").write_text(text.replace(line, " ".join([*words[:5], "nan", *words[6:]])))
-    with pytest.raises(CalibrationError, match=r"picture 'cam01\.png': a number that is not finite"):
-        open_capture(tmp_path)
-
-
 def test_cameras_may_have_pictures_of_different_sizes(tmp_path: Path) -> None:
     write_pictures(tmp_path, "images/CAM/FRAME.png")
     for frame in range(FRAMES):

@@ -37,10 +37,6 @@ def on_sphere(azimuth: float, elevation: float, *, radius: float = 3.0) -> tuple
     return radius * math.cos(e) * math.sin(a), -radius * math.sin(e), -radius * math.cos(e) * math.cos(a)
 
 
-def test_in_an_arc_it_is_the_one_in_the_middle() -> None:
-    assert best_surrounded(rig_of({f"c{i}": on_sphere(12 * i - 48, 10) for i in range(9)})) == "c4"
-
-
 def test_in_a_grid_it_is_the_one_in_the_middle() -> None:
     grid = {f"{row}{column}": on_sphere(10 * column - 20, 10 * row) for row in range(3) for column in range(5)}
     assert best_surrounded(rig_of(grid)) == "12"
@@ -52,10 +48,6 @@ def test_a_flat_array_of_parallel_cameras_is_judged_by_position() -> None:
     for name, eye in eyes.items():
         viewmats[name][:3, 3] = -torch.tensor(eye, dtype=torch.float64)
     assert best_surrounded(CameraRig({name: Camera(viewmats[name], K, 48, 32) for name in eyes})) == "22"
-
-
-def test_in_a_ring_where_all_are_alike_it_is_the_first() -> None:
-    assert best_surrounded(rig_of({f"c{i}": on_sphere(30 * i, 20) for i in range(12)})) == "c0"
 
 
 def test_in_a_ring_it_is_where_the_cameras_stand_densely() -> None:
@@ -89,18 +81,6 @@ def test_a_camera_that_looks_elsewhere_is_neither_taken_nor_surrounds() -> None:
     assert best_surrounded(CameraRig({"away": away["a"], "too": away["b"], **rig.cameras})) == "c2"
 
 
-def test_what_looks_outwards_is_judged_as_well() -> None:
-    """As Google's rig: cameras on a half sphere that look away from its middle."""
-    eyes = {"top": on_sphere(0, 90 - 1e-3)} | dome({60: 6, 30: 9, 0: 12})
-    cameras = {
-        name: Camera(
-            look_at(torch.tensor(eye, dtype=torch.float64), 3 * torch.tensor(eye, dtype=torch.float64)), K, 48, 32
-        )
-        for name, eye in eyes.items()
-    }
-    assert not best_surrounded(CameraRig(cameras)).startswith("0-")
-
-
 @examples(100)
 @given(
     seed=st.integers(0, 2**20),
@@ -121,10 +101,6 @@ def test_neither_unit_nor_world_nor_order_matters(seed: int, scale: float, place
         viewmat[:3, 3] = scale * viewmat[:3, 3]
         moved[name] = Camera(viewmat, K, 48, 32)
     assert best_surrounded(CameraRig(moved)) == best_surrounded(rig)
-
-
-def test_cameras_at_one_place_give_the_first() -> None:
-    assert best_surrounded(rig_of(dict.fromkeys("abc", (0.0, 0.0, -2.0)))) == "a"
 
 
 def test_two_cameras_can_spare_none() -> None:

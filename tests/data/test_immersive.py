@@ -13,7 +13,6 @@ from structgstream.data.dataset_layouts import open_immersive, read_models
 from structgstream.data.lenses import Fisheye, LensCamera
 from structgstream.data.open import open_capture
 from structgstream.data.undistortion import UndistortedSource, Undistortion
-from structgstream.errors import CalibrationError
 from tests.support.calibrations import pixels
 from tests.support.captures import all_numbers, write_immersive
 
@@ -53,15 +52,6 @@ def test_pixels_are_those_of_opencvs_fisheye(tmp_path: Path) -> None:
     local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     pixels = camera.lens.distort(local[:, :2] / local[:, 2:]) @ camera.K[:2, :2].T + camera.K[:2, 2]
     np.testing.assert_allclose(pixels, expected[:, 0] + 0.5, atol=1e-6)
-
-
-def test_a_broken_file(tmp_path: Path) -> None:
-    write_immersive(tmp_path)
-    entries = json.loads((tmp_path / "models.json").read_text())
-    del entries[1]["focal_length"]
-    (tmp_path / "models.json").write_text(json.dumps(entries))
-    with pytest.raises(CalibrationError, match=r"'camera_0002' of .*models\.json .*no 'focal_length'.*; expected"):
-        open_immersive(tmp_path)
 
 
 def test_a_camera_without_a_video_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

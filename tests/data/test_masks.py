@@ -119,24 +119,6 @@ def test_masked_pixels_of_a_lens_have_no_influence_after_undistortion(size: tupl
     assert 0.6 < counts.mean() < mask.mean()
 
 
-def test_a_mask_and_what_the_lens_shows_join(tmp_path: Path) -> None:
-    rig = write_clip(tmp_path, frames=2)
-    write_mask(tmp_path / "masks/cam02.png", left_half())
-    source = open_capture(tmp_path)
-    lens = RadialTangential(-0.25, 0.08)
-    wide = {name: LensCamera(source.rig[name], lens) for name in rig}
-    made = undistort(open_capture(tmp_path), wide, target=lambda each: rectilinear(each, degrees=100))
-    frame = next(made.frames())
-    shown = made._plan("cam02").shown  # type: ignore[attr-defined]
-    assert set(frame.masks) == set(rig)
-    assert 0.2 < shown.mean() < 0.9
-    np.testing.assert_array_equal(frame.masks["cam01"], shown)
-    assert not (frame.masks["cam02"] & ~shown).any()
-    middle = frame.masks["cam02"][HEIGHT // 2]
-    assert middle[: WIDTH // 2 - 4].any()
-    assert not middle[WIDTH // 2 + 2 :].any()
-
-
 def test_masks_lie_below_the_lenses_whatever_lies_above(tmp_path: Path) -> None:
     rig = write_clip(tmp_path, frames=2)
     write_mask(tmp_path / "others/cam02.png", left_half())

@@ -149,9 +149,3 @@ def test_cameras_are_held_out_by_their_name_in_the_calibration(tmp_path: Path) -
     names = tuple(f"images/{name}/0000.png" for name in ("left", "middle", "right"))
     given = replace(calibration(names), held_out=names[1:2])
     assert open_posed(written(tmp_path), given, fps=25.0).rig.testing == ("middle",)
-
-
-def test_a_camera_to_hold_out_that_there_is_none_of(tmp_path: Path) -> None:
-    sentence = "rig.json holds out camera 'nobody', which it does not have; its cameras are left, middle, right"
-    with pytest.raises(CalibrationError, match=sentence):
-        open_posed(written(tmp_path), replace(calibration(("left", "middle", "right")), held_out=["nobody"]))

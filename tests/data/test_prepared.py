@@ -23,7 +23,7 @@ from structgstream.data.prepared import (
 from structgstream.data.source import apart_seconds
 from structgstream.data.timeline import Clock
 from structgstream.data.undistortion import rectilinear
-from structgstream.errors import CalibrationError, CaptureError, StorageError
+from structgstream.errors import CalibrationError, CaptureError
 from tests.support.captures import (
     HEIGHT,
     WIDTH,
@@ -217,9 +217,3 @@ def test_points_may_not_be_a_pickle(tmp_path: Path) -> None:
     write_prepared(tmp_path, capture)
     with pytest.raises(CalibrationError, match=r"points\.npy cannot be read"):
         open_prepared(tmp_path)
-
-
-def test_nothing_is_left_where_it_cannot_be_written(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(StorageError, match=r"capture\.json cannot be written"):
-        write_prepared(tmp_path / "file", content())

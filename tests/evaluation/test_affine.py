@@ -42,7 +42,6 @@ def test_the_fit_never_loses_on_pictures_inside_the_range() -> None:
 def test_a_picture_of_one_colour_has_a_fit() -> None:
     grey = np.full((6, 7, 3), 90, np.uint8)
     truth = np.full((6, 7, 3), 120, np.uint8)
-    assert psnr_affine(grey, truth) == pytest.approx(PSNR_OF_EQUALS, abs=250)
     assert psnr_affine(grey, truth) > 80
 
 

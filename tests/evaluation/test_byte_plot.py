@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from structgstream.errors import StorageError
 from structgstream.evaluation.byte_count import REST, Parts, Row, field_colors, groups_of, write_byte_plot
 from structgstream.figure import COLORS, OTHER
 from tests.support.drawn import coloured, pixels_of
@@ -70,9 +69,3 @@ def test_a_towering_key_packet_does_not_hide_the_others(tmp_path: Path) -> None:
 def test_a_long_stream_and_a_packet_alone(tmp_path: Path) -> None:
     assert bars_of(tmp_path / "long.png", packets(400)) > 0.1
     assert bars_of(tmp_path / "one.png", packets(1)) > 0.1
-
-
-def test_a_picture_that_cannot_be_written(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(StorageError, match=r"x\.png cannot be written"):
-        write_byte_plot(tmp_path / "file" / "x.png", packets(2), parts(packets(2)), title="")

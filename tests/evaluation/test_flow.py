@@ -1,13 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Flow of pictures that were moved by known amounts."""
 
-import sys
-
 import cv2
 import numpy as np
-import pytest
 
-from structgstream.errors import MissingExtraError
 from structgstream.evaluation.optional_metrics import dis_flow
 
 
@@ -37,9 +33,3 @@ def test_what_was_covered_is_not_seen() -> None:
     assert field.seen[10:-10, 56:74].mean() > 0.9
     assert field.seen[10:-10, 82:88].mean() < 0.5
     assert field.seen[10:-10, 10:40].mean() > 0.95
-
-
-def test_without_opencv_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(MissingExtraError, match=r"structgstream\[eval\]"):
-        dis_flow()

@@ -21,7 +21,6 @@ from structgstream.evaluation.lpips import (
     VGG,
     Lpips,
     Trunk,
-    how_to_get,
     load_lpips,
     published_heads,
     weights_file,
@@ -143,12 +142,6 @@ def test_the_published_heads_weigh_and_never_reward() -> None:
     assert digest.hexdigest() == "4d2f82151894aec30dadde0050597d43933fad2081591795703153fb1a8e31b5"
 
 
-def test_the_layers_are_numbered_as_torchvisions() -> None:
-    for trunk in TRUNKS:
-        convolutions = [i for i, module in enumerate(network(trunk)[0]) if isinstance(module, nn.Conv2d)]
-        assert [layer.index for layer in trunk.layers] == convolutions
-
-
 def test_places_are_searched_in_order(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert weights_file(ALEX) is None
     cache = tmp_path / "hub" / "hub" / "checkpoints"
@@ -166,12 +159,6 @@ def test_places_are_searched_in_order(folder: Path, tmp_path: Path, monkeypatch:
     monkeypatch.setenv(ENVIRONMENT, str(tmp_path / "gone"))
     with pytest.raises(ConfigError, match=f"gone, where {ENVIRONMENT}"):
         weights_file(ALEX)
-
-
-def test_how_to_get_them_is_said() -> None:
-    assert "vgg16-397923af.pth" in how_to_get(VGG)
-    assert ENVIRONMENT in how_to_get(ALEX)
-    assert "--lpips-weights" in how_to_get(ALEX)
 
 
 def test_wrong_files_are_refused(folder: Path, tmp_path: Path) -> None:

@@ -98,14 +98,3 @@ def test_no_two_stages_look_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     axis = panels([frame(0, {"left": 30.0}, log={"seconds": seconds | {"total": 78.0}})], monkeypatch)["seconds"]
     looks = {(bars[0].get_facecolor(), bars[0].get_hatch()) for bars in axis.containers}  # type: ignore[index]
     assert len(looks) == len(axis.containers) == 12
-
-
-def test_a_score_that_hardly_changes_lies_within_its_panel(monkeypatch: pytest.MonkeyPatch) -> None:
-    frames = [frame(index, {"left": 30.0}) for index in range(3)]
-    frames = [
-        replace(one, mean=replace(mean_of(one), flip=value))
-        for one, value in zip(frames, (0.1389, 0.1391, 0.1391), strict=True)
-    ]
-    bottom, top = panels(frames, monkeypatch)["distance"].get_ylim()
-    assert bottom == 0.0
-    assert top > 1.05 * 0.1391

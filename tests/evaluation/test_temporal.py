@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from structgstream.evaluation.optional_metrics import FlowField, dis_flow, flicker, warping_error
+from structgstream.evaluation.optional_metrics import FlowField, flicker, warping_error
 from structgstream.flow import inside
 
 WIDTH, HEIGHT, FOCAL, DISTANCE = 96, 64, 80.0, 4.0
@@ -47,39 +47,6 @@ def test_only_seen_pixels_count() -> None:
     assert warping_error(now, before, still) == pytest.approx(0.0, abs=1e-10)
     still.seen[:] = False
     assert warping_error(now, before, still) is None
-
-
-def wall(time: float) -> tuple[np.ndarray, FlowField]:
-    """A painted wall that slides right and away from a camera, and the exact flow to it from the time before."""
-
-    def depth(t: float) -> float:
-        return DISTANCE * (1 + 0.05 * t)
-
-    def on_the_wall(t: float) -> tuple[np.ndarray, np.ndarray]:
-        y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-        return (x - WIDTH / 2) * depth(t) / FOCAL - 0.1 * t, (y - HEIGHT / 2) * depth(t) / FOCAL
-
-    u, v = on_the_wall(time)
-    paint = [127 + 90 * np.sin(3 * u + phase) * np.cos(4 * v - phase) for phase in (0.0, 1.0, 2.0)]
-    before = np.stack(
-        [(u + 0.1 * (time - 1)) * FOCAL / depth(time - 1) + WIDTH / 2, v * FOCAL / depth(time - 1) + HEIGHT / 2], 2
-    )
-    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    offsets = (before - np.stack([x, y], 2)).astype(np.float32)
-    return np.rint(np.stack(paint, 2)).astype(np.uint8), FlowField(offsets, inside(offsets))
-
-
-def test_exact_flow_of_a_synthetic_capture_leaves_what_sampling_loses() -> None:
-    before, _ = wall(0)
-    now, exact = wall(1)
-    error = warping_error(now, before, exact)
-    assert error is not None
-    assert error < 1e-4  # bilinear sampling of waves 80 pixels long, and rounding
-    nothing = FlowField(np.zeros_like(exact.offsets), exact.seen)
-    assert error_of(now, before, nothing) > 50 * error
-    estimated = dis_flow()(before, now, "cam", 1)
-    both = estimated.seen & exact.seen
-    assert np.median(np.linalg.norm(estimated.offsets - exact.offsets, axis=2)[both]) < 0.3
 
 
 def test_flicker_is_the_mean_change_of_still_pixels_in_levels() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from structgstream.executors import ray_cluster as ray_worker
 from structgstream.executors.ray_cluster import CommandKilled, run_task
-from structgstream.executors.tasks import CommandProcess, Task, TaskResult
+from structgstream.executors.tasks import CommandProcess, Task
 
 
 def test_an_ending_comes_back_also_of_one_that_fails() -> None:
@@ -60,8 +60,3 @@ def test_cancelled_it_leaves_no_command(monkeypatch: pytest.MonkeyPatch, cancell
     with pytest.raises(cancelled):
         run_task(Task("a", ("sleep", "60")), {})
     assert not Path(f"/proc/{seen[0].pid}").exists()
-
-
-def test_an_ending_can_be_carried() -> None:
-    ending = run_task(Task("a", ("true",)), {})
-    assert isinstance(pickle.loads(pickle.dumps(ending)), TaskResult)

@@ -1,17 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Baking: what does not depend on the camera stays, what does is averaged and fitted as stated."""
 
-import math
 from dataclasses import replace
 
 import pytest
 import torch
 
-from structgstream.cameras import Similarity
 from structgstream.errors import StreamError
-from structgstream.exporters.bake import BakedGaussians, bake, with_low_pass
+from structgstream.exporters.bake import bake, with_low_pass
 from structgstream.geometry import quaternion_matrices
-from structgstream.scene.harmonics import MAX_DEGREE, sh_basis
 from structgstream.scene.render import Drawable, render
 from structgstream.scene.sampling import RigSampling
 from structgstream.scene.scene import Scene
@@ -34,19 +31,6 @@ def distance(one: Drawable, other: Drawable, names: tuple[str, ...] = RIG.traini
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     return random_scene(60, free=5, cameras=5, seed=4)
-
-
-def test_the_basis_is_orthonormal_and_signed_as_viewers_have_it() -> None:
-    count = 20_000
-    z = 1.0 - (2.0 * torch.arange(count, dtype=torch.float64) + 1.0) / count
-    turn = torch.arange(count, dtype=torch.float64) * math.pi * (3.0 - math.sqrt(5.0))
-    ring = (1.0 - z * z).sqrt()
-    basis = sh_basis(torch.stack([ring * turn.cos(), ring * turn.sin(), z], dim=1), MAX_DEGREE)
-    gram = basis.T @ basis * (4.0 * math.pi / count)
-    torch.testing.assert_close(gram, torch.eye((MAX_DEGREE + 1) ** 2, dtype=torch.float64), atol=1e-4, rtol=0)
-    axes = sh_basis(torch.eye(3), 1)
-    torch.testing.assert_close(axes[:, 0], torch.full((3,), 0.2820948))
-    torch.testing.assert_close(axes[:, 1:], 0.4886025 * torch.tensor([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]))
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
@@ -97,32 +81,9 @@ def test_averages_are_what_the_cameras_draw(scene: Scene) -> None:
     torch.testing.assert_close(found.scales, torch.stack([torch.as_tensor(entry) for entry in logs]).exp())
 
 
-def test_units_of_the_capture(scene: Scene) -> None:
-    """A camera of the capture sees the same in the capture's units as in the scene's."""
-    similarity = Similarity((0.4, -0.2, 0.3), 0.25)
-    rig = similarity.rig(RIG)
-    shrunk = bake(scene, CAMERAS, BACKEND)
-    x, y, z = similarity.center
-    inverse = Similarity((-0.25 * x, -0.25 * y, -0.25 * z), 1.0 / 0.25)
-    small = shrunk.in_capture_units(inverse)
-    name = RIG.training[1]
-    one = render(shrunk, RIG[name], BACKEND).image
-    torch.testing.assert_close(render(small, rig[name], BACKEND).image, one, atol=2e-3, rtol=0)
-    back = small.in_capture_units(similarity)
-    torch.testing.assert_close(back.means, shrunk.means, atol=1e-6, rtol=1e-5)
-    torch.testing.assert_close(back.scales, shrunk.scales)
-
-
 def test_a_scene_without_gaussians_is_refused() -> None:
     with pytest.raises(StreamError, match="nothing to export"):
         bake(random_scene(0, cameras=5), CAMERAS, BACKEND)
-
-
-def test_rows_are_selected_in_order(scene: Scene) -> None:
-    found: BakedGaussians = bake(scene, CAMERAS, BACKEND)
-    part = found.select(torch.tensor([3, 1]))
-    assert len(part) == 2
-    assert torch.equal(part.sh, found.sh[[3, 1]])
 
 
 def test_a_low_pass_makes_an_export_look_as_trained_where_viewers_add_none() -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where an export goes and which frames it has, for every way to say it; refusals are in ``cli/test_export.py``."""
+"""Where an export goes and which frames it has, for every way to say it; ``cli/test_export.py`` has more refusals."""
 
 import math
 import re

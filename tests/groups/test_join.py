@@ -9,10 +9,9 @@ import pytest
 from structgstream.codec.packets import PacketKind
 from structgstream.codec.reader import open_stream
 from structgstream.codec.sinks import FileSink
-from structgstream.errors import ConfigError, StorageError, StreamError
+from structgstream.errors import ConfigError, StreamError
 from structgstream.groups import join
 from structgstream.groups.join import check_births, join_segments
-from structgstream.owned_folders import MARKER
 from structgstream.training.online.patching import IDS_PER_FRAME
 from tests.support.clip_groups import FRAMES, LENGTH, made
 from tests.support.streams import moved, small_scene, write_stream
@@ -30,13 +29,6 @@ def test_the_result_is_an_ordinary_stream(tmp_path: Path) -> None:
         births = [int(b) for _, scene in by_scan.scenes() for b in scene.free.births]
         assert all(b // IDS_PER_FRAME < FRAMES for b in births)
     assert [*tmp_path.iterdir()] == [path]
-
-
-def test_it_depends_on_the_segments_alone(tmp_path: Path) -> None:
-    one, other = tmp_path / "a.sgs", tmp_path / "b.sgs"
-    join_segments(made().segments, one)
-    join_segments(made().segments[1:] + made().segments[:1], other)
-    assert one.read_bytes() == other.read_bytes()
 
 
 def test_gaps_overlaps_and_damage_are_refused_and_nothing_is_written(tmp_path: Path) -> None:
@@ -86,16 +78,3 @@ def test_a_result_that_fails_its_check_replaces_nothing(tmp_path: Path, monkeypa
         join_segments(made().segments, path, check=True)
     assert path.read_bytes() == b"good"
     assert [*tmp_path.iterdir()] == [path]
-
-
-def test_a_folder_of_others_where_runs_are_handed_over_stays(tmp_path: Path) -> None:
-    folder = tmp_path / "a.sgs.runs"
-    folder.mkdir()
-    (folder / "run-0").write_text("mine")
-    with pytest.raises(StorageError, match="somebody else's"), join._folder_of_runs(tmp_path / "a.sgs"):
-        pass
-    assert (folder / "run-0").read_text() == "mine"
-    with join._folder_of_runs(tmp_path / "b.sgs") as made_here:
-        (made_here / "run-0").touch()
-        (made_here / "mine").touch()
-    assert sorted(path.name for path in made_here.iterdir()) == ["mine", MARKER]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A group's frames: which of them are fitted how, from what, and what happens once when memory is short."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,7 +15,6 @@ from structgstream.groups.unit import (
     CATCH_UP_FRAMES,
     GroupEntry,
     GroupMethod,
-    catching_up,
     lowered_budget,
     lowered_start,
 )
@@ -151,20 +150,3 @@ def test_short_memory_lowers_the_budget_once_and_is_reported(
     with pytest.raises(OutOfMemoryError):
         made.next(Past(SCENE, FrameZeroContext()), task(index))
     assert made.start == lowered_start(START)
-
-
-def test_lower_is_half_of_the_views_and_a_quarter_of_the_births() -> None:
-    online = TINY.online
-    wide = replace(online, scene_flow=replace(online.scene_flow, views=9), spawn=replace(online.spawn, most=100))
-    assert (lowered_budget(wide).scene_flow.views, lowered_budget(wide).spawn.most) == (4, 25)
-    two = replace(wide, scene_flow=replace(online.scene_flow, views=2))
-    assert lowered_budget(two).scene_flow.views == 2, "flow needs two"
-    assert lowered_start(START) == replace(START, births=10)
-
-
-def test_a_group_catches_up_by_thin_births_in_small_clusters_and_is_else_as_any_stream() -> None:
-    found, births = catching_up(TINY), TINY.online.spawn
-    assert (births.thin.overflow, found.online.spawn.thin.rules.overflow) == ("none", "small-clusters")
-    assert found.online.spawn.rules.overflow == births.rules.overflow == "coarser"
-    thin = replace(found.online.spawn.thin, overflow="none")
-    assert replace(found, online=replace(found.online, spawn=replace(births, thin=thin))) == TINY

@@ -18,21 +18,6 @@ from tests.support.clip_groups import CAPTURE, LENGTH, fit, made, task
 from tests.support.small_presets import QUICK
 
 
-def test_a_segment_is_finished_when_it_has_its_name() -> None:
-    for number, path in enumerate(made().segments):
-        found = open_segment(path)
-        assert [frame for frame, _, _ in found.entries] == [*range(number * LENGTH, (number + 1) * LENGTH)]
-        assert found.complete
-        assert not partial_path(path).exists()
-
-
-def test_a_finished_segment_is_left_as_it_is() -> None:
-    path = made().segments[1]
-    before = path.stat()
-    assert fit(path, task(made(), LENGTH)) is None
-    assert path.stat().st_mtime_ns == before.st_mtime_ns
-
-
 def test_stopped_between_frames_and_within_one_it_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
     """Cuts at other bytes: test_segment_file.py and test_segment_sink.py."""
     path, whole = tmp_path / "g.sgs", made().segments[1].read_bytes()

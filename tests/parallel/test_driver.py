@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run ends with the same bytes whatever runs it and whatever happened before; what is whole is not made again."""
 
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +8,7 @@ import pytest
 
 from structgstream.errors import ConfigError, StorageError, TaskError
 from structgstream.executors.tasks import PYTHON, Task, TaskQueue, TaskResult
-from structgstream.parallel.driver import Job, Status, _Drive, drive
-from structgstream.parallel.exchange import SharedFolder
+from structgstream.parallel.driver import Job, Status, drive
 from structgstream.parallel.parts import Parts, group_name
 from tests.support.inline_engine import InlineEngine
 from tests.support.stand_ins import job, sha256, workers
@@ -129,29 +125,7 @@ def test_a_track_that_fails_ends_the_run(tmp_path: Path) -> None:
         run(bad, Parts(tmp_path / "parts"))
 
 
-def test_of_two_drivers_one_is_refused(tmp_path: Path) -> None:
-    parts = Parts(tmp_path / "parts")
-    with parts.locked():
-        code = f"""
-from pathlib import Path
-from structgstream.parallel.parts import Parts
-with Parts(Path({str(parts.folder)!r})).locked():
-    pass
-"""
-        paths = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-        other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=paths, check=False)
-        assert "StorageError: Another process makes the parts" in other.stderr
-
-
 def test_a_worker_that_does_not_see_the_folder_is_reported(tmp_path: Path) -> None:
     given = job(tmp_path)
     with pytest.raises(StorageError, match="do all machines see this folder at the same place"):
         run(replace(given, unit=replace(given.unit, program=("true",))), Parts(tmp_path / "parts"))
-
-
-def test_the_log_has_what_the_last_attempt_on_another_machine_has_printed(tmp_path: Path) -> None:
-    parts = Parts(tmp_path / "parts")
-    drive = _Drive(job(tmp_path), parts, workers(), SharedFolder(), print)
-    for said in ("first failure\n", "second failure\n", "second failure\n"):
-        drive._store_output(TaskResult("header", 1, 1.0, 1, 0, said))
-    assert parts.log("header").read_text() == "first failure\nsecond failure\n"

@@ -63,15 +63,6 @@ def test_killed_at_any_step_of_a_note_the_notes_are_those_before_or_one_more(tmp
         assert set(read_completed(folder)) == {"header", "track"}
 
 
-def test_a_note_after_one_that_was_cut_is_not_lost(parts: Parts) -> None:
-    """As earlier versions may have left them."""
-    path = parts.folder / "done.jsonl"
-    path.write_text(path.read_text() + '{"name": "track", "ke')
-    again = Parts(parts.folder)
-    again.record(TaskResult("join", 0, 1.0), "key", parts.header, frames=5)
-    assert set(read_completed(parts.folder)) == {"header", "join"}
-
-
 def test_killed_at_any_step_of_clearing_what_is_left_is_refused_as_before_or_nothing(
     tmp_path: Path, parts: Parts
 ) -> None:
@@ -122,15 +113,6 @@ def test_a_folder_that_is_not_of_parts_is_refused(tmp_path: Path) -> None:
         Parts(folder).clear()
     assert (folder / "plan.json").read_text() == "{}"
     assert not (folder / MARKER).exists()
-
-
-def test_a_lock_that_is_a_link_is_not_followed(parts: Parts, tmp_path: Path) -> None:
-    (tmp_path / "mine").write_text("mine")
-    (parts.folder / ".driver").unlink()
-    (parts.folder / ".driver").symlink_to(tmp_path / "mine")
-    with pytest.raises(StorageError, match=".driver in it is a link, which is not followed"), parts.locked():
-        pass
-    assert (tmp_path / "mine").read_text() == "mine"
 
 
 def test_a_run_that_begins_anew_has_another_name(parts: Parts) -> None:

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of a command come from a store and go to it, also while they grow, and after the command was killed."""
 
-import errno
 import json
 import os
 import shutil
@@ -123,12 +122,6 @@ printf f >> "$0/t.partial"; mv "$0/t.partial" "$0/t"
     assert store.read("t") == b"abcdef"
 
 
-def test_two_files_may_grow(store: ObjectFolder) -> None:
-    script = 'printf aaaa > "$0/a.partial"; printf b > "$0/b.partial"; sleep 0.1; printf b >> "$0/b.partial"'
-    assert run(store, script, "--grows", "a.partial", "--grows", "b.partial") == 0
-    assert (store.read("a.partial"), store.read("b.partial")) == (b"aaaa", b"bb")
-
-
 def test_a_growing_file_goes_on_here_or_on_another_machine(store: ObjectFolder, tmp_path: Path) -> None:
     flags = ("--grows", "t.partial", "--gives", "t")
     store.write("t.partial", b"abc")
@@ -167,22 +160,6 @@ def test_a_command_that_is_killed_ends_this_process_the_same_way(store: ObjectFo
     assert done.returncode == -signal.SIGKILL
     assert store.read("t.partial") == b"abc", "what had grown is in the store"
     assert len(scratch(tmp_path)) == 1, "and here, for the next attempt"
-
-
-def test_a_disk_of_this_machine_without_room_is_a_sentence(
-    store: ObjectFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def full(descriptor: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    store.write("a", b"a")
-    monkeypatch.setattr(os, "fsync", full)
-    monkeypatch.setenv(staged.STORE, store.url)
-    monkeypatch.setattr(sys, "argv", ["staged", json.dumps({"name": "task", "needs": ["a"]}), "true"])
-    assert staged.main() == 1
-    error = capsys.readouterr().err
-    assert error.startswith("structgstream: ")
-    assert error.endswith("cannot be written (No space left on device); make room.\n")
 
 
 def test_a_store_that_cannot_be_used_is_a_sentence(

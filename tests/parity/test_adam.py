@@ -23,17 +23,6 @@ def test_steps(isa: int, shape: tuple[int, ...]) -> None:
         assert (moment.double() - wanted).norm() <= 1e-6 * wanted.norm()
 
 
-def test_as_torch() -> None:
-    param = torch.randn(33, 3)
-    gradients = [torch.randn(33, 3) for _ in range(20)]
-    twin = param.clone().requires_grad_()
-    theirs = torch.optim.Adam([twin], **OPTIONS)
-    for gradient in gradients:
-        twin.grad = gradient
-        theirs.step()
-    assert torch.allclose(steps(cpu_losses, param, gradients)[0], twin.detach(), rtol=1e-6, atol=1e-6)
-
-
 def test_bitwise_equal_for_any_number_of_threads(isa: int) -> None:
     param = torch.randn(30_000, 3)
     gradients = [torch.randn(30_000, 3) for _ in range(2)]

@@ -9,7 +9,6 @@ from structgstream.errors import BackendError
 from structgstream.kernels import cpu_losses, reference_losses
 from structgstream.kernels.native import native_reason
 from structgstream.kernels.values import TileSelection, tile_grid
-from tests.support.published import published_ssim
 
 pytestmark = pytest.mark.skipif(native_reason() is not None, reason=str(native_reason()))
 
@@ -42,15 +41,6 @@ def test_value_and_gradient(isa: int, size: tuple[int, int], as_bytes: bool) -> 
         assert abs(l1.double() - exact_l1) < 1e-6
         assert abs(ssim.double() - exact_ssim) < 1e-6
         assert (gradient - exact).norm() < 1e-5 * exact.norm()
-
-
-def test_inside_the_border_it_is_the_published_ssim() -> None:
-    """A border of zeros makes every window lie inside, so the mean is that of scikit-image's map."""
-    image, target = pictures(40, 48)
-    margin = 12
-    padded = [torch.nn.functional.pad(x, (0, 0, margin, margin, margin, margin)) for x in (image, target)]
-    theirs = published_ssim(padded[0], padded[1])
-    assert cpu_losses.l1_ssim(padded[0], padded[1])[1].item() == pytest.approx(theirs.mean(), abs=1e-6)
 
 
 def test_bitwise_equal_for_any_number_of_threads(isa: int) -> None:

@@ -122,7 +122,6 @@ def inverted(rig: CameraRig) -> CameraRig:
 
 
 def test_camera_to_world_given_as_world_to_camera_is_named(clip_frame: MultiViewFrame) -> None:
-    """Other conventions: test_explanations.py."""
     with pytest.raises(CalibrationError, match="look inverted \\(camera to world in place of world to camera\\)"):
         check_poses(clip_frame, inverted(CLIP.rig))
 

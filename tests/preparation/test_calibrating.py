@@ -16,7 +16,7 @@ from structgstream.preparation.calibration.solved import Observations, SolvedCal
 from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import PrepareOptions
 from structgstream.preparation.output_folder import Stored
-from structgstream.preparation.prepare import check_enough, check_used, chosen_method
+from structgstream.preparation.prepare import check_used, chosen_method
 from structgstream.preparation.solvers import check_complete, given_cameras, packed, summary, unpacked
 from tests.support.captures import write_video
 from tests.support.filmed import ring
@@ -77,13 +77,6 @@ def test_what_would_have_no_effect_is_refused(tmp_path: Path) -> None:
     check_used("board", there, PrepareOptions(board_videos=tmp_path, lens="brown"))
     check_used("sfm", there, PrepareOptions(intrinsics="shared", lens="brown"))
     check_used(given, there, PrepareOptions(lens="fisheye", refine=True))
-
-
-def test_three_cameras_are_enough(tmp_path: Path) -> None:
-    check_enough(footage(tmp_path, "a", "b", "c"))
-    for names in (("a", "b"), ("a",)):
-        with pytest.raises(CalibrationError, match="needs 3 or more, as two cameras cannot confirm"):
-            check_enough(footage(tmp_path, *names))
 
 
 def test_every_camera_is_placed_or_named(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ import pytest
 from PIL import Image
 
 from structgstream.data.calibration import Calibration
-from structgstream.data.timeline import Clock
 from structgstream.errors import CalibrationError, ConfigError
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.options import Distance, PrepareOptions
@@ -124,13 +123,6 @@ def test_a_table_of_times_that_comes_later_is_looked_at(tmp_path: Path) -> None:
     clocks, _ = run(again)
     assert "synchronize" not in again.steps.skipped
     assert clocks.method == "csv"
-
-
-def test_clocks_come_back_as_they_were(room: Path, tmp_path: Path) -> None:
-    found = Clocks({"a": Clock(0.25, 1.00001), "b": Clock()}, "motion", "summary", sure=False)
-    assert job(room, tmp_path)._clocks("clocks", {}, lambda: found) == found
-    other = job(room, tmp_path)._clocks("clocks", {}, lambda: pytest.fail("it is there"))
-    assert other == found
 
 
 def test_another_calibration_is_another_result(room: Path, tmp_path: Path) -> None:

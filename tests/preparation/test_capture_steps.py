@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The steps from a calibration to a capture."""
 
-import errno
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,7 @@ import pytest
 
 from structgstream.data.prepared import PreparedCapture, prepared_entries, read_prepared
 from structgstream.data.timeline import Clock
-from structgstream.errors import ConfigError, StorageError
+from structgstream.errors import ConfigError
 from structgstream.preparation.calibration.solved import SolvedCalibration
 from structgstream.preparation.footage import Footage, find_footage
 from structgstream.preparation.options import PrepareOptions
@@ -145,17 +144,6 @@ def test_near_plane_and_points_are_kept(tmp_path: Path) -> None:
     again, steps, content = brought(tmp_path, options)
     assert prepared_entries(steps.points(steps.near(content))) == prepared_entries(pointed)
     assert again.steps.skipped == ["near", "points"]
-
-
-def test_a_full_disk_while_points_are_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    _, steps, content = brought(tmp_path)
-
-    def full(path: object, values: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(np, "save", full)
-    with pytest.raises(StorageError, match=r"points.npy cannot be written \(No space left on device\)"):
-        steps.points(content)
 
 
 def test_the_check_is_done_again_when_its_report_is_gone(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ import av
 import numpy as np
 import pytest
 
-from structgstream.data.images import picture_size
 from structgstream.data.timeline import Clock
 from structgstream.errors import CaptureError
 from structgstream.preparation.footage import find_footage, shared_seconds, shots_of, spread_moments
@@ -115,21 +114,6 @@ def test_pictures_of_another_size_are_named(tmp_path: Path) -> None:
     footage = find_footage(tmp_path)
     with pytest.raises(CaptureError, match=r"1\.png has \d+x\d+ pixels, the first one of camera 'a' \d+x\d+; expected"):
         list(footage.pictures("a", [0, 1]))
-
-
-def test_the_size_is_read_once_for_all_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of some formats the whole first picture is decoded for it."""
-    for frame in range(3):
-        write_picture(tmp_path / "a" / f"{frame}.png", picture(0, frame))
-    footage, asked = find_footage(tmp_path), []
-
-    def size(file: Path) -> tuple[int, int]:
-        asked.append(file)
-        return picture_size(file)
-
-    monkeypatch.setattr("structgstream.preparation.footage.picture_size", size)
-    assert len(list(footage.pictures("a", [0, 1, 2]))) == 3
-    assert len(asked) == 1
 
 
 def test_ambiguous_files_are_reported(tmp_path: Path) -> None:

@@ -90,12 +90,6 @@ def test_where_there_is_none(tmp_path: Path) -> None:
         require_calibration(tmp_path / "nothing.json")
 
 
-def test_a_pickle_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "cameras.pkl").write_bytes(b"")
-    with pytest.raises(CalibrationError, match="is a pickle"):
-        find_calibration(tmp_path / "cameras.pkl")
-
-
 @pytest.mark.parametrize("tool", ["anipose", "multical", "cmu_panoptic", "kalibr", "qualisys"])
 def test_the_named_one_of_several_files_of_a_tool_is_taken(tool: str, tmp_path: Path) -> None:
     """Each of the files could be the one, and another one comes first in the folder."""

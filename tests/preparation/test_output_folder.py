@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whose folder a capture is, and who works on it."""
 
-import errno
 import os
 import shutil
 from collections.abc import Callable
@@ -88,19 +87,6 @@ def test_a_folder_that_cannot_be_made_is_reported(tmp_path: Path, videos: Path) 
         mark_output(tmp_path / "file" / "capture", videos)
 
 
-def test_a_full_disk_leaves_the_folder_free_for_the_next_time(
-    tmp_path: Path, videos: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(descriptor: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("os.fsync", full)
-        with pytest.raises(StorageError, match=r"cannot be written \(No space left on device\)"):
-            mark_output(tmp_path / "capture", videos)
-    mark_output(tmp_path / "capture", videos)
-
-
 def test_killed_at_any_step_it_leaves_the_folder_free_for_the_next_time(tmp_path: Path, videos: Path) -> None:
     killed = folders_of_the_killed(
         tmp_path,
@@ -129,16 +115,6 @@ def test_who_fails_leaves_the_capture_free(tmp_path: Path, videos: Path) -> None
         raise KeyError
     with lock_output(tmp_path / "capture"):
         assert (tmp_path / "capture" / FOLDER / LOCK).exists()
-
-
-def test_a_file_system_without_locks_has_none(tmp_path: Path, videos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def unknown(file: object, how: int) -> None:
-        raise OSError(errno.ENOLCK, "No locks available")
-
-    mark_output(tmp_path / "capture", videos)
-    monkeypatch.setattr("fcntl.flock", unknown)
-    with lock_output(tmp_path / "capture"), lock_output(tmp_path / "capture"):
-        pass
 
 
 def test_a_folder_that_was_not_claimed_cannot_be_held(tmp_path: Path) -> None:
@@ -188,13 +164,6 @@ def test_folders_come_file_by_file(tmp_path: Path) -> None:
         (tmp_path / "cam" / f"{number}.png").write_text(str(number))
     link(tmp_path / "cam", tmp_path / "out" / "cam", how="hard")
     assert sorted(file.name for file in (tmp_path / "out" / "cam").iterdir()) == ["0.png", "1.png", "2.png"]
-
-
-def test_no_room_is_reported(tmp_path: Path) -> None:
-    (tmp_path / "a").write_text("film")
-    (tmp_path / "file").write_text("")
-    with pytest.raises(StorageError, match=r"cannot be linked or copied to .*--link symlink"):
-        link(tmp_path / "a", tmp_path / "file" / "a", how="hard")
 
 
 @pytest.mark.parametrize("kind", [OSError(28, "No space left on device"), KeyboardInterrupt()])
@@ -294,17 +263,6 @@ def test_what_was_cut_is_done_again(tmp_path: Path, damage: Callable[[Path], obj
     damage(tmp_path / FOLDER)
     assert run(Steps(tmp_path, Silent()), "a", 3, done) == 3
     assert done == ["a", "a"]
-
-
-def test_an_interruption_leaves_no_result(tmp_path: Path) -> None:
-    def interrupted() -> int:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        Steps(tmp_path, Silent()).run(
-            "a", {}, interrupted, pack=lambda _: Stored(), unpack=lambda _: 0, summary=lambda _: ""
-        )
-    assert not list(tmp_path.rglob("a.*"))
 
 
 def test_killed_at_any_step_of_writing_it_is_done_again_or_was_done(tmp_path: Path) -> None:

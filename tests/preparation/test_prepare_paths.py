@@ -141,13 +141,6 @@ def test_dead_cameras_are_reported_once(tmp_path: Path, caplog: pytest.LogCaptur
     assert "is absent from the 5 frames after that" in made.report.read_text()
 
 
-def test_cameras_that_see_nothing_in_common(tmp_path: Path) -> None:
-    for seed in range(3):
-        write_video(tmp_path / "videos" / f"cam{seed}.mp4", [noise_texture(seed, size=160)] * 2)
-    with pytest.raises(CalibrationError, match="Too few cameras see anything in common"):
-        prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(NONE, lens="pinhole"))
-
-
 def test_a_board_that_is_not_there(tmp_path: Path) -> None:
     write_videos(tmp_path / "videos", ["a", "b", "c"], frames=2)
     with pytest.raises(CalibrationError, match=r"No camera shows the board .* in any of its"):
@@ -155,27 +148,3 @@ def test_a_board_that_is_not_there(tmp_path: Path) -> None:
     write_videos(tmp_path / "board", ["a", "b"], frames=2)
     with pytest.raises(CaptureError, match=r"has no video of camera 'c' of .*film the board with it too"):
         prepare_capture(tmp_path / "videos", tmp_path / "out", options=replace(NONE, board_videos=tmp_path / "board"))
-
-
-def test_videos_shorter_than_their_offset(tmp_path: Path) -> None:
-    write_room(tmp_path / "videos", cameras=3, frames=4)
-    rows = "".join(f"cam0{index},0,{9 * index}\n" for index in range(3))
-    (tmp_path / "videos" / "timestamps.csv").write_text("camera,frame,seconds\n" + rows)
-    with pytest.raises(CaptureError, match=r"'cam00' \(0.10 s\) and 'cam01' \(0.10 s\) have no instant in common"):
-        prepare_capture(tmp_path / "videos", tmp_path / "out")
-
-
-def test_a_broken_table_of_times_is_reported_before_the_calibration(tmp_path: Path) -> None:
-    write_videos(tmp_path, ["a", "b", "c"], frames=2)
-    (tmp_path / "timestamps.csv").write_text("camera,frame,seconds\na,zero,0\n")
-    with pytest.raises(CaptureError, match=r"Line 2 of .*timestamps\.csv is not a camera, a frame number and seconds"):
-        first_clocks(find_footage(tmp_path), PrepareOptions())
-
-
-def test_an_unknown_codec(tmp_path: Path) -> None:
-    write_room(tmp_path / "videos", cameras=3)
-    file = tmp_path / "videos" / "cam01.mp4"
-    file.write_bytes(file.read_bytes().replace(b"avc1", b"zzzz"))
-    with pytest.raises(CaptureError, match=r"cam01\.mp4 is coded in a way .* convert it to H\.264"):
-        prepare_capture(tmp_path / "videos", tmp_path / "out")
-    assert not (tmp_path / "out").exists()

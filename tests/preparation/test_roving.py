@@ -142,17 +142,6 @@ def test_registered_frames_are_in_the_capture_and_train_frame_0_alone(
     assert roving_of(open_capture(out)) is None
 
 
-def test_a_capture_without_roving_pictures_says_nothing_of_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(solvers, "solve_structure", solved)
-    write_room(tmp_path / "videos")
-    made = prepare_capture(tmp_path / "videos", tmp_path / "out", options=OPTIONS)
-    assert "roving" not in (tmp_path / "out" / "capture.json").read_text()
-    assert not (tmp_path / "out" / "roving").exists()
-    assert "roving" not in made.steps["calibrate"]
-
-
 def test_pictures_are_of_the_video_that_is_given_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solvers, "solve_structure", solved)
     write_room(tmp_path / "videos")

@@ -50,13 +50,6 @@ def table(footage: Footage, late: dict[str, float]) -> None:
     (footage.where / TIMESTAMPS).write_text("\n".join(lines) + "\n")
 
 
-def test_one_signal_starts_all(tmp_path: Path) -> None:
-    found = synchronized(filmed(tmp_path), PrepareOptions(synchronize="none"))
-    assert (found.method, found.sure) == ("none", True)
-    assert dict(found.clocks) == dict.fromkeys(NAMES, Clock())
-    assert found.summary.startswith("none: ")
-
-
 def test_a_table_of_times_is_taken_by_itself(tmp_path: Path) -> None:
     footage = filmed(tmp_path)
     table(footage, {"b": 0.1})

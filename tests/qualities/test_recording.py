@@ -129,14 +129,6 @@ def test_each_quality_has_the_bytes_of_a_run_of_its_own(whole: Path, tmp_path: P
     assert len(found["low"]) < len(found["high"])
 
 
-def test_frame_numbers_and_times_are_equal(whole: Path) -> None:
-    readers = [open_stream(whole / name) for name in NAMES]
-    times = [[(info.index, info.pts_seconds) for info in reader.packets] for reader in readers]
-    assert times[0] == times[1] == [(index, index / 4) for index in range(FRAMES)]
-    assert all(reader.complete for reader in readers)
-    assert [reader.header.config["online"]["rounding"]["quality"] for reader in readers] == [-2.0, 2.0]
-
-
 def counted(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """How often pictures are prepared and first frames are fitted."""
     counts = Counter[str]()

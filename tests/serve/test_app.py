@@ -61,15 +61,6 @@ def test_the_list(server: Served) -> None:
     assert "notes" not in page
 
 
-def test_a_stream_that_comes_later_is_found(server: Served, folder: Path) -> None:
-    assert server.ask("/streams/later.sgs/state").status == 404
-    (folder / "later.sgs").write_bytes(STREAM)
-    last = time.monotonic() + 20
-    while server.ask("/streams/later.sgs/state").status != 200:
-        assert time.monotonic() < last
-        time.sleep(0.1)
-
-
 def test_the_page_plays_what_is_beside_it(server: Served) -> None:
     for name, source in (("studio", "manifest.json"), ("ball.sgs", "stream.sgs")):
         page = server.ask(f"/streams/{name}/")

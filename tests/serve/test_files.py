@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.codec.segments.manifest import history_name, init_name, part_name, segment_name
-from structgstream.errors import StreamError
 from structgstream.serve.streams import hash_in_name, is_plain_path, is_stream_name, open_below
 from tests.support.properties import examples
 
@@ -32,16 +31,6 @@ def test_a_file_at_any_depth(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"shallow")
     assert content(tmp_path, "a", "b", "file") == b"deep"
     assert content(tmp_path, "file") == b"shallow"
-
-
-def test_slices_are_those_of_the_bytes(tmp_path: Path) -> None:
-    whole = bytes(range(100))
-    (tmp_path / "file").write_bytes(whole)
-    opened = open_below(tmp_path, "file")
-    assert opened is not None
-    with opened:
-        for part in (slice(None), slice(5, 20), slice(-7, None), slice(90, 200), slice(30, 10), slice(200, 300)):
-            assert opened[part] == whole[part]
 
 
 def test_nothing_that_is_no_file_is_opened(tmp_path: Path) -> None:
@@ -107,17 +96,6 @@ def test_the_stamp_changes_when_a_file_grows_or_is_replaced(tmp_path: Path) -> N
         stamps.append(opened.stamp)
         opened.close()
     assert len(set(stamps)) == 3
-
-
-def test_bytes_of_a_file_that_becomes_shorter(tmp_path: Path) -> None:
-    (tmp_path / "file").write_bytes(bytes(range(100)))
-    opened = open_below(tmp_path, "file")
-    assert opened is not None
-    with opened:
-        os.truncate(tmp_path / "file", 10)
-        assert len(opened) == 100
-        with pytest.raises(StreamError, match="file: it has become shorter"):
-            opened[5:55]
 
 
 PLAIN = string.ascii_letters + string.digits + "._-"

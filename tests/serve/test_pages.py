@@ -50,6 +50,13 @@ class Elements(HTMLParser):
     def text(self, tag: str) -> str:
         return "".join(text for name, text in self.texts if name == tag)
 
+    def all(self, tag: str, attribute: str) -> list[str]:
+        return [found for given in self.of(tag) if (found := given.get(attribute))]
+
+    @property
+    def shown(self) -> list[str]:
+        return [stripped for _, text in self.texts if (stripped := text.strip())]
+
     def policy(self) -> dict[str, str]:
         (rules,) = (m["content"] for m in self.of("meta") if m.get("http-equiv") == "Content-Security-Policy")
         assert rules is not None
@@ -147,26 +154,6 @@ def test_an_installation_without_it_is_reported(tmp_path: Path, monkeypatch: pyt
         bundle()
 
 
-class Seen(HTMLParser):
-    """Elements with their attributes, and the texts of a page's body."""
-
-    def __init__(self, page: str) -> None:
-        super().__init__()
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
-        self.texts: list[str] = []
-        self.feed(page)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.elements.append((tag, dict(attrs)))
-
-    def handle_data(self, data: str) -> None:
-        if data.strip():
-            self.texts.append(data.strip())
-
-    def all(self, tag: str, attribute: str) -> list[str]:
-        return [found for name, given in self.elements if name == tag and (found := given.get(attribute))]
-
-
 def listed(name: str, live: bool | None, seconds: float | None) -> dict[str, object]:
     """An entry of streams.json, as far as the page needs it."""
     base = f"streams/{name}/"
@@ -182,21 +169,21 @@ STREAMS = [
 
 
 def test_every_address_carries_the_query() -> None:
-    seen = Seen(list_page(STREAMS, query="?token=v1.2.x"))
+    seen = Elements(list_page(STREAMS, query="?token=v1.2.x"))
     assert seen.all("a", "href") == [f"streams/{one['name']}/?token=v1.2.x" for one in STREAMS]
     pictures = [re.fullmatch(r'background-image:url\("(.*)"\)', style) for style in seen.all("i", "style")]
     assert [found and found[1] for found in pictures] == [f"streams/{s['name']}/preview?token=v1.2.x" for s in STREAMS]
 
 
 def test_live_streams_and_lengths_of_others() -> None:
-    texts = Seen(list_page(STREAMS, query="")).texts
+    texts = Elements(list_page(STREAMS, query="")).shown
     shown = texts[texts.index("studio") :]
     assert shown == ["studio", "live", "ball.sgs", "done", "1:02:05", "short", "1:00"]
 
 
 def test_a_list_without_streams_says_so_and_looks_again() -> None:
     page = list_page([], query="")
-    assert "There is none yet." in Seen(page).texts
+    assert "There is none yet." in Elements(page).shown
     assert "<ul>" not in page
     assert f'<meta http-equiv="refresh" content="{REFRESH_SECONDS}">' in page
     assert "There is none yet." not in list_page(STREAMS, query="")
@@ -205,7 +192,7 @@ def test_a_list_without_streams_says_so_and_looks_again() -> None:
 @pytest.mark.parametrize("hostile", ['"><script>alert(1)</script>', "a&b<i>", "'x'"])
 def test_names_and_queries_are_texts(hostile: str) -> None:
     """Names are checked before; the page does not rely on it."""
-    seen = Seen(list_page([listed(hostile, None, None)], query=f"?token={hostile}"))
-    assert hostile in seen.texts
+    seen = Elements(list_page([listed(hostile, None, None)], query=f"?token={hostile}"))
+    assert hostile in seen.shown
     assert seen.all("a", "href") == [f"streams/{hostile}/?token={hostile}"]
-    assert not any(tag == "script" for tag, _ in seen.elements)
+    assert not seen.of("script")

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from structgstream.codec.container.records import FOOTER, FOOTER_MAGIC
-from structgstream.codec.reader import StreamReader, open_stream
+from structgstream.codec.reader import StreamReader
 from structgstream.errors import StorageError, StreamError
-from structgstream.serve.pages import StreamFile, bundle, check_has_header, single_page, write_page, write_site
+from structgstream.serve.pages import StreamFile, check_has_header, write_page, write_site
 from tests.support.streams import small_stream
 
 STREAM = small_stream()
@@ -71,23 +71,6 @@ def stream(tmp_path: Path) -> StreamFile:
     path = tmp_path / "clip.sgs"
     path.write_bytes(STREAM)
     return StreamFile(path)
-
-
-def test_a_page(stream: StreamFile, tmp_path: Path) -> None:
-    path = tmp_path / "new" / "clip.html"
-    assert write_page(path, stream) == path.stat().st_size
-    assert path.read_bytes() == single_page("clip", module=bundle(), stream=STREAM)
-
-
-def test_a_site(stream: StreamFile, tmp_path: Path) -> None:
-    site = tmp_path / "site"
-    size_bytes = write_site(site, stream)
-    assert sorted(entry.name for entry in site.iterdir()) == ["index.html", "player.js", "stream.sgs"]
-    assert size_bytes == sum(entry.stat().st_size for entry in site.iterdir())
-    assert (site / "player.js").read_text() == bundle()
-    assert 'src="stream.sgs"' in (site / "index.html").read_text()
-    with open_stream(site / "stream.sgs") as reader:
-        assert reader.complete
 
 
 def test_a_site_never_replaces_its_own_stream(tmp_path: Path) -> None:

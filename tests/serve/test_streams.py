@@ -74,28 +74,6 @@ def several(folder: Path, *names: str, listed: tuple[str, ...] | None = None) ->
     write_list(folder, [ListedQuality(name, f"{name}/manifest.json", 9.0 - n) for n, name in enumerate(given)])
 
 
-def test_several_qualities_of_one_stream_are_one(tmp_path: Path) -> None:
-    several(tmp_path / "studio", "high", "low")
-    (tmp_path / "studio.metrics.json").write_text("{}")
-    for folder in (tmp_path, tmp_path / "studio"):
-        (one,) = Catalog(folder).found().values()
-        assert (one.name, one.kind, one.renditions) == ("studio", StreamKind.QUALITIES, ("low", "high"))
-        assert [(own.name, own.kind) for own in one.segments] == [
-            ("studio/low", StreamKind.SEGMENTS),
-            ("studio/high", StreamKind.SEGMENTS),
-        ]
-        assert all(own.segments == (own,) for own in one.segments)
-        for opened in (
-            one.open("qualities.json"),
-            one.segments[0].open("manifest.json"),
-            one.open_beside(".metrics.json"),
-        ):
-            assert opened is not None
-            opened.close()
-        assert one.segments[0].open_beside(".metrics.json") is None
-    assert StreamKind.QUALITIES.source == "qualities.json"
-
-
 def test_several_qualities_are_served_when_all_have_a_frame(tmp_path: Path) -> None:
     several(tmp_path / "waits", "high", listed=("high", "low"))
     (tmp_path / "waits" / "low").mkdir()

@@ -53,13 +53,6 @@ def test_schedules_fit_their_length(name: str) -> None:
     assert online.patching.iteration < online.iterations
 
 
-@pytest.mark.parametrize("name", ["paper-n3dv", "paper-meetroom", "paper-immersive"])
-def test_paper_presets_keep_the_published_rates(name: str) -> None:
-    initial = PRESETS[name].initial
-    assert initial.rates == InitialRates()
-    assert (initial.iterations, initial.schedule_iterations, initial.seed_voxels) == (4000, 30_000, 1)
-
-
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_configuration_comes_back_from_a_header(name: str) -> None:
     assert from_json(json.loads(json.dumps(to_json(PRESETS[name])))) == PRESETS[name]

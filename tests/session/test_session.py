@@ -117,11 +117,6 @@ def test_every_frame_has_a_seed_of_its_own(quick_fits: list[int]) -> None:
     assert 0 <= frame_seed(-3, 5) < 2**63
 
 
-def test_two_runs_and_both_sinks_give_the_same_bytes(quick_fits: list[int], tmp_path: Path) -> None:
-    run(capture(), FileSink(tmp_path / "a.sgs"))
-    assert (tmp_path / "a.sgs").read_bytes() == uninterrupted()
-
-
 def test_resuming_gives_the_bytes_of_an_uninterrupted_run(quick_fits: list[int], tmp_path: Path) -> None:
     whole = uninterrupted()
     path = tmp_path / "a.sgs"

@@ -200,20 +200,6 @@ def test_what_masks_leave_out_has_no_influence_on_a_single_byte(world: World, tm
     assert streams[0] == streams[1]
 
 
-def test_what_masks_leave_out_is_not_learned(world: World, tmp_path: Path) -> None:
-    """Noise stands in the left part of every training picture; the held-out camera sees the scene without it."""
-    masks = {name: np.broadcast_to(np.arange(96) >= 24, (64, 96)).copy() for name in world.rig.training}
-    longer = replace(CONFIG, initial=replace(CONFIG.initial, iterations=150, schedule_iterations=150))
-    quality = []
-    for with_masks in (True, False):
-        source, path = masked(world, masks, 7), tmp_path / f"{with_masks}.sgs"
-        source.pictures = [replace(frame, masks=masks if with_masks else {}) for frame in source.pictures[:1]]
-        run(source, path, config=longer)
-        with open_stream(path) as reader:
-            quality.append(evaluate(reader, source, backend=quickest_backend(), metrics="basic").mean.psnr)
-    assert quality[0] > quality[1] + 0.5
-
-
 def test_a_held_out_camera_is_scored_where_it_has_pictures(world: World, plain: Path, tmp_path: Path) -> None:
     path = plain
     lacking = capture(world, {0: "cam00", 2: "cam00"})

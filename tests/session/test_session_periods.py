@@ -6,13 +6,11 @@ from functools import cache
 from itertools import count
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from structgstream.codec.container.records import RecordType, scan_records
 from structgstream.codec.reader import StreamReader
-from structgstream.codec.segments.stored_bytes import write_archive
-from structgstream.codec.sinks import FileSink, MemorySink, resume_segments
+from structgstream.codec.sinks import FileSink, MemorySink
 from structgstream.frames import MultiViewFrame
 from structgstream.scene.scene import Scene
 from structgstream.session import struct_gstream as method
@@ -25,7 +23,6 @@ from tests.session.test_session_compact import CONFIG as COMPACT_CONFIG
 from tests.session.test_session_compact import WORLD
 from tests.support.backends import quickest_backend
 from tests.support.memory_captures import MemoryCapture
-from tests.support.segment_streams import Hands, Killed, KilledStore, folder
 from tests.support.streams import same
 
 FRAMES = 8
@@ -109,20 +106,6 @@ def test_stopped_it_goes_on_to_the_same_bytes(case: str, tmp_path: Path) -> None
         assert path.read_bytes() == data, cut
 
 
-def test_a_killed_writer_of_segments_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
-    """Killed when the second period is named and has no frame; other operations: codec/segments/test_periods.py."""
-    store = folder(tmp_path / "store")
-    with pytest.raises(Killed):
-        run(
-            resume_segments(KilledStore(store, at="put part-00000006", done=False), clocks=Hands().clocks())[0],
-            BY_RESIDUAL,
-        )
-    sink, resumed = resume_segments(store)
-    run(sink, BY_RESIDUAL, resumed=resumed)
-    write_archive(store, tmp_path / "out.sgs")
-    assert (tmp_path / "out.sgs").read_bytes() == whole("residual")[0]
-
-
 def test_each_frame_starts_from_what_a_reader_sees() -> None:
     """The next frame after a period has begun starts from that period's scene, and the period from the one before."""
     data, _, started = whole("scheduled")
@@ -136,17 +119,3 @@ def test_without_periods_nothing_is_measured_and_nothing_changes(monkeypatch: py
     data = sink.data
     assert {record.period for record in scan_records(data)} == {0}
     assert "period" not in StreamReader(data).header.config
-
-
-def test_a_new_period_shows_the_changed_scene_better() -> None:
-    """The mean error of the last frame, with and without: the reason that there are periods."""
-    with_period = whole("residual")[0]
-    run(sink := MemorySink(), BASE)
-    errors = [error_of(StreamReader(data)) for data in (sink.data, with_period)]
-    assert errors[1] < 0.8 * errors[0]
-
-
-def error_of(reader: StreamReader) -> float:
-    frame = frames()[FRAMES - 1]
-    pictures = {name: reader.render(FRAMES - 1, name, backend=quickest_backend()) for name in WORLD.rig.training}
-    return float(np.mean([np.abs(image.astype(float) - frame.images[name]).mean() for name, image in pictures.items()]))

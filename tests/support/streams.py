@@ -106,14 +106,6 @@ def small_stream(frames: int = 4) -> bytes:
     return sink.data
 
 
-def splat_stream(frames: int = 7) -> bytes:
-    """A complete stream of codec ``compact`` with some splats that can be seen, a key packet at every third."""
-    sink = MemorySink()
-    scenes = [moved(random_scene(60, seed=4), step) for step in range(frames)]
-    write_stream(sink, scenes, header=compact_header(scenes[0]))
-    return sink.data
-
-
 def same(a: Scene, b: Scene) -> bool:
     """Whether two scenes are equal bit for bit, NaN included."""
     one, other = state_of(a), state_of(b)

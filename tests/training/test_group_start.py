@@ -133,9 +133,3 @@ def test_births_of_several_rounds_have_identities_of_their_own(monkeypatch: pyte
     assert len(births) > 0
     assert len(births.unique()) == len(births)
     assert (births // IDS_PER_FRAME == FRAME).all()
-
-
-def test_it_is_repeatable() -> None:
-    world = scenery(movers=20)
-    one, other = (state_of(fit(world, truth(world, 20)).scene) for _ in range(2))
-    assert all(torch.equal(one[name], other[name]) for name in one)

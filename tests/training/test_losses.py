@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each term beside the paper's equation in plain NumPy."""
 
-from typing import Literal
-
 import numpy as np
 import pytest
 import torch
@@ -36,15 +34,14 @@ def test_volume_of_nothing_is_zero_and_differentiable() -> None:
     assert scales.grad is not None
 
 
-@pytest.mark.parametrize("reading", ["scaled", "raw", "norm"])
-def test_offset_distance_counts_what_is_beyond_two_voxels(reading: Literal["scaled", "raw", "norm"]) -> None:
+def test_offset_distance_counts_what_is_beyond_two_voxels() -> None:
     anchors = random_scene().anchors
     offsets = anchors.offsets.double().numpy()
     scaled = offsets * np.exp(anchors.log_offset_scales.double().numpy())[:, None]
-    length = {"raw": np.abs(offsets), "scaled": np.abs(scaled), "norm": np.linalg.norm(scaled, axis=-1)}[reading]
+    length = np.abs(scaled)
     eps = 0.03
     expected = np.where(length - 2 * eps > 0, np.abs(length - 2 * eps), 0.0).sum()  # theta(O - 2 eps) ||O - 2 eps||
-    weights = InitialLossWeights(offset_distance=1.0, offset_distance_reading=reading, offset_distance_reduction="sum")
+    weights = InitialLossWeights(offset_distance=1.0, offset_distance_reduction="sum")
     assert offset_distance(
         anchors, voxel_size=eps, weights=weights, backend=reference_backend()
     ).item() == pytest.approx(expected, rel=1e-5)

@@ -53,17 +53,6 @@ def test_a_rate_of_zero_moves_nothing() -> None:
     assert torch.equal(parameters.values["anchor_positions"], before)
 
 
-def test_a_leaf_that_is_put_in_anew_has_no_moments_and_counts_on() -> None:
-    adam = Adam(reference_backend(), leaves({"x": torch.zeros(3), "y": torch.zeros(2)}))
-    adam.step({"x": torch.ones(3), "y": torch.ones(2)}, {"x": 0.1, "y": 0.1})
-    adam.replace_values("x", torch.full((3,), 5.0))
-    assert adam.values["x"].tolist() == [5.0] * 3
-    assert adam.values["x"].requires_grad
-    assert not adam.first["x"].any()
-    assert adam.first["y"].all()
-    assert adam.steps == {"x": 1, "y": 1}
-
-
 def test_leaves_are_copies() -> None:
     value = torch.zeros(3)
     leaf = leaves({"x": value})["x"]

@@ -117,12 +117,6 @@ def test_when_everything_is_missing_nothing_is_spawned_and_that_is_reported() ->
     assert len(found.new_free) == 0
 
 
-def test_spawning_is_repeated_bit_for_bit() -> None:
-    one, other = (renewed(quickest_backend()).new_free for _ in range(2))
-    assert torch.equal(one.means, other.means)
-    assert torch.equal(one.colors, other.colors)
-
-
 def test_a_ghost_dies() -> None:
     """The ball was there in a wrong place before: nobody sees it there now."""
     ghost = emerging_ball(0.95)

@@ -65,10 +65,6 @@ def test_off_everything_begins_where_its_prior_says() -> None:
     assert start.active_tiles
 
 
-def test_the_start_is_repeated_bit_for_bit() -> None:
-    assert torch.equal(begun(world())[1].displacements, begun(world())[1].displacements)
-
-
 def test_displaced_moves_anchors_and_free_gaussians() -> None:
     scene = world().scene
     by = torch.arange(3.0 * len(scene.anchors)).reshape(-1, 3)

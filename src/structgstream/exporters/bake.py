@@ -53,10 +53,6 @@ class BakedGaussians:
         """The rows of a mask ``[N]`` or of indices ``[n]``, in order of the indices."""
         return BakedGaussians(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
-    def to(self, device: torch.device) -> "BakedGaussians":
-        """The same on ``device``."""
-        return BakedGaussians(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
-
     def colors(self, center: Tensor) -> Tensor:
         """sRGB colours ``[N, 3]`` seen from ``center`` ``[3]``."""
         basis = sh_basis(torch.nn.functional.normalize(self.means - center, dim=1), self.degree)

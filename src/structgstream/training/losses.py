@@ -50,9 +50,6 @@ class InitialLossWeights(LossWeights):
     """On L_dist, the paper's lambda_dist (0.005)."""
     offset_distance_reduction: Literal["mean", "sum"] = "mean"
     """Reduction of L_dist: the paper's equation is a sum over anchors and offsets."""
-    offset_distance_reading: Literal["scaled", "raw", "norm"] = "scaled"
-    """What L_dist compares with 2 eps: ``scaled`` each component of |O * l_v|, ``raw`` of |O|, ``norm`` the norm of
-    O * l_v."""
 
 
 def volume(scales: Tensor, opacities: Tensor, *, reduction: Literal["mean", "sum"], backend: Backend) -> Tensor:
@@ -69,17 +66,11 @@ def offset_distance(
 ) -> Tensor:
     """L_dist: penalty on offsets of Gaussians from their anchors beyond two voxels.
 
-    theta(x) x is a hinge: only the part above ``2 * voxel_size`` (the paper's 2 eps) counts.
+    theta(x) x is a hinge: of each component of O * l_v only the part above ``2 * voxel_size`` (the paper's 2 eps)
+    counts.
     """
-    if weights.offset_distance_reading == "scaled":
-        total = backend.excess(anchors.offsets, anchors.log_offset_scales, 2.0 * voxel_size)
-        return total / max(1, anchors.offsets.numel()) if weights.offset_distance_reduction == "mean" else total
-    if weights.offset_distance_reading == "raw":
-        length = anchors.offsets.abs()
-    else:
-        length = (anchors.offsets * anchors.log_offset_scales.exp()[:, None]).norm(dim=-1)
-    excess = torch.relu(length - 2.0 * voxel_size)
-    return excess.mean() if weights.offset_distance_reduction == "mean" else excess.sum()
+    total = backend.excess(anchors.offsets, anchors.log_offset_scales, 2.0 * voxel_size)
+    return total / max(1, anchors.offsets.numel()) if weights.offset_distance_reduction == "mean" else total
 
 
 LossT = TypeVar("LossT", bound="Loss")

@@ -108,13 +108,6 @@ class Adam(Generic[Name]):
                     kept = state[name][kept_rows]
                     state[name] = torch.cat([kept, kept.new_zeros(rows.shape)])
 
-    def replace_values(self, name: Name, value: Tensor) -> None:
-        """Replace a leaf by ``value`` and reset its moments, but not its step count."""
-        self.values[name] = value.detach().clone().contiguous().requires_grad_()
-        for state in (self.first, self.second):
-            if name in state:
-                state[name] = torch.zeros_like(value)
-
 
 SampleT = TypeVar("SampleT")
 LossT = TypeVar("LossT", bound=Loss)

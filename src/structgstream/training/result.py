@@ -25,7 +25,6 @@ class Stopwatch:
 
 
 SceneT = TypeVar("SceneT", covariant=True)
-OtherT = TypeVar("OtherT")
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,3 @@ class FitResult(Generic[SceneT]):
     counts: Mapping[str, int] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
     losses: Mapping[str, float] = field(default_factory=dict)
-
-    def with_scene(self, scene: OtherT) -> "FitResult[OtherT]":
-        """The same result with another ``scene``."""
-        return FitResult(**{**vars(self), "scene": scene})

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
 from contextlib import suppress
-from itertools import product
 
 import numpy as np
 import pytest
@@ -8,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from structgstream.codec.entropy.bits import fixed, pack_bits, signed_golomb
-from structgstream.codec.entropy.rans import encode
 from structgstream.codec.entropy.tables import (
     TOTAL,
     FrequencyTables,
@@ -53,19 +51,6 @@ def test_what_occurs_has_a_frequency_and_a_row_sums_to_4096(counts: list[int]) -
     row = normalize_counts(np.array([counts])).rows[0]
     assert row.sum() == TOTAL
     assert ((row > 0) == (np.array(counts) > 0)).all() or not any(counts)
-
-
-@pytest.mark.parametrize("counts", [[1000, 3, 1], [70_000, 2, 2], [5, 5, 5], [1, 100, 10_000], [123_456, 65_432, 7]])
-def test_no_other_frequencies_code_noticeably_shorter(counts: list[int]) -> None:
-    """The code length is convex in the frequencies: what is best nearby is best."""
-    n = np.array(counts)
-    row = normalize_counts(n[None]).rows[0].astype(int)
-    step = np.arange(-100, 101)
-    first, second = np.meshgrid(row[0] + step, row[1] + step, indexing="ij")
-    others = np.stack([first, second, TOTAL - first - second])
-    bits = (n[:, None, None] * -np.log2(np.maximum(others, 0.5) / TOTAL)).sum(0)
-    best = float(bits[(others > 0).all(0)].min())
-    assert bits_for(n, row) <= best * (1 + 1e-5) + 1e-9
 
 
 def test_equals_are_served_from_the_first_on() -> None:
@@ -168,27 +153,6 @@ def test_tables_that_fit_are_kept_in_no_bytes() -> None:
     assert (nothing.rows == tables.rows).all()
 
 
-@pytest.mark.parametrize(("low", "high"), [(0.2, 0.6), (0.3, 1.0), (0.5, 2.0), (1.5, 5.0)])
-def test_fifty_contexts_of_peaked_symbols_with_tables_are_within_a_twentieth(low: float, high: float) -> None:
-    counts = laplace_counts(count=30_000, contexts=50, low=low, high=high)
-    tables, bits = choose_tables(counts, geometric(np.full(50, 100), alphabet=16))
-    context, symbols = np.divmod(np.repeat(np.arange(counts.size), counts.reshape(-1)), 16)
-    section = encode(symbols.astype(np.uint8), context.astype(np.uint16), tables)
-    p = counts / counts.sum(1, keepdims=True)
-    entropy = float(-(counts * np.log2(np.where(p > 0, p, 1))).sum()) / 8
-    assert len(bits) + len(section) <= 1.05 * entropy
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_a_peaked_row_of_no_family_takes_ten_bytes(seed: int) -> None:
-    g = np.random.default_rng(seed)
-    shape = np.exp(-np.arange(16) / 2) * np.exp(g.normal(0, 0.5, 16))
-    counts = np.rint(2000 * shape / shape.sum()).astype(int)[None]
-    tables, bits = choose_tables(counts, geometric(np.array([100]), alphabet=16))
-    assert len(bits) <= 10
-    assert bits_for(counts, tables.rows) <= 1.01 * bits_for(counts, normalize_counts(counts).rows)
-
-
 def test_precision_follows_the_number_of_symbols() -> None:
     shape = np.array([[700, 130, 90, 33, 57, 12, 15, 1, 0, 4, 0, 0, 0, 0, 0, 2]])
     previous = geometric(np.array([100]), alphabet=16)
@@ -241,17 +205,6 @@ def test_a_damaged_set_is_refused(data: bytes, problem: str) -> None:
 def test_arbitrary_bytes_are_refused_or_are_tables(data: bytes) -> None:
     with suppress(StreamError):
         assert decode_tables(data, geometric(np.array([3, 100, 250]), alphabet=16)).contexts == 3
-
-
-def test_every_damaged_byte_is_refused_or_gives_tables() -> None:
-    previous = geometric(np.full(6, 100), alphabet=16)
-    _, bits = choose_tables(laplace_counts(count=20_000, contexts=6, low=0.2, high=5), previous)
-    assert len(bits) > 20
-    for place, change in product(range(len(bits)), (0x01, 0x80, 0xFF, 0x5A)):
-        damaged = bytearray(bits)
-        damaged[place] ^= change
-        with suppress(StreamError):
-            assert decode_tables(bytes(damaged), previous).rows.shape == previous.rows.shape
 
 
 def test_counts_of_another_shape_are_refused() -> None:

@@ -155,10 +155,3 @@ def test_the_most_that_few_bytes_can_make(monkeypatch: pytest.MonkeyPatch) -> No
     more = FreeBins(np.arange(1, 2**12 + 2), np.zeros((2**12 + 1, 14), np.int32), many.change)
     with pytest.raises(StreamError, match="adds 1 free Gaussians, which makes more than"):
         code_free(new_encoder(), more, many, where="Frame 1")
-
-
-def test_a_birth_takes_few_bytes() -> None:
-    writer = new_encoder()
-    many = free([2**32 + i for i in range(300)], scale=20.0)
-    code_free(writer, many, FreeBins.none(), where="")
-    assert sum(map(len, writer.fields().values())) / 300 < 14, "6 to 7 bits an attribute"

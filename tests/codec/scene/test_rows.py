@@ -82,49 +82,6 @@ def test_history_goes_back_three_frames() -> None:
         assert change.history.tolist() == history
 
 
-@pytest.mark.parametrize("what", ["motion goes on", "neighbours move alike"])
-def test_prediction_saves_bytes(what: str) -> None:
-    """A motion that its own past or its neighbours foretell costs less than one that nothing foretells."""
-    g = np.random.default_rng(3)
-
-    def cost(alike: bool) -> int:
-        models, change, size = Models(), Change.none(2000, 3), 0
-        if what == "motion goes on":
-            velocity = g.normal(0, 6, (2000, 3))
-            frames = [velocity if alike else g.permutation(velocity) for _ in range(4)]
-        else:
-            smooth = np.repeat(g.normal(0, 6, (100, 3)), 20, axis=0)
-            frames = [g.permutation(smooth)] if not alike else [smooth]
-        for frame in frames:
-            models = Models(models)
-            fields, change = written(models, np.rint(frame + g.normal(0, 0.3, frame.shape)).astype(np.int32), change)
-            size += sum(map(len, fields.values()))
-        return size
-
-    assert 1.3 * cost(True) < cost(False)
-
-
-def test_a_group_of_frames_is_near_the_entropy_of_its_noise() -> None:
-    """2000 of 30,000 rows move in 12 frames by a steady step and noise; who knew the steps would pay the noise."""
-    g = np.random.default_rng(7)
-    rows = 30_000
-    moving = np.zeros(rows, np.bool_)
-    for start in g.integers(0, rows - 400, 8):
-        moving[start : start + 250] = True
-    velocity = np.repeat(g.integers(-4, 5, (rows // 50, 3)), 50, axis=0)
-    models, change, size, noises = Models(), Change.none(rows, 3), 0, []
-    for _ in range(12):
-        models = Models(models)
-        noise = np.rint(g.laplace(0, 0.6, (rows, 3)))
-        noises.append(noise[moving].astype(int))
-        fields, change = written(models, ((velocity + noise) * moving[:, None]).astype(np.int32), change)
-        size += sum(map(len, fields.values()))
-    counts = np.unique(np.concatenate(noises), return_counts=True)[1]
-    share = counts / counts.sum()
-    entropy_bytes = -float((counts * np.log2(share)).sum()) / 8
-    assert entropy_bytes < size < 1.2 * entropy_bytes
-
-
 def test_a_residual_beyond_23_bits_cannot_be_coded() -> None:
     residuals = np.zeros((3, 3), np.int32)
     residuals[1, 2] = 2**23 + 1

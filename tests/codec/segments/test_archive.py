@@ -8,7 +8,7 @@ import pytest
 
 from structgstream.codec.segments.store import FolderStore
 from structgstream.codec.segments.stored_bytes import read_manifest, write_archive
-from structgstream.errors import StorageError, StreamError
+from structgstream.errors import StreamError
 from tests.support.segment_folders import GrowingFolder
 from tests.support.segment_streams import folder, packets, written
 from tests.support.streams import small_stream
@@ -44,25 +44,3 @@ def test_what_was_there_stays_when_a_file_is_damaged(store: FolderStore, tmp_pat
         write_archive(store, tmp_path / "a.sgs")
     assert (tmp_path / "a.sgs").read_bytes() == b"an earlier archive"
     assert sorted(os.listdir(tmp_path)) == ["a.sgs", "out"]
-
-
-def test_a_file_that_cannot_be_written_leaves_nothing(
-    store: FolderStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with pytest.raises(StorageError, match=r"nowhere/a\.sgs cannot be written \(No such file or directory\)"):
-        write_archive(store, tmp_path / "nowhere" / "a.sgs")
-
-    def full(handle: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(StorageError, match=r"a\.sgs cannot be written \(No space left on device\); make room"):
-        write_archive(store, tmp_path / "a.sgs")
-    assert os.listdir(tmp_path) == ["out"]
-
-
-def test_a_folder_is_not_replaced_by_a_file(store: FolderStore, tmp_path: Path) -> None:
-    (tmp_path / "taken").mkdir()
-    with pytest.raises(StorageError, match="taken cannot be written"):
-        write_archive(store, tmp_path / "taken")
-    assert sorted(os.listdir(tmp_path)) == ["out", "taken"]

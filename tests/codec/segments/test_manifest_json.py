@@ -15,6 +15,7 @@ from structgstream.codec.packets import PacketKind
 from structgstream.codec.segments.manifest import (
     MAX_MANIFEST_BYTES,
     Edge,
+    Fields,
     HistoryEntry,
     Manifest,
     PartEntry,
@@ -129,6 +130,7 @@ BAD: list[tuple[tuple[Any, ...], Any, str]] = [
     (("segments", 0, "frame_bytes"), [1, 2], "expected a list of 3 whole numbers"),
     (("segments", 0, "first_frame"), 7, "begins with frame 7 and segment 2, where frame 6 and segment 2 belong"),
     (("segments", 1, "segment"), 2, "where frame 9 and segment 3 belong"),
+    (("segments", 0, "pts_seconds"), [1.0], "two numbers"),
     (("segments", 0, "pts_seconds"), [1.0, 0.5], "two numbers that do not fall"),
     (("segments", 0, "period"), 1, "names no init record of period 1"),
     (("segments",), {}, "expected a list of at most 4096 objects"),
@@ -147,6 +149,21 @@ def test_what_contradicts_the_format_is_refused_in_words(path: tuple[Any, ...], 
     place[path[-1]] = value
     with pytest.raises(StreamError, match=message):
         read(json.dumps(plain).encode())
+
+
+@pytest.mark.parametrize(
+    "name", ["", ".a", "..", "a/b", "a\\b", "a b", "a\n", "A" * 129, "é", "http:x", "%2e", None, 1, ["a"]]
+)
+def test_names_that_lead_elsewhere(name: object) -> None:
+    with pytest.raises(StreamError, match="plain name of a file"):
+        Fields({"file": name}, "it").file()
+
+
+@pytest.mark.parametrize("digest", ["0" * 63, "0" * 65, "A" * 64, "g" * 64, "0" * 63 + "\n", None, 0])
+def test_what_is_no_hash(digest: object) -> None:
+    with pytest.raises(StreamError, match="64 hex digits"):
+        Fields({"sha256": digest}, "it").sha256()
+    assert Fields({"sha256": "0f" * 32}, "it").sha256() == "0f" * 32
 
 
 def test_a_manifest_that_has_ended_has_no_parts_and_what_is_missing_is_named() -> None:

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
 import json
-import os
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,7 @@ from structgstream.codec.segments.quality_list import (
     read_list,
     write_list,
 )
-from structgstream.errors import StorageError, StreamError
+from structgstream.errors import StreamError
 from tests.support.killed import folders_of_the_killed
 
 LOW, HIGH = ListedQuality("low", "low/manifest.json", 1.5e6), ListedQuality("high", "high/manifest.json", 6e6)
@@ -38,14 +37,6 @@ def test_whoever_reads_gets_one_list_or_the_other(tmp_path: Path) -> None:
     found = [read_list(folder) for folder in folders]
     assert set(found) == {(LOW, HIGH), (HIGH, LOW)}
     assert found[-1] == (HIGH, LOW)
-
-
-def test_a_list_that_cannot_be_written_stays(tmp_path: Path) -> None:
-    write_list(tmp_path, (LOW,))
-    os.symlink(tmp_path / "nowhere" / "x", tmp_path / f"{QUALITIES}.partial")
-    with pytest.raises(StorageError, match="The list of qualities .* cannot be written"):
-        write_list(tmp_path, (HIGH,))
-    assert read_list(tmp_path) == (LOW,)
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from structgstream.data.live import resume_cache
 from structgstream.data.live.resume_cache import (
-    FORMAT,
     LAST,
-    WITHOUT_RESIDUALS,
     ResumeCache,
     read_pictures,
     residuals,
@@ -55,15 +52,6 @@ def test_a_plane_leaves_nothing_but_its_edges() -> None:
     down, across = np.mgrid[:40, :60]
     image = np.stack([2 * down + across + offset for offset in (3, 50, 200)], axis=2).astype(np.uint8)
     assert not residuals(image)[:, 1:, 1:].any()
-
-
-def test_files_of_an_earlier_version_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path, frame = tmp_path / "x", some_frame()
-    monkeypatch.setattr(resume_cache, "residuals", lambda image: image)
-    write_pictures(path, frame, origin_seconds=0.0)
-    path.write_bytes(path.read_bytes().replace(FORMAT.encode(), WITHOUT_RESIDUALS.encode()))
-    read, _ = read_pictures(path)
-    assert all((read.images[name] == frame.images[name]).all() for name in "ab")
 
 
 def test_a_file_that_is_cut_or_changed_anywhere_is_refused(tmp_path: Path) -> None:

@@ -92,12 +92,6 @@ def test_a_bumped_camera_is_named_before_a_moving_thing() -> None:
     assert [each.cameras for each in found] == [("cam02",)]
 
 
-def test_blank_pictures_have_nothing_to_say() -> None:
-    blank = {name: np.full((240, 320, 3), 127, np.uint8) for name in rig()}
-    assert picture_movement(blank["cam00"], blank["cam01"]) is None
-    assert findings(blank, blank) == []
-
-
 SCENE = noise_texture(4, size=320)
 SIZE = 240
 

@@ -2,7 +2,6 @@
 """What the pictures of a report show, read from the figures."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,20 +23,6 @@ def checked() -> Checked:
     rig = room_rig(7)
     stated = rig.mapped({name: turned(camera, 2.0) if name == OFF else camera for name, camera in rig.cameras.items()})
     return check_capture(MemoryCapture(stated, [room_frame(rig)]))
-
-
-@pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
-    """Calls a function that draws, and returns its figure."""
-
-    def draw(function: Callable[..., None], *arguments: Any) -> Any:
-        kept: list[Any] = []
-        monkeypatch.setattr(overlays, "save_figure", lambda figure, path: kept.append(figure))
-        function(Path("unused.png"), *arguments)
-        (figure,) = kept
-        return figure
-
-    return draw
 
 
 def test_pairs_are_the_worst_of_who_is_off_then_the_worst_and_the_surest(checked: Checked) -> None:

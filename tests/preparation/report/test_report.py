@@ -65,20 +65,6 @@ def test_no_room_is_reported(tmp_path: Path) -> None:
         write_report(tmp_path / "file", checked)
 
 
-@pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
-    """Calls a function that draws, and returns its figure."""
-
-    def draw(function: Callable[..., None], *arguments: Any, **keywords: Any) -> Any:
-        kept: list[Any] = []
-        monkeypatch.setattr(charts, "save_figure", lambda figure, path: kept.append(figure))
-        function(Path("unused.png"), *arguments, **keywords)
-        (figure,) = kept
-        return figure
-
-    return draw
-
-
 def report_of(cameras: dict[str, CameraCheck], pairs: tuple[PairCheck, ...] = ()) -> CheckReport:
     return CheckReport("take", 0, cameras, pairs, Coverage(0, 0.0, 0.0), (), 1.0, 0.1, None)
 

@@ -209,19 +209,6 @@ def test_a_point_is_in_the_same_bundle_of_both_views(pair: tuple[str, str]) -> N
     assert np.minimum(apart, BUNDLES - apart).max() <= 1
 
 
-def test_a_scaled_fundamental_matrix_is_the_same() -> None:
-    points = np.random.default_rng(1).uniform(-0.5, 0.5, (20, 3))
-    geometry = CalibratedGeometry(CAMERAS).pair("cam0", "cam1")
-    assert geometry is not None
-    scaled = PairGeometry(-7.5 * geometry.F, geometry.straighten)
-    views = spots("cam0", points), spots("cam1", points)
-    first, second = line_signals(*views, geometry), line_signals(*views, scaled)
-    assert first is not None
-    assert second is not None
-    assert np.allclose(first[0], second[0])
-    assert np.allclose(first[1], second[1])
-
-
 def test_views_that_share_few_lines_have_no_signals() -> None:
     """The second picture is far above the first one, on rows that no line of the first meets."""
     F = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # the same rows

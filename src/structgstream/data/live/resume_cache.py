@@ -36,7 +36,6 @@ LAST = 3
 FOLDER_PURPOSE = "pictures that a live stream needs to be resumed"
 FILE_NAME = re.compile(r"frame-(\d{8})\.pictures")
 FORMAT = "structgstream-pictures-2"
-WITHOUT_RESIDUALS = "structgstream-pictures-1"  # of earlier versions
 LEVEL = 1  # 300 MB/s and more, at about the sizes of higher levels: noise does not compress
 MAX_HEADER = 1 << 20
 
@@ -146,13 +145,10 @@ def read_pictures(path: Path) -> tuple[MultiViewFrame, float]:
     try:
         with path.open("rb") as file:
             header: dict[str, Any] = json.loads(file.readline(MAX_HEADER))
-            written = header["format"]
-            if written not in (FORMAT, WITHOUT_RESIDUALS):
+            if header["format"] != FORMAT:
                 raise ValueError("another format")
-            images = {name: _read(file, entry, np.uint8, (3,)) for name, entry in header["images"].items()}
+            images = {name: restored(_read(file, entry, np.uint8, (3,))) for name, entry in header["images"].items()}
             masks = {name: _read(file, entry, np.bool_, ()) for name, entry in header["masks"].items()}
-        if written == FORMAT:
-            images = {name: restored(image) for name, image in images.items()}
         times = float(header["pts_seconds"]), header["captured_unix_seconds"]
         return MultiViewFrame(int(header["index"]), times[0], images, masks, times[1]), float(header["origin_seconds"])
     except FileNotFoundError:

@@ -18,6 +18,9 @@ from structgstream_studies.experiments.readings import READINGS
 from structgstream_studies.experiments.results import Result, round_floats
 from structgstream_studies.experiments.variants import FULL_METHODS, variants
 
+SETTLED: Mapping[str, Any] = {"initial.losses.offset_distance_reading": "scaled"}
+"""Fields that are gone, with the value that every present program has: a result with it has today's configuration."""
+
 
 @dataclass(frozen=True)
 class Former:
@@ -136,7 +139,7 @@ def _fields(config: Mapping[str, Any], before: str = "") -> dict[str, Any]:
     for name, value in config.items():
         if isinstance(value, Mapping):
             found |= _fields(value, f"{before}{name}.")
-        elif before or name != "seed":
+        elif (before or name != "seed") and SETTLED.get(before + name) != value:
             found[before + name] = value
     return found
 

@@ -71,16 +71,6 @@ READINGS: Mapping[str, Reading] = {
     "reading-l1": Reading(
         "the weight of L1", "0.8, as Scaffold-GS's code", _losses(lambda losses: replace(losses, l1=0.8))
     ),
-    "reading-distance-raw": Reading(
-        "what L_dist compares with 2 eps",
-        "each component of |O|",
-        _losses(lambda losses: replace(losses, offset_distance_reading="raw"), everywhere=False),
-    ),
-    "reading-distance-norm": Reading(
-        "what L_dist compares with 2 eps",
-        "the length of O * l_v",
-        _losses(lambda losses: replace(losses, offset_distance_reading="norm"), everywhere=False),
-    ),
     "reading-distance-sum": Reading(
         "L_dist a sum or a mean",
         "sum, as printed",

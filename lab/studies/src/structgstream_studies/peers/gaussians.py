@@ -230,7 +230,9 @@ class _FromScratchHooks(Hooks[View, ViewLoss]):
                 self._densify(prune_large=config.has_reset(iteration))
             if iteration == config.reset_at:
                 logits = reset_opacities(self.adam.values["logit_opacities"])
-                self.adam.replace_values("logit_opacities", logits)
+                self.adam.values["logit_opacities"] = logits.detach().clone().contiguous().requires_grad_()
+                for moments in (self.adam.first, self.adam.second):
+                    moments["logit_opacities"] = torch.zeros_like(logits)
 
     def _densify(self, *, prune_large: bool) -> None:
         change = densify(

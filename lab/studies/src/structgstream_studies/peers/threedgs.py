@@ -34,7 +34,7 @@ class ThreeDGS(IndependentFrames[PlainGaussians]):
             seed=task.seed,
             on_step=task.on_step,
         )
-        return fit.with_scene(fit.scene.gaussians)
+        return FitResult(**{**vars(fit), "scene": fit.scene.gaussians})
 
     def arrays(self, state: PlainGaussians) -> Arrays:
         """Every parameter in float32, as the published code stores it."""

@@ -172,7 +172,8 @@ class ThreeDGStream(PicturesOnly):
         )
         base, color = fit.scene.gaussians, fit.scene.camera_color
         none = PlainGaussians.empty(base.degree, base.means)
-        return fit.with_scene(StreamedGaussians(base, none, color, box_of(base.means, self.config.box_share), None))
+        scene = StreamedGaussians(base, none, color, box_of(base.means, self.config.box_share), None)
+        return FitResult(**{**vars(fit), "scene": scene})
 
     def prepare(self, state: StreamedGaussians, task: Callable[[], FrameTask]) -> Cache:
         """The cache that every frame starts from."""
