@@ -14,9 +14,8 @@ from structgstream.kernels.values import Rasterizer
 
 SIDE = 40  # pixels: tiles are cut at the border
 COUNT = 60  # Gaussians
-TOLERANCE = (
-    1e-3  # mean difference, relative to the mean: a pixel in which a Gaussian falls below 1/255 alone may differ
-)
+TOLERANCE = 1e-3
+"""Mean difference relative to the mean; a Gaussian near 1/255 may be missing in a pixel."""
 
 
 def disagreement(rasterize: Rasterizer, oracle: Rasterizer, device: torch.device) -> str | None:
