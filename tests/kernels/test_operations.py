@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from structgstream.kernels import cuda, cuda_library
+from structgstream.kernels import cuda, cuda_library, self_check
 from structgstream.kernels.backend import Backend, cpu_backend, cuda_backend, reference_backend
 from structgstream.kernels.cuda_library import CUDA_PROTOTYPES, KernelLibrary
 from structgstream.kernels.native import native_reason
@@ -42,6 +42,7 @@ def pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     library = KernelLibrary(functions, "cuda", lambda device: 0)
     monkeypatch.setattr(cuda, "cuda_reason", lambda: None)
     monkeypatch.setattr(cuda_library, "kernel_library", lambda: library)
+    monkeypatch.setattr(self_check, "disagreement", lambda rasterize, oracle, device: None)
 
 
 @pytest.mark.usefixtures("pretended_gpu")
