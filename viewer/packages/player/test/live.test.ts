@@ -335,6 +335,23 @@ describe("a host in trouble", () => {
     expect(play.errors).toEqual([]);
   });
 
+  test("a part that was removed is not lost while the manifest that says where it is now does not come", async () => {
+    const live = run(13, { frameSeconds: 1 });
+    const host = new Host({ "": live });
+    const part = live.newest("part-");
+    const play = opened(host, 0);
+    await play.settled();
+    live.files.delete(part);
+    host.instead.set("/manifest.json", live.files.get("manifest.json")!);
+    play.engine.seekFrame(12);
+    await play.until(() => host.asked(part) > 4, "five requests");
+    expect(play.errors).toEqual([]);
+    live.write(4);
+    host.instead.delete("/manifest.json");
+    await play.until(() => play.shown.at(-1) === 12, "frame 12");
+    expect(play.errors).toEqual([]);
+  });
+
   test("a replaced stream is reported", async () => {
     const live = run(10);
     const host = new Host({ "": live });

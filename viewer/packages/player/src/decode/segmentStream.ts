@@ -12,7 +12,7 @@ import { type Chapter, Chapters, type Stream, type StreamEvents } from "./stream
 
 /** Seconds to wait after a file could not be fetched. */
 const AGAIN_MILLISECONDS = 1000;
-/** Number of requests of a file that is missing or wrong. */
+/** Number of requests of a file that is missing or wrong; while the stream goes on, of manifests that name it. */
 const ATTEMPTS = 3;
 
 export interface SegmentEvents extends Omit<StreamEvents, "failed"> {
@@ -30,7 +30,9 @@ export class SegmentStream implements Stream {
   private readonly chapters = new Chapters();
   /** Files that are being fetched, except those with packets. */
   private readonly coming = new Set<string>();
-  private readonly failures = new Map<string, number>();
+  private readonly failures = new Map<string, { readonly count: number; readonly manifest: number }>();
+  /** Manifests so far. */
+  private manifests = 0;
   private following: number | undefined;
   private troubled = false;
 
@@ -97,6 +99,7 @@ export class SegmentStream implements Stream {
   }
 
   private take(manifest: Manifest): void {
+    this.manifests++;
     this.catalog.take(manifest);
     this.loader.blocked = false;
     this.events.changed();
@@ -185,10 +188,12 @@ export class SegmentStream implements Stream {
     }, AGAIN_MILLISECONDS);
   }
 
-  /** Number of permanent failures of a file. */
+  /** Number of permanent failures of a file. Until the next manifest one that was removed cannot be found elsewhere. */
   private attempt(file: string, temporary: boolean): number {
-    const count = (this.failures.get(file) ?? 0) + Number(!temporary);
-    this.failures.set(file, count);
+    const before = this.failures.get(file);
+    const same = this.catalog.live && before?.manifest === this.manifests;
+    const count = (before?.count ?? 0) + Number(!temporary && !same);
+    this.failures.set(file, { count, manifest: temporary ? (before?.manifest ?? -1) : this.manifests });
     if (this.failures.size > 64) this.failures.delete(this.failures.keys().next().value as string);
     return count;
   }
