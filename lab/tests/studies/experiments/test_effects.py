@@ -66,7 +66,7 @@ def test_what_the_switches_are() -> None:
         == (100, 50)
         == (RIG.online.iterations, RIG.online.patching.iteration)
     )
-    assert whole.iterations == 140
+    assert whole.iterations > paced.iterations
     assert online["compact-rank-8"].appearance_rank == 8 != whole.appearance_rank
     dark = online["compact-without-light"]
     assert whole.exposure.enabled
