@@ -78,7 +78,9 @@ def box(seed: int, middle: tuple[float, float], size: Sequence[float], *, degree
     return [*sides, _plane(painted(10 * seed + 4), top, turn @ turned(90.0, axis=0), (width, depth))]
 
 
-def _plane(texture: NDArray[np.uint8], corner: Sequence[float], rotation: Floats, size: tuple[float, float]) -> Plane:
+def _plane(
+    texture: NDArray[np.uint8], corner: Sequence[float] | Floats, rotation: Floats, size: tuple[float, float]
+) -> Plane:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, corner
     return Plane(texture, pose, size)

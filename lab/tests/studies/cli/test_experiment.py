@@ -33,7 +33,7 @@ from tests.support.small_presets import few_points
 ROOT = Path(__file__).parents[4]
 SMALL = ["--frames", "2", "--scale", "0.25", "--seeds", "0", "--device", QUICKEST, "--jobs", "2"]
 QUICK = ["--preset", "tiny", "--initial.iterations", "3", "--online.iterations", "2"]
-QUICK += ["--online.patching.iteration", "1"]
+QUICK += ["--online.patching.iteration", "1", "--initial.losses.offset_distance", "0.005"]
 
 
 def with_iterations(config: StreamConfig, iterations: int) -> StreamConfig:

@@ -2,7 +2,7 @@
 """The protocol of peers: fitting of frames, and conversion of frames to arrays and back."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Generic, Protocol
 
 import numpy as np
@@ -16,7 +16,7 @@ from structgstream.kernels.backend import Backend
 from structgstream.session.pipeline import FrameTask, Memory, Method, Past, State
 from structgstream.training.online.preprocess import FramePictures
 from structgstream.training.result import FitResult
-from structgstream.training.views import training_views
+from structgstream.training.views import View, training_views
 
 Arrays = dict[str, NDArray[Any]]
 """A frame's fields by name, as they are stored: float16, float32, uint8 or int64."""
@@ -60,7 +60,7 @@ class PicturesOnly:
     needs_older = False
 
     def observe(
-        self, frame: MultiViewFrame, before: MultiViewFrame | None, *, rig: CameraRig, backend: Backend
+        self, frame: MultiViewFrame, before: Sequence[View] | None, *, rig: CameraRig, backend: Backend
     ) -> FramePictures:
         """The training views."""
         return FramePictures(training_views(frame, rig, backend.device), None)
