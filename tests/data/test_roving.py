@@ -152,7 +152,7 @@ def test_a_capture_has_its_roving_pictures(tmp_path: Path) -> None:
 
 
 def test_what_moves_has_the_points_of_the_still_cameras_and_of_its_hull(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     write_capture(tmp_path)
     source = open_capture(tmp_path)
@@ -166,7 +166,9 @@ def test_what_moves_has_the_points_of_the_still_cameras_and_of_its_hull(
     hull = np.array([[0.1, 0.0, 0.0]])
     monkeypatch.setattr(WithRoving, "hull", lambda self, frame: hull)
     frame = next(source.frames())
-    np.testing.assert_array_equal(frame_points(source, frame), np.concatenate([behind, moving, hull]))
+    with caplog.at_level("INFO"):
+        np.testing.assert_array_equal(frame_points(source, frame), np.concatenate([behind, moving, hull]))
+    assert "Of what moves 1 points were matched; its hull gives 1" in caplog.text
     np.testing.assert_array_equal(frame_points(source, replace(frame, index=1)), np.concatenate([moving, still]))
     alone = open_capture(tmp_path, roving=False)
     np.testing.assert_array_equal(frame_points(alone, frame), np.concatenate([moving, still]))
