@@ -151,8 +151,9 @@ def test_a_capture_has_its_roving_pictures(tmp_path: Path) -> None:
     assert more.masks["roving/0"] is pictures[0].mask or (more.masks["roving/0"] == pictures[0].mask).all()
 
 
-def test_what_moves_has_the_points_of_the_still_cameras_and_of_its_hull(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize(("count", "added"), [(100, 100), (10, 0)])
+def test_what_moves_has_the_points_of_the_still_cameras_and_of_its_hull_if_these_are_few(
+    count: int, added: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     write_capture(tmp_path)
     source = open_capture(tmp_path)
@@ -163,12 +164,12 @@ def test_what_moves_has_the_points_of_the_still_cameras_and_of_its_hull(
 
     monkeypatch.setattr(roving_module, "initial_points", found)
     monkeypatch.setattr(WithRoving, "moving", lambda self, points, frame: (points == 0).all(1))
-    hull = np.array([[0.1, 0.0, 0.0]])
+    hull = np.tile([0.1, 0.0, 0.0], (count, 1))
     monkeypatch.setattr(WithRoving, "hull", lambda self, frame: hull)
     frame = next(source.frames())
     with caplog.at_level("INFO"):
-        np.testing.assert_array_equal(frame_points(source, frame), np.concatenate([behind, moving, hull]))
-    assert "Of what moves 1 points were matched; its hull gives 1" in caplog.text
+        np.testing.assert_array_equal(frame_points(source, frame), np.concatenate([behind, moving, hull[:added]]))
+    assert f"Of what moves 1 points were matched; {added} of its hull are added" in caplog.text
     np.testing.assert_array_equal(frame_points(source, replace(frame, index=1)), np.concatenate([moving, still]))
     alone = open_capture(tmp_path, roving=False)
     np.testing.assert_array_equal(frame_points(alone, frame), np.concatenate([moving, still]))

@@ -42,6 +42,7 @@ REACH_PIXELS = 2  # of the reduced pictures, by which what differs is enlarged
 DEPTHS = 96  # places on a ray, evenly in the logarithm of depth: 5 % apart, less than people are thick
 FAR_NEARS = 96.0  # near planes to the farthest place on a ray, which is as far as all still cameras at least
 MIN_SEEN = 2  # still cameras that see a place
+MATCHED_SHARE = 0.02  # matched points of what moves, for each of the hull, below which the hull's are added
 NEAR_SHARE = 0.25  # of the near plane of the still cameras: one walks closer to things
 
 
@@ -164,8 +165,8 @@ def frame_points(
     """Initial points ``[P, 3]`` of a frame; of frame 0 from the roving pictures, too.
 
     Roving pictures are closer to a still camera than its neighbours are, and have nothing of what moves. So what moves
-    has the points of the still cameras alone; these hardly match between cameras that are far apart, so the surface of
-    the hull is added.
+    has the points of the still cameras alone. Cameras that are far apart hardly match any; then the surface of the hull
+    is added, which is too large, and harms where there are matches.
     """
     config, roving = config or PointsConfig(), roving_of(source)
     found = initial_points(frame, source.rig, config=config, seed=seed).positions
@@ -173,8 +174,9 @@ def frame_points(
         return found
     still = initial_points(*joined(source.rig, frame, roving.roving(frame)), config=config, seed=seed).positions
     moving, hull = found[roving.moving(found, frame)], roving.hull(frame)
-    _log.info("Of what moves %d points were matched; its hull gives %d", len(moving), len(hull))
-    return np.concatenate([still, moving, hull])
+    lacking = len(moving) < MATCHED_SHARE * len(hull)
+    _log.info("Of what moves %d points were matched; %d of its hull are added", len(moving), lacking * len(hull))
+    return np.concatenate([still, moving, hull] if lacking else [still, moving])
 
 
 def joined(
