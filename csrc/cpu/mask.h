@@ -22,6 +22,9 @@ inline bool any(mask m) { return m != 0; }
 inline uint32_t bits(mask m) { return m; }
 inline vf choose(mask m, vf a, vf b) { return (vf)_mm512_mask_blend_ps(m, (__m512)b, (__m512)a); }
 inline vf keep(mask m, vf a) { return (vf)_mm512_maskz_mov_ps(m, (__m512)a); }
+inline void store_first(float* p, vf v, int lanes) {  // the first lanes only
+    _mm512_mask_storeu_ps(p, static_cast<mask>((1u << lanes) - 1), (__m512)v);
+}
 
 #else
 
@@ -34,6 +37,10 @@ inline mask either(mask a, mask b) { return a | b; }
 inline mask without(mask a, mask b) { return a & ~b; }
 inline vf choose(mask m, vf a, vf b) { return (vf)(((vi)a & m) | ((vi)b & ~m)); }
 inline vf keep(mask m, vf a) { return (vf)((vi)a & m); }
+inline void store_first(float* p, vf v, int lanes) {  // the first lanes only
+    if (lanes == kLanes) return store(p, v);
+    for (int i = 0; i < lanes; ++i) p[i] = v[i];
+}
 
 // A bit for each lane.
 inline uint32_t bits(mask m) {

@@ -27,15 +27,13 @@ constexpr int kMapsAtOnce = 8;
 template <int Count>
 inline void store_sums(const vf (&m)[Count], float* out) {
     constexpr int kGroups = (Count + kLanes - 1) / kLanes;
-    float sums[kGroups * kLanes];
 #pragma GCC unroll 4
     for (int g = 0; g < kGroups; ++g) {
         vf rows[kLanes];
 #pragma GCC unroll 16
         for (int i = 0; i < kLanes; ++i) rows[i] = g * kLanes + i < Count ? m[g * kLanes + i] : splat(0.0f);
-        store(sums + g * kLanes, sums_of_lanes(rows));
+        store_first(out + g * kLanes, sums_of_lanes(rows), std::min(kLanes, Count - g * kLanes));
     }
-    std::memcpy(out, sums, sizeof(float) * Count);
 }
 
 // 2^x for x in [-8, 0.1]: integer part by rounding, fraction by a polynomial (error 9e-8) whose terms do not wait for

@@ -8,7 +8,14 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from structgstream.training.online.config import MotionConfig
-from structgstream.training.residuals import ResidualFloor, apply_camera_color, box_mean, residual, residual_floor
+from structgstream.training.residuals import (
+    ResidualFloor,
+    apply_camera_color,
+    box_mean,
+    recorded,
+    residual,
+    residual_floor,
+)
 from structgstream.training.views import blackened, training_views
 from tests.support.backends import quickest_backend
 from tests.support.varied import varied
@@ -47,6 +54,18 @@ def test_a_rendering_is_compared_as_its_camera_would_have_recorded_it() -> None:
     drawn = (view.colors - 0.1) / 2.0
     assert residual(drawn, view, color, BACKEND).max() < 1e-6
     assert residual(view.colors, view, color, BACKEND).mean() > 0.05
+
+
+def test_gradients_of_a_recorded_rendering_are_those_of_its_formula() -> None:
+    generator = torch.Generator().manual_seed(1)
+    numbers = [torch.rand(size, generator=generator) for size in ((5, 7, 3), (3,), (3,))]
+    image, gains, biases = (values.requires_grad_() for values in numbers)
+    weights = torch.rand(5, 7, 3, generator=generator)
+    found, expected = (
+        torch.autograd.grad(values, [image, gains, biases], weights)
+        for values in (recorded(image, gains, biases), image * gains + biases)
+    )
+    torch.testing.assert_close(found, expected)
 
 
 def test_the_floor_is_what_frame_0_missed_nearby() -> None:

@@ -193,9 +193,9 @@ def picture_loss(
         image, tiles = rendering.image, None if active is None else active.tiles
         gains, biases = color.gains[view.index], color.biases[view.index]
         if view.mask is not None:  # Note [Masked pixels]
-            l1, ssim = backend.l1_ssim(blackened(image * gains + biases, view.mask), view.image, tiles=tiles)
+            l1, ssim = backend.l1_ssim(blackened(recorded(image, gains, biases), view.mask), view.image, tiles=tiles)
         elif gains.requires_grad:
-            l1, ssim = backend.l1_ssim(image * gains + biases, view.image, tiles=tiles)
+            l1, ssim = backend.l1_ssim(recorded(image, gains, biases), view.image, tiles=tiles)
         else:  # The loss kernel applies a constant correction at no cost.
             l1, ssim = backend.l1_ssim(image, view.image, gains=gains, biases=biases, tiles=tiles)
         terms = {"l1": l1, "ssim": 1.0 - ssim}
@@ -259,8 +259,8 @@ class GradientStatistics:
         drawn = (rendering.radii > 0).to(length)
         # An id occurs once a rendering, so sums repeat bit for bit.
         ids = rendering.gaussians.ids
-        self.total.index_add_(0, ids, length * drawn)
-        self.count.index_add_(0, ids, drawn)
+        self.total.scatter_add_(0, ids, length.mul_(drawn))
+        self.count.scatter_add_(0, ids, drawn)
 
     def mean(self) -> Tensor:
         """Mean gradient norm of each slot, ``[slots]`` in NDC; 0 if it was never drawn."""

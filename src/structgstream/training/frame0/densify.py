@@ -99,8 +99,9 @@ class OpacityStatistics:
 
     def add(self, structured: StructuredGaussians) -> None:
         """Add one rendering."""
-        self.opacity[structured.anchors] += structured.raw_opacities.clamp(min=0.0).sum(1)
-        self.visits[structured.anchors] += 1.0
+        opacities = structured.raw_opacities.clamp(min=0.0).sum(1)
+        self.opacity.scatter_add_(0, structured.anchors, opacities)
+        self.visits.scatter_add_(0, structured.anchors, torch.ones_like(opacities))
 
 
 @dataclass(frozen=True)
