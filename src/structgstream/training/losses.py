@@ -149,15 +149,13 @@ class SceneLoss(ViewLoss):
 
     Args:
         structured: the Gaussians of its anchors.
-        unperturbed: all its Gaussians before perturbation.
     """
 
     structured: StructuredGaussians
-    unperturbed: Gaussians
 
     def detached(self) -> Self:
         structured = replace(self.structured, gaussians=self.structured.gaussians.detached())
-        return replace(super().detached(), structured=structured, unperturbed=self.unperturbed.detached())
+        return replace(super().detached(), structured=structured)
 
 
 def picture_loss(
@@ -223,8 +221,9 @@ def view_loss(
     with watch.stage("generate"):
         tiles = None if active is None else active.tiles
         structured = scene.structured(view.camera, backend, tiles=tiles)
-        unperturbed = scene.with_free_gaussians(structured)
-        gaussians = unperturbed if perturbation is None else perturbation(unperturbed)
+        gaussians = scene.with_free_gaussians(structured)
+        if perturbation is not None:
+            gaussians = perturbation(gaussians)
     loss = picture_loss(
         gaussians,
         view,
@@ -241,7 +240,7 @@ def view_loss(
             scales, opacities = gaussians.scales, gaussians.opacities
             value = volume(scales, opacities, reduction=weights.volume_reduction, backend=backend)
             loss = with_term(loss, "volume", value, weight=weights.volume)
-    return SceneLoss(**vars(loss), structured=structured, unperturbed=unperturbed)
+    return SceneLoss(**vars(loss), structured=structured)
 
 
 class GradientStatistics:
