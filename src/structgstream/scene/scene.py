@@ -94,9 +94,8 @@ class Scene:
         )
         if intervals is None:
             return generated
-        of_slots = intervals[:, None].expand(-1, cloud.offsets_per_anchor).reshape(-1)
-        of_drawn = of_slots.index_select(0, generated.gaussians.ids)
-        return replace(generated, gaussians=replace(generated.gaussians, sampling_intervals=of_drawn))
+        of_anchor = generated.gaussians.ids // cloud.offsets_per_anchor
+        return replace(generated, gaussians=replace(generated.gaussians, sampling_intervals=intervals[of_anchor]))
 
     def gaussians_of_views(
         self, cameras: Sequence[Camera], backend: Backend, *, tiles: Sequence[TileSelection] | None = None

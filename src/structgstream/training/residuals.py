@@ -67,7 +67,7 @@ def apply_camera_color(image: Tensor, color: CameraColor, view_index: int) -> Te
 
 def recorded(image: Tensor, gains: Tensor, biases: Tensor) -> Tensor:
     """``gains * image + biases`` of a rendering ``[..., H, W, 3]``; the two are ``[..., 3]``."""
-    # By rows instead of pixels of three numbers, which takes a sixth of the time, and a third with gradients.
+    # By rows instead of pixels of three numbers, which takes a sixth of the time.
     factors, summands = (t.repeat(*[1] * (t.dim() - 1), image.shape[-2]).unsqueeze(-2) for t in (gains, biases))
     return (image.flatten(-2) * factors + summands).reshape(image.shape)
 
